@@ -59,13 +59,13 @@ def test_the_readme_and_the_help_name_the_same_exit_codes() -> None:
     in_help = set(re.findall(r"^ +(\d+)  \w", said[said.index("Exit codes:") :], flags=re.MULTILINE))
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     sentence = readme[readme.index("Exit codes: ") :].split("\n\n")[0]
-    assert set(re.findall(r"(?:^|[ ,:])(\d+) [a-z]", sentence)) == in_help == {"0", "1", "2", "3", "4", "5", "6", "130"}
+    assert set(re.findall(r"\b(\d+) [a-z]", sentence)) == in_help == {"0", "1", "2", "3", "4", "5", "6", "7", "130"}
 
 
 def test_help_of_a_command_checks_no_option_with_pydantic() -> None:
     code = (
         "import sys; sys.argv = ['log2sim', 'replay', '-h']\nfrom log2sim import cli\ntry: cli.main()\n"
-        "except SystemExit: pass\nsys.stderr.write(','.join(m for m in ('pydantic', 'rich', 'importlib.metadata') if m in sys.modules))"
+        "except SystemExit: pass\nsys.stderr.write(','.join(m for m in ('pydantic', 'rich') if m in sys.modules))"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stderr == ""

@@ -39,6 +39,7 @@ PURPOSES = {
     "parquet": "Argoverse 2 and Waymo's parquet as logs, to_parquet",
     "dataframe": "scenario.to_dataframe",
     "odometry": "--poses lidar and auto",
+    "dataframe": "tables of scenarios as pandas.DataFrame",
     "rerun": "export --to rerun",
     "carla": "replay --simulator carla",
 }
