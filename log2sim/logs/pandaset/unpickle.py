@@ -10,7 +10,9 @@ import io
 import pickle
 import re
 import struct
+import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,12 +23,12 @@ from log2sim.errors import LogError, RecordError
 from log2sim.input_files import read_file
 from log2sim.logs.pandaset.arrow_text import decode_text
 
-try:  # a third of the time, see the extra `pandaset`
-    from isal.isal_zlib import IsalError as GzipError
-    from isal.isal_zlib import decompressobj
-except ImportError:
-    from zlib import decompressobj
-    from zlib import error as GzipError
+decompressobj: Callable[..., Any] = zlib.decompressobj
+GzipError: type[Exception] = zlib.error
+with suppress(ImportError):  # a third of the time, see the extra `pandaset`
+    from isal import isal_zlib
+
+    decompressobj, GzipError = isal_zlib.decompressobj, isal_zlib.IsalError
 
 MAX_TABLE_BYTES = 512 * 1024 * 1024
 # Cells that become objects of Python: a few bytes of a pickle can name the same text again and again.

@@ -132,7 +132,7 @@ def _around(visible: ProjectedPoints, boxes_px: Array, k: int) -> NDArray[np.int
     for j, (a0, b0, a1, b1) in enumerate(boxes_px.tolist()):
         if j != k and not (a0 <= u0 and a1 >= u1):
             found &= ~((u >= a0) & (u <= a1) & (v >= b0) & (v <= b1))
-    return near[found]
+    return np.asarray(near[found])
 
 
 def _goes_on(visible: ProjectedPoints, body: NDArray[np.intp], around: NDArray[np.intp], box_px: Array) -> bool:
