@@ -20,6 +20,9 @@ from log2sim.datatypes import Scenario
 from log2sim.geometry import Array
 from log2sim.simulation.policy import Controls, EgoState, Observation, Others, PathAhead
 
+FULL_BRAKE_MPS2 = 12.0
+"""More than dry tires hold."""
+
 
 class BrakeInTime:
     """Drives the way of the scenario, yet does not slow down with it: it brakes hard, and only when it must.
@@ -44,7 +47,7 @@ class BrakeInTime:
         # Once it brakes it goes on until it is as slow as the leader.
         self.braking = needed_mps2 > self.brake_at_mps2 or (self.braking and closing > 0 and np.isfinite(gap_m))
         if self.braking:
-            accel = -max(needed_mps2, self.brake_at_mps2)
+            accel = -min(max(needed_mps2, self.brake_at_mps2), FULL_BRAKE_MPS2)
         else:
             cruise_mps = self.hurry * float(seen.path.speed_mps[:30].max())
             close = gap_m < 2 * self.room_m + 0.5 * ego.speed_mps

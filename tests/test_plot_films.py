@@ -176,6 +176,14 @@ def test_a_range_of_time_cuts_tracks_at_its_ends() -> None:
     there = cut_replay(result, Span(0.6, 1.25), scenario).agent("car-1")
     assert 0.55 < there.t_s[0] < there.t_s[-1] < 1.3
     assert len(there.cross_track_m) == len(there.commands.gear) == len(there.t_s)
+    parked = cut_replay(result, Span(0.6, 1.25), scenario).agent(
+        "parked"
+    )  # has a state at the start and one at the end
+    assert parked.x_m[0] == 5.0
+    event = {"t_s": 0.9, "agents": ["car-1", "parked"], "belongs_to": "replay"}
+    hit = dataclasses.replace(result, metrics={**result.metrics, "collisions": [event]})
+    for span, count in ((Span(0.6, 1.25), 1), (Span(1.0, 2.0), 0)):
+        assert len(cut_replay(hit, span, scenario).metrics["collisions"]) == count
     assert cut_scenario(scenario, Span(0.0, scenario.duration_s)) is scenario
     early = world(straight("ego"), straight("gone", start=(0.0, 3.0), t_s=np.array([0.0, 0.5, 1.0])))
     assert [a.id for a in cut_scenario(early, Span(2.0, 3.0)).agents] == ["ego"]

@@ -98,7 +98,8 @@ def cut_replay(replay: Any, span: Span, scenario: Scenario) -> Any:
     """Return a replay with what is within a range of the scenario's time."""
     if replay is None or (span.start_s <= 0.0 and span.stop_s >= scenario.duration_s):
         return replay
-    agents = tuple(_cut_states(agent, span.holds(agent.t_s)) for agent in replay.agents if span.holds(agent.t_s).any())
+    cut = [_cut_states(agent, span) for agent in replay.agents]
+    agents = tuple(agent for agent in cut if agent is not None)
     there = {agent.id for agent in agents}
     events = [e for e in replay.metrics.get("collisions", ()) if span.holds(e["t_s"]) and set(e["agents"]) <= there]
     warnings = replay.warnings
@@ -126,7 +127,11 @@ def _cut_agent(agent: Agent, span: Span) -> Agent | None:
     return replace(agent, waypoints=replace(taken, t_s=t_s, **exact))
 
 
-def _cut_states(agent: Any, keep: NDArray[np.bool_]) -> Any:
+def _cut_states(agent: Any, span: Span) -> Any:
+    """Return the states of a replayed agent within a range; None when it is not there."""
+    keep = span.holds(agent.t_s)
+    if not keep.any():  # what stands has a state at the start and one at the end
+        return agent if len(agent.t_s) and agent.t_s[0] < span.start_s and agent.t_s[-1] > span.stop_s else None
     commands = agent.commands
     if commands is not None:
         commands = replace(commands, **{name: getattr(commands, name)[keep] for name in commands.COLUMNS})
