@@ -62,7 +62,7 @@ class Obstacles:
         """Return the indices (n,), rising, of the points in the square of `reach_m` to all four sides of a place (2,), map frame."""
         x, y = (xy - self.origin[:2]).astype(np.float32)
         near = np.flatnonzero(np.abs(self._x - x) <= reach_m)
-        return near[np.abs(self.xyz[near, 1] - y) <= reach_m]
+        return np.asarray(near[np.abs(self.xyz[near, 1] - y) <= reach_m], dtype=np.intp)
 
     @cached_property
     def _x(self) -> NDArray[np.float32]:

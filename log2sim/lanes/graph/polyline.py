@@ -174,7 +174,7 @@ def crossings(one: Polyline, two: Polyline) -> Array:
     sine = np.abs(det) / (np.hypot(*da.T) * np.hypot(*db.T))
     hit = (sine > MIN_SINE) & (f >= 0) & (f < 1) & (g >= 0) & (g < 1)
     found = np.column_stack([s[i] + f * np.diff(s)[i], t[j] + g * np.diff(t)[j]])[hit]
-    return found[found[:, 0] < found[:, 1] - CROSSING_STEP_M] if one is two else found
+    return np.asarray(found[found[:, 0] < found[:, 1] - CROSSING_STEP_M] if one is two else found)
 
 
 def _near_chords(a: Array, b: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
