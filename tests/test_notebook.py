@@ -329,9 +329,12 @@ def test_plot_draws_into_given_axes(scenario: Scenario, replayed: Replay) -> Non
         assert ax.get_ylim()[0] < w.y_m[0] < ax.get_ylim()[1]
     assert ax.get_legend() is None
     limits = ax.get_xlim(), ax.get_ylim()
-    plot(replace(scenario, agents=scenario.agents[:1]), ax, legend=True)
+    doubted = replace(scenario, agents=tuple(replace(a, confidence=0.2) for a in scenario.agents[:2]))
+    plot(doubted, ax, legend=True)
     assert (ax.get_xlim(), ax.get_ylim()) == limits
-    assert ax.get_legend() is not None
+    legend = ax.get_legend()
+    assert legend is not None
+    assert any("doubt" in text.get_text() for text in legend.get_texts())
 
 
 def test_plot_makes_a_figure_of_its_own(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from log2sim.visualization.plot import doubts, drawing
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.labels import draw_labels, place_labels
 from log2sim.visualization.plot.layout import legend_rows
-from log2sim.visualization.plot.road_features import draw_road, draw_signals
+from log2sim.visualization.plot.road_features import draw_road, draw_signals, road_rows
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles, is_moving
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED
 from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
@@ -82,7 +82,8 @@ def plot(
     if new if legend is None else legend:
         overlays = {"truth": truth is not None, "replay": replay is not None}
         collisions = len(new_collisions(replay)[0])
-        _draw_legend(ax, legend_rows(roles, step_s, placed.told, collisions=collisions, outside=0, **overlays))
+        rows = legend_rows(roles, step_s, placed.told, collisions=collisions, outside=0, **overlays)
+        _draw_legend(ax, [*rows, *doubts.doubt_rows(roles, placed.told), *road_rows(scenario)])
     return ax
 
 
