@@ -4,7 +4,8 @@
 
 Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
 with as many as there are cores. Parts are the packages whose functions a thread is in, found by looking at all threads
-every few milliseconds and giving the processor time that each took since then to the function it is in. Linux only.
+every few milliseconds and giving the processor time that each took since then to the function it is in. Kept detections are
+not used. Linux only.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from log2sim.input_files import read_file
 from log2sim.logs.pandaset.arrow_text import decode_text
 
 decompressobj: Callable[..., Any] = zlib.decompressobj
-GzipError: type[Exception] = zlib.error
+GzipError: Any = zlib.error
 with suppress(ImportError):  # a third of the time, see the extra `pandaset`
     from isal import isal_zlib
 
@@ -59,7 +59,7 @@ def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_by
 
 def _gunzip(packed: bytes, limit_bytes: int) -> bytes:
     unpacker = decompressobj(wbits=31)
-    data = unpacker.decompress(packed, limit_bytes)
+    data: bytes = unpacker.decompress(packed, limit_bytes)
     if unpacker.unconsumed_tail:
         raise ValueError(f"unpacks to more than the {limit_bytes} bytes that a table may have")
     if not unpacker.eof:
