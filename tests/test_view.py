@@ -145,7 +145,7 @@ def test_view_writes_a_page(tmp_path: Path) -> None:
     arguments = ("view", TRUTH, "--truth", TRUTH, "--replay", tmp_path / "r.json", "--out", tmp_path / "v.html")
     ran = run(*arguments)
     assert ran.code == 0, ran.err
-    assert "v.html: 0.2 MB, 12 agents" in ran.out
+    assert "v.html: 0.2 MB, 11 agents and the ego" in ran.out
     assert names(tmp_path) == ["r.json", "v.html"]
     assert "--overwrite" in run(*arguments).line
     assert run(*arguments, "--overwrite", "--quiet").out == ""

@@ -104,9 +104,11 @@ def unpacked(text: str) -> np.ndarray:
 def test_records_are_taken_at_a_rate_or_evenly() -> None:
     t_ns = START_NS + STEP_NS * np.arange(100)
     assert records_within(t_ns, scene()).tolist() == list(range(21))
-    assert take_at_rate(t_ns, np.arange(21), 5.0).tolist() == list(range(0, 21, 2))
-    assert take_at_rate(t_ns, np.arange(21), 10.0).tolist() == list(range(21))
-    assert take_at_rate(t_ns, np.arange(21), 1.0).tolist() == [0, 10, 20]
+    assert take_at_rate(t_ns, np.arange(21), 5.0, START_NS).tolist() == list(range(0, 21, 2))
+    assert take_at_rate(t_ns, np.arange(21), 10.0, START_NS).tolist() == list(range(21))
+    assert take_at_rate(t_ns, np.arange(21), 1.0, START_NS).tolist() == [0, 10, 20]
+    early = t_ns - STEP_NS // 5  # a camera whose first picture is a little before the scenario shows the same moments
+    assert take_at_rate(early, np.arange(1, 21), 5.0, START_NS).tolist() == [1, *range(2, 21, 2)]
     assert take_evenly(9, 3).tolist() == [0, 4, 8]
     assert take_evenly(3, 9).tolist() == [0, 1, 2]
 

@@ -66,12 +66,15 @@ def records_within(t_ns: NDArray[np.int64], scenario: Scenario) -> NDArray[np.in
     return np.flatnonzero((t_ns >= scenario.t0_ns - margin_ns) & (t_ns <= end_ns + margin_ns)).astype(np.int64)
 
 
-def take_at_rate(t_ns: NDArray[np.int64], index: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """Return those of the records `index` (n,) of stamps (F,) that are nearest to the beats of a rate; all below twice the rate."""
+def take_at_rate(t_ns: NDArray[np.int64], index: NDArray[np.int64], rate_hz: float, start_ns: int) -> NDArray[np.int64]:
+    """Return those of the records `index` (n,) of stamps (F,) that are nearest to the beats of a rate; all of slower sensors.
+
+    Beats count from `start_ns`, so that the cameras of a rig show the same moments.
+    """
     if len(index) < 2 or period_of(t_ns[index]) * rate_hz > 0.75:
         return index
-    stamps = t_ns[index]
-    beats = np.arange(stamps[0], stamps[-1] + 1, round(NS_PER_S / rate_hz), dtype=np.int64)
+    stamps, step_ns = t_ns[index], round(NS_PER_S / rate_hz)
+    beats = np.arange(start_ns, stamps[-1] + step_ns // 2, step_ns, dtype=np.int64)
     return index[np.unique(nearest_index(stamps, beats))]
 
 

@@ -122,7 +122,7 @@ def picture_document(
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
     within = {name: index for name, index in within.items() if len(index)}
     probes = _probe(log, within, projector, reader)
-    size, chosen = _fit(log, {name: within[name] for name in probes}, probes, budget_bytes)
+    size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
     pictures = ShrunkPictures(chosen, size.width_px)
     look_again(log, reader, [pictures], progress)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
@@ -159,13 +159,17 @@ def _probe(
 
 
 def _fit(
-    log: Log, within: Mapping[str, NDArray[np.int64]], probes: Mapping[str, Mapping[int, float]], budget_bytes: int
+    log: Log,
+    start_ns: int,
+    within: Mapping[str, NDArray[np.int64]],
+    probes: Mapping[str, Mapping[int, float]],
+    budget_bytes: int,
 ) -> tuple[PictureSize, dict[str, NDArray[np.int64]]]:
     """Choose the best size that fits, and the frames of each camera."""
     chosen: dict[str, NDArray[np.int64]] = {}
     size = SIZES[-1]
     for size in SIZES:
-        chosen = {n: take_at_rate(log.streams[n].t_ns, index, size.rate_hz) for n, index in within.items()}
+        chosen = {n: take_at_rate(log.streams[n].t_ns, index, size.rate_hz, start_ns) for n, index in within.items()}
         if SAFETY * sum(len(index) * probes[n][size.width_px] for n, index in chosen.items()) <= budget_bytes:
             return size, chosen
     one_of_each = SAFETY * sum(probe[size.width_px] for probe in probes.values())

@@ -103,7 +103,7 @@ def point_document(
     if not probes:
         return None
     bright = _brightest(probes)
-    spacing, chosen = _fit(log.streams[main].t_ns, within, probes, bright, budget_bytes)
+    spacing, chosen = _fit(log.streams[main].t_ns, within, scenario.t0_ns, probes, bright, budget_bytes)
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
         if (points := sweeps.at(main, i)) is not None:
@@ -153,7 +153,12 @@ def _brightest(points: list[PointsAbove]) -> float:
 
 
 def _fit(
-    t_ns: NDArray[np.int64], within: NDArray[np.int64], probes: list[PointsAbove], bright: float, budget_bytes: int
+    t_ns: NDArray[np.int64],
+    within: NDArray[np.int64],
+    start_ns: int,
+    probes: list[PointsAbove],
+    bright: float,
+    budget_bytes: int,
 ) -> tuple[PointSpacing, NDArray[np.int64]]:
     """Choose the finest spacing that fits, and the sweeps."""
     sizes: Mapping[float, float] = {}
@@ -161,7 +166,7 @@ def _fit(
         if spacing.cell_m not in sizes:
             mean = np.mean([len(pack(p, spacing.cell_m, bright)) for p in probes])
             sizes = {**sizes, spacing.cell_m: SAFETY * float(mean) + BYTES_OF_ENTRY}
-        chosen = take_at_rate(t_ns, within, spacing.rate_hz)
+        chosen = take_at_rate(t_ns, within, spacing.rate_hz, start_ns)
         if len(chosen) * sizes[spacing.cell_m] <= budget_bytes:
             return spacing, chosen
     most = int(budget_bytes / sizes[spacing.cell_m])
