@@ -113,7 +113,9 @@ def measure(root: Path, out: Path, jobs: int, detector: str) -> Iterable[str]:
     found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
     wall, own, workers = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
     with progress(quiet=False) as report_progress:
-        rows = run_batch(batch, local_workers(jobs), progress=lambda done, total: report_progress("logs", done, total))
+        rows = run_batch(
+            batch, lambda: local_workers(jobs), progress=lambda done, total: report_progress("logs", done, total)
+        )
     wall = time.perf_counter() - wall
     own, workers = _cpu(resource.RUSAGE_SELF) - own, _cpu(resource.RUSAGE_CHILDREN) - workers
     ran = [row for row in rows if row.name in missing]

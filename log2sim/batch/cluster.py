@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from distributed import Client
 
 HOST = "127.0.0.1"
-"""Of the local cluster: pickles travel between its processes, so nobody else may reach it."""
+"""Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for certificates, too: other users of the
+machine do not get in."""
 PROTOCOLS = ("tcp://", "tls://")
 CONNECT_TIMEOUT_S = 20
 START_TIMEOUT_S = 120
@@ -34,6 +35,7 @@ SETTINGS: dict[str, Any] = {
     "distributed.comm.timeouts.tcp": "120s",
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "10s",
     # No pages: their servers would show what is run to whoever is on this machine.
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -48,16 +50,11 @@ class Workers:
     ----------
     client : distributed.Client
     are_ours : bool
-        Whether they were started for the batch, and may be restarted.
+        Whether they were started for this round of the batch, so that none ran a log in an earlier one.
     """
 
     client: Client
     are_ours: bool
-
-    def refresh(self) -> None:
-        """Start new processes where that is ours to do."""
-        if self.are_ours:
-            self.client.restart(timeout=START_TIMEOUT_S)
 
     def others_than(self, address: str) -> list[str]:
         """Return the addresses of all workers but one."""
@@ -84,7 +81,8 @@ def local_workers(count: int) -> Iterator[Workers]:
             threads_per_worker=1,
             processes=True,
             host=HOST,
-            protocol="tcp://",
+            protocol="tls://",
+            security=distributed.Security.temporary(),
             dashboard_address=None,
             worker_dashboard_address=None,
             memory_limit=MEMORY_LIMIT // count,
@@ -126,6 +124,7 @@ def workers_of(address: str) -> Iterator[Workers]:
 
 def _import_dask() -> tuple[Any, Any]:
     try:
+        import cryptography  # noqa: F401  (for the certificates of a local cluster)
         import dask
         import distributed
         import pyarrow  # noqa: F401  (for the tables at the end)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from distributed import Future
 
 Progress = Callable[[int, int], None]
+Connect = Callable[[], AbstractContextManager[Workers]]
 
 MAX_SUBMITTED = 4000
 """Jobs that the scheduler knows at once: enough for 1,000 workers, and little memory for any number of logs."""
@@ -113,16 +114,15 @@ def plan_batch(
     return Batch(folder, tuple(jobs), {name: row for name, row in rows.items() if row is not None and row.is_done})
 
 
-def run_batch(
-    batch: Batch, connection: AbstractContextManager[Workers], *, progress: Progress = lambda done, total: None
-) -> list[Row]:
+def run_batch(batch: Batch, connect: Connect, *, progress: Progress = lambda done, total: None) -> list[Row]:
     """Run the logs of a batch that are missing, and write its tables, however it ends.
 
     Parameters
     ----------
     batch : Batch
-    connection : context manager of Workers
-        Entered only if there is something to do.
+    connect : callable
+        Returns a context manager of workers. It is called if there is something to do, and again for what is repeated, so that workers
+        that are started for it are fresh ones.
     progress : callable
         Called as `progress(done, total)`.
 
@@ -135,8 +135,8 @@ def run_batch(
     try:
         if batch.missing:
             progress(finished, len(batch.jobs))
-            with connection as workers:
-                for ended in run_jobs(workers, batch.missing, batch.folder):
+            with closing(run_jobs(connect, batch.missing, batch.folder)) as endings:
+                for ended in endings:
                     rows[ended.job.name] = ended.row
                     finished += ended.repetition is None
                     progress(finished, len(batch.jobs))
@@ -148,21 +148,21 @@ def run_batch(
     return listed
 
 
-def run_jobs(workers: Workers, jobs: Iterable[Job], folder: BatchFolder) -> Iterator[Finished]:
+def run_jobs(connect: Connect, jobs: Iterable[Job], folder: BatchFolder) -> Generator[Finished, None, None]:
     """Run jobs and yield each as it ends; those that may succeed a second time are repeated at the end, on fresh workers."""
     avoided: dict[str, str] = {}
     for last in (*[False] * (MAX_ROUNDS - 1), True):
         again = []
-        for ended in _run_once(workers, jobs, folder, avoided):
-            if ended.repetition is not None and last:
-                folder.write_failure(ended.row, ended.row.error)
-                yield replace(ended, repetition=None)
-                continue
-            yield ended
-            again += [] if ended.repetition is None else [ended]
+        with connect() as workers:
+            for ended in _run_once(workers, jobs, folder, avoided):
+                if ended.repetition is not None and last:
+                    folder.write_failure(ended.row, ended.row.error)
+                    yield replace(ended, repetition=None)
+                    continue
+                yield ended
+                again += [] if ended.repetition is None else [ended]
         if not again:
             return
-        workers.refresh()
         jobs = [ended.repetition for ended in again if ended.repetition is not None]
         avoided = {ended.job.name: ended.worker for ended in again if ended.worker}
 
