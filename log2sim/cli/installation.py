@@ -37,7 +37,6 @@ PURPOSES = {
     "ros": "ROS bags and MCAP as logs",
     "pandaset": "sweeps of PandaSet in half the time",
     "parquet": "Argoverse 2 and Waymo's parquet as logs, to_parquet",
-    "dataframe": "scenario.to_dataframe",
     "odometry": "--poses lidar and auto",
     "dataframe": "tables of scenarios as pandas.DataFrame",
     "rerun": "export --to rerun",
