@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from batch_logs import FAST, damage, install_reader, lay_out_logs, tell
 from command_line import names, run
-from hypothesis import example, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from log2sim.batch import cluster
@@ -99,7 +99,7 @@ def test_links_are_followed_only_when_asked_for_and_loops_end(many_formats: Path
         assert ids(root) == [("log2sim", "other/a"), ("log2sim", "other/deeper/b")]
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(st.text("aAbB/. \n\udcff\u00e4-_", min_size=1, max_size=9), min_size=1, max_size=8, unique=True))
 @example(["a" * 81, "b" + "a" * 80, "..", "/", "a/b", "a_b"])
 def test_names_of_folders_are_safe_and_differ(texts: list[str]) -> None:
