@@ -267,3 +267,16 @@ def test_rows_are_broken_at_the_width_of_the_terminal(monkeypatch: pytest.Monkey
     assert max(map(len, broken)) <= 40
     assert broken[1].startswith("      ")
     assert " ".join(" ".join(broken).split()) == "name one two three four five six seven eight nine ten eleven"
+
+
+def test_a_stage_that_ends_early_is_shown_as_done_and_may_come_again() -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    display = Progress(console=Console(file=io.StringIO()))
+    bars = Bars(display)
+    for call in (("check lidar", 19, 20), ("track", 1, 2)):
+        bars(*call)
+    assert [(task.completed, task.total) for task in display.tasks] == [(20, 20), (1, 2)]
+    bars("check lidar", 1, 20)
+    assert [(task.completed, task.total) for task in display.tasks] == [(1, 20), (2, 2)]

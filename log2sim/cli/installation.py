@@ -38,7 +38,6 @@ PURPOSES = {
     "pandaset": "sweeps of PandaSet in half the time",
     "parquet": "Argoverse 2 and Waymo's parquet as logs, to_parquet",
     "odometry": "--poses lidar and auto",
-    "dataframe": "tables of scenarios as pandas.DataFrame",
     "rerun": "export --to rerun",
     "carla": "replay --simulator carla",
 }

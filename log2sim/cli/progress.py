@@ -91,14 +91,21 @@ class Bars:
         if stage != self._current:
             self._end_current()
             self._current = stage
+            if stage in self._tasks:
+                self._display.reset(self._tasks[stage])
         if stage not in self._tasks:
             self._tasks[stage] = self._display.add_task(say_stage(stage), total=total or None)
         self._display.update(self._tasks[stage], completed=done, total=total or None)
 
     def _end_current(self) -> None:
-        """Take the bar of a stage of unknown length away: it would go on moving."""
+        """Fill the bar of a stage that ends, and take that of a stage of unknown length away: it would go on moving."""
         task = self._tasks.get(self._current or "")
-        if task is not None and self._display.tasks[self._display.task_ids.index(task)].total is None:
+        if task is None:
+            return
+        total = self._display.tasks[self._display.task_ids.index(task)].total
+        if total is not None:
+            self._display.update(task, completed=total)
+        else:
             self._display.remove_task(task)
             del self._tasks[self._current or ""]
 

@@ -37,12 +37,16 @@ def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = Fals
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
         *(("used", line) for line in (plan_lines(scenario) if verbose else ())),
-        ("next", next_line),
     ]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
     table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
     made = ", ".join([f"made in {speed}", *known_pictures(result.report)])
-    return [f"{out}: {ids} over {scenario.duration_s:.1f} s, {made}", *table]
+    # Never broken into lines: it is there to be copied.
+    return [
+        f"{out}: {ids} over {scenario.duration_s:.1f} s, {made}",
+        *table,
+        f"  {'next':<{len('doubtful')}}  {next_line}",
+    ]
 
 
 def known_pictures(report: dict[str, Any]) -> list[str]:
