@@ -319,7 +319,10 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
         assert run(*command).code == 0
     only = run("edit", source, "--only", "ego,bus_1", "--only", "car_turning", "--out", out, "--overwrite", "--quiet")
     assert (only.code, only.out, only.err) == (0, "", "")
-    assert "1 edit, no agent but the ego over 5.2 s" in run("edit", source, "--only", "ego", "--out", out, "--overwrite").out
+    assert (
+        "1 edit, no agent but the ego over 5.2 s"
+        in run("edit", source, "--only", "ego", "--out", out, "--overwrite").out
+    )
     run("edit", source, "--only", "ego,bus_1,car_turning", "--out", out, "--overwrite")
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 

@@ -91,7 +91,7 @@ def _motion_of_ends(t: Array, m: Measurements) -> _Motion | None:
     if len(rows) < 3:
         return None
     yaw, origin = float(m.yaw_rad[rows[np.argmax(m.points[rows])]]), m.center_m[rows[0], :2]
-    both = [box_fitting.extents(m.cluster[k][:, :2] - origin, yaw) for k in rows]
+    both = [box_fitting.extents(m.cluster[k][:, :2] - origin, yaw) for k in rows.tolist()]
     ends = np.stack([np.stack(e, axis=1) for e in both])
     sensor = box_fitting.rotate(m.sensor_m[rows, :2] - origin, -yaw)
     real = real_ends(ends[..., 0], ends[..., 1], sensor, m.ends_visible[rows]) > 0

@@ -72,8 +72,8 @@ class Row(BaseModel):
         return self.status == "done"
 
 
-def done_row(job: Job, report: dict[str, Any], **spent: float) -> Row:
-    """Return the row of a log that was reconstructed, with `seconds`, `cpu_s` and `peak_memory_mib`."""
+def done_row(job: Job, report: dict[str, Any], spent: dict[str, Any]) -> Row:
+    """Return the row of a log that was reconstructed, with what it took: `seconds`, `cpu_s` and `peak_memory_mib`."""
     agents = report["agents"]
     return Row(
         **_identity(job),
@@ -89,10 +89,10 @@ def done_row(job: Job, report: dict[str, Any], **spent: float) -> Row:
     )
 
 
-def failed_row(job: Job, kind: str, message: str, **spent: float) -> Row:
+def failed_row(job: Job, kind: str, message: str, spent: dict[str, Any] | None = None) -> Row:
     """Return the row of a log that failed."""
     text = message[:MAX_ERROR_CHARS].encode("utf-8", "backslashreplace").decode()
-    return Row(**_identity(job), status="failed", error_kind=kind, error=text, **spent)
+    return Row(**_identity(job), status="failed", error_kind=kind, error=text, **(spent or {}))
 
 
 def _identity(job: Job) -> dict[str, Any]:

@@ -28,10 +28,8 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
 
 def _plain_type(annotation: Any) -> type:
     """Return the type of the values of a field, where it may be absent or is one of several texts."""
-    for part in get_args(annotation) if isinstance(annotation, UnionType) else (annotation,):
-        if part in (int, float, str):
-            return part
-    return str
+    parts = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+    return next((kind for kind in (int, float) if kind in parts), str)
 
 
 def sum_up(rows: Sequence[Row]) -> dict[str, float]:

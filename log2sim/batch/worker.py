@@ -50,13 +50,13 @@ def run_job(job: Job) -> tuple[dict[str, Any], bool]:
             result = reconstruct(log, config, cache=job.cache)
             result.scenario.save(unfinished / SCENARIO_FILE)
             write_json(unfinished / REPORT_FILE, result.report)
-            row = done_row(job, result.report, **spent())
+            row = done_row(job, result.report, spent())
             write_json(unfinished / ROW_FILE, row.model_dump())
         return row.model_dump(), False
     except Log2SimError as error:
-        row, may_repeat, text = failed_row(job, type(error).__name__, str(error), **spent()), False, str(error)
+        row, may_repeat, text = failed_row(job, type(error).__name__, str(error), spent()), False, str(error)
     except Exception as error:  # whatever it is, the other logs go on
-        row = failed_row(job, type(error).__name__, f"internal error: {type(error).__name__}: {error}", **spent())
+        row = failed_row(job, type(error).__name__, f"internal error: {type(error).__name__}: {error}", spent())
         may_repeat, text = True, traceback.format_exc()
     folder.write_failure(row, text)
     return row.model_dump(), may_repeat

@@ -27,7 +27,8 @@ class KeepingReader(RecordReader):
         kept = self._kept.get((stream, index))
         if kept is not None:
             head, names, columns = kept
-            return replace(head, **dict(zip(names, columns, strict=True)))
+            read: dict[str, Any] = dict(zip(names, columns, strict=True))
+            return replace(head, **read)
         record = super().get(stream, index)
         if isinstance(record, Sweep) and len(self._kept) < self._most:
             self._keep((stream, index), record)
@@ -42,5 +43,6 @@ class KeepingReader(RecordReader):
     def _keep(self, key: tuple[str, int], sweep: Sweep) -> None:
         names = [name for name in COLUMNS if getattr(sweep, name) is not None]
         columns = ArrayList([self._file.keep(getattr(sweep, name)) for name in names])
-        head = replace(sweep, **{name: getattr(sweep, name)[:0].copy() for name in names})
+        empty: dict[str, Any] = {name: getattr(sweep, name)[:0].copy() for name in names}
+        head = replace(sweep, **empty)
         self._kept[key] = head, names, columns

@@ -41,7 +41,8 @@ class _Tick:
 
     def _rays(self) -> Rays:
         assert self.lidars is not None
-        return Rays(*self.rays, *self.lidars)
+        end, t_s, sensor = self.rays
+        return Rays(end, t_s, sensor, *self.lidars)
 
 
 class ObstacleList(Sequence["Obstacles | None"]):
@@ -76,10 +77,10 @@ class ObstacleList(Sequence["Obstacles | None"]):
         return None if kept is None else kept.obstacles()
 
     def _kept(self, of: Obstacles) -> _Tick:
-        points = [of.xyz, of.t_s] + ([] if of.seen_from is None else [of.seen_from])
-        rays = [] if of.free is None else [of.free.end, of.free.t_s, of.free.sensor]
+        points = self._keep_all([of.xyz, of.t_s] + ([] if of.seen_from is None else [of.seen_from]))
+        rays = self._keep_all([] if of.free is None else [of.free.end, of.free.t_s, of.free.sensor])
         lidars = None if of.free is None else (of.free.position, of.free.velocity_mps)
-        return _Tick(
-            of.stamp_ns, of.origin, of.sensor, of.viewpoints,
-            *(ArrayList([self._file.keep(column) for column in columns]) for columns in (points, rays)), lidars,
-        )  # fmt: skip
+        return _Tick(of.stamp_ns, of.origin, of.sensor, of.viewpoints, points, rays, lidars)
+
+    def _keep_all(self, columns: Sequence[NDArray[Any]]) -> ArrayList:
+        return ArrayList([self._file.keep(column) for column in columns])

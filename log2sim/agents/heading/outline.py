@@ -89,7 +89,7 @@ def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tup
     yaw = np.interp(t_s[rows], waypoints.t_s, np.unwrap(waypoints.yaw_rad))
     ground_m = np.where(np.isfinite(m.bottom_m[rows]), m.bottom_m[rows], np.median(m.bottom_m[rows]))
     points, views = [], []
-    for k, row in enumerate(rows):
+    for k, row in enumerate(rows.tolist()):
         xyz = subsample(m.cluster[row][:, :3], MAX_POINTS_EACH) - [x[k], y[k], ground_m[k]]
         points.append(np.column_stack([rotate(xyz[:, :2], -yaw[k]), xyz[:, 2]]))
         views.append(rotate(m.sensor_m[row, :2] - [x[k], y[k]], -yaw[k]))

@@ -62,7 +62,7 @@ class BoxTable:
         for first in range(0, len(t_s), TICKS_AT_A_TIME):
             some = t_s[first : first + TICKS_AT_A_TIME]
             rows = np.flatnonzero((life[:, 0] <= some[-1] + SAME_S) & (life[:, 1] >= some[0] - SAME_S))
-            table = cls.of([agents[k] for k in rows], some, margin_s=SAME_S)
+            table = cls.of([agents[k] for k in rows.tolist()], some, margin_s=SAME_S)
             there = np.flatnonzero(table.present.any(axis=1))
             yield rows[there], first, table.take(there)
 

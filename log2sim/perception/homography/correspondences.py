@@ -85,7 +85,7 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
     good = (measured.source == "lidar") & ~measured.truncated & (measured.points >= MIN_FOOT_POINTS) & kept
     rows = np.flatnonzero(good & (measured.camera == camera.name))
     uv, xy = [], []
-    for k in rows:
+    for k in rows.tolist():
         sensor, cluster = measured.sensor_m[k, :2], measured.cluster[k][:, :2]
         direction = measured.center_m[k, :2] - sensor
         direction /= np.hypot(*direction)

@@ -266,7 +266,7 @@ def _occupied(roles: AgentRoles, view: Viewport) -> list[Bounds]:
 def _points_of(agent: Agent) -> Array:
     """Return points (K, 2) along a track, m."""
     xy = centers_xy(agent)
-    return xy[np.linspace(0, len(xy) - 1, min(len(xy), MAX_TRACK_POINTS)).round().astype(int)]
+    return np.asarray(xy[np.linspace(0, len(xy) - 1, min(len(xy), MAX_TRACK_POINTS)).round().astype(int)])
 
 
 def _bounds(agent: Agent, k: int) -> Bounds:

@@ -256,7 +256,9 @@ def _read_out(ax: Axes, text: str, **style: Any) -> Any:
 
 def _beside(ax: Axes, inches: float) -> float:
     """Convert inches to the right of axes into a fraction of their width."""
-    return 1.0 + inches / (ax.get_position().width * float(ax.get_figure(root=True).get_figwidth()))
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    return 1.0 + inches / (ax.get_position().width * figure.get_figwidth())
 
 
 def _limits(chart: Chart) -> tuple[float, float]:
