@@ -59,6 +59,10 @@ class ArrayFile:
         self._file: BinaryIO | None = None
         self._lock = threading.Lock()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies in other processes are empty; an `ArrayList` takes its arrays along."""
+        return ArrayFile, (self.memory_bytes,)
+
     def keep(self, array: NDArray[Any]) -> NDArray[Any] | StoredArray:
         """Return the array itself while there is room for it in memory, else what reads it from the file.
 
@@ -106,6 +110,10 @@ class ArrayList(Sequence[NDArray[Any]]):
 
     def __init__(self, items: Iterable[NDArray[Any] | StoredArray]) -> None:
         self.items = tuple(items)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies in other processes hold the arrays themselves."""
+        return ArrayList, (tuple(self),)
 
     def __len__(self) -> int:
         """Return how many there are."""

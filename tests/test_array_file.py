@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -104,3 +105,13 @@ def test_points_near_a_place_are_those_of_the_square() -> None:
     cloud = Obstacles(0, np.array([100.0, 50.0, 0.0]), xyz, xyz[:, 0], np.zeros(3, np.float32))
     inside = np.all(np.abs(xyz[:, :2] - [3.0, -2.0]) <= 2.5, axis=1)
     assert cloud.near(np.array([103.0, 48.0]), 2.5).tolist() == np.flatnonzero(inside).tolist()
+
+
+@pytest.mark.parametrize("memory_bytes", [0, 10_000])
+def test_arrays_go_along_to_other_processes(memory_bytes: int) -> None:
+    file = ArrayFile(memory_bytes)
+    arrays = [np.arange(40.0), np.ones((3, 2), dtype=np.uint8)]
+    copy = pickle.loads(pickle.dumps(ArrayList([file.keep(array) for array in arrays])))
+    for array, back in zip(arrays, copy, strict=True):
+        np.testing.assert_array_equal(back, array)
+        assert back.dtype == array.dtype

@@ -535,7 +535,7 @@ def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: 
     ran = run("bench", *options)
     assert ran.code == 0, ran.err
     assert names(tmp_path / "b") == ["bench.json", "bench.png"]
-    assert "detect: 6 of 6" in ran.err
+    assert "detecting: 6 of 6" in ran.err
     assert run("validate", tmp_path / "b/bench.json").code == 0
     picture = cv2.imread(str(tmp_path / "b/bench.png"))
     assert picture.shape[1] > 1500

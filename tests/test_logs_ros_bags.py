@@ -617,7 +617,7 @@ def test_a_missing_library_names_the_extra(module: str, tmp_path: Path, monkeypa
 def test_inspect_and_validate_take_the_file_of_a_bag(plain: Path) -> None:
     shown = CliRunner().invoke(app, ["inspect", str(plain)])
     assert shown.exit_code == 0
-    assert re.search(r"/velodyne_points +\d+ +lidar top ", shown.output), shown.output
+    assert re.search(r"/top/points +\d+ +lidar top ", shown.output), shown.output
     assert CliRunner().invoke(app, ["validate", str(plain)]).exit_code == 0
 
 

@@ -10,4 +10,4 @@ for package in ${LOG2SIM_TEST_PACKAGES:-}; do
     timeout 600 .venv/bin/python -m pip install -qq --disable-pip-version-check "$package" || echo "no $package: its tests will be skipped"
 done
 export OPENBLAS_NUM_THREADS=1
-exec .venv/bin/python -m pytest -m 'not peers' --numprocesses auto --dist loadfile "$@"
+exec .venv/bin/python -m pytest -m 'not peers' --numprocesses auto --dist loadfile --no-loadscope-reorder "$@"

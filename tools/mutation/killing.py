@@ -106,7 +106,12 @@ def kill_many(folder: Path, count: int, seed: int = 0) -> Iterator[Killed]:
 def names_and_sizes(out: Path) -> dict[str, int]:
     """The files of a result by their size, without temporary ones."""
     files = (p for p in sorted(out.rglob("*")) if p.is_file())
-    return {n: p.stat().st_size for p in files if not (n := str(p.relative_to(out))).startswith(".")}
+    return {n: p.stat().st_size for p in files if not is_temporary(n := str(p.relative_to(out)))}
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file is hidden or in a hidden folder; exports into a folder that exists are made in it."""
+    return any(part.startswith(".") for part in Path(name).parts)
 
 
 def names_and_inodes(out: Path) -> dict[str, int]:
@@ -114,7 +119,7 @@ def names_and_inodes(out: Path) -> dict[str, int]:
 
 
 def _what_is_left(out: Path, before: dict[str, int], whole: dict[str, int]) -> tuple[str, str]:
-    found, inodes = names_and_sizes(out), {n: i for n, i in names_and_inodes(out).items() if not n.startswith(".")}
+    found, inodes = names_and_sizes(out), {n: i for n, i in names_and_inodes(out).items() if not is_temporary(n)}
     if inodes == before:
         return ("old" if before else "nothing"), ""
     if before and not found:
