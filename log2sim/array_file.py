@@ -60,7 +60,7 @@ class ArrayFile:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies in other processes are empty; an `ArrayList` takes its arrays along."""
+        """Return an empty one for other processes; an `ArrayList` takes its arrays along."""
         return ArrayFile, (self.memory_bytes,)
 
     def keep(self, array: NDArray[Any]) -> NDArray[Any] | StoredArray:
@@ -112,7 +112,7 @@ class ArrayList(Sequence[NDArray[Any]]):
         self.items = tuple(items)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies in other processes hold the arrays themselves."""
+        """Return a copy for other processes that holds the arrays themselves."""
         return ArrayList, (tuple(self),)
 
     def __len__(self) -> int:
