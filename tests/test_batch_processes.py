@@ -86,7 +86,8 @@ def test_workers_that_die_lose_no_log_but_the_one_that_kills_them(
     assert {log: row.status for log, row in rows.items()} == {
         **dict.fromkeys("abcd", "done"), "y-killed-once": "done", "z-killer": "failed",
     }  # fmt: skip
-    assert sum(rows[log].attempts - 1 for log in "abcd") <= 1  # of the worker that was killed from outside
+    # Of the worker that was killed from outside, and of those that logs killed: what ran or waited there begins once more.
+    assert max(rows[log].attempts for log in "abcd") <= 2
     assert (rows["y-killed-once"].attempts, rows["z-killer"].error_kind) == (2, "WorkerDied")
     assert len(list(out.glob("logs/*/scenario.json"))) == 5
 
