@@ -95,9 +95,9 @@ def test_workers_that_die_lose_no_log_but_the_one_that_kills_them(
 def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
     tiny_folder: Path, tmp_path: Path, site: Path
 ) -> None:
-    root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"abcdef"), tmp_path / "out"
+    root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"abcdefghijklmnopqrstuvwx"), tmp_path / "out"
     process = start(root, out, site)
-    wait_until(lambda: any(out.glob("logs/[a-f]/row.json")), process)
+    wait_until(lambda: any(out.glob("logs/?/row.json")), process)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 130, errors
@@ -106,7 +106,7 @@ def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
     assert sorted(p.name for p in out.iterdir()) == ["batch.json", "logs", "table.html", "table.parquet"]
     assert [p for p in (out / "logs").iterdir() if p.name.startswith(".")] == []
     first = {path: path.stat().st_mtime_ns for path in out.glob("logs/*/row.json")}
-    assert 1 <= len(first) < 6
+    assert 1 <= len(first) < 24
 
     again = start(root, out, site)
     printed, errors = again.communicate(timeout=LIMIT_S)
