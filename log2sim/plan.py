@@ -281,7 +281,7 @@ def _signals(config: Config, sensors: Sensors) -> Decision:
         return Decision(Stage.SIGNALS, False, "appearance.signals=false")
     if not sensors.cameras or not config.detect.in_images:
         return Decision(Stage.SIGNALS, False, NO_CAMERA)
-    if config.detect.in_images == "labels":
+    if config.detect.in_images == LABELS:
         return Decision(Stage.SIGNALS, False, "labels of road users take the place of a detector")
     return Decision(Stage.SIGNALS, True, "detectors with the classes of COCO know them")
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from log2sim.errors import PluginError
+
 
 @dataclass(frozen=True)
 class Call:
@@ -67,7 +69,20 @@ def find_defect(kind: str, found: Any) -> str | None:
     return next((defect for defect in defects if defect is not None), None)
 
 
-def find_member_defect(found: Any, members: tuple[str, ...], call: Call) -> str | None:
+def require_members(found: Any, members: tuple[str, ...], call: Call, source: str) -> None:
+    """Require that an object has its members and that its method `detect` can be called.
+
+    Raises
+    ------
+    PluginError
+        In one line that begins with `source`.
+    """
+    defect = _find_member_defect(found, members, call)
+    if defect is not None:
+        raise PluginError(f"{source}: {defect}")
+
+
+def _find_member_defect(found: Any, members: tuple[str, ...], call: Call) -> str | None:
     """Return which of its members an object lacks, or why its method `detect` cannot be called; None where nothing is wrong."""
     missing = [name for name in members if not hasattr(found, name)]
     if missing:

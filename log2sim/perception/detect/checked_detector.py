@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from log2sim import registry
 from log2sim.datatypes import CATEGORIES, Detections, Frame
 from log2sim.errors import Log2SimError, PluginError
-from log2sim.plugin_checks import DETECT, find_member_defect
+from log2sim.plugin_checks import DETECT, require_members
 
 MEMBERS = ("name", "default_min_score", "detect")
 ROW = "x0, y0, x1, y1 in px, score, category"
@@ -135,9 +135,7 @@ def checked(detector: Any, source: str) -> CheckedDetector:
     PluginError
         When it lacks a member of `Detector`, or its `detect` cannot be called.
     """
-    defect = find_member_defect(detector, MEMBERS, DETECT)
-    if defect is not None:
-        raise PluginError(f"{source}: {defect}")
+    require_members(detector, MEMBERS, DETECT, source)
     return CheckedDetector(detector, source)
 
 

@@ -12,7 +12,7 @@ from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.plugin_checks import DETECT_IN_CLOUD, find_member_defect
+from log2sim.plugin_checks import DETECT_IN_CLOUD, require_members
 
 PREFIX = "lidar:"
 MEMBERS = ("name", "detect")
@@ -88,9 +88,7 @@ def checked(detector: Any, source: str) -> LidarDetector:
     PluginError
         When it lacks a member of `LidarDetector`, or its `detect` cannot be called.
     """
-    defect = find_member_defect(detector, MEMBERS, DETECT_IN_CLOUD)
-    if defect is not None:
-        raise PluginError(f"{source}: {defect}")
+    require_members(detector, MEMBERS, DETECT_IN_CLOUD, source)
     return _CheckedLidarDetector(detector, source)
 
 
