@@ -69,7 +69,7 @@ def refine_poses(log: Log, scenario: Scenario, reader: RecordReader) -> Log:
         return log
     pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
     found = work_ahead(lambda pair: _registered(keyframes[pair[0]], keyframes[pair[1]]), pairs)
-    links = [(*pair, registration) for pair, registration in zip(pairs, found) if registration is not None]
+    links = [(*pair, registration) for pair, registration in zip(pairs, found, strict=True) if registration is not None]
     twists = solve_twists(keyframes, links)
     return replace_poses(log, corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists))
 

@@ -21,14 +21,15 @@ def work_ahead(work: Callable[[Item], Out], items: Iterable[Item], ahead: int = 
     Reading, decompressing and arithmetic on arrays leave the interpreter to others meanwhile.
     """
     waiting: deque[Future[Out]] = deque()
-    with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) > ahead:
-                    yield waiting.popleft().result()
-            while waiting:
+    pool = ThreadPoolExecutor(BACKGROUND_THREADS)
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > ahead:
                 yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        # Without waiting: an iterator that is left early may be closed by the garbage collector, in any thread, while that
+        # thread holds a lock that ending threads need.
+        pool.shutdown(wait=False, cancel_futures=True)
