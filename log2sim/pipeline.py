@@ -24,6 +24,7 @@ from log2sim.cooperation.registration import register_road
 from log2sim.datatypes import ENDS, Agent, Fault, Log, Measurements, Scenario, Track
 from log2sim.describe import Recorded, describe
 from log2sim.errors import NothingToReconstruct
+from log2sim.fusion_level import FusionLevel
 from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
 from log2sim.logs.time_checks import say_without_pose
@@ -33,7 +34,7 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.given_detectors import GivenDetector, sort_detectors
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.plan import FusionLevel, Plan, Stage, make_plan
+from log2sim.plan import Plan, Stage, make_plan
 from log2sim.report import extended_report, report_of
 from log2sim.run_detectors import Detectors, create_detectors
 from log2sim.sensors import Sensors, choose_detector, select_sensors

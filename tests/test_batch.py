@@ -26,8 +26,9 @@ from log2sim.batch.table import write_parquet
 from log2sim.cli import batch as command
 from log2sim.config import Config
 from log2sim.documents import check
-from log2sim.errors import ConfigError, LogError
+from log2sim.errors import ConfigError, LogError, PluginError
 from log2sim.links import following_links
+from log2sim.run_detectors import check_detectors
 from log2sim.threads import usable_threads
 
 EVIL = "<script>alert('{{root}}')</script>&\"'"
@@ -271,6 +272,49 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     ticks = [entry["counts"]["truth_ticks"] for entry in document["logs"]]
     assert ticks[0] == ticks[1] > 0
     assert document["total"]["counts"]["truth_ticks"] == sum(ticks)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (("--detector", "ssd-mobilnet-v2"), 2, "unknown detector 'ssd-mobilnet-v2' (did you mean 'ssd-mobilenet-v2'?)"),
+        (("--detector", "lidar:vehicles"), 2, "unknown LiDAR detector 'vehicles' (did you mean 'vehicle'?)"),
+        (("--detector", "labels+lidar:no.onnx"), 2, "no.onnx"),
+        (("--detector", "labels", "--set", "detect.layout=yolox"), 2, "layout 'yolox'"),
+        (("--set", "track.birth_scor=0.3"), 2, "track.birth_scor"),
+    ],
+)
+def test_settings_with_which_no_log_could_be_reconstructed_stop_the_batch_before_the_first(
+    options: tuple[str, ...], code: int, words: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(count: int) -> None:
+        raise AssertionError("workers were started")
+
+    monkeypatch.setattr(cluster, "local_workers", start)
+    root = lay_out_logs(tmp_path / "root", tiny_folder, "a", "b")
+    ran = run("batch", root, "--out", tmp_path / "out", *options)
+    assert (ran.code, words in ran.line) == (code, True), ran.err
+    assert not (tmp_path / "out").exists()
+    assert run("reconstruct", root / "a", "--out", tmp_path / "s.json", *options).code == code
+
+
+def test_detectors_of_other_packages_are_left_to_the_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are made for a log, and may look at it."""
+    (tmp_path / "picky.py").write_text(
+        "def create(log, *rest, **settings):\n    raise ValueError(log.cameras['front'])\n"
+    )
+    info = tmp_path / "picky-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: picky\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[log2sim.detector]\npicky = picky:create\nlost = picky:lost\n[log2sim.lidar_detector]\npicky = picky:create\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    check_detectors(Config.load(detect={"name": "picky+lidar:picky"}))
+    with pytest.raises(PluginError, match="lost"):
+        check_detectors(Config.load(detect={"name": "lost"}))
+    with pytest.raises(ConfigError, match="begins with 'lidar:'"):
+        check_detectors(Config.load(cooperation={"road_detector": "picky"}))
 
 
 def test_options_that_exclude_each_other_and_wrong_addresses_are_refused(tiny_folder: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Batches on worker processes: some that are killed, Ctrl-C in the middle, and where they listen."""
+"""Batches on worker processes: some that are killed, Ctrl-C in the middle, a scheduler of others, and where they listen."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from batch_logs import FAST, install_reader, lay_out_logs, tell
+from command_line import run
 
 from log2sim.batch.discovery import find_logs
 from log2sim.batch.folder import BatchFolder
@@ -20,6 +21,16 @@ from log2sim.batch.rows import Row
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 120
+# Ends when its standard input does, so that it never outlives the test.
+SCHEDULER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    options = {"n_workers": 1, "threads_per_worker": 1, "host": "127.0.0.1", "protocol": "tcp://"}
+    with LocalCluster(dashboard_address=None, worker_dashboard_address=None, **options) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
 
 pytestmark = pytest.mark.slow
 
@@ -114,3 +125,35 @@ def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
     assert f"{len(first)} of them done before" in printed
     assert {path: path.stat().st_mtime_ns for path in first} == first
     assert all(row is not None and row.is_done for row in rows_of(root, out).values())
+
+
+@pytest.fixture
+def scheduler(site: Path, tmp_path: Path) -> Iterator[str]:
+    """Address of a Dask scheduler with one worker, both of somebody else; the worker is started again when it dies."""
+    pytest.importorskip("distributed")
+    (tmp_path / "scheduler.py").write_text(SCHEDULER)
+    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / "scheduler.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": path, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    yield process.stdout.readline().strip()
+    process.communicate("", timeout=LIMIT_S)
+    assert process.returncode == 0
+
+
+def test_the_workers_of_a_scheduler_run_a_batch_and_go_on_for_others(
+    tiny_folder: Path, tmp_path: Path, scheduler: str
+) -> None:
+    root, out = lay_out_logs(tmp_path / "root", tiny_folder, "a"), tmp_path / "out"
+    tell(root / "b-killed-once", "die-once", tiny_folder)
+    ran = run("batch", root, "--out", out, "--scheduler", scheduler, *FAST)
+    assert ran.code == 0, ran.err
+    rows = {log: (row.status, row.attempts) for log, row in rows_of(root, out).items() if row}
+    assert rows == {"a": ("done", 1), "b-killed-once": ("done", 2)}
+    assert len(list(out.glob("logs/*/scenario.json"))) == 2
+    from distributed import Client
+
+    with Client(scheduler, timeout=LIMIT_S) as client:
+        assert client.submit(sum, [1, 2]).result(timeout=LIMIT_S) == 3

@@ -20,6 +20,7 @@ from log2sim.errors import LogError
 from log2sim.evaluation.bench.benchmark import bench
 from log2sim.evaluation.bench.document import document
 from log2sim.evaluation.detection.detect_log import without_ego
+from log2sim.fusion_level import FusionLevel, fusion_level
 from log2sim.geometry import rectangle_iou, rotation_from_rpy, transform, wrap_angle
 from log2sim.perception.cooperative.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
@@ -34,7 +35,6 @@ from log2sim.perception.lidar.measure_boxes import follow_box, measure_boxes
 from log2sim.perception.lidar.viewpoints import assemble_cloud, assemble_views, group_by_viewpoint, join_parts
 from log2sim.perception.prefetch import obstacles_of
 from log2sim.pipeline import reconstruct
-from log2sim.plan import FusionLevel, fusion_level
 from log2sim.tracking.merging import merge_tracks, track_ends, velocities
 
 POST = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -158,6 +159,20 @@ def test_unknown_pose_gives_no_boxes() -> None:
     log = log_with((0, "car", (22.0, 0, 0), CAR))
     log = Log("made", "log2sim", {"front": camera}, {}, {}, labels=log.labels)
     assert len(create_detector("labels", log).detect(Frame(camera, 0, no_image))) == 0
+
+
+def test_2d_labels_are_those_of_the_frame_whatever_their_order() -> None:
+    stamps = np.array([5, 1, 3, 1, 5, 1]) * SECOND + np.array([0, 900_000, 0, -900_000, 0, 1_100_000])
+    box = np.array([[0, 0, 10 + k, 10] for k in range(6)], dtype=np.float64)
+    category = np.array(["car", "car", "tree", "truck", "bus", "car"])
+    labels = ImageLabels(stamps, box, category)
+    log = log_with(image_labels={"front": labels})
+    assert {k: sorted(detect(log, k * SECOND).box_px[:, 2]) for k in range(7)} == {
+        0: [], 1: [11, 13], 2: [], 3: [], 4: [], 5: [10, 14], 6: [],
+    }  # fmt: skip
+    assert detect(log, 5 * SECOND).category.tolist() == ["car", "bus"]
+    small = log_with(image_labels={"front": replace(labels, box_px=box / 2)})
+    assert detect(small, 5 * SECOND).box_px.size == 0
 
 
 def test_log_without_labels_names_the_other_detectors() -> None:

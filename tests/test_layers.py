@@ -22,7 +22,7 @@ import imports  # noqa: E402
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (
     "errors", "version", "plugin_checks", "registry", "threads", "late_functions", "log_odds", "numerals", "array_file", "input_files", "links", "cache_folder", "disk_cache", "outputs", "output_folders", "output_claims", "json_keys", "documents", "model_errors", "geometry", "datatypes", "color_names", "stage_clock", "config_sections", "config", "logs",
-    "synth", "tracking", "sensors", "plan", "perception", "localization", "calibration", "cooperation", "agents", "mapping", "lanes", "appearance", "signals", "outcome", "describe", "report", "run_detectors", "pipeline", "prediction", "simulation", "edit", "export",
+    "synth", "tracking", "sensors", "fusion_level", "plan", "perception", "localization", "calibration", "cooperation", "agents", "mapping", "lanes", "appearance", "signals", "outcome", "describe", "report", "run_detectors", "pipeline", "prediction", "simulation", "edit", "export",
     "visualization", "evaluation", "batch", "cli", "__init__", "__main__",
 )  # fmt: skip
 PUBLIC = ["Config", "Log2SimError", "Scenario", "__version__", "evaluate", "open_log", "plot", "reconstruct", "replay"]

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
+from log2sim import registry
 from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, PoseTrack
@@ -99,6 +101,19 @@ def test_a_recorded_log_opens_without_its_sweeps(real_data: Path, path: str) -> 
         open_log(real_data / path)
     assert names
     assert not [name for name in names if name.endswith(SWEEP_SUFFIXES)]
+
+
+def test_installed_packages_are_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_log(tiny_log(observe=False, duration_s=0.3)[0], tmp_path / "log")
+    asked, real = [], registry.installed
+
+    def installed(kind: str) -> EntryPoints:
+        asked.append(kind)
+        return real(kind)
+
+    monkeypatch.setattr(registry, "installed", installed)
+    assert open_log(tmp_path / "log").format == "log2sim"
+    assert asked == ["log"]
 
 
 def test_stamps_far_from_all_others_are_left_out() -> None:

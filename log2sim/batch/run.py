@@ -21,6 +21,7 @@ from log2sim.batch.table import write_parquet
 from log2sim.config import Config
 from log2sim.errors import ConfigError, Log2SimError
 from log2sim.links import follows_links
+from log2sim.run_detectors import check_detectors
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -102,8 +103,12 @@ def plan_batch(
     LogError
         Where there is no log.
     ConfigError
-        For an output folder that holds the logs, something else, or a batch of other settings.
+        For an output folder that holds the logs, something else, or a batch of other settings, and for detectors that could
+        search no log.
+    MissingExtra
+        Where a detector needs what is not installed.
     """
+    check_detectors(config)
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ConfigError(f"{out}: holds the logs; choose another folder for the results")
     logs = find_logs(root, format=format, leave_out=out)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from log2sim import registry
@@ -51,8 +53,10 @@ def open_log(
 def _open(root: Path, format: str, sequence: str | None) -> Log:
     if not root.exists():
         raise LogError(f"{root}: no such folder; give the folder of a log, or its file")
-    name = find_reader(root) if format == "auto" else format
-    reader: Reader = registry.load("log", name)
+    # Once: each asks which distributions are installed.
+    usable = _usable_readers() if format == "auto" else None
+    name = format if usable is None else _find_reader(root, usable)
+    reader: Reader = registry.load("log", name) if usable is None else usable.readers[name]
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     with registry.blaming("log", name):
@@ -63,36 +67,43 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
             opened = reader.open(root, chosen)
         registry.require_type("log", name, opened, Log)
         log = without_impossible_labels(guard_log(opened, str(root)))
-    others = _other_formats(root, name) if format == "auto" else []
-    notes = [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []
-    notes += _usable_readers()[1] if format == "auto" else []
+    notes = [] if usable is None else [*_other_formats_note(root, name, usable.readers), *usable.defects]
     # Notes may wait for labels.
     return log.changed(notes=lambda: (*notes, *log.notes, *list_calibration_problems(log), *list_time_problems(log)))
 
 
 def find_reader(root: Path) -> str:
     """Name of the reader that matches a folder or file; `LogError` when none does."""
-    readers, defects = _usable_readers()
+    return _find_reader(root, _usable_readers())
+
+
+def _find_reader(root: Path, usable: _UsableReaders) -> str:
+    readers = usable.readers
     for name, reader in readers.items():
         if _matches(name, reader, root):
             return name
-    broken = "".join(f"; {defect}" for defect in defects)
+    broken = "".join(f"; {defect}" for defect in usable.defects)
     if root.is_file():
         suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
         raise LogError(
-            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root)}{broken}"
+            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root, readers)}{broken}"
         )
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
     raise LogError(
-        f"{root}: no known log format{_log_above(root)}; a log is one of: {known}. Force one with --format{broken}"
+        f"{root}: no known log format{_log_above(root, readers)}; a log is one of: {known}. Force one with --format{broken}"
     )
 
 
-def _usable_readers() -> tuple[dict[str, Reader], list[str]]:
-    """Return all readers by name but those of other packages that cannot be used, and what is wrong with these.
+@dataclass(frozen=True)
+class _UsableReaders:
+    """All readers by name but those of other packages that cannot be used, and what is wrong with these."""
 
-    A broken plug-in is told; it does not keep logs of other formats from being opened.
-    """
+    readers: Mapping[str, Reader]
+    defects: list[str]
+
+
+def _usable_readers() -> _UsableReaders:
+    """Load all readers; a broken plug-in is told, and does not keep logs of other formats from being opened."""
     readers: dict[str, Reader] = {}
     defects = []
     for name in registry.names("log"):
@@ -100,7 +111,7 @@ def _usable_readers() -> tuple[dict[str, Reader], list[str]]:
             readers[name] = registry.load("log", name)
         except PluginError as error:
             defects.append(str(error))
-    return readers, defects
+    return _UsableReaders(readers, defects)
 
 
 def _matches(name: str, reader: Reader, root: Path) -> bool:
@@ -117,17 +128,16 @@ def _seems_to_match(name: str, reader: Reader, root: Path) -> bool:
         return False
 
 
-def _other_formats(root: Path, name: str) -> list[str]:
-    """Names of further formats of which a folder holds logs, as a folder of downloads may."""
+def _other_formats_note(root: Path, name: str, readers: Mapping[str, Reader]) -> list[str]:
+    """Say of which further formats a folder holds logs, as a folder of downloads may; nothing where there are none."""
     if root.is_file():
         return []
-    readers = _usable_readers()[0].items()
-    return [other for other, reader in readers if other != name and _seems_to_match(other, reader, root)]
+    others = [other for other, reader in readers.items() if other != name and _seems_to_match(other, reader, root)]
+    return [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []
 
 
-def _log_above(path: Path) -> str:
+def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:
     """Say which folder above a path is a log, for who gave a part of one; "" when none is."""
-    readers = _usable_readers()[0]
     for folder in list(path.absolute().parents)[:-1][:MAX_LEVELS_ABOVE]:
         for name, reader in readers.items():
             if _seems_to_match(name, reader, folder):
@@ -137,7 +147,7 @@ def _log_above(path: Path) -> str:
 
 def is_log_file(path: Path) -> bool:
     """Return whether a file has a suffix of a format of which a file is a log."""
-    return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers()[0].values())
+    return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers().readers.values())
 
 
 def _may_read(reader: Reader, root: Path) -> bool:

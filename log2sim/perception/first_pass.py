@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.array_file import ArrayFile
 from log2sim.datatypes import ENDS, Boxes3D, Detections, Fault, Log, Measurements, Obstacles, end_of
+from log2sim.fusion_level import FusionLevel
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
@@ -29,7 +30,7 @@ from log2sim.perception.light_boxes import LightBox, with_ranges
 from log2sim.perception.obstacle_list import ObstacleList
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
-from log2sim.plan import FusionLevel, Plan, Stage
+from log2sim.plan import Plan, Stage
 from log2sim.stage_clock import StageClock
 
 MAX_GROUND_POINTS_PER_FRAME = 40

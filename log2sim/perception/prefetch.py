@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Boxes3D, Log, Obstacles, Sweep
+from log2sim.fusion_level import FusionLevel
 from log2sim.perception.cooperative.alignment import align_parts
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import RecordReader
@@ -19,7 +20,7 @@ from log2sim.perception.lidar.rays import sample_rays
 from log2sim.perception.lidar.viewpoints import assemble_views
 from log2sim.perception.record_checks.sweep_sketches import sketch_sweep
 from log2sim.perception.sync import Schedule
-from log2sim.plan import FusionLevel, Plan, Stage
+from log2sim.plan import Plan, Stage
 
 OBSTACLE_REACH_M = 70.0
 OBSTACLE_VOXEL_M = 0.12

@@ -13,10 +13,11 @@ from log2sim.evaluation.bench.pareto import Point
 from log2sim.evaluation.bench.runs import BenchContext
 from log2sim.evaluation.bench.scores import Scope, Score, check_scope, score_scenario
 from log2sim.evaluation.bench.settings import Grid, Setting
+from log2sim.fusion_level import FusionLevel
 from log2sim.geometry import period_of
 from log2sim.perception.cooperative.detector import detector_by_mounting
 from log2sim.pipeline import first_pass, schedule_of, second_pass, start
-from log2sim.plan import FusionLevel, make_plan
+from log2sim.plan import make_plan
 from log2sim.sensors import select_sensors
 
 STAGE = "ends"

@@ -13,11 +13,11 @@ from log2sim.datatypes import ROAD, Boxes3D, Log, end_of
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes_file import DetectedBoxes
 from log2sim.evaluation.detection.sweep_clouds import clouds, stamps_of
+from log2sim.fusion_level import FusionLevel
 from log2sim.localization.pose_choice import PoseChoice
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.measure_boxes import outside_ego
 from log2sim.pipeline import start
-from log2sim.plan import FusionLevel
 
 
 @dataclass(frozen=True, eq=False)

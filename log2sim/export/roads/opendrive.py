@@ -14,7 +14,8 @@ from log2sim.export.placement import ExportPlacement, near_origin, on_map
 from log2sim.export.roads.checks import require_roads
 from log2sim.export.roads.lanes import lanes
 from log2sim.export.roads.marks import MarkFinder, RoadMark
-from log2sim.export.roads.network import Network, Road, build_network
+from log2sim.export.roads.network import Network, build_network
+from log2sim.export.roads.road import Road
 from log2sim.export.roads.road_objects import RoadObjects, add_objects, add_signals
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 

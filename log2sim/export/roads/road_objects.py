@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import Marking, Scenario, Signal
 from log2sim.export.placement import ExportPlacement
-from log2sim.export.roads.network import Road
+from log2sim.export.roads.road import Road
 from log2sim.export.roads.signal_lanes import signal_lanes
 from log2sim.export.xml_text import element, escaped, number
 from log2sim.geometry import Array

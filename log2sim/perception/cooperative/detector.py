@@ -10,13 +10,13 @@ import numpy as np
 
 from log2sim.config import Config
 from log2sim.datatypes import ROAD, Boxes3D, Log, end_of, seen_from
+from log2sim.fusion_level import FusionLevel, fusion_level
 from log2sim.geometry import Array
 from log2sim.perception.cooperative.matching import SeenBoxes
 from log2sim.perception.cooperative.merging import METHODS, Method, fuse_boxes, join
 from log2sim.perception.cooperative.refinement import refine_boxes
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.plan import FusionLevel, fusion_level
 from log2sim.sensors import ROADSIDE_NETWORK, VEHICLE_NETWORK, network_for
 
 AUTO = "auto"

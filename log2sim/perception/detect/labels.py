@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim import registry
 from log2sim.datatypes import CATEGORIES, Detections, Frame, ImageLabels, Log
@@ -21,6 +22,37 @@ from log2sim.perception.lidar.projection import View, project_boxes_in_view, vie
 MIN_SIDE_PX = 6.0
 # Stamps of labels and frames of one moment differ by rounding in some logs.
 STAMP_TOLERANCE_NS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBoxes:
+    """2D labels of a camera that a detector could find, by frame.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Never decreasing.
+    boxes : Detections
+        (L,), those of one stamp in the order of the labels.
+    """
+
+    t_ns: NDArray[np.int64]
+    boxes: Detections
+
+    @classmethod
+    def of(cls, labels: ImageLabels) -> FrameBoxes:
+        """Sort the labels of a camera and leave out categories and boxes that no detector finds."""
+        large = np.all(labels.box_px[:, 2:] - labels.box_px[:, :2] >= MIN_SIDE_PX, axis=1)
+        rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & large)
+        rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
+        box = np.asarray(labels.box_px[rows], dtype=np.float64)
+        return cls(labels.t_ns[rows], Detections(box, np.ones(len(box)), labels.category[rows].astype("<U16")))
+
+    def at(self, t_ns: int) -> Detections:
+        """Return the boxes of the frame at a stamp."""
+        first = np.searchsorted(self.t_ns, t_ns - STAMP_TOLERANCE_NS, side="left")
+        end = np.searchsorted(self.t_ns, t_ns + STAMP_TOLERANCE_NS, side="right")
+        return self.boxes.take(np.arange(first, end))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +75,17 @@ class LabelDetector:
         """Return the labels of one frame with score 1, nearest first where they come from 3D labels."""
         labels = self.log.image_labels.get(frame.camera.name)
         if labels is not None:
-            return boxes_of_frame(labels, frame.t_ns)
+            return self._image_boxes[frame.camera.name].at(frame.t_ns)
         boxes, window = self._boxes
         view = view_of(self.log, frame.camera.name, frame.t_ns)
         if not len(boxes.t_ns) or view is None:
             return Detections.empty()
         return project_labels(interpolate_boxes(boxes, frame.t_ns, window), view)
+
+    @cached_property
+    def _image_boxes(self) -> dict[str, FrameBoxes]:
+        """2D labels by camera; sorted once, since a search of all for each frame takes time that grows with the square of the log."""
+        return {camera: FrameBoxes.of(labels) for camera, labels in self.log.image_labels.items()}
 
     @cached_property
     def _boxes(self) -> tuple[LabelBoxes, int]:
@@ -83,14 +120,6 @@ def create(
             f"choose another detector: {others}, or the path of an ONNX file"
         )
     return LabelDetector(log)
-
-
-def boxes_of_frame(labels: ImageLabels, t_ns: int) -> Detections:
-    """Select the 2D labels of the frame at a stamp."""
-    rows = (np.abs(labels.t_ns - t_ns) <= STAMP_TOLERANCE_NS) & np.isin(labels.category, CATEGORIES)
-    box = np.asarray(labels.box_px[rows], dtype=np.float64)
-    found = Detections(box, np.ones(len(box)), labels.category[rows].astype("<U16"))
-    return found.take(np.all(box[:, 2:] - box[:, :2] >= MIN_SIDE_PX, axis=1))
 
 
 def project_labels(boxes: LabelBoxes, view: View) -> Detections:
