@@ -19,7 +19,7 @@ def ends_of(solids, of=0, only=None, **options):
         members = members[only(xyz[members])]
     assert len(members) > 20
     index = AzimuthIndex.of(xyz.astype(np.float32), SENSOR, owner == -1)
-    return index.ends_visible(members).tolist()
+    return index.ends_visible([members])[0].tolist()
 
 
 WALL = standing(30.0, 0.0, 0.0, (0.5, 60.0, 4.0))
@@ -69,7 +69,7 @@ def test_a_cloud_of_nothing_else_shows_no_ends():
     xyz, owner = scan([standing(12, 0, 0)])
     alone = xyz[owner == 0].astype(np.float32)
     index = AzimuthIndex.of(alone, SENSOR, np.zeros(len(alone), dtype=bool))
-    assert index.ends_visible(np.arange(len(alone))).tolist() == [False, False]
+    assert index.ends_visible([np.arange(len(alone))])[0].tolist() == [False, False]
 
 
 def test_the_turned_world_shows_the_same_ends():
@@ -79,6 +79,21 @@ def test_the_turned_world_shows_the_same_ends():
     for angle in np.linspace(-np.pi, np.pi, 13):
         c, s = np.cos(angle), np.sin(angle)
         turned = xyz @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        found.append(tuple(AzimuthIndex.of(turned.astype(np.float32), SENSOR, owner == -1).ends_visible(members)))
+        found.append(tuple(AzimuthIndex.of(turned.astype(np.float32), SENSOR, owner == -1).ends_visible([members])[0]))
     assert len(set(found)) == 1
     assert found[0] == (True, False)
+
+
+def test_clusters_are_judged_alike_alone_and_together():
+    """Clusters of very different sizes, one across the azimuth at which a turn begins, and two that share points."""
+    pole = standing(-7, 1.6, 0, (0.4, 0.4, 3.0))
+    solids = [standing(-12, 0, 10), pole, standing(14, 0, 90), standing(7, 2.4, 0, (0.5, 0.5, 3.0)), WALL]
+    xyz, owner = scan(solids, azimuth_deg=(-180, 180))
+    members = [np.flatnonzero((owner == k) & (xyz[:, 2] > 0.2)) for k in range(len(solids))]
+    members = [one for one in [*members, np.union1d(members[0], members[1])] if len(one)]
+    assert len(members) >= 5
+    index = AzimuthIndex.of(xyz.astype(np.float32), SENSOR, owner == -1)
+    alone = [index.ends_visible([one])[0].tolist() for one in members]
+    assert index.ends_visible(members).tolist() == alone
+    assert [True, True] in alone
+    assert any(ends != [True, True] for ends in alone)

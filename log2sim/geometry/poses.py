@@ -82,7 +82,8 @@ class PoseTrack:
         )
         margin = round(self.extrapolate_s * NS_PER_S)
         inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
-        return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | np.isin(t, self.t_ns))
+        recorded = (t == self.t_ns[i]) | (t == self.t_ns[k])
+        return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | recorded)
 
     def sigmas_at(self, t_ns: ArrayLike, usual: tuple[float, float]) -> Array:
         """Interpolate the standard deviations (N, 2) of position, m, and yaw, rad, at stamps (N,) int64 ns.

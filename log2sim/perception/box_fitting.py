@@ -10,15 +10,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M
 from log2sim.geometry import Array, wrap_angle
+from log2sim.perception.yaw_search import correct_yaws, fit_yaws
 
-SEARCH_STEP_RAD = np.deg2rad(2.0)
-# Distances to an edge below the noise of a LiDAR score alike.
-MIN_EDGE_DISTANCE_M = 0.03
-MAX_FIT_POINTS = 256
-MIN_CONTRAST = 0.1
-# A yaw known from elsewhere is corrected by at least so many points, and by no more than it can be wrong.
-MIN_YAW_POINTS, MAX_CORRECTION_POINTS = 30, 128
-CORRECTIONS_RAD = np.arange(-7, 8) * SEARCH_STEP_RAD
 # A side longer than this multiple of the typical width is not a front or rear.
 MAX_WIDTH_FACTOR = 1.2
 # Smallest and largest size of a category are so many standard deviations of the logarithm apart.
@@ -30,6 +23,8 @@ MIN_AZIMUTH_STEP_RAD = np.deg2rad(0.04)
 MIN_EXTENT_M, MIN_PROBABILITY = 0.05, 1e-6
 # Stray points are outside an object by less than this.
 MAX_TRIM_M = 0.1
+# Share of the points beyond either end of the extents.
+TRIM = 0.01
 # Quantile of the points' heights that is taken for the top, robust to stray points.
 TOP_QUANTILE = 0.98
 
@@ -66,70 +61,13 @@ def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = Non
 
 def corrected_yaw(points: Array, yaw_rad: float) -> float:
     """Correct a yaw that is known roughly by the direction of the sides of points (n, 2), where they show it."""
-    if len(points) < MIN_YAW_POINTS:
-        return yaw_rad
-    angles = yaw_rad + CORRECTIONS_RAD
-    score = _closeness(subsample(points, MAX_CORRECTION_POINTS), angles)
-    best = int(np.argmax(score))
-    if best in (0, len(angles) - 1) or score[best] / np.median(score) - 1.0 < MIN_CONTRAST:
-        return yaw_rad
-    return float(angles[0] + _parabolic_peak(score, best) * SEARCH_STEP_RAD)
+    return float(correct_yaws(points, np.array([len(points)]), np.array([yaw_rad]))[0])
 
 
 def fit_yaw(xy_m: Array) -> tuple[float, float]:
-    """Find the yaw of the rectangle whose sides are nearest to the points (N, 2), up to quarter turns.
-
-    Returns
-    -------
-    yaw_rad : float
-        In [0, pi/2).
-    contrast : float
-        Score of the best direction over the median score, less 1: 0 for a round or shapeless cluster; below about
-        `MIN_CONTRAST` the yaw carries no information.
-
-    Notes
-    -----
-    Closeness criterion of Zhang, Xu, Dong & Dolan, "Efficient L-Shape Fitting for Vehicle Detection Using Laser
-    Scanners" (IV 2017), section III-B: a point scores the inverse of its distance to the nearer side. Cost O(45 N), with N
-    limited to `MAX_FIT_POINTS` by an even subsample.
-    """
-    score = _closeness(subsample(xy_m, MAX_FIT_POINTS), np.arange(0.0, np.pi / 2, SEARCH_STEP_RAD))
-    best = int(np.argmax(score))
-    contrast = float(score[best] / np.median(score) - 1.0)
-    return float(_parabolic_peak(score, best) * SEARCH_STEP_RAD % (np.pi / 2)), contrast
-
-
-def _closeness(points: Array, angles: Array) -> Array:
-    """Score (K,) the directions of a rectangle's sides by how near points (N, 2) are to them."""
-    c, s = np.cos(angles), np.sin(angles)
-    directions = np.concatenate(
-        [np.stack([c, s], axis=1), np.stack([-s, c], axis=1)]
-    )  # (2K, 2): length axes, then width axes
-    distance = _edge_distance(directions @ points.T)
-    closeness = np.minimum(distance[: len(angles)], distance[len(angles) :])
-    return np.asarray((1.0 / np.maximum(closeness, MIN_EDGE_DISTANCE_M)).mean(axis=1))
-
-
-def _edge_distance(offsets: Array) -> Array:
-    """Measure the distance (K, N) of every value to the nearer end of its row, ignoring one stray value at each end."""
-    low, high = _lower_end(offsets)[:, None], -_lower_end(-offsets)[:, None]
-    return np.minimum(np.abs(offsets - low), np.abs(high - offsets))
-
-
-def _lower_end(offsets: Array) -> Array:
-    """Return the second lowest value of every row (K, N), or the lowest of fewer than 8."""
-    if offsets.shape[1] < 8:
-        return np.asarray(offsets.min(axis=1))
-    others = offsets.copy()
-    others[np.arange(len(others)), others.argmin(axis=1)] = np.inf
-    return np.asarray(others.min(axis=1))
-
-
-def _parabolic_peak(score: Array, best: int) -> float:
-    """Refine the index of the best of cyclic scores (K,) by the parabola through it and its neighbors."""
-    left, mid, right = score[best - 1], score[best], score[(best + 1) % len(score)]
-    curvature = left - 2 * mid + right
-    return best + (0.5 * (left - right) / curvature if curvature < 0 else 0.0)
+    """Find the yaw of the rectangle whose sides are nearest to the points (N, 2), and its contrast, see `fit_yaws`."""
+    yaw_rad, contrast = fit_yaws(xy_m, np.array([len(xy_m)]))
+    return float(yaw_rad[0]), float(contrast[0])
 
 
 def subsample(points: NDArray[Any], max_count: int) -> NDArray[Any]:
@@ -169,7 +107,7 @@ def sample_surface(range_m: Array, max_count: int) -> NDArray[np.intp]:
     return np.unique(np.searchsorted(area, (np.arange(max_count) + 0.5) / max_count * area[-1]))
 
 
-def extents(xy_m: Array, yaw_rad: float, trim: float = 0.01, max_trim_m: float = np.inf) -> tuple[Array, Array]:
+def extents(xy_m: Array, yaw_rad: float, trim: float = TRIM, max_trim_m: float = np.inf) -> tuple[Array, Array]:
     """Measure the lower and upper ends (2,), (2,) of points (N, 2) along the length and width axes of a yaw.
 
     The ends are the quantiles `trim` and 1 - `trim`, so that a few stray points do not stretch a box, but at most

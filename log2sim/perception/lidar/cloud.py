@@ -126,6 +126,9 @@ class Cloud:
         """Return (2,), in the order of `ENDS`, whose sensors measured points (n,): those with `MIN_END_POINTS` or half of them."""
         if not self.sensors or not len(index):
             return np.zeros(len(ENDS), dtype=bool)
+        ends = {s.end for s in self.sensors}
+        if len(ends) == 1:
+            return np.array([end in ends for end in ENDS])
         sensor = np.searchsorted(np.cumsum([s.points for s in self.sensors]), index, side="right")
         end = np.array([ENDS.index(s.end) for s in self.sensors], dtype=np.int64)[sensor]
         return np.asarray(np.bincount(end, minlength=len(ENDS)) >= max(min(MIN_END_POINTS, len(index) / 2), 1))

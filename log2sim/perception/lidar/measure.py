@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements, OtherView, end_of
-from log2sim.geometry import NS_PER_S, Array, Camera
+from log2sim.datatypes import MAX_SIZE_M, Detections, Measurements, end_of
+from log2sim.geometry import Array, Camera
 from log2sim.perception.box_completion import place_boxes
-from log2sim.perception.box_fitting import fit_extents, sample_surface, top_of, upper_median
+from log2sim.perception.box_fitting import upper_median
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
@@ -26,12 +26,11 @@ from log2sim.perception.lidar.clusters import (
     continued_sides,
     region_grow,
 )
+from log2sim.perception.lidar.evidence import write_evidence
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
 # A box that ends nearer to the image border may be cut by it.
 BORDER_PX = 3.0
-# Points of a cluster that are kept as evidence.
-MAX_KEPT_POINTS = 400
 # Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
 MIN_LONG_M = 10.0
 NEAR_END_QUANTILE = 0.05
@@ -77,13 +76,14 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
     visible = project_points(view, cloud.origin, columns_m)
     index = points[visible.index]
     options, inside = [], points_in_image_boxes(visible, rows.box_px, MARGIN)
+    xyz, uv = columns_m.take(visible.index, axis=1).T, np.stack([visible.u, visible.v], axis=1)
+    range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
     for k, i in enumerate(inside):
-        xyz, uv = columns_m[:, visible.index[i]].T, np.stack([visible.u[i], visible.v[i]], axis=1)
-        range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
-        found = candidate_clusters(xyz, uv, range_m, rows.box_px[k], str(rows.category[k]))
+        found = candidate_clusters(xyz[i], uv[i], range_m[i], rows.box_px[k], str(rows.category[k]))
         options.append([(i[members], score) for members, score in found])
     columns, assigned = writable(rows), assign_clusters(options, rows.box_px, len(index))
     taken = np.bincount(np.concatenate([*assigned, index[:0]]), minlength=len(index)) > 0
+    rows_seen, members_seen = list[int](), list[NDArray[np.intp]]()
     for k, chosen in enumerate(assigned):
         if len(chosen) < MIN_CLUSTER_POINTS:
             continue
@@ -102,7 +102,9 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
         is_long, depth = MAX_SIZE_M[category][0] >= MIN_LONG_M, visible.depth[chosen]
         depth_m = float(np.quantile(depth, NEAR_END_QUANTILE)) if is_long else upper_median(depth)
         columns["height_px_m"][k] = (box[3] - box[1]) * depth_m / view.camera.K[1, 1]
-        write_evidence(columns, k, members, cloud)
+        rows_seen.append(k)
+        members_seen.append(members)
+    write_evidence(columns, rows_seen, members_seen, cloud)
     return place_boxes(Measurements(**with_tuples(columns)))
 
 
@@ -112,52 +114,6 @@ def _continuation(
     """Find those of the points `rest` that continue the sides of the points `members`, see `continued_sides`."""
     seed, others = (cloud.xyz[rows, :2].astype(np.float64) - cloud.sensor[:2] for rows in (members, rest))
     return continued_sides(seed, others, max_length_m)
-
-
-def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
-    """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector says which side is the length.
-
-    Points of several viewpoints are measured from the one that has most of them; a second one is kept beside it.
-    """
-    views = cloud.split(members)
-    view, own = views[0]
-    if len(own) < min(MIN_CLUSTER_POINTS, len(members)):
-        return
-    _write_view(columns, k, own, view)
-    columns["points"][k] = len(members)
-    columns["seen_by"][k] |= cloud.ends_of(members)
-    if len(views) > 1 and len(views[1][1]) >= MIN_CLUSTER_POINTS:
-        columns["others"][k] = _other_view(*views[1], int(columns["t_ns"][k]))
-
-
-def _other_view(cloud: Cloud, members: NDArray[np.intp], t_ns: int) -> OtherView:
-    """Describe what the points at `members` (n,) of a second viewpoint show of an object that is measured at a time."""
-    xyz = cloud.xyz[members].astype(np.float64)
-    late_s = cloud.t_s[members].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
-    kept = sample_surface(np.linalg.norm(xyz - cloud.sensor, axis=1), MAX_KEPT_POINTS)
-    return OtherView(
-        cloud.sensor + cloud.origin,
-        cloud.azimuth_index.ends_visible(members),
-        np.column_stack([xyz + cloud.origin, late_s])[kept],
-    )
-
-
-def _write_view(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
-    """Write what the points at `members` (n,) of one viewpoint show into row `k`."""
-    xyz = cloud.xyz[members].astype(np.float64)
-    xy, box_yaw = xyz[:, :2] - cloud.sensor[:2], float(columns["box_yaw_rad"][k])
-    typical = np.array(TYPICAL_SIZE_M[str(columns["category"][k])])
-    yaw, low, high = fit_extents(xy, typical, None if np.isnan(box_yaw) else box_yaw)
-    columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = yaw, low, high
-    columns["ends_visible"][k] = cloud.azimuth_index.ends_visible(members)
-    columns["bottom_m"][k] = upper_median(xyz[:, 2] - cloud.height[members]) + cloud.origin[2]
-    columns["top_m"][k] = top_of(xyz[:, 2]) + cloud.origin[2]
-    t_s = cloud.t_s[members].astype(np.float64)
-    mean_ns = round(float(t_s.mean()) * NS_PER_S)
-    columns["t_ns"][k] = cloud.stamp_ns + mean_ns
-    columns["sensor_m"][k] = cloud.sensor + cloud.origin
-    timed = np.column_stack([xyz + cloud.origin, t_s - mean_ns / NS_PER_S])
-    columns["cluster"][k] = timed[sample_surface(np.linalg.norm(xyz - cloud.sensor, axis=1), MAX_KEPT_POINTS)]
 
 
 def _measure_as_paper(rows: Measurements, view: View, cloud: Cloud) -> Measurements:

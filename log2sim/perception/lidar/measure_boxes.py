@@ -15,7 +15,8 @@ from log2sim.perception.box_fitting import rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
-from log2sim.perception.lidar.measure import with_tuples, writable, write_evidence
+from log2sim.perception.lidar.evidence import write_evidence
+from log2sim.perception.lidar.measure import with_tuples, writable
 
 # A box is wrong by less than this at each side; neighbors are farther away.
 BOX_MARGIN_M = 0.2
@@ -35,12 +36,13 @@ def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
         columns[end][:] = boxes.center_m[:, 2] + sign * boxes.size_m[:, 2]
     if cloud.parts:
         columns["sensor_m"][:] = _nearest_viewpoints(boxes, cloud)
-    for k, members in enumerate(_members_of_all(boxes, cloud)):
+    found = _members_of_all(boxes, cloud)
+    for k, members in enumerate(found):
         columns["seen_by"][k] = cloud.ends_of(members)
-        if boxes.seen_by is not None:
-            columns["seen_by"][k] |= boxes.seen_by[k]
-        if len(members) >= MIN_CLUSTER_POINTS:
-            write_evidence(columns, k, members, cloud)
+    if boxes.seen_by is not None:
+        columns["seen_by"] |= boxes.seen_by
+    enough = [k for k, members in enumerate(found) if len(members) >= MIN_CLUSTER_POINTS]
+    write_evidence(columns, enough, [found[k] for k in enough], cloud)
     return place_boxes(Measurements(**with_tuples(columns)))
 
 

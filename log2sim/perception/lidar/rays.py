@@ -19,7 +19,6 @@ COLUMNS = STEPS_PER_TURN // CELL_STEPS + 1
 # Cells from straight down to straight up, more than there are.
 CELLS_PER_COLUMN = 1024
 MAX_REACH_M = 70.0
-RANK_BITS = 25  # more than the points of any sweep
 
 
 def sample_rays(cloud: Cloud) -> Rays:
@@ -39,9 +38,10 @@ def sample_rays(cloud: Cloud) -> Rays:
     slope = np.clip(index.slope[row] / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
     column = _sensor_of(cloud, point) * COLUMNS + index.azimuth[row] // CELL_STEPS
     cell = column * CELLS_PER_COLUMN + np.floor(slope).astype(np.int64) + CELLS_PER_COLUMN // 2
-    # Cell and rank in one number: numbers are sorted several times as fast as their places are.
-    ordered = np.sort((cell << RANK_BITS) + point)
-    kept = ordered[np.flatnonzero(np.diff(ordered >> RANK_BITS, prepend=-1))] & ((1 << RANK_BITS) - 1)
+    # Written from the last to the first point, a cell holds its first one; cells without points are not read.
+    first = np.empty(max(len(cloud.sensors), 1) * COLUMNS * CELLS_PER_COLUMN, dtype=np.int32)
+    first[cell[::-1]] = point[::-1]
+    kept = point[first[cell] == point]
     sensors = cloud.sensors or (CloudSensor(len(cloud.xyz), cloud.sensor.astype(np.float64), np.zeros(3)),)
     return Rays(
         cloud.xyz[kept],
@@ -69,5 +69,4 @@ def _sensor_of(cloud: Cloud, point: NDArray[np.intp]) -> NDArray[np.int64]:
     """Return the number (n,) of the sensor that measured each point."""
     if len(cloud.sensors) < 2:
         return np.zeros(len(point), dtype=np.int64)
-    last = np.cumsum([sensor.points for sensor in cloud.sensors])
-    return np.searchsorted(last, point, side="right").astype(np.int64)
+    return np.repeat(np.arange(len(cloud.sensors)), [sensor.points for sensor in cloud.sensors])[point]
