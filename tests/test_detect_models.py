@@ -12,7 +12,8 @@ import pytest
 from log2sim.datatypes import Detections, Frame, Log
 from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Camera, box_iou
-from log2sim.perception.detect import ssd_mobilenet
+from log2sim.perception.detect import ssd_convert, ssd_mobilenet
+from log2sim.perception.detect.classes import COCO_91
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.detect.ssd_graph import fields, read_graph, read_tensor
 
@@ -82,10 +83,38 @@ def test_ssd_finds_van_cyclist_and_pedestrian(in_cache: Path, real_data: Path) -
 def test_ssd_gives_1917_boxes_and_nothing_on_gray(in_cache: Path) -> None:
     detector = create_detector("ssd-mobilenet-v2", LOG)
     outputs = detector.model.run(np.full((1, 300, 300, 3), 128, np.uint8))  # type: ignore[attr-defined]
-    assert (outputs["boxes"].shape, outputs["scores"].shape) == ((1, 1917, 4), (1, 1917, 90))
+    assert (outputs["boxes"].shape, outputs["scores"].shape) == ((1, 1917, 4), (1, 1917, 7))
     assert 0 <= outputs["scores"].min() < outputs["scores"].max() < 0.5
     camera = Camera("c", 320, 240, np.eye(3), "ego", np.eye(4))
     assert len(detector.detect(Frame(camera, 0, lambda: np.full((240, 320, 3), 128, np.uint8)))) == 0
+
+
+@needs_weights
+def test_classes_of_the_ssd_are_those_that_coco_gives_categories(in_cache: Path) -> None:
+    detector = create_detector("ssd-mobilenet-v2", LOG)
+    expected = [COCO_91.category_of[i] for i in ssd_convert.CLASS_NAMES]
+    assert list(detector.classes.category_of.values()) == expected  # type: ignore[attr-defined]
+    assert set(ssd_convert.CLASS_NAMES) == set(COCO_91.category_of)
+
+
+@pytest.mark.slow
+@needs_weights
+def test_classes_that_are_left_out_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    ort = pytest.importorskip("onnxruntime")
+    picture = np.random.default_rng(0).integers(0, 256, (1, 300, 300, 3), dtype=np.uint8)
+
+    def run() -> Any:
+        content = ssd_convert.convert(ssd_mobilenet.graph_bytes()).SerializeToString()
+        session = ort.InferenceSession(content, providers=["CPUExecutionProvider"])
+        return session.run(["boxes", "scores"], {"images": picture})
+
+    names = ssd_convert.CLASS_NAMES
+    boxes, scores = run()
+    monkeypatch.setattr(ssd_convert, "CLASS_NAMES", {i: str(i) for i in range(91)})
+    all_boxes, all_scores = run()
+    assert all_scores.shape[2] == 91
+    np.testing.assert_array_equal(boxes, all_boxes)
+    np.testing.assert_allclose(scores, all_scores[..., list(names)], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -19,15 +19,21 @@ BLOCK = "block/add"
 
 
 def network(rng: np.random.Generator) -> Any:
-    """Convolution, scale, shift and ReLU6; a depthwise one; a projection that is added to what came in; a head."""
+    """Picture of bytes; convolution, scale, shift and ReLU6; a depthwise one; a projection added to what came in; two heads."""
     helper, of_array = onnx.helper, onnx.numpy_helper.from_array
     shapes = {"w0": (CHANNELS, 3, 3, 3), "w1": (CHANNELS, 1, 3, 3), "w2": (CHANNELS, CHANNELS, 1, 1)}
     constants = {name: rng.normal(0, 0.4, shape).astype(np.float32) for name, shape in shapes.items()}
     constants |= {f"scale{k}": rng.uniform(0.5, 2, (1, CHANNELS, 1, 1)).astype(np.float32) for k in range(1)}
     constants |= {f"shift{k}": rng.normal(1, 1, (1, CHANNELS, 1, 1)).astype(np.float32) for k in range(2)}
     constants |= {"zero": np.float32(0), "six": np.float32(6), "BoxEncodingPredictor/w": constants["w2"] * 2}
+    constants |= {"ClassPredictor/w": rng.normal(0, 0.2, (2, CHANNELS, 3, 3)).astype(np.float32)}
+    constants |= {"ClassPredictor/b": rng.normal(0, 1, (1, 2, 1, 1)).astype(np.float32)}
+    constants |= {"picture/scale": np.float32(2 / 255), "picture/shift": np.float32(1)}
     nodes = [
-        helper.make_node("Identity", ["images"], ["picture_nchw"]),
+        helper.make_node("Cast", ["images"], ["picture/float"], to=1),
+        helper.make_node("Mul", ["picture/float", "picture/scale"], ["picture/scaled"]),
+        helper.make_node("Sub", ["picture/scaled", "picture/shift"], ["picture/shifted"]),
+        helper.make_node("Transpose", ["picture/shifted"], ["picture_nchw"], perm=[0, 3, 1, 2]),
         helper.make_node("Conv", ["picture_nchw", "w0"], ["c0"], auto_pad="SAME_UPPER"),
         helper.make_node("Mul", ["c0", "scale0"], ["m0"]),
         helper.make_node("Add", ["m0", "shift0"], ["a0"]),
@@ -38,10 +44,12 @@ def network(rng: np.random.Generator) -> Any:
         helper.make_node("Conv", ["r1", "w2"], ["c2"]),
         helper.make_node("Add", ["c2", "r0"], [BLOCK]),
         helper.make_node("Conv", [BLOCK, "BoxEncodingPredictor/w"], ["BoxEncodingPredictor"]),
+        helper.make_node("Conv", [BLOCK, "ClassPredictor/w"], ["ClassPredictor/Conv2D"], auto_pad="SAME_UPPER"),
+        helper.make_node("Add", ["ClassPredictor/Conv2D", "ClassPredictor/b"], ["ClassPredictor"]),
     ]
-    picture = helper.make_tensor_value_info("images", 1, (1, 3, SIDE, SIDE))
-    shape = (1, CHANNELS, SIDE, SIDE)
-    outputs = [helper.make_tensor_value_info(n, 1, shape) for n in ("BoxEncodingPredictor", BLOCK)]
+    picture = helper.make_tensor_value_info("images", 2, (1, SIDE, SIDE, 3))
+    channels = {"BoxEncodingPredictor": CHANNELS, BLOCK: CHANNELS, "ClassPredictor": 2}
+    outputs = [helper.make_tensor_value_info(name, 1, (1, n, SIDE, SIDE)) for name, n in channels.items()]
     graph = helper.make_graph(nodes, "blocks", [picture], outputs, [of_array(v, n) for n, v in constants.items()])
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
 
@@ -58,26 +66,66 @@ def test_convolutions_are_folded_with_what_follows_them() -> None:
         "c1": ("r1", True),
         "c2": ("c2", False),
         "BoxEncodingPredictor": ("BoxEncodingPredictor", False),
+        "ClassPredictor/Conv2D": ("ClassPredictor", False),
     }
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_quantized_network_differs_by_steps_of_its_levels(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    model, picture = network(rng), rng.uniform(-1, 1, (1, 3, SIDE, SIDE)).astype(np.float32)
+    model, picture = network(rng), rng.integers(0, 256, (1, SIDE, SIDE, 3), dtype=np.uint8)
     before = model.SerializeToString(deterministic=True)
     floats = run(model, picture)
     reach = float(np.abs(floats[1]).max()) + 6
     small = quantize(model, {"c2": (-reach, reach), BLOCK: (-reach, reach)})
-    head, block = run(small, picture)
+    box, block, logits = run(small, picture)
     step = 2 * reach / 255
     # Half a step of each of the values that lead there: some steps at most, and below one on average.
     assert np.abs(block - floats[1]).max() < 4 * step
     assert 0 < np.abs(block - floats[1]).mean() < step
-    np.testing.assert_allclose(head, floats[0], atol=0.05 * np.abs(floats[0]).max() + 8 * step)
+    np.testing.assert_allclose(box, floats[0], atol=0.05 * np.abs(floats[0]).max() + 8 * step)
+    np.testing.assert_allclose(logits, floats[2], atol=0.05 * np.abs(floats[2]).max() + 8 * step)
     assert model.SerializeToString(deterministic=True) == before
     assert {"QuantizeLinear", "Conv"} <= {node.op_type for node in small.graph.node}
-    assert not {"Clip", "Mul"} & {node.op_type for node in small.graph.node}
+    assert "Clip" not in {node.op_type for node in small.graph.node}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_heads_lose_nothing_but_the_rounding_of_their_weights(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model, picture = network(rng), rng.integers(0, 256, (1, SIDE, SIDE, 3), dtype=np.uint8)
+    small = quantize(model, {"c2": (-30.0, 30.0), BLOCK: (-30.0, 30.0)})
+    box, block, logits = run(small, picture)
+    constants = {i.name: onnx.numpy_helper.to_array(i) for i in model.graph.initializer}
+    bordered = np.pad(block[0], ((0, 0), (1, 1), (1, 1)))
+    windows = np.lib.stride_tricks.sliding_window_view(bordered, (3, 3), axis=(1, 2))
+    for name, found, seen in (
+        ("BoxEncodingPredictor", box, windows[..., 1:2, 1:2]),
+        ("ClassPredictor", logits, windows),
+    ):
+        weights = constants[f"{name}/w"]
+        scale = np.abs(weights).max(axis=(1, 2, 3), keepdims=True) / 127
+        sums = np.einsum("cyxvu,mcvu->myx", seen, np.rint(weights / scale) * scale)
+        expected = sums + constants.get(f"{name}/b", np.zeros((1, 1, 1, 1)))[0]
+        np.testing.assert_allclose(found[0], expected, atol=1e-4)
+
+
+def test_bytes_of_a_picture_keep_all_their_levels() -> None:
+    rng = np.random.default_rng(0)
+    model = network(rng)
+    picture = rng.integers(0, 256, (1, SIDE, SIDE, 3), dtype=np.uint8)
+    # Weights of whole 127ths lose nothing themselves.
+    weights = (rng.integers(-127, 127, (2, 3, 3, 3)) / 127).astype(np.float32)
+    weights[:, 0, 0, 0] = 1
+    model.graph.initializer.append(onnx.numpy_helper.from_array(weights, "picture/w"))
+    head = onnx.helper.make_node("Conv", ["picture_nchw", "picture/w"], ["ClassPredictor/2"], auto_pad="SAME_UPPER")
+    model.graph.node.append(head)
+    model.graph.output.append(onnx.helper.make_tensor_value_info("ClassPredictor/2", 1, (1, 2, SIDE, SIDE)))
+    small = quantize(model, {"c2": (-30.0, 30.0), BLOCK: (-30.0, 30.0)})
+    found, floats = run(small, picture)[3], run(model, picture)[3]
+    np.testing.assert_allclose(found[..., 1:-1, 1:-1], floats[..., 1:-1, 1:-1], atol=1e-4)
+    # Around the picture the byte 128 stands for 0: half a level, as often as the kernel is outside.
+    assert np.abs(found - floats).max() < 0.5 * 2 / 255 * np.abs(weights).sum(axis=(1, 2, 3)).max()
 
 
 def test_a_value_without_a_range_is_refused() -> None:

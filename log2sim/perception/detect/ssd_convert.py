@@ -18,8 +18,13 @@ if TYPE_CHECKING:
 OPSET = 13
 IR_VERSION = 8
 INPUT_PX = 300
-# With the background, which is column 0.
-CLASSES = 91
+# Classes by their column among the 91 of the graph, 0 of which is the background: those that are no road users are left out,
+# and with them most of the work, since classes are chosen for each of thousands of boxes.
+CLASS_NAMES = {
+    1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck", 10: "traffic light",
+}  # fmt: skip
+GRAPH_CLASSES = 91
+CLASS_HEAD = "/ClassPredictor/"
 SCALED, SHIFTED = "Preprocessor/mul/x", "Preprocessor/sub/y"
 PICTURE = "Preprocessor/sub"
 ENCODED_BOXES, CLASS_LOGITS = "concat", "concat_1"
@@ -100,7 +105,7 @@ class Converter:
             return self.add("Clip", [self.translate(node.inputs[0]), "zero", "six"], node.name)
         if node.op == "Reshape":
             # Both heads end in one; its target shape is computed in the graph, but only the last dimension matters.
-            last = CLASSES if node.name.endswith("_1") else 4
+            last = len(CLASS_NAMES) if node.name.endswith("_1") else 4
             moved = self.add("Transpose", [self.translate(node.inputs[0])], f"{node.name}/nhwc", perm=[0, 2, 3, 1])
             shape = self.store(f"{node.name}/shape", np.array([1, -1, last], dtype=np.int64))
             return self.add("Reshape", [moved, shape], node.name)
@@ -112,10 +117,14 @@ class Converter:
         value = self.constant(node.inputs[i])
         if value is None:
             return self.translate(node.inputs[i])
+        if CLASS_HEAD in node.name:
+            value = of_known_classes(value)
         return self.store(f"{node.name}/{i}", value.reshape(1, -1, 1, 1) if value.ndim == 1 else value)
 
     def _convolution(self, node: Node) -> str:
         weights = self.required(node.inputs[1])  # height, width, channels in, channels out or multiplier
+        if CLASS_HEAD in node.name:
+            weights = of_known_classes(weights)
         if node.op == "Conv2D":
             kernel, groups = weights.transpose(3, 2, 0, 1), 1
         else:
@@ -134,7 +143,7 @@ class Converter:
 
 
 def convert(graph: bytes) -> onnx.ModelProto:
-    """Convert the frozen graph: `images` (1, 300, 300, 3) uint8 RGB to `boxes` (1, 1917, 4) and `scores` (1, 1917, 90).
+    """Convert the frozen graph: `images` (1, 300, 300, 3) uint8 RGB to `boxes` (1, 1917, 4) and `scores` (1, 1917, 7).
 
     Raises
     ------
@@ -152,18 +161,23 @@ def convert(graph: bytes) -> onnx.ModelProto:
         raise ValueError(f"the graph has no node {error}") from None
     anchors = anchor_boxes()
     decode_boxes(converter, encoded, anchors)
-    probabilities = converter.add("Sigmoid", [logits], "probabilities")
-    bounds = [converter.store(f"classes/{i}", np.array([i], dtype=np.int64)) for i in (1, CLASSES, 2)]
-    converter.add("Slice", [probabilities, *bounds], "scores")
+    converter.add("Sigmoid", [logits], "scores")
     picture = helper.make_tensor_value_info("images", TensorProto.UINT8, [1, INPUT_PX, INPUT_PX, 3])
     outputs = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, len(anchors), columns])
-        for name, columns in (("boxes", 4), ("scores", CLASSES - 1))
+        for name, columns in (("boxes", 4), ("scores", len(CLASS_NAMES)))
     ]
     body = helper.make_graph(converter.onnx_nodes, "ssd_mobilenet_v2_coco", [picture], outputs, converter.initializers)
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    helper.set_model_props(model, {"names": repr(dict(enumerate(CLASS_NAMES.values())))})
     onnx.checker.check_model(model)
     return model
+
+
+def of_known_classes(constant: NDArray[Any]) -> NDArray[Any]:
+    """Leave only the columns of `CLASS_NAMES` of a constant (..., K * 91) of the classes of K shapes of boxes."""
+    by_class = constant.reshape(*constant.shape[:-1], -1, GRAPH_CLASSES)
+    return by_class[..., list(CLASS_NAMES)].reshape(*constant.shape[:-1], -1)
 
 
 def normalize_picture(converter: Converter) -> None:

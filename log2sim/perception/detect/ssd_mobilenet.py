@@ -26,7 +26,7 @@ GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad
 GRAPH_LIMIT_BYTES = 256 * 1024**2
 MAX_DIGEST_BYTES = 1024
 # To be raised when the conversion changes, so that cached models of older versions are not used.
-CONVERSION = 2
+CONVERSION = 3
 PROCESSOR = Path("/proc/cpuinfo")
 PROCESSOR_LIMIT_BYTES = 16 * 1024**2
 # Processors that add up products of bytes in 32 bits; others saturate at 16.
