@@ -95,14 +95,20 @@ def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Arra
     """
     points = np.asarray(points_cam)
     front = points[:, 2] > MIN_DEPTH_M
-    uv = np.full((len(points), 2), np.nan)
-    xy = points[front, :2] / points[front, 2:]
+    index = None if front.all() else np.flatnonzero(front)
+    # Column by column: rows of two are slow.
+    x, y, z = points.T if index is None else (column[index] for column in points.T)
+    x, y = x / z, y / z
     if _is_distorted(camera):
-        usable = _before_fold(camera, xy)
-        xy = distort(camera, np.where(usable[:, None], xy, np.nan))
-    uv[front] = xy @ camera.K[:2, :2].T + camera.K[:2, 2]
+        usable = _before_fold(camera, x, y)
+        x, y = _distorted(camera, np.where(usable, x, np.nan), np.where(usable, y, np.nan))
+    u, v = (row[0] * x + row[1] * y + row[2] for row in camera.K[:2])
     with np.errstate(invalid="ignore"):
-        inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width_px) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height_px)
+        shown = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
+    if index is None:
+        return np.stack([u, v], axis=1), shown
+    uv, inside = np.full((len(points), 2), np.nan), np.zeros(len(points), dtype=bool)
+    uv[index, 0], uv[index, 1], inside[index] = u, v, shown
     return uv, inside
 
 
@@ -110,13 +116,13 @@ def _is_distorted(camera: Camera) -> bool:
     return camera.distortion_model != "none" and any(camera.distortion)
 
 
-def _before_fold(camera: Camera, xy: Array) -> NDArray[np.bool_]:
-    """Mark (N,) the rays (N, 2) at which the radius in the image still increases with that of the ray."""
-    before: NDArray[np.bool_] = (xy * xy).sum(axis=1) < fold_radius(camera) ** 2
+def _before_fold(camera: Camera, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Mark (N,) the rays at which the radius in the image still increases with that of the ray."""
+    before: NDArray[np.bool_] = x * x + y * y < fold_radius(camera) ** 2
     if camera.distortion_model == "brown":
         # The tangential terms fold too, but only beyond three times the view.
-        half_view = 1.5 * np.array([camera.width_px / camera.K[0, 0], camera.height_px / camera.K[1, 1]])
-        before &= np.all(np.abs(xy) <= half_view, axis=1)
+        before &= np.abs(x) <= 1.5 * camera.width_px / camera.K[0, 0]
+        before &= np.abs(y) <= 1.5 * camera.height_px / camera.K[1, 1]
     return before
 
 
@@ -162,9 +168,11 @@ def _first_positive_root(polynomial: Polynomial) -> float:
 
 def distort(camera: Camera, xy: Array) -> Array:
     """Apply the lens distortion to normalized image coordinates (N, 2)."""
-    if not _is_distorted(camera):
-        return xy
-    x, y = xy[:, 0], xy[:, 1]
+    return np.stack(_distorted(camera, xy[:, 0], xy[:, 1]), axis=1) if _is_distorted(camera) else xy
+
+
+def _distorted(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    """Apply the lens distortion to normalized image coordinates x (N,) and y (N,)."""
     r2 = x * x + y * y
     if camera.distortion_model == "fisheye":
         k1, k2, k3, k4 = _padded(camera.distortion, 4)
@@ -173,15 +181,16 @@ def distort(camera: Camera, xy: Array) -> Array:
         a2 = angle * angle
         bent = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
         scale = np.divide(bent, r, out=np.ones_like(r), where=r > 0)
-        return xy * scale[:, None]
+        return x * scale, y * scale
     k1, k2, p1, p2, k3, k4, k5, k6 = _padded(camera.distortion, 8)
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=1,
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if k4 or k5 or k6:
+        radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    if not (p1 or p2):
+        return x * radial, y * radial
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     )
 
 
@@ -206,7 +215,7 @@ def undistort(camera: Camera, uv_px: Array) -> Array:
             break
         xy = xy - _newton_step(camera, xy, error)
     error = np.abs(distort(camera, xy) - target).max(axis=1, initial=0.0)
-    found = (error <= tolerance) & _before_fold(camera, xy)
+    found = (error <= tolerance) & _before_fold(camera, xy[:, 0], xy[:, 1])
     return np.where(found[:, None], xy, np.nan)
 
 
