@@ -87,7 +87,8 @@ def test_the_turned_world_shows_the_same_ends():
 def test_clusters_are_judged_alike_alone_and_together():
     """Clusters of very different sizes, one across the azimuth at which a turn begins, and two that share points."""
     pole = standing(-7, 1.6, 0, (0.4, 0.4, 3.0))
-    solids = [standing(-12, 0, 10), pole, standing(14, 0, 90), standing(7, 2.4, 0, (0.5, 0.5, 3.0)), WALL]
+    occluder = standing(7, 0.9, 0, (1.0, 0.8, 3.0))
+    solids = [standing(-12, 0, 10), pole, standing(14, 0, 90), occluder, standing(14, -9, 90), WALL]
     xyz, owner = scan(solids, azimuth_deg=(-180, 180))
     members = [np.flatnonzero((owner == k) & (xyz[:, 2] > 0.2)) for k in range(len(solids))]
     members = [one for one in [*members, np.union1d(members[0], members[1])] if len(one)]
