@@ -212,20 +212,18 @@ def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array
     map_T_lidar, valid = log.map_T_sensor(lidar, knots)
     if not valid.all():
         return None
-    place = (t_ns - first) / max(span, 1) * bins
-    k = np.minimum(place.astype(np.int64), bins - 1)
-    order = np.argsort(k.astype(np.uint16), kind="stable")  # short numbers are sorted by their digits
-    edges = np.searchsorted(k[order], np.arange(bins + 1))
+    place = (t_ns - first) * (bins / max(span, 1))
+    k = np.minimum(place.astype(np.intp), bins - 1)
+    place -= k
+    # Coordinate by coordinate, rotated in the points' own precision: entries of the pose of each point come from small tables.
+    xyz = [np.ascontiguousarray(sweep.xyz_m[:, axis]) for axis in range(3)]
+    rotation = map_T_lidar[:, :3, :3].astype(np.result_type(sweep.xyz_m, np.float32))
+    position, moved = map_T_lidar[:-1, :3, 3], np.diff(map_T_lidar[:, :3, 3], axis=0)
     out = np.empty((len(t_ns), 3))
-    sorted_points = np.asarray(sweep.xyz_m, dtype=np.float64)[order]
-    rotated = np.empty_like(sorted_points)
-    for b in np.flatnonzero(np.diff(edges)):
-        rows = slice(edges[b], edges[b + 1])
-        np.matmul(sorted_points[rows], map_T_lidar[b, :3, :3].T, out=rotated[rows])
-    out[order] = rotated
-    position = map_T_lidar[:, :3, 3]
-    fraction = (place - k)[:, None]
-    return np.asarray(out + position[k] * (1 - fraction) + position[k + 1] * fraction)
+    for row in range(3):
+        rotated = sum(rotation[:, row, axis].take(k) * xyz[axis] for axis in range(3))
+        out[:, row] = rotated + position[:, row].take(k) + moved[:, row].take(k) * place
+    return out
 
 
 def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:

@@ -127,12 +127,12 @@ def assemble_cloud(
         middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
         local = (mapped[0] - origin).astype(np.float32)
-        near = (np.abs(local) <= max_range_m).all(axis=1)
+        near = np.flatnonzero(np.logical_and.reduce([np.abs(local[:, axis]) <= max_range_m for axis in range(3)]))
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
-        parts.append((local[near], t_s[near], position))
+        parts.append((local.take(near, axis=0), t_s.take(near), position))
         place = _follow_sensor(log, name, stamp, t_s, origin)
-        sensors.append(CloudSensor(int(near.sum()), *place, end_of(log.lidars[name])))
+        sensors.append(CloudSensor(len(near), *place, end_of(log.lidars[name])))
     if not parts:
         return None
     xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
