@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 from log2sim.agents.smooth.feasibility import broken_limits, limit_doubts
 from log2sim.agents.smooth.fixed_interval import smooth_interval
-from log2sim.agents.smooth.heading import yaw_of_motion, yaw_sigma
+from log2sim.agents.smooth.heading import course_is_known, yaw_of_motion, yaw_sigma
 from log2sim.agents.smooth.motion_model import MotionModel
 from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
@@ -694,3 +694,39 @@ def test_it_takes_no_longer_than_two_splines(maneuvers: ModuleType) -> None:
         maneuvers.spline_estimate(world, 0.1)
         seconds["spline"].append(time.process_time() - begin)
     assert min(seconds["ours"]) < 2 * min(seconds["spline"])
+
+
+@pytest.mark.parametrize("pulled_m", [0.6, 0.9])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_comes_to_rest_does_not_turn_where_its_last_boxes_are_pulled_aside(pulled_m: float, seed: int) -> None:
+    """Of a car that is hidden little by little, one corner is left, with which the center of its box seems to drive off."""
+    t = np.arange(0.0, 4.7, DT)
+    noisy = braked(t, 2.5) + np.random.default_rng(seed).normal(0, 0.02, (len(t), 2))
+    noisy[-4:] += np.outer([0.25, 0.5, 0.75, 1.0], [pulled_m / 3, pulled_m])
+    covariance = np.tile(0.17**2 * np.eye(2), (len(t), 1, 1))
+    path = smooth_track(t, noisy, covariance=covariance, motion=MotionModel(heading_rad=0.0))
+    assert np.abs(path.yaw_rad).max() < 0.05
+
+
+@pytest.mark.parametrize("radius_m", [4.5, 6.0])
+def test_a_slow_turn_as_tight_as_a_car_can_is_followed(radius_m: float) -> None:
+    t = np.arange(0.0, 7.0, DT)
+    truth = 2.0 * t / radius_m
+    circle = radius_m * np.column_stack([np.sin(truth), 1 - np.cos(truth)])
+    noisy = circle + np.random.default_rng(5).normal(0, 0.05, (len(t), 2))
+    path = smooth_track(t, noisy, covariance=np.tile(0.1**2 * np.eye(2), (len(t), 1, 1)))
+    assert np.abs(wrap_angle(path.yaw_rad - truth))[5:-5].max() < 0.15
+    assert np.abs(wrap_angle(path.yaw_rad - truth)).max() < 0.3
+
+
+def test_of_courses_too_different_for_the_way_between_them_the_surer_one_is_known() -> None:
+    velocity = np.array([[4.0, 0.0], [3.0, 0.0], [1.5, 0.9], [0.0, 1.2], [-1.5, 0.0]])
+    xy = np.array([[0.0, 0.0], [1.0, 0.0], [1.5, 0.0], [1.6, 0.0], [1.7, 0.0]])
+    covariance = np.tile(0.1**2 * np.eye(2), (5, 1, 1))
+    # 0.54 rad are too much for half a meter, a right angle is for 0.1 m; backward is no turn.
+    found = course_is_known(xy, velocity, covariance, correlated=True)
+    assert found.tolist() == [True, True, False, False, True]
+    # As far from each other as that, or of unknown direction, all of them are.
+    assert course_is_known(10 * xy, velocity, covariance, correlated=True)[:3].all()
+    assert course_is_known(xy, velocity, 400 * covariance, correlated=True).all()
+    assert course_is_known(xy, velocity, covariance, correlated=True, holonomic=True).all()

@@ -16,6 +16,7 @@ from log2sim.agents.heading.course import forward_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
+from log2sim.agents.smooth import feasibility
 from log2sim.agents.smooth.feasibility import limit_doubts
 from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
 from log2sim.agents.smooth.motion_model import MotionModel
@@ -27,6 +28,14 @@ from log2sim.tracking.motion import CENTER_SIGMA_M
 
 # Spectral density of the jerk, m2/s5, of groups for which it is not estimated.
 JERK_DENSITY = {"pedestrian": 2.0}
+# Tightest ways of groups: that of road vehicles; of a bicycle with a wheelbase of 1.05 m whose front wheel is turned by 30 degrees,
+# tan(30 degrees) / 1.05 m; of others nothing is known.
+MAX_CURVATURE_1PM = {
+    "vehicle": feasibility.MAX_CURVATURE_1PM,
+    "two_wheeler": 0.55,
+    "pedestrian": np.inf,
+    "other": np.inf,
+}
 # Without smoothing: so large that the trajectory follows the positions.
 UNSMOOTHED_JERK_DENSITY = 1e4
 # Standard deviation of box centers beyond their covariance: points are no exact outlines.
@@ -78,7 +87,8 @@ def moving_candidate(
     t = timeline.seconds(m.t_ns)
     noise = FITTED_CENTER_SIGMA_M[group] ** 2 * np.eye(2)
     heading, heading_sigma = _first_heading(track)
-    motion = MotionModel(JERK_DENSITY.get(group), group == "pedestrian", heading, heading_sigma)
+    curvature = MAX_CURVATURE_1PM[group]
+    motion = MotionModel(JERK_DENSITY.get(group), group == "pedestrian", heading, heading_sigma, curvature)
     xy, covariance = m.center_m[:, :2], m.covariance
     for _ in range(PRELIMINARY_SMOOTHINGS):
         rough = smooth_track(t, xy, covariance=covariance + noise, at_s=t, motion=motion)

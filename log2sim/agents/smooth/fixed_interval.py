@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.agents.smooth.heading import course_is_known, unwrap, yaw_of_motion, yaw_sigma
 from log2sim.agents.smooth.jerk_density import STRONG_PRIOR, WEAK_PRIOR, DensityEstimator, min_density
@@ -138,9 +139,7 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
         covariance = least.covariance()
     residual = np.hypot(*problem.measurement.residual(state).T)
     state, covariance = _at_times(prior, asked_s, state, covariance)
-    known = course_is_known(
-        state[:, 1], covariance[:, 2:4, 2:4], holonomic=motion.holonomic, correlated=observed.correlated
-    )
+    known = _known_courses(state, covariance, motion, correlated=observed.correlated)
     yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, holonomic=motion.holonomic, known=known)
     sigma = yaw_sigma(state[:, 0], state[:, 1], covariance[:, 2:4, 2:4], known, hint_sigma_rad=motion.heading_sigma_rad)
     return Smoothed(state, covariance, yaw, sigma, residual, problem.weight, problem.density)
@@ -153,7 +152,9 @@ def _without_rolling_back(
     observed = problem.measurement.observed
     for _ in range(MAX_HOLDING_ROUNDS):
         before = least
-        for run in backward_runs(state, least.covariance(), motion.heading_rad, correlated=observed.correlated):
+        covariance = least.covariance()
+        known = _known_courses(state, covariance, motion, correlated=observed.correlated)
+        for run in backward_runs(state, known, motion.heading_rad):
             hold = held_at(problem.state, run)
             both = hold if constraints is None else weighted_sum([(1.0, constraints), (1.0, hold)])
             stands, its_state = problem.solve(both)
@@ -257,12 +258,7 @@ def _constraints(problem: _Problem, state: Array, covariance: Array, motion: Mot
     velocity = state[:, 1]
     sigma = zero_velocity_sigma(problem.prior.knots_s, problem.measurement, problem.weight, state, covariance)
     still = np.isfinite(sigma)
-    known = ~still & course_is_known(
-        velocity,
-        covariance[:, 2:4, 2:4],
-        holonomic=motion.holonomic,
-        correlated=problem.measurement.observed.correlated,
-    )
+    known = ~still & _known_courses(state, covariance, motion, correlated=problem.measurement.observed.correlated)
     slow = ~known & ~still
     if motion.holonomic or not (known.any() or motion.heading_rad is not None):
         slow[:] = False
@@ -275,6 +271,18 @@ def _constraints(problem: _Problem, state: Array, covariance: Array, motion: Mot
     about_velocity = about_velocity + (sigma**-2)[:, None, None] * np.eye(2)
     about_acceleration = ((sigma * STANDSTILL_HZ) ** -2)[:, None, None] * np.eye(2)
     return zero_motion(problem.state, about_velocity, about_acceleration)
+
+
+def _known_courses(state: Array, covariance: Array, motion: MotionModel, *, correlated: bool) -> NDArray[np.bool_]:
+    """Where (K,) the velocity of a state (K, 3, 2) with covariances (K, 6, 6) gives the heading."""
+    return course_is_known(
+        state[:, 0],
+        state[:, 1],
+        covariance[:, 2:4, 2:4],
+        holonomic=motion.holonomic,
+        correlated=correlated,
+        max_curvature_1pm=motion.max_curvature_1pm,
+    )
 
 
 def _at_times(prior: MotionPrior, asked_s: Array, state: Array, covariance: Array) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.agents.smooth.feasibility import MAX_CURVATURE_1PM
 from log2sim.geometry import Array, wrap_angle
 
 # Below these speeds of vehicles and pedestrians the direction of a smoothed velocity is noise.
@@ -25,17 +26,77 @@ UNKNOWN_YAW_RAD = float(np.pi / np.sqrt(12.0))
 
 
 def course_is_known(
-    velocity_mps: Array, covariance: Array, *, holonomic: bool = False, correlated: bool = False
+    xy_m: Array,
+    velocity_mps: Array,
+    covariance: Array,
+    *,
+    holonomic: bool = False,
+    correlated: bool = False,
+    max_curvature_1pm: float = MAX_CURVATURE_1PM,
 ) -> NDArray[np.bool_]:
-    """Where (T,) the direction of velocities (T, 2) with covariances (T, 2, 2) gives the heading.
+    """Where (T,) the direction of the velocity gives the heading.
 
-    With `correlated` errors the covariances are too small, so the speed alone decides.
+    Parameters
+    ----------
+    xy_m : (T, 2) float64, m
+    velocity_mps : (T, 2) float64, m/s
+    covariance : (T, 2, 2) float64, m2/s2
+        Of the velocity.
+    holonomic : bool
+    correlated : bool
+        Whether the errors of the positions repeat. The covariances are too small then, so the speed alone decides.
+    max_curvature_1pm : float, 1/m
+        Of a path that is not holonomic. Courses that a vehicle could not turn between are not both known, see
+        `_turns_feasible`.
     """
     speed = np.hypot(*velocity_mps.T)
     if correlated:
-        return np.asarray(speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS))
-    sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
-    return np.asarray(speed > np.maximum(MIN_COURSE_SIGMAS[holonomic] * sigma, MIN_COURSE_MPS[holonomic]))
+        known = np.asarray(speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS))
+    else:
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+        known = np.asarray(speed > np.maximum(MIN_COURSE_SIGMAS[holonomic] * sigma, MIN_COURSE_MPS[holonomic]))
+    rows = np.flatnonzero(known)
+    if holonomic or len(rows) < 2 or np.isinf(max_curvature_1pm):
+        return known
+    course = np.arctan2(velocity_mps[rows, 1], velocity_mps[rows, 0])
+    sigma = np.sqrt(_course_variance(velocity_mps[rows], covariance[rows]))
+    known[rows] = _turns_feasible(_distance_covered(xy_m, speed)[rows], course, sigma, max_curvature_1pm)
+    return known
+
+
+def _turns_feasible(
+    distance_m: Array, course_rad: Array, sigma_rad: Array, max_curvature_1pm: float
+) -> NDArray[np.bool_]:
+    """Select courses (n,), (n,) bool, of which no two differ by more than a vehicle can turn on the way between them.
+
+    A smoothed velocity swings round where an object comes to rest or is seen for the first time. A course counts if it
+    differs from the surer ones that count by no more than the distance driven times the largest curvature, plus the
+    standard deviation of the difference. Forward and backward are the same.
+    """
+    counts = np.ones(len(course_rad), dtype=bool)
+    turned = np.abs(wrap_angle(2 * np.diff(course_rad))) / 2
+    if np.all(turned <= max_curvature_1pm * np.diff(distance_m)):  # then it holds between any two
+        return counts
+    counts[:] = False
+    # Within this distance any turn is feasible.
+    reach_m = np.pi / 2 / max_curvature_1pm
+    first = np.searchsorted(distance_m, distance_m - reach_m)
+    last = np.searchsorted(distance_m, distance_m + reach_m, side="right")
+    for k in np.argsort(sigma_rad, kind="stable").tolist():
+        near = slice(first[k], last[k])
+        turned = np.abs(wrap_angle(2 * (course_rad[near] - course_rad[k]))) / 2
+        feasible = max_curvature_1pm * np.abs(distance_m[near] - distance_m[k]) + np.hypot(
+            sigma_rad[near], sigma_rad[k]
+        )
+        counts[k] = np.all((turned <= feasible) | ~counts[near])
+    return counts
+
+
+def _course_variance(velocity_mps: Array, covariance: Array) -> Array:
+    """Return the variance (n,) in rad2 of the directions of velocities (n, 2) with covariances (n, 2, 2)."""
+    across = np.stack([-velocity_mps[:, 1], velocity_mps[:, 0]], axis=-1)
+    squared = (velocity_mps**2).sum(axis=1)
+    return np.asarray(np.einsum("ka,kab,kb->k", across, covariance, across) / squared**2)
 
 
 def yaw_of_motion(
@@ -101,8 +162,7 @@ def yaw_sigma(
     if len(rows) == 0:
         return np.full(len(xy_m), min(hint_sigma_rad, UNKNOWN_YAW_RAD))
     speed = np.hypot(*velocity_mps.T)
-    across = np.stack([-velocity_mps[:, 1], velocity_mps[:, 0]], axis=-1)[rows] / speed[rows, None]
-    variance = np.einsum("ka,kab,kb->k", across, covariance[rows], across) / speed[rows] ** 2
+    variance = _course_variance(velocity_mps[rows], covariance[rows])
     distance = _distance_covered(xy_m, speed)
     after = np.clip(np.searchsorted(rows, np.arange(len(xy_m))), 0, len(rows) - 1)
     nearest = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from log2sim.agents.smooth.feasibility import MAX_CURVATURE_1PM
 from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
 from log2sim.geometry import Array
 
@@ -22,12 +23,15 @@ class MotionModel:
         Heading where the motion does not give one.
     heading_sigma_rad : float
         Its standard deviation.
+    max_curvature_1pm : float, 1/m
+        Of its way, unless it is holonomic.
     """
 
     jerk_density: float | None = None
     holonomic: bool = False
     heading_rad: float | None = None
     heading_sigma_rad: float = UNKNOWN_YAW_RAD
+    max_curvature_1pm: float = MAX_CURVATURE_1PM
 
     @property
     def density_by_direction(self) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.motion_evidence import VIEW_S
-from log2sim.agents.smooth.heading import course_is_known, yaw_of_motion
+from log2sim.agents.smooth.heading import yaw_of_motion
 from log2sim.agents.smooth.likelihood import zero_motion
 from log2sim.agents.smooth.motion_prior import NoisyPositions
 from log2sim.agents.smooth.quadratic import Quadratic
@@ -20,22 +20,18 @@ MAX_ROLL_M = 2.0
 HELD_SIGMA_MPS, MAX_HOLDING_ROUNDS = 0.02, 4
 
 
-def backward_runs(
-    state: Array, covariance: Array, heading_rad: float | None, *, correlated: bool
-) -> list[NDArray[np.intp]]:
+def backward_runs(state: Array, known: NDArray[np.bool_], heading_rad: float | None) -> list[NDArray[np.intp]]:
     """Return the knots of each short way backward of a vehicle.
 
     Parameters
     ----------
     state : (K, 3, 2) float64
-    covariance : (K, 6, 6) float64
+    known : (K,) bool
+        Where the course is known.
     heading_rad : float, optional
         Heading where the motion does not give one.
-    correlated : bool
-        Whether errors of the positions repeat.
     """
     velocity = state[:, 1]
-    known = course_is_known(velocity, covariance[:, 2:4, 2:4], correlated=correlated)
     if heading_rad is None and not known.any():
         return []
     yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=heading_rad, known=known)
