@@ -134,6 +134,12 @@ def take_arrays(arrays: Sequence[NDArray[Any]], rows: Iterable[int]) -> Sequence
     return tuple(arrays[k] for k in rows)
 
 
+def array_lengths(arrays: Sequence[NDArray[Any]]) -> list[int]:
+    """Return how many rows each of several arrays has, without reading those that are in a file."""
+    items = arrays.items if isinstance(arrays, ArrayList) else arrays
+    return [item.shape[0] for item in items]
+
+
 def join_arrays(parts: Iterable[Sequence[NDArray[Any]]]) -> Sequence[NDArray[Any]]:
     """Return the arrays of several sequences in one, without reading those that are in a file."""
     parts = list(parts)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.array_file import ArrayFile, ArrayList, StoredArray, join_arrays, take_arrays
+from log2sim.array_file import ArrayFile, ArrayList, StoredArray, array_lengths, join_arrays, take_arrays
 from log2sim.datatypes import Measurements, Obstacles, Rays
 from log2sim.perception.obstacle_list import ObstacleList
 
@@ -30,6 +30,7 @@ def test_arrays_come_back_as_they_were(kinds: list[Any], memory_bytes: int) -> N
     for array, back in zip(arrays, kept, strict=True):
         assert (back.dtype, back.shape) == (array.dtype, array.shape)
         np.testing.assert_array_equal(back, array)
+    assert array_lengths(kept) == array_lengths(arrays) == [len(array) for array in arrays]
     in_memory = sum(item.nbytes for item in kept.items if isinstance(item, np.ndarray))
     assert in_memory <= memory_bytes
     assert in_memory == sum(a.nbytes for a in arrays) or any(isinstance(item, StoredArray) for item in kept.items)

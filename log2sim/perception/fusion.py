@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.array_file import array_lengths
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.box_completion import place_boxes, provisional_sizes
@@ -61,10 +62,7 @@ def fuse_tick(measurements: Measurements, *, across: bool = True) -> Measurement
         else:
             owner[i] = i
     leaders = np.flatnonzero(owner == np.arange(len(rows)))
-    if across:
-        out = Measurements.join([_join(rows, int(leader), np.flatnonzero(owner == leader)) for leader in leaders])
-    else:
-        out = rows.take(leaders)
+    out = _join_all(rows, leaders, owner) if across else rows.take(leaders)
     return out.take(~_is_driver(out))
 
 
@@ -89,7 +87,7 @@ def _gated_pairs(rows: Measurements) -> NDArray[np.bool_]:
 
 def _has_points(rows: Measurements) -> NDArray[np.bool_]:
     """Mark the rows (M,) with LiDAR points."""
-    return np.array([s == "lidar" and len(c) > 0 for s, c in zip(rows.source, rows.cluster)], dtype=bool)
+    return np.asarray((rows.source == "lidar") & (np.array(array_lengths(rows.cluster), dtype=np.intp) > 0))
 
 
 def _share_points(rows: Measurements, i: int, j: int) -> bool:
@@ -107,15 +105,27 @@ def _share_inside(rows: Measurements, i: int, j: int) -> float:
     return float(((points >= low) & (points <= high)).all(axis=1).mean())
 
 
-def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measurements:
-    """Merge the LiDAR evidence that other cameras have of the leader's object into its row."""
-    row = rows.take([leader])
+def _join_all(rows: Measurements, leaders: NDArray[np.intp], owner: NDArray[np.intp]) -> Measurements:
+    """Return one row for each leader, with the LiDAR evidence that other cameras have of its object; each row (M,) has an owner."""
     with_points = _has_points(rows)
-    others = [m for m in members if m != leader and rows.camera[m] != rows.camera[leader] and with_points[m]]
-    row = replace(row, seen_by=np.asarray(rows.seen_by[members].any(axis=0, keepdims=True)))
-    if not others or not with_points[leader]:
-        return row
-    merged = [leader, *others]
+    seen_by = np.array([rows.seen_by[owner == leader].any(axis=0) for leader in leaders], dtype=bool)
+    out = replace(rows.take(leaders), seen_by=seen_by.reshape(-1, rows.seen_by.shape[1]))
+    usable = with_points & with_points[owner] & (rows.camera != rows.camera[owner])
+    joined = {}
+    for k in np.flatnonzero(np.isin(leaders, owner[usable])).tolist():
+        joined[k] = _join(
+            rows, out.take([k]), [int(leaders[k]), *np.flatnonzero(usable & (owner == leaders[k])).tolist()]
+        )
+    if not joined:
+        return out
+    others = [k for k in range(len(leaders)) if k not in joined]
+    place = np.argsort([*others, *joined])
+    return Measurements.join([out.take(others), *joined.values()]).take(place)
+
+
+def _join(rows: Measurements, row: Measurements, merged: Sequence[int]) -> Measurements:
+    """Return a leader's row with the points that it, the first of `merged`, and other cameras have of its object."""
+    leader = merged[0]
     boxed = rows.take([next((m for m in merged if np.isfinite(rows.box_yaw_rad[m])), leader)])
     row = replace(row, **{column: getattr(boxed, column) for column in BOX_COLUMNS})
     cluster = _timed_from(rows, merged, int(row.t_ns[0]))
@@ -126,8 +136,8 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
         row, cluster=(cluster,), yaw_rad=np.array([yaw]), low_m=low[None], high_m=high[None],
         top_m=np.array([top_of(cluster[:, 2])]),
         # Where one camera's box cut the object, another's may show its end.
-        ends_visible=np.asarray(rows.ends_visible[merged].any(axis=0, keepdims=True)),
-        truncated=np.array([rows.truncated[merged].all()]), points=rows.points[merged].max(keepdims=True),
+        ends_visible=np.asarray(rows.ends_visible[list(merged)].any(axis=0, keepdims=True)),
+        truncated=np.array([rows.truncated[list(merged)].all()]), points=rows.points[list(merged)].max(keepdims=True),
     ))  # fmt: skip
 
 
