@@ -105,7 +105,8 @@ def clip_box(corners_cam: Array, planes: Array) -> Array:
         return corners_cam
     if not inside.any(axis=0).all():
         return np.zeros((0, 3))
-    return np.concatenate([clip_polygon(corners_cam[list(face)], planes) for face in FACES])
+    cutting = planes[~inside.all(axis=0)]
+    return np.concatenate([clip_polygon(corners_cam[list(face)], cutting) for face in FACES])
 
 
 def clip_polygon(polygon: Array, planes: Array) -> Array:
@@ -113,14 +114,16 @@ def clip_polygon(polygon: Array, planes: Array) -> Array:
     for plane in planes:
         if not len(polygon):
             break
-        side = polygon @ plane[:3] + plane[3]
-        following, next_side = np.roll(polygon, -1, axis=0), np.roll(side, -1)
+        side = (polygon @ plane[:3] + plane[3]).tolist()
+        if min(side) >= 0:
+            continue
         kept = []
-        for p, s, q, t in zip(polygon, side, following, next_side, strict=True):
+        for i, s in enumerate(side):
+            k = (i + 1) % len(side)
             if s >= 0:
-                kept.append(p)
-            if (s >= 0) != (t >= 0):
-                kept.append(p + (q - p) * (s / (s - t)))
+                kept.append(polygon[i])
+            if (s >= 0) != (side[k] >= 0):
+                kept.append(polygon[i] + (polygon[k] - polygon[i]) * (s / (s - side[k])))
         polygon = np.array(kept).reshape(-1, 3)
     return polygon
 
