@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from log2sim import Config, open_log, pipeline
+from log2sim.calibration import edge_views
 from log2sim.calibration.cameras import check_cameras
 from log2sim.calibration.corrections import turn_mount
 from log2sim.calibration.depth_edges import DepthEdges, find_depth_edges, keep_standing, read_depth_edges
@@ -276,6 +277,22 @@ def test_a_turned_camera_is_told_and_corrected(sample: Log) -> None:
     rest = mended.cameras["front"].mount_T_cam[:3, :3].T @ sample.cameras["front"].mount_T_cam[:3, :3]
     assert np.degrees(np.arccos((np.trace(rest) - 1) / 2)) < 0.15
     assert mended.cameras["front_left"] is sample.cameras["front_left"]
+
+
+def test_only_frames_of_cameras_that_may_be_turned_are_all_looked_at(
+    sample: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[tuple[str, int]] = []
+
+    def note(stream: Any, index: int, camera: Camera) -> Any:
+        read.append((camera.name, index))
+        return read_gray(stream, index, camera)
+
+    monkeypatch.setattr(edge_views, "read_gray", note)
+    checked(with_cameras(sample, yawed(sample.cameras["front"], 1.0)))
+    counts = {name: sum(name == other for other, _ in read) for name in ("front", "front_right")}
+    assert counts == {"front": edge_views.MAX_FRAMES, "front_right": edge_views.MAX_FRAMES // 2}
+    assert len(set(read)) == len(read)
 
 
 def test_exchanged_mounts_are_told_by_name_and_given_back(sample: Log) -> None:

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from log2sim.calibration.edge_alignment import YawEstimate
+from log2sim.calibration.edge_alignment import EdgeView, YawEstimate
 from log2sim.calibration.edge_views import EdgeViews, choose_moments, is_near
 from log2sim.calibration.mount_mistakes import Mistake, MountCheck, estimate_mount_yaw, find_mistakes, turn_by
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Treatment
-from log2sim.geometry import Array
+from log2sim.geometry import Array, Camera
 from log2sim.localization.choice import during_ns
 from log2sim.localization.ego_sweeps import densest_lidar
 from log2sim.plan import LABELS
@@ -21,6 +21,8 @@ from log2sim.sensors import Sensors
 # At 30 m this is 0.3 m, half the width of a pedestrian: LiDAR points leave the image boxes of their objects.
 MIN_TOLD_RAD = 0.01
 MIN_SIGMAS = 4.0
+# Up to half of that, a camera is sound whatever more frames say.
+SOUND_RAD = MIN_TOLD_RAD / 2
 FIX = "--fix-calibration"
 DONE: Mapping[Treatment, str] = {
     "corrected": "corrected",
@@ -121,10 +123,20 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Prog
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
-    views = {name: seen.of_camera(name) for name in names}
-    return MountCheck(
-        log, lidar, views, unknown | {name: estimate_mount_yaw(log.cameras[name], views[name]) for name in names}
-    )
+    looks = {name: _look_through(log.cameras[name], seen) for name in names}
+    progress("check cameras", len(moments.sweeps), len(moments.sweeps))
+    views = {name: views for name, (views, _) in looks.items()}
+    return MountCheck(log, lidar, views, unknown | {name: yaw for name, (_, yaw) in looks.items()})
+
+
+def _look_through(camera: Camera, seen: EdgeViews) -> tuple[list[EdgeView], YawEstimate | None]:
+    """Return views of a camera and its yaw: by every second moment, and by all where those do not show that it is sound."""
+    few = seen.of_camera(camera.name, every=2)
+    yaw = estimate_mount_yaw(camera, few)
+    if yaw is not None and abs(yaw.yaw_rad) < SOUND_RAD:
+        return few, yaw
+    views = seen.of_camera(camera.name)
+    return views, estimate_mount_yaw(camera, views)
 
 
 def _fault_of_mistake(name: str, lidar: str, mistake: Mistake, treatment: Treatment) -> Fault:

@@ -23,6 +23,8 @@ MAX_STEP_SHARE = 0.3
 MAX_SHIFT_M, MAX_SHIFT_RAD = 0.2, np.deg2rad(0.5)
 # Neighboring rays of one laser are 0.1 to 0.4 degrees apart; those of one band of elevation belong to one or two lasers.
 BAND_RAD, MAX_APART_RAD = np.deg2rad(0.2), np.deg2rad(0.8)
+# More than the azimuths of a band differ.
+WHOLE_TURN_RAD = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +93,12 @@ def find_depth_edges(points: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
     left : (n,) bool
         Whether the surface ends on its left, counter-clockwise; else on its right.
     """
-    range_m = np.linalg.norm(points, axis=1)
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    band = np.floor(np.arcsin(points[:, 2] / np.maximum(range_m, MIN_RANGE_M / 100)) / BAND_RAD)
-    order = np.lexsort((azimuth, band))
+    x, y, z = points.T
+    range_m = np.sqrt(x * x + y * y + z * z)
+    azimuth = np.arctan2(y, x)
+    band = np.floor(np.arcsin(z / np.maximum(range_m, MIN_RANGE_M / 100)) / BAND_RAD)
+    # By band, then azimuth, in one sort.
+    order = np.argsort(band * WHOLE_TURN_RAD + azimuth, kind="stable")
     range_m, azimuth, band = range_m[order], azimuth[order], band[order]
     neighbors = (band[1:] == band[:-1]) & (np.diff(azimuth) < MAX_APART_RAD)
     inner = slice(1, -1)

@@ -140,11 +140,16 @@ def score_angles(camera: Camera, view: EdgeView) -> FrameScores:
     # Turning the camera by an angle turns what it sees by the opposite one.
     moved = np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1).reshape(-1, 3)
     uv, inside = project(camera, moved @ camera.mount_T_cam[:3, :3])
-    px = np.nan_to_num((uv + 0.5) * view.scale - 0.5, nan=0.0)
     image = view.level if is_sideways(camera.mount_T_cam) else view.upright
-    px = np.clip(np.round(px), 0, np.array(image.shape[::-1]) - 1).astype(np.int64)
+    rows = np.flatnonzero(inside)
+    u, v = (
+        np.clip(np.round((uv[rows, axis] + 0.5) * view.scale - 0.5), 0, image.shape[1 - axis] - 1).astype(np.int64)
+        for axis in (0, 1)
+    )
     # Relative to its surroundings an edge has strength 1 by chance, so edges that leave the image neither gain nor lose.
-    strength = np.where(inside, image[px[:, 1], px[:, 0]] - 1.0, 0.0).reshape(len(angles), -1)
+    flat = np.zeros(len(uv), dtype=image.dtype)
+    flat[rows] = image[v, u] - 1.0
+    strength = flat.reshape(len(angles), -1)
     shown = inside.reshape(len(angles), -1)[len(angles) // 2]
     scores = np.stack([strength[:, left].sum(axis=1), strength[:, ~left].sum(axis=1)])
     line = 2 * np.floor(np.arctan2(y, x) / LINE_RAD) + left

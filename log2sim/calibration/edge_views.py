@@ -54,7 +54,7 @@ def choose_moments(log: Log, lidar: str, reference: str, during_ns: tuple[int, i
 
 
 class EdgeViews:
-    """The views of all cameras at the moments that are looked at; every sweep is read once.
+    """The views of all cameras at the moments that are looked at; every sweep and every frame is read once, when it is asked for.
 
     Parameters
     ----------
@@ -65,26 +65,33 @@ class EdgeViews:
     """
 
     def __init__(self, log: Log, moments: Moments, progress: Callable[[int, int], None]) -> None:
-        self._log, self._moments = log, moments
-        self._edges: list[DepthEdges | None] = []
-        for done, row in enumerate(moments.sweeps.tolist(), 1):
-            self._edges.append(_standing_edges(log, moments.lidar, row))
-            progress(done, len(moments.sweeps))
+        self._log, self._moments, self._progress = log, moments, progress
+        self._edges: dict[int, DepthEdges | None] = {}
+        self._views: dict[tuple[str, int], EdgeView | None] = {}
 
-    def of_camera(self, name: str) -> list[EdgeView]:
-        """Return the views of a camera, in the order of time."""
-        log, stamps = self._log, self._log.streams[name].t_ns
-        views: list[EdgeView] = []
-        if not len(stamps) or not len(self._moments.t_ns):
-            return views
-        for edges, frame, t_ns in zip(self._edges, nearest_index(stamps, self._moments.t_ns), self._moments.t_ns):
-            if edges is None or abs(int(stamps[frame]) - int(t_ns)) > MAX_APART_NS:
-                continue
-            points = points_in_mount(log, log.cameras[name], int(stamps[frame]), edges.points_map)
-            gray = None if points is None else read_gray(log.streams[name], int(frame), log.cameras[name])
-            if points is not None and gray is not None:
-                views.append(EdgeView(gray, gray.shape[1] / log.cameras[name].width_px, points, edges.left))
-        return views
+    def of_camera(self, name: str, *, every: int = 1) -> list[EdgeView]:
+        """Return the views of a camera at every moment, or at every second, third, ..., in the order of time."""
+        if not len(self._log.streams[name].t_ns):
+            return []
+        for k in range(0, len(self._moments.t_ns), every):
+            if (name, k) not in self._views:
+                self._views[name, k] = self._view(name, k)
+        chosen = (self._views[name, k] for k in range(0, len(self._moments.t_ns), every))
+        return [view for view in chosen if view is not None]
+
+    def _view(self, name: str, k: int) -> EdgeView | None:
+        log, stamps, t_ns = self._log, self._log.streams[name].t_ns, int(self._moments.t_ns[k])
+        if k not in self._edges:
+            self._edges[k] = _standing_edges(log, self._moments.lidar, int(self._moments.sweeps[k]))
+            self._progress(len(self._edges), len(self._moments.sweeps))
+        edges, frame = self._edges[k], int(nearest_index(stamps, np.array([t_ns]))[0])
+        if edges is None or abs(int(stamps[frame]) - t_ns) > MAX_APART_NS:
+            return None
+        points = points_in_mount(log, log.cameras[name], int(stamps[frame]), edges.points_map)
+        gray = None if points is None else read_gray(log.streams[name], frame, log.cameras[name])
+        if points is None or gray is None:
+            return None
+        return EdgeView(gray, gray.shape[1] / log.cameras[name].width_px, points, edges.left)
 
 
 def is_near(log: Log, name: str, lidar: str) -> bool:
