@@ -99,8 +99,9 @@ def _sight_of(log: Log, box: LightBox, map_T_cam: Array) -> _Sight:
 def _take_frame(log: Log, housings: list[Housing], sights: list[_Sight], map_T_cam: Array) -> None:
     """Give each sight of a frame to the housing that it fits best, or make a new one."""
     sights = [sight for sight in sights if np.isfinite(sight.ray).all() and sight.side_rad > 0]
-    cost = np.array([[_misfit(housing, sight) for housing in housings] for sight in sights])
-    cost = cost.reshape(len(sights), len(housings))
+    positions = np.array([housing.position for housing in housings]).reshape(-1, 3)
+    covariances = np.array([housing.covariance for housing in housings]).reshape(-1, 3, 3)
+    cost = np.array([_misfits(positions, covariances, sight) for sight in sights]).reshape(len(sights), len(housings))
     rows, columns = linear_sum_assignment(np.minimum(cost, 10 * GATE))
     taken = set()
     for row, column in zip(rows.tolist(), columns.tolist()):
@@ -110,20 +111,24 @@ def _take_frame(log: Log, housings: list[Housing], sights: list[_Sight], map_T_c
     housings += [_new_housing(sight) for k, sight in enumerate(sights) if k not in taken]
 
 
-def _misfit(housing: Housing, sight: _Sight) -> float:
-    """Return the squared Mahalanobis distance of a housing's direction from a sight's; infinite for another size."""
-    away = housing.position - sight.eye
-    distance = float(np.linalg.norm(away))
-    if distance < 1.0 or away @ sight.ray <= 0:
-        return np.inf
+def _misfits(positions: Array, covariances: Array, sight: _Sight) -> Array:
+    """Return the squared Mahalanobis distances (H,) of directions of housings from a sight's; infinite for another size.
+
+    `positions` (H, 3) and `covariances` (H, 3, 3) are those of the housings.
+    """
+    away = positions - sight.eye
+    distance = np.linalg.norm(away, axis=1)
     ratio = sight.side_rad * distance / SIDE_M
-    if not 1 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
-        return np.inf
+    possible = (distance >= 1.0) & (away @ sight.ray > 0) & (1 / MAX_SIZE_RATIO < ratio) & (ratio < MAX_SIZE_RATIO)
+    misfits = np.full(len(positions), np.inf)
+    away, distance = away[possible], distance[possible]
     across = _across(sight.ray)
-    off = across @ away / distance
+    off = away @ across.T / distance[:, None]
     off_m = (sight.sigma_rad * distance) ** 2 + PART_M**2
-    spread = (across @ housing.covariance @ across.T + np.eye(2) * off_m) / distance**2
-    return float(off @ np.linalg.solve(spread, off))
+    spread = across @ covariances[possible] @ across.T + np.eye(2) * off_m[:, None, None]
+    directed = np.linalg.solve(spread / (distance**2)[:, None, None], off[..., None])[..., 0]
+    misfits[possible] = (off * directed).sum(axis=1)
+    return misfits
 
 
 def _across(ray: Array) -> Array:
