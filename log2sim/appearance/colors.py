@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ MAX_GRAY_DIFFERENCE = 4  # between channels of a picture without color, by the e
 # The road from here to there around a vehicle lies in the same light, outside of the shade under it.
 GROUND_FROM_M, GROUND_TO_M, GROUND_STEPS = 0.7, 2.5, 4
 GROUND_PER_SIDE = 12
+ROUNDING_RAD = 1e-6
 
 
 class ColorSampler:
@@ -45,6 +47,7 @@ class ColorSampler:
         self._log, self._scenario = log, scenario
         self._vehicles = [a.id for a in scenario.others if a.category in SHAPES]
         self._views = choose_views(log, scenario, self._vehicles)
+        self._boxes = {camera: self._boxes_in(camera, frames) for camera, frames in self.frames().items()}
         self._looks: dict[str, list[Look]] = {}
         self.gray: set[str] = set()
 
@@ -64,13 +67,18 @@ class ColorSampler:
         view = view_of(self._log, camera, t_ns)
         if view is None:
             return
-        boxes = boxes_at(self._scenario.others, np.array([(t_ns - self._scenario.t0_ns) / NS_PER_S]))
+        boxes = self._boxes[camera].at(int(np.searchsorted(self.frames()[camera], index)))
         scene = _Scene(view, boxes, image_bgr, *halves)
         for agent in self._views.get(camera, {}).get(index, ()):
             row = next(k for k, other in enumerate(boxes.agents) if other.id == agent)
             look = scene.look_at(row)
             if look is not None:
                 self._looks.setdefault(agent, []).append(look)
+
+    def _boxes_in(self, camera: str, frames: NDArray[np.int64]) -> Boxes:
+        """Return the boxes of all agents at the times of frames of a camera."""
+        t_ns = self._log.streams[camera].t_ns[frames]
+        return boxes_at(self._scenario.others, (t_ns - self._scenario.t0_ns) / NS_PER_S)
 
     def colors(self) -> dict[str, dict[str, Any]]:
         """Return the color of each vehicle that was seen, by id, as `Agent.color` holds it."""
@@ -97,6 +105,14 @@ class _Scene:
     above: Image
     below: Image
 
+    @cached_property
+    def _linear_above(self) -> Array:
+        return linear_values(self.above)
+
+    @cached_property
+    def _linear_below(self) -> Array:
+        return linear_values(self.below)
+
     def look_at(self, row: int) -> Look | None:
         """Look at an agent; None where too little of its paint is seen."""
         center, yaw, size = self.boxes.center[row, 0], self.boxes.yaw[row, 0], self.boxes.size[row]
@@ -109,15 +125,17 @@ class _Scene:
         uv, rays = self._rays(map_T_cam, found.box_px[0])
         origin, turned = _to_box(map_T_cam[:3, 3], rays, center, yaw)
         hits = hit_vehicle(self.boxes.agents[row].category, size, origin, turned)
-        clear = hits.distance < self._others(row, map_T_cam[:3, 3], rays)
+        clear = np.isfinite(hits.distance)
+        distance = hits.distance[clear]
+        clear[clear] = distance < self._others(map_T_cam[:3, 3], rays[clear], distance, but=row)
         weight = np.where(clear, hits.weight, 0.0)
         rows = np.flatnonzero(weight)
         if len(rows) < MIN_PAINT_PIXELS:
             return None
         height_px = float(found.box_px[0, 3] - found.box_px[0, 1])
         surface = Surface(self._pixels(uv[rows]), weight[rows], hits.facing[rows], height_px)
-        light = estimate_light(linear_values(self.below), linear_values(self.above), self._road(row, map_T_cam))
-        veil = veil_of(self._pixels(uv[clear & np.isfinite(hits.distance)]), light)
+        light = estimate_light(self._linear_below, self._linear_above, self._road(row, map_T_cam))
+        veil = veil_of(self._pixels(uv[clear]), light)
         paint = find_paint(lab_of_linear(reflectances(surface.pixels, light, surface.facing, veil)), surface.weight)
         return Look.of(paint, light, surface)
 
@@ -138,21 +156,36 @@ class _Scene:
         seen = np.isfinite(rays).all(axis=1)
         return uv[seen], rays[seen]
 
-    def _others(self, row: int, origin: Array, rays: Array) -> Array:
-        """Return the distances (N,) at which rays meet an agent other than one."""
+    def _others(self, origin: Array, rays: Array, within: Array, but: int | None = None) -> Array:
+        """Return the distances (N,), in lengths of the rays, at which rays meet an agent other than one.
+
+        What they meet farther away than all of `within` (N,) may be left out.
+        """
         nearest = np.full(len(rays), np.inf)
-        for k in self._near(origin, row):
-            half = self.boxes.size[k] / 2
-            start, turned = _to_box(origin, rays, self.boxes.center[k, 0], self.boxes.yaw[k, 0])
-            nearest = np.minimum(nearest, hit_block(-half, half, start, turned)[0])
+        for k in self._near(origin, rays, within):
+            if k != but:
+                half = self.boxes.size[k] / 2
+                start, turned = _to_box(origin, rays, self.boxes.center[k, 0], self.boxes.yaw[k, 0])
+                np.minimum(nearest, hit_block(-half, half, start, turned)[0], out=nearest)
         return nearest
 
-    def _near(self, origin: Array, row: int) -> list[int]:
-        """Return the rows of agents that may hide one: not farther away than it."""
-        away = np.linalg.norm(self.boxes.center[:, 0] - origin, axis=1)
+    def _near(self, origin: Array, rays: Array, within: Array) -> list[int]:
+        """Return the rows of agents that rays (N, 3) may meet: those whose spheres reach into the cone around the rays."""
+        if not len(rays):
+            return []
+        length = np.linalg.norm(rays, axis=1)
+        directions = rays / length[:, None]
+        axis = directions.mean(axis=0)
+        axis /= np.linalg.norm(axis)
+        cone = np.arccos(np.clip((directions @ axis).min(), -1, 1))
+        toward = self.boxes.center[:, 0] - origin
+        away = np.linalg.norm(toward, axis=1)
         reach = np.linalg.norm(self.boxes.size, axis=1) / 2
-        with np.errstate(invalid="ignore"):
-            return [int(k) for k in np.flatnonzero(away - reach < away[row] + reach[row]) if k != row]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            angle = np.arccos(np.clip(toward @ axis / away, -1, 1))
+            sphere = np.where(away > reach, np.arcsin(np.clip(reach / away, -1, 1)), np.pi)
+            near = (away - reach < (within * length).max()) & (angle <= cone + sphere + ROUNDING_RAD)
+        return [int(k) for k in np.flatnonzero(near)]
 
     def _road(self, row: int, map_T_cam: Array) -> Array:
         """Return pixels (G, 3), linear RGB, of the road around an agent, where no agent hides it."""
@@ -164,7 +197,7 @@ class _Scene:
         if not len(points):
             return np.zeros((0, 3))
         rays = points - map_T_cam[:3, 3]
-        hidden = self._others(-1, map_T_cam[:3, 3], rays) < 1
+        hidden = self._others(map_T_cam[:3, 3], rays, np.ones(len(rays))) < 1
         return self._pixels(np.floor(uv[~hidden]))
 
     def _pixels(self, uv: Array) -> Array:

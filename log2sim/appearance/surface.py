@@ -146,11 +146,16 @@ def hit_block(low: Array, high: Array, origin: Array, rays: Array) -> tuple[Arra
     -----
     Slabs (Kay and Kajiya 1986). A block around the origin of the rays is not entered.
     """
+    # By axis: reductions over rows of three take many times as long.
+    near, far = [], []
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (low - origin) / rays, (high - origin) / rays
-    near, far = np.fmin(a, b), np.fmax(a, b)
-    entry, leave = near.max(axis=1), far.min(axis=1)
-    return np.where((entry <= leave) & (entry > 0), entry, np.inf), near.argmax(axis=1)
+        for k in range(3):
+            a, b = (low[k] - origin[k]) / rays[:, k], (high[k] - origin[k]) / rays[:, k]
+            near.append(np.fmin(a, b))
+            far.append(np.fmax(a, b))
+    entry, leave = np.maximum(np.maximum(near[0], near[1]), near[2]), np.minimum(np.minimum(far[0], far[1]), far[2])
+    axis = np.where(near[0] == entry, 0, np.where(near[1] == entry, 1, 2))
+    return np.where((entry <= leave) & (entry > 0), entry, np.inf), axis
 
 
 def _weights(block: Block, category: str, size_m: Array, points: Array, axis: NDArray[np.intp]) -> Array:

@@ -35,6 +35,10 @@ class Boxes:
     yaw: Array
     size: Array
 
+    def at(self, k: int) -> Boxes:
+        """Return the boxes at one of the times."""
+        return Boxes(self.agents, self.center[:, k : k + 1], self.yaw[:, k : k + 1], self.size)
+
 
 def boxes_at(agents: Sequence[Agent], t_s: Array) -> Boxes:
     """Return the boxes of agents at times (F,), s, of the scenario."""

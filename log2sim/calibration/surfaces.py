@@ -79,7 +79,8 @@ def surfaces_of(xyz_m: Array) -> Surfaces | None:
     middles = _thin(near)
     if len(middles) < MIN_PIECES:
         return None
-    tree = cKDTree(middles)
+    # Made in a third of the time, and asked as fast; what it finds is the same.
+    tree = cKDTree(middles, balanced_tree=False, compact_nodes=False)
     tried = middles[:: -(-len(middles) // MAX_TRIED)]
     _, index = tree.query(tried, k=NEIGHBORS)
     around = middles[index]

@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from log2sim.config_sections import MapConfig
 from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.mapping.color_raster import ColorRaster, sample_mask
+from log2sim.mapping.color_raster import ColorRaster
 from log2sim.mapping.ground_map import GroundMap
 from log2sim.mapping.ground_points import GroundPoints, PointCollector, PreparedSweep
 from log2sim.mapping.ground_view import Image
-from log2sim.mapping.picture_warp import View, find_hidden, warp_onto
+from log2sim.mapping.picture_warp import View, find_hidden, sample_nearest, warp_onto
 from log2sim.mapping.pose_refinement import refine_poses
 from log2sim.mapping.raster import Raster, coarsened_cell_m
 from log2sim.mapping.records import (
     MAX_PICTURES,
     MAX_SWEEPS,
     PICTURE_STEP_M,
-    SWEEP_STEP_M,
     choose_records,
     extent_of,
     path_of,
     roadside_places,
+    sweep_step_m,
 )
 from log2sim.mapping.reflectivity import map_intensity
 from log2sim.mapping.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
@@ -48,6 +48,8 @@ MAX_APART_S = 0.15
 BLIND_M = 6.0
 # Rings of a LiDAR are up to this far apart on ground that its pictures still show finely.
 MAX_AWAY_M = 2.0
+# Of a LiDAR, to see how many points it gives.
+PROBED_SWEEPS = 3
 Progress = Callable[[int, int], None]
 
 
@@ -108,8 +110,8 @@ class GroundMapBuilder:
         self.raster = Raster.covering(extent, cell_m)
         places = self._path if len(self._path) else roadside
         self._anchors, self._z0_m = places, float(np.median(places[:, 2]))
-        self._sweeps = choose_records(log, scenario, list(log.lidars), SWEEP_STEP_M, MAX_SWEEPS)
-        self._frames = choose_records(log, scenario, self._cameras(), PICTURE_STEP_M, MAX_PICTURES)
+        self._sweeps = choose_records(log, scenario, {k: self._sweep_step_m(k) for k in log.lidars}, MAX_SWEEPS)
+        self._frames = choose_records(log, scenario, dict.fromkeys(self._cameras(), PICTURE_STEP_M), MAX_PICTURES)
         stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
         self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
         self._standing: dict[str, tuple[View, StandingPictures]] = {}
@@ -137,15 +139,16 @@ class GroundMapBuilder:
         warp = warp_onto(view, self._ground.laid, self._z0_m, self.raster)
         if warp is None:
             return
-        opacity = np.where(sample_mask(users, warp, MASK_SHRINK), 0, warp.opacity)
-        opacity[self._likely_ground[warp.rows, warp.columns] == 0] = 0
+        kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
+        kept &= self._likely_ground[warp.rows, warp.columns] > 0
+        if view.camera.mount == "ego":
+            ego = draw_footprints([self._users.ego_at(view.t_ns)], self.raster)
+            kept &= ego[warp.rows, warp.columns] == 0
+        warp = warp.take(kept)
         hiding = self._hiding_at(view.t_ns) if view.camera.mount == "ego" else None
         if hiding is not None:
-            opacity[find_hidden(view, warp, hiding)] = 0
-        if view.camera.mount == "ego":
-            ego = draw_footprints([self._users.ego_at(view.t_ns)], self.raster)[warp.rows, warp.columns]
-            opacity[ego > 0] = 0
-        colors.add(view.camera.name, image, warp, opacity.astype(np.float32))
+            warp = warp.take(~find_hidden(view, warp, hiding))
+        colors.add(view.camera.name, image, warp)
 
     def build(self) -> GroundMap:
         """Return the map of all that was added, as far as anything is known; once, since what it is made of is let go."""
@@ -170,6 +173,15 @@ class GroundMapBuilder:
             color, alpha, height, intensity, self.raster.resolution_m, self.raster.extent_m, tuple(self.notes)
         )
         return whole.around(whole.known)
+
+    def _sweep_step_m(self, lidar: str) -> float:
+        """Return how far apart sweeps are taken, m, by how many points the first that can be read has."""
+        t_ns = self._log.streams[lidar].t_ns if lidar in self._log.streams else np.zeros(0, np.int64)
+        for index in np.flatnonzero(t_ns >= self._scenario.t0_ns)[:PROBED_SWEEPS].tolist():
+            sweep = self._reader.get(lidar, index)
+            if sweep is not None:
+                return sweep_step_m(len(sweep.xyz_m))
+        return sweep_step_m(0)
 
     def _cameras(self) -> list[str]:
         """Cameras that the scenario was made with; all of the log where it names none."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.mapping.ground_view import Image, sample_colors
+from log2sim.mapping.ground_view import Image, sample_at
 from log2sim.mapping.picture_warp import Warp
 from log2sim.mapping.raster import Raster
 
@@ -40,15 +39,18 @@ class ColorRaster:
         self._opacity = np.zeros(raster.shape, dtype=np.uint8)
         self.gains: dict[str, list[Array]] = {}
 
-    def add(self, camera: str, image: Image, warp: Warp, opacity: NDArray[np.float32]) -> None:
-        """Add a picture of a camera with the opacity (r, c) of what it shows of the ground."""
-        color = sample_colors(image, (warp.u, warp.v), warp.scale, opacity > 0)
-        weight = opacity * np.minimum(warp.scale, MAX_SCALE) ** 4
-        gain = self._gain(camera, color, weight, opacity, warp)
-        place = (warp.rows, warp.columns)
-        self._sum[place] += color * (weight[..., None] * gain.astype(np.float32))
-        self._weight[place] += weight
-        np.maximum(self._opacity[place], np.rint(255 * opacity).astype(np.uint8), out=self._opacity[place])
+    def add(self, camera: str, image: Image, warp: Warp) -> None:
+        """Add a picture of a camera, as far as a warp shows it."""
+        color = sample_at(image, warp.u, warp.v, warp.scale).astype(np.float32)
+        weight = warp.opacity * np.minimum(warp.scale, MAX_SCALE) ** 4
+        cell = warp.rows * self.raster.shape[1] + warp.columns
+        gain = self._gain(camera, color, weight, warp, cell)
+        color *= weight[:, None] * gain.astype(np.float32)
+        # Each cell is there once.
+        self._sum.reshape(-1, 3)[cell] += color
+        self._weight.reshape(-1)[cell] += weight
+        opacity = self._opacity.reshape(-1)
+        opacity[cell] = np.maximum(opacity[cell], np.rint(255 * warp.opacity).astype(np.uint8))
 
     def image(self) -> tuple[Image, Image]:
         """Return colors (R, C, 3) and opacity (R, C)."""
@@ -60,26 +62,25 @@ class ColorRaster:
         return color, np.where(seen, np.maximum(self._opacity, 1), 0).astype(np.uint8)
 
     def _gain(
-        self, camera: str, color: Image, weight: NDArray[np.float32], opacity: NDArray[np.float32], warp: Warp
+        self,
+        camera: str,
+        color: NDArray[np.float32],
+        weight: NDArray[np.float32],
+        warp: Warp,
+        cell: NDArray[np.int64],
     ) -> Array:
         """Gains (3,) of a picture's channels that fit it to what is mapped so far."""
-        some = (slice(warp.rows.start, warp.rows.stop, STEP), slice(warp.columns.start, warp.columns.stop, STEP))
-        own = color[::STEP, ::STEP].astype(np.float32)
-        there, mapped = self._weight[some], self._sum[some]
-        common = (opacity[::STEP, ::STEP] > MIN_COMMON_OPACITY) & (self._opacity[some] > 255 * MIN_COMMON_OPACITY)
-        common &= np.all((own > DARKEST) & (own < BRIGHTEST), axis=2)
-        common &= weight[::STEP, ::STEP] > 0
+        some = np.flatnonzero(
+            (warp.rows % STEP == 0) & (warp.columns % STEP == 0) & (warp.opacity > MIN_COMMON_OPACITY) & (weight > 0)
+        )
+        some = some[self._opacity.reshape(-1)[cell[some]] > 255 * MIN_COMMON_OPACITY]
+        some = some[np.all((color[some] > DARKEST) & (color[some] < BRIGHTEST), axis=1)]
         last = self.gains.setdefault(camera, [])
-        if np.count_nonzero(common) < MIN_COMMON_CELLS:
+        if len(some) < MIN_COMMON_CELLS:
             gain = last[-1] if last else np.ones(3)
         else:
-            ratio = (mapped[common] / there[common][:, None]) / own[common]
+            mapped = self._sum.reshape(-1, 3)[cell[some]] / self._weight.reshape(-1)[cell[some], None]
+            ratio = mapped / color[some]
             gain = np.exp(np.clip(np.log(np.maximum(np.median(ratio, axis=0), 1e-3)), -MAX_LOG_GAIN, MAX_LOG_GAIN))
         last.append(np.asarray(gain, dtype=np.float64))
         return last[-1]
-
-
-def sample_mask(mask: NDArray[np.uint8], warp: Warp, shrink: int) -> NDArray[np.bool_]:
-    """Look up in a mask of a picture, `shrink` times smaller, what cells (r, c) of a warp show."""
-    at_u, at_v = (a / shrink - np.float32(0.5) for a in (warp.u, warp.v))
-    return np.asarray(cv2.remap(mask, at_u, at_v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,6 +57,11 @@ class GroundMap:
     def coverage(self) -> NDArray[np.bool_]:
         """Mask (R, C) of the cells that a camera saw."""
         return self.alpha > 0
+
+    @cached_property
+    def has_color(self) -> bool:
+        """Whether a camera saw any of it."""
+        return bool(self.alpha.any())
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -122,12 +122,14 @@ class PointCollector:
         sensor = map_T_lidar[0, :3, 3] if known[0] else np.asarray(xyz.mean(axis=0))
         origin = np.array([sensor[0], sensor[1], cloud_origin(self._log, sweep.stamp_ns)[1]])
         local = (xyz - origin).astype(np.float32)
-        height = local[:, 2] - estimate_ground(local, np.zeros(2), 0.0).at(local[:, :2])
-        reach = np.hypot(local[:, 0], local[:, 1])
-        above = np.flatnonzero((height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M) & (reach < REACH_M))
+        ground = estimate_ground(local, np.zeros(2), 0.0)
+        within = np.flatnonzero(np.hypot(local[:, 0], local[:, 1]) < REACH_M)
+        local = local[within]
+        height = local[:, 2] - ground.at(local[:, :2])
+        above = within[(height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)]
         above = above[:: max(len(above) // MAX_HIDING_POINTS, 1)]
         hiding = xyz[above]
-        near = np.flatnonzero((np.abs(height) < NEAR_GROUND_M) & (reach < REACH_M))
+        near = within[np.abs(height) < NEAR_GROUND_M]
         near = near[:: -(-len(near) // self._most)] if len(near) > self._most else near
         cell, inside = self._raster.index_of(xyz[near, :2])
         near = near[inside & (hidden.ravel()[cell] == 0)]

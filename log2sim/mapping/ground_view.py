@@ -150,15 +150,24 @@ def sample_colors(
     wanted : (R, C) bool, optional
         The others stay black.
     """
+    chosen = np.ones(scale.shape, bool) if wanted is None else wanted
+    out = np.zeros((*scale.shape, 3), dtype=np.uint8)
+    out[chosen] = sample_at(image, uv[0][chosen], uv[1][chosen], scale[chosen])
+    return out
+
+
+def sample_at(
+    image: Image, u: NDArray[np.float32], v: NDArray[np.float32], scale: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """Sample colors (N, 3) at pixels (N,) as `sample_colors` does."""
     level = np.clip(np.rint(np.log2(np.maximum(scale, 1e-6))), 0, PYRAMID_LEVELS).astype(np.int8)
-    if wanted is not None:
-        level[~wanted] = -1
-    out = np.zeros((*level.shape, 3), dtype=np.uint8)
-    for k in range(int(level.max(initial=0)) + 1):
-        chosen = level == k
-        if chosen.any():
-            out[chosen] = _sample(image, uv[0][chosen] * np.float32(0.5**k), uv[1][chosen] * np.float32(0.5**k))
-        if k < PYRAMID_LEVELS:
+    out = np.zeros((len(level), 3), dtype=np.uint8)
+    highest = int(level.max(initial=0))
+    for k in range(highest + 1):
+        chosen = np.flatnonzero(level == k)
+        if len(chosen):
+            out[chosen] = _sample(image, u[chosen] * np.float32(0.5**k), v[chosen] * np.float32(0.5**k))
+        if k < highest:
             image = np.asarray(cv2.pyrDown(image), dtype=np.uint8)
     return out
 

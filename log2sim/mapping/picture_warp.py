@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from log2sim.mapping.surface import Surface, upsample
 COARSEST_M = 0.6
 # Opacity rises from the image border inwards over this share of the width, which feathers seams.
 FEATHER_SHARE = 0.04
+MIN_OPACITY = 0.01
 MAX_REACH_M = 100.0
 # Cells of the surface between those that are projected first, to find the part of the map that is in view.
 PROBE_STEP = 8
@@ -25,32 +27,37 @@ DEPTH_SHRINK = 24
 # Ground hides nothing of itself, though its depth at the edge of such a pixel is another than in its middle.
 MIN_HIDDEN_BY, MIN_HIDDEN_BY_M = 0.08, 0.5
 NOTHING_M = 1e6
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Where cells of a window of a map appear in a picture.
+    """Where the cells of a map that are in view appear in a picture, N cells.
 
     Attributes
     ----------
-    rows, columns : slice
-        Window of the map.
-    u, v : (r, c) float32, px
-    scale : (r, c) float32
+    rows, columns : (N,) int64
+        Of the cells in the map.
+    u, v : (N,) float32, px
+    scale : (N,) float32
         Pixels along a cell's edge, geometric mean of both directions.
-    opacity : (r, c) float32
-        In [0, 1], 0 where a cell is not in view.
-    depth_m : (r, c) float32, m
+    opacity : (N,) float32
+        In (0, 1].
+    depth_m : (N,) float32, m
         Along the optical axis.
     """
 
-    rows: slice
-    columns: slice
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
     u: NDArray[np.float32]
     v: NDArray[np.float32]
     scale: NDArray[np.float32]
     opacity: NDArray[np.float32]
     depth_m: NDArray[np.float32]
+
+    def take(self, kept: NDArray[np.bool_]) -> Warp:
+        """Choose cells by a mask (N,)."""
+        return Warp(*(getattr(self, f.name)[kept] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +116,19 @@ def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster) -> Warp
     scale, opacity = _quality(view.camera, uv, usable, factor, raster.resolution_m)
     if not opacity.any():
         return None
-    fine_rows = slice(rows.start * factor, min(rows.stop * factor, raster.shape[0]))
-    fine_columns = slice(columns.start * factor, min(columns.stop * factor, raster.shape[1]))
-    shape = (fine_rows.stop - fine_rows.start, fine_columns.stop - fine_columns.start)
-    nodes = np.dstack([np.where(np.isfinite(uv), uv, -1e4), scale, opacity]).astype(np.float32)
-    u, v, fine_scale, fine_opacity = np.moveaxis(upsample(nodes, factor, shape), 2, 0)
-    fine_opacity = np.where(fine_opacity > 0.01, fine_opacity, 0)
-    fine_depth = upsample(depth.astype(np.float32), factor, shape)
-    return Warp(fine_rows, fine_columns, u.copy(), v.copy(), fine_scale.copy(), fine_opacity, fine_depth)
+    shape = (
+        min(rows.stop * factor, raster.shape[0]) - rows.start * factor,
+        min(columns.stop * factor, raster.shape[1]) - columns.start * factor,
+    )
+    fine_opacity = upsample(opacity, factor, shape)
+    row, column = np.nonzero(fine_opacity > MIN_OPACITY)
+    nodes = np.where(np.isfinite(uv), uv, -1e4).astype(np.float32)
+    u, v, fine_scale, fine_depth = (
+        upsample(np.ascontiguousarray(layer, np.float32), factor, shape)[row, column]
+        for layer in (nodes[..., 0], nodes[..., 1], scale, depth)
+    )
+    place = (row + rows.start * factor, column + columns.start * factor)
+    return Warp(*place, u, v, fine_scale, fine_opacity[row, column], fine_depth)
 
 
 def reach_of(camera: Camera, height_m: float) -> float:
@@ -180,7 +192,7 @@ def _quality(
 
 
 def find_hidden(view: View, warp: Warp, hiding: Array) -> NDArray[np.bool_]:
-    """Mark the cells (r, c) of a warp that are behind points (H, 3), m, map frame, of what stands on the ground."""
+    """Mark the cells (N,) of a warp that are behind points (H, 3), m, map frame, of what stands on the ground."""
     uv, depth = view.project(hiding)
     width, height = (-(-n // DEPTH_SHRINK) for n in (view.camera.width_px, view.camera.height_px))
     with np.errstate(invalid="ignore"):
@@ -190,7 +202,15 @@ def find_hidden(view: View, warp: Warp, hiding: Array) -> NDArray[np.bool_]:
     cell = (row[inside] * width + column[inside]).astype(np.int64)
     np.minimum.at(nearest, cell, depth[inside].astype(np.float32))
     # Between two rings of points there is the same object.
-    image = cv2.erode(nearest.reshape(height, width), np.ones((3, 1), np.uint8))
-    at_u, at_v = (a / DEPTH_SHRINK - np.float32(0.5) for a in (warp.u, warp.v))
-    shown = cv2.remap(image, at_u, at_v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=NOTHING_M)
+    image = np.asarray(cv2.erode(nearest.reshape(height, width), np.ones((3, 1), np.uint8)), np.float32)
+    shown = sample_nearest(image, warp, DEPTH_SHRINK, np.float32(NOTHING_M))
     return np.asarray(warp.depth_m > shown * (1 + MIN_HIDDEN_BY) + MIN_HIDDEN_BY_M)
+
+
+def sample_nearest(image: NDArray[Pixel], warp: Warp, shrink: int, outside: Pixel) -> NDArray[Pixel]:
+    """Look up in an image, `shrink` times smaller than the picture, what cells (N,) of a warp show."""
+    column, row = (np.rint(a / shrink - np.float32(0.5)).astype(np.int32) for a in (warp.u, warp.v))
+    height, width = image.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen = image.ravel().take(np.where(inside, row * width + column, 0))
+    return np.where(inside, seen, outside).astype(image.dtype)

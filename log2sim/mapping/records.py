@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,9 @@ from log2sim.perception.lidar.cloud import cloud_origin
 PICTURE_STEP_M = 2.0
 # Rings of a sweep are 0.1 to 1 m apart on the ground: small steps of the ego fill the gaps between them.
 SWEEP_STEP_M = 0.1
+# So many points for each meter of the way are a return a centimeter on rings of 60 m, on 30 rings: more make no finer map. Of a
+# sweep of 120,000 points one is taken each 0.6 m, as at 6 m/s anyway.
+POINTS_A_METER = 200_000
 # What stands still, the same sensor shows again; several records of it average the noise and let moving shadows pass.
 STANDING_RECORDS = 7
 MAX_PICTURES, MAX_SWEEPS = 400, 160
@@ -26,11 +31,17 @@ ROADSIDE_MARGIN_M = 70.0
 
 
 def choose_records(
-    log: Log, scenario: Scenario, names: list[str], step_m: float, most: int
+    log: Log, scenario: Scenario, steps_m: Mapping[str, float], most: int
 ) -> dict[str, NDArray[np.int64]]:
-    """Choose the records of sensors by name: where the ego is `step_m` farther on, at most `most` of all sensors together."""
-    names = [name for name in names if name in log.streams]
-    return {name: _choose(log, scenario, name, step_m, max(most // len(names), STANDING_RECORDS)) for name in names}
+    """Choose the records of sensors by name: where the ego is a step, m, farther on, at most `most` of all sensors together."""
+    steps_m = {name: step_m for name, step_m in steps_m.items() if name in log.streams}
+    most = max(most // max(len(steps_m), 1), STANDING_RECORDS)
+    return {name: _choose(log, scenario, name, step_m, most) for name, step_m in steps_m.items()}
+
+
+def sweep_step_m(points: int) -> float:
+    """Return how far the ego goes, m, between sweeps of a number of points that are taken."""
+    return max(SWEEP_STEP_M, points / POINTS_A_METER)
 
 
 def _choose(log: Log, scenario: Scenario, name: str, step_m: float, most: int) -> NDArray[np.int64]:

@@ -68,7 +68,7 @@ def normalize(points: GroundPoints, ground: NDArray[np.bool_], road: NDArray[np.
     on the ego's way (`road`), or of the ground all around where these are too few.
     """
     out = np.full(len(points.z), np.nan, np.float32)
-    for lidar in np.unique(points.lidar[ground]):
+    for lidar in np.flatnonzero(np.bincount(points.lidar[ground])):
         own = points.lidar == lidar
         rows = np.flatnonzero(own & ground)
         top = float(np.percentile(points.intensity[rows], 99.5))

@@ -96,9 +96,13 @@ def estimate_surface(points: GroundPoints, raster: Raster, path: Array, z0_m: fl
 
 def cells_of_points(points: GroundPoints, raster: Raster) -> NDArray[np.int64]:
     """Return the number of the cell (N,) of points; the raster has the north-west corner of that of the points."""
-    column, row = (points.xy / np.float32(raster.resolution_m)).astype(np.int32).T
-    rows, columns = raster.shape
-    return np.asarray(np.clip(row, 0, rows - 1).astype(np.int64) * columns + np.clip(column, 0, columns - 1))
+    column, row = (
+        (points.xy[:, k] / np.float32(raster.resolution_m)).astype(np.int32).clip(0, raster.shape[1 - k] - 1)
+        for k in range(2)
+    )
+    cell = np.multiply(row, raster.shape[1], dtype=np.int64)
+    cell += column
+    return np.asarray(cell, dtype=np.int64)
 
 
 def _trimmed_means(
@@ -111,20 +115,22 @@ def _trimmed_means(
     From the mean of a cell down: in each round points too far above the last mean are left out, so that it sinks through grass
     and tires until it rests on points that are all within the noise.
     """
-    weight, mean = _means(cell, z, near, count)
+    heavy = near * z
+    weight, mean = _means(cell, heavy, near, count)
     for k in range(ROUNDS):
         wide = 2.0 ** max(ROUNDS - 2 - k, 0)
         off = z - mean.astype(np.float32)[cell]
         kept = (off < wide * ABOVE_M) & (off > -wide * BELOW_M)
-        weight, mean = _means(cell[kept], z[kept], near[kept], count)
+        weight, mean = _means(cell[kept], heavy[kept], near[kept], count)
     return weight, mean
 
 
 def _means(
-    cell: NDArray[np.int64], z: NDArray[np.float32], near: NDArray[np.float32], count: int
+    cell: NDArray[np.int64], heavy: NDArray[np.float32], near: NDArray[np.float32], count: int
 ) -> tuple[Array, Array]:
-    weight: Array = np.bincount(cell, near, count).astype(np.float64)
-    total: Array = np.bincount(cell, near * z, count).astype(np.float64)
+    """Means (count,) of heights, of which `heavy` (N,) are the products with the weights `near` (N,)."""
+    weight: Array = np.bincount(cell, near, count).astype(np.float64, copy=False)
+    total: Array = np.bincount(cell, heavy, count).astype(np.float64, copy=False)
     return weight, np.divide(total, weight, out=np.zeros(count), where=weight > 0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,10 +83,12 @@ def _coarsen(ground: GroundMap) -> _Coarse:
     rows, columns = (size // factor for size in ground.alpha.shape)
     part = (slice(rows * factor), slice(columns * factor))
 
-    def mean(values: NDArray[np.float32], valid: Mask) -> tuple[Layer, Layer]:
+    def mean(values: Callable[[], NDArray[np.float32]], valid: Mask) -> tuple[Layer, Layer]:
+        if not valid.any():
+            return np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
         size = (columns, rows)
         share = np.asarray(cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
-        total = cv2.resize(np.where(valid, values, 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        total = cv2.resize(np.where(valid, values(), 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
         return np.divide(total, share, out=np.zeros_like(share), where=share > 0), share
 
     seen, hit, level = (
@@ -94,9 +97,9 @@ def _coarsen(ground: GroundMap) -> _Coarse:
         np.isfinite(ground.height_m[part]),
     )
     layers = (
-        mean(log_color(ground.color_bgr[part])[1] / np.float32(YELLOW_SIGMA), seen),
-        mean(log_intensity(ground.intensity[part]) / np.float32(INTENSITY_SIGMA), hit),
-        mean(ground.height_m[part] / np.float32(HEIGHT_SIGMA_M), level),
+        mean(lambda: log_color(ground.color_bgr[part])[1] / np.float32(YELLOW_SIGMA), seen),
+        mean(lambda: log_intensity(ground.intensity[part]) / np.float32(INTENSITY_SIGMA), hit),
+        mean(lambda: ground.height_m[part] / np.float32(HEIGHT_SIGMA_M), level),
     )
     values, known = (np.stack([layer[k] for layer in layers]) for k in (0, 1))
     return _Coarse(values, (known > 0).astype(np.float32), factor * ground.resolution_m)
@@ -123,14 +126,17 @@ def _road_at(coarse: _Coarse, ground: GroundMap, on_lines: Array) -> Array:
 
 def _steps(coarse: _Coarse, ground: GroundMap, road: Array) -> RidgePoints:
     """Find points where the road is on one side only."""
+    seen = [bool(layer.any()) for layer in coarse.known]
     height, width = coarse.values.shape[1:]
     best = np.zeros((height, width), np.float32)
     number = np.zeros(best.shape, np.uint8)
     for k in range(DIRECTIONS):
         there, back, size = turn_image((height, width), np.pi * k / DIRECTIONS)
-        turned = [warp(layer, there, size) for layer in coarse.values]
-        known = [warp(layer, there, size) for layer in coarse.known]
-        for way, step in enumerate(_step(turned, known, road, coarse.cell_m)):
+        turned, known = (
+            [warp(layer, there, size) if some else None for layer, some in zip(layers, seen, strict=True)]
+            for layers in (coarse.values, coarse.known)
+        )
+        for way, step in enumerate(_step(turned, known, road, size, coarse.cell_m)):
             response = warp(step, back, (width, height))
             better = response > best
             best[better], number[better] = response[better], k + way * DIRECTIONS
@@ -145,17 +151,27 @@ def _steps(coarse: _Coarse, ground: GroundMap, road: Array) -> RidgePoints:
     return RidgePoints(np.stack([x, y], 1), angle[crest] % np.pi, here[crest].astype(np.float64))
 
 
-def _step(turned: list[Layer], known: list[Layer], road: Array, cell_m: float) -> tuple[Layer, Layer]:
-    """Sigmas by which the ground on one side of the rows differs from the road on the other: road below, road above."""
-    size = (round(ALONG_M / cell_m), round(ACROSS_M / cell_m))
+def _step(
+    turned: list[Layer | None], known: list[Layer | None], road: Array, size: tuple[int, int], cell_m: float
+) -> tuple[Layer, Layer]:
+    """Sigmas by which the ground on one side of the rows differs from the road on the other: road below, road above.
+
+    Layers are None where nothing of them is known; `size` is that of the others (columns, rows).
+    """
+    kernel = (round(ALONG_M / cell_m), round(ACROSS_M / cell_m))
     reach = round((GAP_M + ACROSS_M / 2) / cell_m)
+    shape = (max(size[1] - 2 * reach, 0), size[0])
     steps: list[NDArray[Any]] = []
     boths: list[NDArray[Any]] = []
-    below_differs: NDArray[Any] = np.array(False)
+    below_differs: NDArray[Any] = np.zeros(shape, bool)
     above_differs, told = below_differs, below_differs
-    for k, (values, valid) in enumerate(zip(turned, known)):
-        share = np.asarray(cv2.blur(valid, size), np.float32)
-        mean = np.divide(cv2.blur(values * valid, size), share, out=np.zeros_like(share), where=share > MIN_SEEN)
+    for k, (values, valid) in enumerate(zip(turned, known, strict=True)):
+        if values is None or valid is None:
+            steps.append(np.zeros(shape, np.float32))
+            boths.append(np.zeros(shape, bool))
+            continue
+        share = np.asarray(cv2.blur(valid, kernel), np.float32)
+        mean = np.divide(cv2.blur(values * valid, kernel), share, out=np.zeros_like(share), where=share > MIN_SEEN)
         above, below = mean[: -2 * reach], mean[2 * reach :]
         both = np.minimum(share[: -2 * reach], share[2 * reach :]) > MIN_SEEN
         steps.append(np.where(both, above - below, 0))
@@ -166,7 +182,7 @@ def _step(turned: list[Layer], known: list[Layer], road: Array, cell_m: float) -
             above_differs = above_differs | (both & (np.abs(above - np.float32(road[k])) > ROAD_TOLERANCE))
     surface = np.square(_surface_step(steps[0], steps[1], boths[1]))
     height = steps[HEIGHT] * np.float32(HEIGHT_SIGMA_M)
-    out = (np.zeros_like(turned[0]), np.zeros_like(turned[0]))
+    out = (np.zeros(size[::-1], np.float32), np.zeros(size[::-1], np.float32))
     for layer, other, rise in zip(out, (below_differs, above_differs), (height, -height)):
         curb = np.where((rise > CURB_M[0]) & (rise < CURB_M[1]), np.square(steps[HEIGHT]), 0)  # only up, and no wall
         layer[reach:-reach] = np.where(told & ~other, np.sqrt(surface + curb), 0)

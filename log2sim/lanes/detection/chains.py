@@ -148,12 +148,15 @@ def _assemble(chains: list[Chain], partner: dict[int, int]) -> list[Chain]:
 
 
 def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float) -> _Ends:
+    contrasts = contrast_of(pieces)
+    if all(len(chain.members) == 1 for chain in chains):
+        return _ends_of_single(pieces, chains, contrasts)
     rows = []
     for chain in chains:
         corners = chain.corners(pieces)
         length = float(np.linalg.norm(corners[-1] - corners[0]))
         width = float(np.median(pieces.width_m[chain.members]))
-        contrast = float(np.median(contrast_of(pieces)[chain.members]))
+        contrast = float(np.median(contrasts[chain.members]))
         for ordered in (corners[::-1], corners):
             tip = ordered[-1]
             near = ordered[np.linalg.norm(ordered - tip, axis=1) <= base_m]
@@ -162,6 +165,25 @@ def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float) -> _Ends:
             rows.append([*tip, angle, sigma, width, contrast, length])
     t = np.array(rows)
     return _Ends(t[:, :2], t[:, 2], t[:, 3], t[:, 4], t[:, 5], t[:, 6])
+
+
+def _ends_of_single(pieces: Pieces, chains: list[Chain], contrasts: Array) -> _Ends:
+    """Return the ends of chains of one piece each, all at once."""
+    member = np.array([chain.members[0] for chain in chains], dtype=np.int64)
+    flipped = np.array([chain.flipped[0] for chain in chains], dtype=bool)
+    ends = pieces.ends(member)
+    ends[flipped] = ends[flipped][:, ::-1]
+    chord = ends[:, 1] - ends[:, 0]
+    length = np.hypot(chord[:, 0], chord[:, 1])
+    # First the end at which the piece begins, from which it points backwards.
+    outward = np.stack([np.arctan2(-chord[:, 1], -chord[:, 0]), np.arctan2(chord[:, 1], chord[:, 0])], axis=1)
+    sigma, width, contrast, length = (
+        np.repeat(values, 2)
+        for values in (
+            POSITION_SIGMA_M * 2 / np.maximum(length, 0.3), pieces.width_m[member], contrasts[member], length
+        )
+    )  # fmt: skip
+    return _Ends(ends.reshape(-1, 2), outward.ravel(), sigma, width, contrast, length)
 
 
 def contrast_of(pieces: Pieces) -> Array:

@@ -93,11 +93,16 @@ def iterate_tiles(ground: GroundMap, margin_cells: int) -> Iterator[CoarseTile]:
             fine = (slice(r0 * factor, r1 * factor), slice(c0 * factor, c1 * factor))
             core = (slice(r - r0, min(r + TILE_CELLS, rows) - r0), slice(c - c0, min(c + TILE_CELLS, columns) - c0))
             alpha, hit = ground.alpha[fine] > 0, np.isfinite(ground.intensity[fine])
-            if alpha.any() or hit.any():
-                values = log_paint(ground.color_bgr[fine])
-                paint, seen = _coarse(values, alpha, factor)
-                peak, dip = _extremes(values, alpha, factor)
-                intensity, share = _coarse(log_intensity(ground.intensity[fine]), hit, factor)
+            by_camera, by_lidar = alpha.any(), hit.any()
+            if by_camera or by_lidar:
+                nothing = np.zeros((r1 - r0, c1 - c0), np.float32)
+                paint, seen, peak, dip, intensity, share = (nothing,) * 6
+                if by_camera:
+                    values = log_paint(ground.color_bgr[fine])
+                    paint, seen = _coarse(values, alpha, factor)
+                    peak, dip = _extremes(values, alpha, factor)
+                if by_lidar:
+                    intensity, share = _coarse(log_intensity(ground.intensity[fine]), hit, factor)
                 yield CoarseTile(paint, peak, dip, seen, intensity, (share > 0).astype(np.float32), core, (r0, c0))
 
 
@@ -144,13 +149,16 @@ def sample(ground: GroundMap, x: Array, y: Array) -> Samples:
     """Sample a map at points (N, M) of the map frame: colors between cells, the others at the nearest cell."""
     u = ((x - ground.extent_m[0]) / ground.resolution_m - 0.5).astype(np.float32)
     v = ((ground.extent_m[3] - y) / ground.resolution_m - 0.5).astype(np.float32)
-    color = np.asarray(cv2.remap(ground.color_bgr, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     rows, columns = np.rint(v).astype(np.int32), np.rint(u).astype(np.int32)
     inside = (rows >= 0) & (rows < ground.alpha.shape[0]) & (columns >= 0) & (columns < ground.alpha.shape[1])
     rows, columns = np.where(inside, rows, 0), np.where(inside, columns, 0)
-    bright, yellow = log_color(color)
-    unseen = ~inside | (ground.alpha[rows, columns] == 0)
-    bright[unseen] = np.nan
-    yellow[unseen] = np.nan
     intensity = np.where(inside, ground.intensity[rows, columns], np.nan)
+    if not ground.has_color:
+        unseen = np.full(u.shape, np.nan, np.float32)
+        return Samples(unseen, unseen, log_intensity(intensity))
+    color = np.asarray(cv2.remap(ground.color_bgr, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    bright, yellow = log_color(color)
+    hidden = ~inside | (ground.alpha[rows, columns] == 0)
+    bright[hidden] = np.nan
+    yellow[hidden] = np.nan
     return Samples(bright, yellow, log_intensity(intensity))

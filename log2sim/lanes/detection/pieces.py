@@ -97,7 +97,8 @@ def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any], scale: float) 
         if np.count_nonzero(member) < MIN_POINTS:
             return None
         center = xy[member].mean(axis=0)
-        moments = np.cov((xy[member] - center).T)
+        off = xy[member] - center
+        moments = off.T @ off  # of which only the directions are asked for
         angle = float(0.5 * np.arctan2(2 * moments[0, 1], moments[0, 0] - moments[1, 1]))
     along, across = _turned(xy - center, angle)
     member = chosen & (np.abs(across) < across_m)
@@ -105,7 +106,7 @@ def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any], scale: float) 
         return None
     begin, end = along[member].min(), along[member].max()
     length = end - begin + cell_m
-    covered = len(np.unique(np.floor((along[member] - begin) / cell_m + 0.5))) * cell_m
+    covered = len(set(np.floor((along[member] - begin) / cell_m + 0.5).tolist())) * cell_m
     if length < MIN_PIECE_M * scale or covered < MIN_COVERED * length:
         return None
     middle = points.xy_map[seed] + center + (begin + end) / 2 * np.array([np.cos(angle), np.sin(angle)])

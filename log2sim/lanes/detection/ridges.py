@@ -92,14 +92,16 @@ def _join(tile: CoarseTile, cell_m: float) -> tuple[Layer, Layer, Layer]:
     The best filter for known contrasts in independent noise weighs by contrast over variance. The others are those of
     the brightest and the darkest cells.
     """
-    color, peak, dip = (_high_pass(values, tile.seen, cell_m) for values in (tile.paint, tile.peak, tile.dip))
-    if not np.any(tile.hit):
-        return color, peak, dip
+    by_camera = bool(np.any(tile.seen))
+    if by_camera:
+        color, peak, dip = (_high_pass(values, tile.seen, cell_m) for values in (tile.paint, tile.peak, tile.dip))
+        if not np.any(tile.hit):
+            return color, peak, dip
     # Means over what was hit within 3 x 3 cells: rings of LiDAR leave gaps.
     hit = cv2.blur(tile.hit, (3, 3))
     filled = np.divide(cv2.blur(tile.intensity * tile.hit, (3, 3)), hit, out=np.zeros_like(hit), where=hit > 1e-3)
     intensity = _high_pass(filled, (hit > 1e-3).astype(np.float32), cell_m)
-    if not np.any(tile.seen):
+    if not by_camera:
         return intensity, intensity, intensity
     c, i = _spread(color, tile.seen), _spread(intensity, tile.hit)
     ratio = (EXPECTED_INTENSITY / i**2) / (EXPECTED_COLOR / c**2)
@@ -134,10 +136,14 @@ def _respond(layers: tuple[Layer, Layer, Layer], cell_m: float) -> tuple[Layer, 
     noise = np.ones_like(flat)
     for k in range(DIRECTIONS):
         there, back, size = turn_image(flat.shape, np.pi * k / DIRECTIONS)
-        turned, peak, dip = (warp(layer, there, size) for layer in layers)
-        response, plain = _across(turned, peak, dip, cell_m)
+        # By LiDAR alone all three are one layer, which is warped and blurred once.
+        turned = {id(layer): layer for layer in layers}
+        turned = {key: _blur(warp(layer, there, size), _cells(ALONG_M, cell_m), 1) for key, layer in turned.items()}
+        along, brightest, darkest = (turned[id(layer)] for layer in layers)
         if k == 0:
+            plain = _mean_contrast(along, brightest, cell_m)
             noise = _block_sigma(warp(plain, back, (flat.shape[1], flat.shape[0])), cell_m)
+        response = _across(along, brightest, darkest, cell_m)
         response = warp(response, back, (flat.shape[1], flat.shape[0]))
         better = np.asarray(cv2.compare(response, best, cv2.CMP_GT), np.uint8)
         cv2.max(response, best, dst=best)
@@ -150,30 +156,49 @@ def warp(image: Layer, matrix: Array, size: tuple[int, int]) -> Layer:
     return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR), np.float32)
 
 
-def _across(turned: Layer, peak: Layer, dip: Layer, cell_m: float) -> tuple[Layer, Layer]:
-    """Respond to ridges along the rows: the lesser contrast of the best width, and the mean contrast of the least one."""
-    along, brightest, darkest = (_blur(layer, max(1, round(ALONG_M / cell_m)), 1) for layer in (turned, peak, dip))
-    best, plain = np.zeros_like(along), np.zeros_like(along)
-    flank = _blur(along, 1, max(1, round(FLANK_M / cell_m)))
-    for k, width_m in enumerate(WIDTHS_M):
-        middle = max(1, round(width_m / cell_m)) | 1
-        # From the middle of the paint to that of the flank, whose own middle lies half a cell off if it is even.
-        reach = round((width_m / 2 + GAP_M / 2 + FLANK_M / 2) / cell_m + 0.25)
-        inner = (brightest if middle == 1 else _blur(along, 1, middle))[reach:-reach]
-        above, below = flank[: -2 * reach], flank[2 * reach :]
-        np.maximum(best[reach:-reach], inner - np.maximum(above, below), out=best[reach:-reach])
-        if k == 0:
-            np.maximum(best, _narrow(brightest, darkest), out=best)
-            plain[reach:-reach] = inner - (above + below) / 2
-    return best, plain
+def _across(along: Layer, brightest: Layer, darkest: Layer, cell_m: float) -> Layer:
+    """Respond to ridges along the rows by the lesser contrast of the best width; the layers are means along the rows."""
+    best = _narrow(brightest, darkest)
+    flank = _blur(along, 1, _cells(FLANK_M, cell_m))
+    for width_m in WIDTHS_M:
+        reach = _reach(width_m, cell_m)
+        contrast = np.maximum(flank[: -2 * reach], flank[2 * reach :])
+        np.subtract(_middle(along, brightest, width_m, cell_m)[reach:-reach], contrast, out=contrast)
+        np.maximum(best[reach:-reach], contrast, out=best[reach:-reach])
+    return best
+
+
+def _mean_contrast(along: Layer, brightest: Layer, cell_m: float) -> Layer:
+    """Contrast of ridges of the least width to the mean of both sides, as texture has it, too."""
+    flank, reach, out = _blur(along, 1, _cells(FLANK_M, cell_m)), _reach(WIDTHS_M[0], cell_m), np.zeros_like(along)
+    inner = _middle(along, brightest, WIDTHS_M[0], cell_m)[reach:-reach]
+    out[reach:-reach] = inner - (flank[: -2 * reach] + flank[2 * reach :]) / 2
+    return out
+
+
+def _middle(along: Layer, brightest: Layer, width_m: float, cell_m: float) -> Layer:
+    """Mean over the width of the paint."""
+    middle = _cells(width_m, cell_m) | 1
+    return brightest if middle == 1 else _blur(along, 1, middle)
+
+
+def _reach(width_m: float, cell_m: float) -> int:
+    """Cells from the middle of the paint to that of the flank, whose own middle lies half a cell off if it is even."""
+    return round((width_m / 2 + GAP_M / 2 + FLANK_M / 2) / cell_m + 0.25)
+
+
+def _cells(length_m: float, cell_m: float) -> int:
+    return max(1, round(length_m / cell_m))
 
 
 def _narrow(brightest: Layer, darkest: Layer) -> Layer:
-    """Respond to a line of a cell's width with dark gaps of a cell's width beside it, as between a line and a curb."""
+    """Respond to a line of a cell's width with dark gaps of a cell's width beside it, as between a line and a curb; else 0."""
     # The darker of the first and the second cell beside it, as gaps may straddle both.
     gap = np.minimum(darkest[1:], darkest[:-1])
     out = np.zeros_like(brightest)
-    out[2:-2] = brightest[2:-2] - np.maximum(gap[3:], gap[:-3])
+    contrast = np.maximum(gap[3:], gap[:-3])
+    np.subtract(brightest[2:-2], contrast, out=contrast)
+    np.maximum(contrast, 0, out=out[2:-2])
     return out
 
 
