@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from log2sim.appearance.colors import ColorSampler
+from log2sim.appearance.colors import ColorSampler, _Scene, _to_box
 from log2sim.appearance.lab import lab_of_linear, linear_of_lab
 from log2sim.appearance.light import CAMERA_WHITE, estimate_light, linear_values, mirrored_share, reflectances, veil_of
 from log2sim.appearance.paint import find_paint
-from log2sim.appearance.surface import hit_vehicle
+from log2sim.appearance.surface import hit_block, hit_vehicle
 from log2sim.appearance.verdict import geometric_median
 from log2sim.appearance.views import choose_views
 from log2sim.color_names import name_of, to_lab
 from log2sim.datatypes import Log, Scenario
+from log2sim.perception.lidar.projection import view_of
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
@@ -107,6 +108,45 @@ def test_doors_are_paint_and_windows_and_wheels_are_not() -> None:
     assert weights == [1.0, 0.0, 0.0, 0.0]
     assert hit_vehicle("car", SIZE, origin, door).distance[0] == pytest.approx(1.0)
     assert np.isinf(hit_vehicle("car", SIZE, origin, above).distance[0])
+
+
+def test_rays_enter_a_block_where_a_fine_march_along_them_does() -> None:
+    rng = np.random.default_rng(5)
+    low, high, origin = np.array([-2.2, -0.9, -0.7]), np.array([2.2, 0.9, 0.7]), np.array([-9.0, -5.0, 0.4])
+    rays = np.concatenate([rng.uniform(low, high, (300, 3)) * 1.5 - origin, np.eye(3)])
+    entry, axis = hit_block(low, high, origin, rays)
+    steps = np.arange(0, 2, 5e-4)
+    places = origin + steps[:, None, None] * rays
+    inside = ((places > low) & (places < high)).all(axis=2)
+    met = inside.any(axis=0)
+    assert 100 < met.sum() < 290
+    np.testing.assert_array_equal(np.isfinite(entry), met)
+    np.testing.assert_allclose(entry[met], steps[inside.argmax(axis=0)][met], atol=1e-3)
+    face = (origin + entry[met, None] * rays[met])[np.arange(met.sum()), axis[met]]
+    np.testing.assert_allclose(np.minimum(np.abs(face - low[axis[met]]), np.abs(face - high[axis[met]])), 0, atol=1e-9)
+
+
+def test_agents_of_any_distance_hide_and_those_beside_the_rays_are_not_asked() -> None:
+    log, truth = street()
+    sampler = ColorSampler(log, truth)
+    camera, indices = next(iter(sampler.frames().items()))
+    map_T_cam, _ = log.map_T_sensor(camera, int(log.streams[camera].t_ns[indices[0]]))
+    origin = map_T_cam[0, :3, 3]
+    view = view_of(log, camera, int(log.streams[camera].t_ns[indices[0]]))
+    assert view is not None
+    boxes = sampler._boxes_in(camera)[int(indices[0])]
+    none = np.zeros((0, 3), np.uint8)
+    scene = _Scene(view, boxes, np.zeros((2, 2, 3), np.uint8), none, none)
+    for k, center in enumerate(boxes.center[:, 0]):
+        ray = (center - origin)[None]
+        found = scene._near(origin, ray, np.ones(1))
+        assert k in found
+        away = scene._others(origin, ray, np.ones(1))
+        everyone = [hit_block(-boxes.size[j] / 2, boxes.size[j] / 2, *_to_box(
+            origin, ray, boxes.center[j, 0], boxes.yaw[j, 0]))[0] for j in range(len(boxes.agents))]  # fmt: skip
+        np.testing.assert_array_equal(away, np.min(everyone, axis=0))
+        assert away[0] < 1
+    assert len(scene._near(origin, origin - boxes.center[0, 0][None], np.ones(1))) < len(boxes.agents)
 
 
 def test_a_hue_prevails_over_gray_things_and_shading() -> None:

@@ -15,6 +15,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform
 from log2sim.mapping.builder import map_ground
 from log2sim.mapping.ground_map import GroundMap
+from log2sim.mapping.records import MAX_SWEEPS, STANDING_RECORDS, choose_records, sweep_step_m
 from log2sim.mapping.road_users import RoadUsers, draw_outlines
 
 SETTINGS = MapConfig(cell_m=0.05)
@@ -228,3 +229,16 @@ def test_pictures_and_points_of_moving_agents_are_left_out() -> None:
     error = with_car.height_m - height_at(positions(with_car))
     lane = np.abs(positions(with_car)[..., 1] + 2.5) < 0.8
     assert np.nanpercentile(np.abs(error[lane & near_path(positions(with_car), 10.0)]), 95) < 0.05
+
+
+def test_dense_sweeps_are_taken_farther_apart_and_sparse_ones_where_the_log_has_them() -> None:
+    log = world_log(World(lidars=1))
+    way_m = float(np.ptp(log.ego.map_T_ego[:, 0, 3]))  # type: ignore[union-attr]
+    (name,) = log.lidars
+    counts = {}
+    for points in (1_000, 400_000):
+        step_m = sweep_step_m(points)
+        counts[points] = len(choose_records(log, empty_scenario(log), {name: step_m}, MAX_SWEEPS)[name])
+        assert counts[points] >= STANDING_RECORDS
+        assert counts[points] <= max(way_m / step_m + 1, STANDING_RECORDS)
+    assert counts[1_000] > counts[400_000]

@@ -47,7 +47,7 @@ class ColorSampler:
         self._log, self._scenario = log, scenario
         self._vehicles = [a.id for a in scenario.others if a.category in SHAPES]
         self._views = choose_views(log, scenario, self._vehicles)
-        self._boxes = {camera: self._boxes_in(camera, frames) for camera, frames in self.frames().items()}
+        self._boxes: dict[str, dict[int, Boxes]] = {}
         self._looks: dict[str, list[Look]] = {}
         self.gray: set[str] = set()
 
@@ -67,18 +67,25 @@ class ColorSampler:
         view = view_of(self._log, camera, t_ns)
         if view is None:
             return
-        boxes = self._boxes[camera].at(int(np.searchsorted(self.frames()[camera], index)))
+        agents = self._views.get(camera, {}).get(index, ())
+        if not agents:
+            return
+        boxes = self._boxes_in(camera)[index]
         scene = _Scene(view, boxes, image_bgr, *halves)
-        for agent in self._views.get(camera, {}).get(index, ()):
+        for agent in agents:
             row = next(k for k, other in enumerate(boxes.agents) if other.id == agent)
             look = scene.look_at(row)
             if look is not None:
                 self._looks.setdefault(agent, []).append(look)
 
-    def _boxes_in(self, camera: str, frames: NDArray[np.int64]) -> Boxes:
-        """Return the boxes of all agents at the times of frames of a camera."""
-        t_ns = self._log.streams[camera].t_ns[frames]
-        return boxes_at(self._scenario.others, (t_ns - self._scenario.t0_ns) / NS_PER_S)
+    def _boxes_in(self, camera: str) -> dict[int, Boxes]:
+        """Return the boxes of all agents in the frames that it wants of a camera, made for all of them at once."""
+        if camera not in self._boxes:
+            frames = self.frames()[camera]
+            t_s = (self._log.streams[camera].t_ns[frames] - self._scenario.t0_ns) / NS_PER_S
+            boxes = boxes_at(self._scenario.others, t_s)
+            self._boxes[camera] = {index: boxes.at(k) for k, index in enumerate(frames.tolist())}
+        return self._boxes[camera]
 
     def colors(self) -> dict[str, dict[str, Any]]:
         """Return the color of each vehicle that was seen, by id, as `Agent.color` holds it."""
