@@ -31,7 +31,7 @@ TIMELINE = Timeline(np.arange(5) * NS_PER_S, 0)
 def classify(start, end, yaw=0.0, size=CAR):
     """The ending of one ray about a box whose center is the origin."""
     start, end = np.array([start], dtype=float), np.array([end], dtype=float)
-    return Ending(classify_rays(start, end - start, np.array([yaw]), np.array([size]))[0])
+    return Ending(classify_rays(start, end - start, np.array([yaw]), np.array([size]))[0][0])
 
 
 @pytest.mark.parametrize(
@@ -55,10 +55,10 @@ def test_endings_turn_and_shift_with_the_box() -> None:
     rng = np.random.default_rng(2)
     start, to = rng.uniform(-12, 12, (4000, 3)) * [1, 1, 0.1], rng.uniform(-20, 20, (4000, 3)) * [1, 1, 0.02]
     size, yaw = np.tile(CAR, (4000, 1)), rng.uniform(-3, 3, 4000)
-    at_zero = classify_rays(start, to, np.zeros(4000), size)
+    (at_zero,) = classify_rays(start, to, np.zeros(4000), size)
     c, s = np.cos(yaw), np.sin(yaw)
     turned = [np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]]) for v in (start, to)]
-    assert np.array_equal(classify_rays(*turned, yaw, size), at_zero)
+    assert np.array_equal(classify_rays(*turned, yaw, size)[0], at_zero)
     assert {Ending.INSIDE, Ending.THROUGH, Ending.BEFORE, Ending.ELSEWHERE} == set(at_zero)
 
 

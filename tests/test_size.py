@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from worlds import measured_row, rows_at, scan, standing
 
+from log2sim.agents.ends import ends_of
 from log2sim.agents.size import moving_geometry, static_geometry
 from log2sim.agents.standing import is_static
-from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
+from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, OtherView, Track
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.box_fitting import rotate
 
@@ -286,3 +287,25 @@ def test_at_30_mps_a_truck_is_where_it_is_at_rest_since_its_points_carry_their_t
     assert shape.size_m[0] == pytest.approx(12.5, abs=0.25)
     assert np.abs(smeared.xy_m - truth)[:, 0].max() > (0.3 if speed_mps == 30.0 else 0.0)
     assert error.max() < 0.2
+
+
+def test_ends_of_many_measurements_are_those_of_each_alone_from_two_viewpoints_too() -> None:
+    states = [(9.0 + 0.3 * k, 4.0, 0.1) for k in range(6)]
+    track = measured(states, sensors=[(0.0, 0.0, 1.9)] * 6)
+    behind = measured(states, sensors=[(30.0, 0.0, 1.9)] * 6).measurements
+    others = tuple(OtherView(behind.sensor_m[k], behind.ends_visible[k], behind.cluster[k]) for k in range(6))
+    # Two of the measurements have one viewpoint only.
+    both = replace(track.measurements, others=tuple(None if k in (1, 4) else view for k, view in enumerate(others)))
+    track_of_both = replace(track, measurements=both)
+    rows, yaw, velocity = np.array([0, 1, 3, 4, 5]), np.full(5, 0.1), np.tile([3.0, 0.0], (5, 1))
+    together = ends_of(track_of_both, rows, yaw, velocity)
+    one = ends_of(track, rows, yaw, velocity)
+    for k in range(5):
+        alone = ends_of(track_of_both, rows[k : k + 1], yaw[:1], velocity[:1])
+        for name in ("low", "high", "real", "gap_m"):
+            np.testing.assert_array_equal(getattr(together, name)[k], getattr(alone, name)[0])
+    # From behind, its rear end faces the sensor; from ahead, its front does.
+    assert (one.real[:, 0] > 0).tolist() != (together.real[:, 0] > 0).tolist()
+    assert together.real[[0, 2, 4], 0].tolist() == [[2, 2]] * 3
+    np.testing.assert_array_equal(together.real[[1, 3]], one.real[[1, 3]])
+    np.testing.assert_allclose((together.high - together.low)[[0, 2, 4], 0], CAR[0], atol=0.1)

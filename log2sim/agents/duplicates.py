@@ -72,8 +72,17 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
     if groups == {"pedestrian"}:
         p, q = a.at(t), b.at(t)
         return bool(np.median(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m)) < SAME_PERSON_M)
+    if not _touch_long_enough(a, b, t):
+        return False
     least = SHARED_AREA_OF_PERSON if groups == {"pedestrian", "vehicle"} else SHARED_AREA
     return bool(np.median(_shared_areas(a, b, t)) > least)
+
+
+def _touch_long_enough(a: Agent, b: Agent, t_s: Array) -> bool:
+    """Return whether two agents are near enough for their boxes to touch at half of the times (T,); else they share 0 on the median."""
+    p, q = a.at(t_s), b.at(t_s)
+    reach_m = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
+    return bool(np.sum(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) <= reach_m) >= len(t_s) // 2)
 
 
 def _shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:

@@ -44,6 +44,10 @@ class Ends:
     real: NDArray[np.int64]
     gap_m: Array
 
+    def take(self, rows: slice) -> Ends:
+        """Return the ends of some of the views."""
+        return Ends(self.low[rows], self.high[rows], self.real[rows], self.gap_m[rows])
+
     def swapped(self) -> Ends:
         """Return the ends along axes that are turned by a quarter turn."""
         low = np.stack([self.low[:, 1], -self.high[:, 0]], axis=1)
@@ -81,10 +85,8 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     sensor = box_fitting.rotate(np.array([v.sensor_m[:2] for v in seen]).reshape(-1, 2) - origin, -yaw)
     visible = np.array([v.ends_visible for v in seen], dtype=bool).reshape(-1, 2)
     views = box_completion.real_ends(low, high, sensor, visible, min_sine=_min_sine(track.category))
-    gaps = np.array([
-        box_completion.end_gaps(box_fitting.rotate(v.cluster[:, :2] - v.sensor_m[:2], -yaw), low - at, high - at, real)
-        for v, at, real in zip(seen, sensor, views)
-    ])  # fmt: skip
+    steps = [box_fitting.azimuth_step_rad(box_fitting.rotate(v.cluster[:, :2] - v.sensor_m[:2], -yaw)) for v in seen]
+    gaps = box_completion.end_gaps(np.array(steps), low - sensor, high - sensor, views)
     # An end that is real from one viewpoint is real, and known as well as from the best one.
     real = views.max(axis=0)
     gap = np.where(views == real, gaps, np.inf).min(axis=0)
@@ -122,29 +124,46 @@ def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
     return box_fitting.axes_swapped(ends.high[0] - ends.low[0], sensor - (ends.low + ends.high) / 2, typical)
 
 
-def ends_of(track: Track, k: int, yaw_rad: float, velocity_mps: Array) -> Ends:
-    """Find the ends of the points of measurement `k`, relative to its viewpoint, for an object that points along a yaw.
+def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: Array) -> Ends:
+    """Find the ends of the points of measurements `rows` (n,), each relative to its viewpoint.
 
     Of an end that is seen from two viewpoints counts the better view.
+
+    Parameters
+    ----------
+    yaw_rad : (n,) float64
+        Of the object at each of them.
+    velocity_mps : (n, 2) float64
+        By which points are moved to where they were at the time of the measurement.
     """
-    views = [view for _, view in track.measurements.views_of(np.array([k]))]
-    out = _ends_in_view(views[0], yaw_rad, velocity_mps, track.category)
-    for view in views[1:]:
-        ends = _ends_in_view(view, yaw_rad, velocity_mps, track.category)
-        apart = box_fitting.rotate((view.sensor_m - views[0].sensor_m)[:2], -yaw_rad)
-        out = _better_ends(out, replace(ends, low=ends.low + apart, high=ends.high + apart))
-    return out
+    views = track.measurements.views_of(rows)
+    count, place = len(rows), {k: i for i, k in enumerate(rows.tolist())}
+    of = np.array([place[k] for k, _ in views], dtype=np.intp)
+    seen = _ends_in_views([view for _, view in views], yaw_rad[of], velocity_mps[of], track.category)
+    out = seen.take(slice(count))
+    if len(views) == count:
+        return out
+    parts = [out.take(slice(i, i + 1)) for i in range(count)]
+    for j, i in enumerate(of[count:].tolist(), start=count):
+        ends = seen.take(slice(j, j + 1))
+        apart = box_fitting.rotate((views[j][1].sensor_m - views[i][1].sensor_m)[:2], -yaw_rad[i])
+        parts[i] = _better_ends(parts[i], replace(ends, low=ends.low + apart, high=ends.high + apart))
+    return join_ends(parts)
 
 
-def _ends_in_view(view: OtherView, yaw_rad: float, velocity_mps: Array, category: str) -> Ends:
-    """Find the ends of the points of one viewpoint, relative to it."""
-    xy = view.cluster[:, :2] - view.sensor_m[:2]
-    if view.cluster.shape[1] > 3:
-        xy = xy - view.cluster[:, 3:] * velocity_mps
-    low, high = box_fitting.extents(xy, yaw_rad, max_trim_m=box_fitting.MAX_TRIM_M)
-    real = box_completion.real_ends(low, high, np.zeros(2), view.ends_visible, min_sine=_min_sine(category))
-    gap = box_completion.end_gaps(box_fitting.rotate(xy, -yaw_rad), low, high, real)
-    return Ends(low[None], high[None], real[None], gap[None])
+def _ends_in_views(views: list[OtherView], yaw_rad: Array, velocity_mps: Array, category: str) -> Ends:
+    """Find the ends of the points of viewpoints (n,), relative to them, for yaws (n,) and velocities (n, 2)."""
+    low, high, step = np.zeros((len(views), 2)), np.zeros((len(views), 2)), np.zeros(len(views))
+    for k, view in enumerate(views):
+        xy = view.cluster[:, :2] - view.sensor_m[:2]
+        if view.cluster.shape[1] > 3:
+            xy = xy - view.cluster[:, 3:] * velocity_mps[k]
+        local = box_fitting.rotate(xy, -yaw_rad[k])
+        low[k], high[k] = box_fitting.extents_of_rotated(local, max_trim_m=box_fitting.MAX_TRIM_M)
+        step[k] = box_fitting.azimuth_step_rad(local)
+    visible = np.array([view.ends_visible for view in views], dtype=bool).reshape(-1, 2)
+    real = box_completion.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(category))
+    return Ends(low, high, real, box_completion.end_gaps(step, low, high, real))
 
 
 def _better_ends(one: Ends, other: Ends) -> Ends:

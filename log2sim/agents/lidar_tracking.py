@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Obstacles
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.box_completion import SENSOR_SIGMA_M, complete_box, oriented_covariance, real_ends
-from log2sim.perception.box_fitting import align_to, rotate
+from log2sim.perception.box_completion import SENSOR_SIGMA_M, complete_box, facing_ends, oriented_covariance
+from log2sim.perception.box_fitting import align_to, quantile_of_sorted, rotate
 from log2sim.perception.prefetch import OBSTACLE_REACH_M
 
 MIN_POINTS = 8
@@ -177,11 +177,12 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     inside = outside_m <= MARGIN_M
     if inside.sum() < MIN_POINTS or (outside_m > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
         return None
-    low, high = np.quantile(local[inside], 0.01, axis=0), np.quantile(local[inside], 0.99, axis=0)
+    ordered = np.sort(local[inside], axis=0)
+    low, high = quantile_of_sorted(ordered, 0.01), quantile_of_sorted(ordered, 0.99)
     if np.any(high - low > size[:2] + 0.6):
         return None
     sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
-    center, sigma = complete_box(low, high, size[:2], real_ends(low, high, sensor, np.zeros(2, dtype=bool)))
+    center, sigma = complete_box(low, high, size[:2], facing_ends(low, high, sensor))
     hidden = size[:2] - (high - low)
     if np.hypot(*center) > MAX_SHIFT_M or np.any(hidden > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)):
         return None

@@ -8,6 +8,7 @@ fit no such motion are outliers at a fixed cost.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,8 +101,9 @@ def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> Marg
         log += OUTLIER_LOG * int((~inlier).sum())
         if log > best.log:
             best = MarginalLikelihood(log, inlier)
-        padded = np.pad(each, NEIGHBORS, constant_values=np.inf)
-        lowest = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBORS + 1).min(axis=1)
+        padded = np.full(len(each) + 2 * NEIGHBORS, np.inf)
+        padded[NEIGHBORS : NEIGHBORS + len(each)] = each
+        lowest = reduce(np.minimum, [padded[k : k + len(each)] for k in range(2 * NEIGHBORS + 1)])
         worst = np.flatnonzero((each < OUTLIER_LOG) & (each == lowest))
         if len(worst) == 0 or inlier.sum() <= 2:
             break

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.box_votes import independent, mean_box_axis, mean_box_center, typical_box_size, weighted_quantile
-from log2sim.agents.ends import Ends, ends_of, join_ends, persistent_points, static_ends
+from log2sim.agents.ends import Ends, ends_of, persistent_points, static_ends
 from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
 from log2sim.geometry import Array
 from log2sim.perception import box_completion, box_fitting
@@ -118,7 +118,7 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
         return _geometry_without_points(track)
     yaw, sensor = yaw_rad[rows], m.sensor_m[rows, :2]
     moved = np.zeros((len(m), 2)) if velocity_mps is None else velocity_mps
-    ends = join_ends([ends_of(track, k, float(yaw_rad[k]), moved[k]) for k in rows.tolist()])
+    ends = ends_of(track, rows, yaw, moved[rows])
     height, z = _height(track)
     size, is_likely = _estimate_size(ends, track.category, height, typical_box_size(m))
     has_box = np.isfinite(m.box_yaw_rad[rows])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.agents.ends import Ends, ends_of, join_ends
+from log2sim.agents.ends import Ends, ends_of
 from log2sim.agents.motion_evidence import (
     PLACE_SIGMA_M,
     MotionPriorSigmas,
@@ -50,7 +50,7 @@ def starts_or_stops(track: Track) -> bool:
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_ROWS)).round().astype(np.intp))]
     yaw, yaw_sigma = _axis(m.yaw_rad[rows])
     turned_m = TYPICAL_SIZE_M[track.category][1] * yaw_sigma
-    ends = join_ends([ends_of(track, int(k), yaw, np.zeros(2)) for k in rows])
+    ends = ends_of(track, rows, np.full(len(rows), yaw), np.zeros((len(rows), 2)))
     origin = rotate(m.sensor_m[rows, :2] - m.center_m[rows[0], :2], -yaw)
     # Frames that share a sweep measure the same points at the same time.
     t = (m.t_ns[rows] - m.t_ns[rows[0]]) / NS_PER_S + 1e-4 * np.arange(len(rows))

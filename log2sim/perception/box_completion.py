@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M, BoxEvidence, Measurements
 from log2sim.geometry import Array
-from log2sim.perception.box_fitting import MAX_WIDTH_FACTOR, azimuth_step_rad, rotate
+from log2sim.perception.box_fitting import MAX_WIDTH_FACTOR, rotate
 
 # Standard deviation of an observed end: range noise of a LiDAR and the spacing of its rays.
 SENSOR_SIGMA_M = 0.08
@@ -65,7 +65,7 @@ def real_ends(
     right and left ends of the points.
     """
     above, below = sensor > high, sensor < low
-    real = np.where(np.stack([below, above], axis=-1), FACING_END, 0)
+    real = facing_ends(low, high, sensor)
     offset = np.abs(sensor - (low + high) / 2)
     distance = np.hypot(offset[..., 0], offset[..., 1])
     right, left = np.asarray(ends_visible)[..., 0], np.asarray(ends_visible)[..., 1]
@@ -81,18 +81,23 @@ def real_ends(
     return real
 
 
-def end_gaps(xy: Array, low: Array, high: Array, real: NDArray[np.int64]) -> Array:
-    """Measure how far the rays of a LiDAR are apart at the ends (2, 2) of the extents of points (n, 2), m.
+def facing_ends(low: Array, high: Array, sensor: Array) -> NDArray[np.int64]:
+    """Return the `real_ends` (..., 2, 2) of which no other than those of sides that face the sensor are ends of the object."""
+    return np.where(np.stack([sensor < low, sensor > high], axis=-1), FACING_END, 0)
+
+
+def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.int64]) -> Array:
+    """Compute how far the rays of a LiDAR are apart at the ends (..., 2, 2) of the extents of points, m.
 
     An end seen from the side is up to one such distance beyond the outermost point. One that faces the sensor is hit.
 
     Parameters
     ----------
-    xy : (n, 2) float64, m
-        Relative to the sensor, along the length and the width.
-    low, high : (2,) float64, m
-        Ends of the extents.
-    real : (2, 2) int
+    step_rad : (...) float64, rad
+        Angle between neighboring rays, from `box_fitting.azimuth_step_rad`.
+    low, high : (..., 2) float64, m
+        Ends of the extents along the length and the width, relative to the sensor.
+    real : (..., 2, 2) int
         From `real_ends`.
 
     Notes
@@ -100,10 +105,10 @@ def end_gaps(xy: Array, low: Array, high: Array, real: NDArray[np.int64]) -> Arr
     Rays that are a small angle apart meet a side at distance d from the sensor's foot point on it, which is c away, at
     points angle x (c^2 + d^2) / c apart.
     """
-    step_rad = azimuth_step_rad(xy)
-    side_m = np.maximum(np.where(np.abs(low) < np.abs(high), np.abs(low), np.abs(high))[::-1], MIN_SIDE_DISTANCE_M)
+    nearer_m = np.where(np.abs(low) < np.abs(high), np.abs(low), np.abs(high))
+    side_m = np.maximum(nearer_m[..., ::-1], MIN_SIDE_DISTANCE_M)[..., None]
     end_m = np.stack([low, high], axis=-1)
-    gap = step_rad * (side_m[:, None] ** 2 + end_m**2) / side_m[:, None]
+    gap = np.asarray(step_rad)[..., None, None] * (side_m**2 + end_m**2) / side_m
     return np.asarray(np.where(real == FACING_END, 0.0, gap))
 
 

@@ -113,7 +113,12 @@ def extents(xy_m: Array, yaw_rad: float, trim: float = TRIM, max_trim_m: float =
     The ends are the quantiles `trim` and 1 - `trim`, so that a few stray points do not stretch a box, but at most
     `max_trim_m` inside the third outermost point: the far ends of a long object close by hold few of its points.
     """
-    local = np.sort(rotate(xy_m, -yaw_rad), axis=0)
+    return extents_of_rotated(rotate(xy_m, -yaw_rad), trim, max_trim_m)
+
+
+def extents_of_rotated(local_m: Array, trim: float = TRIM, max_trim_m: float = np.inf) -> tuple[Array, Array]:
+    """Measure the lower and upper ends (2,), (2,) of points (N, 2) along their own axes, as `extents`."""
+    local = np.sort(local_m, axis=0)
     third = min(2, (len(local) - 1) // 2)
     low = np.minimum(quantile_of_sorted(local, trim), local[third] + max_trim_m)
     high = np.maximum(quantile_of_sorted(local, 1 - trim), local[-1 - third] - max_trim_m)

@@ -129,14 +129,14 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
     """
     prior = MotionPrior.over(np.concatenate([observed.t_s, asked_s]))
     problem, least, state = _reweight(_problem(prior, MeasurementModel.of(observed, prior), motion))
-    covariance = least.covariance()
+    covariance = least.covariance
     constraints = _constraints(problem, state, covariance, motion)
     if constraints is not None:
         least, state = problem.solve(constraints)
-        covariance = least.covariance()
+        covariance = least.covariance
     if not motion.holonomic:
         least, state = _without_rolling_back(problem, least, state, constraints, motion)
-        covariance = least.covariance()
+        covariance = least.covariance
     residual = np.hypot(*problem.measurement.residual(state).T)
     state, covariance = _at_times(prior, asked_s, state, covariance)
     known = _known_courses(state, covariance, motion, correlated=observed.correlated)
@@ -152,7 +152,7 @@ def _without_rolling_back(
     observed = problem.measurement.observed
     for _ in range(MAX_HOLDING_ROUNDS):
         before = least
-        covariance = least.covariance()
+        covariance = least.covariance
         known = _known_courses(state, covariance, motion, correlated=observed.correlated)
         for run in backward_runs(state, known, motion.heading_rad):
             hold = held_at(problem.state, run)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -57,6 +58,7 @@ class Minimum:
     log_determinant: float
     form: Quadratic
 
+    @cached_property
     def covariance(self) -> Array:
         """Diagonal blocks (K, p, p) of the inverse of A."""
         return selected_inverse(*from_band(self.form.band, self.step.shape[1]))[0]
