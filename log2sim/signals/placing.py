@@ -119,7 +119,7 @@ def _misfits(positions: Array, covariances: Array, sight: _Sight) -> Array:
     away = positions - sight.eye
     distance = np.linalg.norm(away, axis=1)
     ratio = sight.side_rad * distance / SIDE_M
-    possible = (distance >= 1.0) & (away @ sight.ray > 0) & (1 / MAX_SIZE_RATIO < ratio) & (ratio < MAX_SIZE_RATIO)
+    possible = (distance >= 1.0) & (away @ sight.ray > 0) & (ratio > 1 / MAX_SIZE_RATIO) & (ratio < MAX_SIZE_RATIO)
     misfits = np.full(len(positions), np.inf)
     away, distance = away[possible], distance[possible]
     across = _across(sight.ray)
