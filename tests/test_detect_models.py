@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,35 @@ def test_classes_of_the_ssd_are_those_that_coco_gives_categories(in_cache: Path)
     expected = [COCO_91.category_of[i] for i in ssd_convert.CLASS_NAMES]
     assert list(detector.classes.category_of.values()) == expected  # type: ignore[attr-defined]
     assert set(ssd_convert.CLASS_NAMES) == set(COCO_91.category_of)
+
+
+@needs_weights
+def test_tiles_that_run_together_give_the_boxes_of_tiles_alone(in_cache: Path) -> None:
+    import cv2
+
+    detector: Any = create_detector("ssd-mobilenet-v2", LOG, min_score=0.05)
+    assert detector.together > 1
+    sample = Path(__file__).parents[1] / "samples" / "crossing"
+    paths = sorted(sample.glob("front*/*.jpg"))[:8:4]
+    images = [np.asarray(cv2.imread(str(path)), dtype=np.uint8) for path in paths]
+    runs: list[int] = []
+
+    class Noting:
+        def __init__(self, model: Any) -> None:
+            self.spec, self.threads, self._model = model.spec, 1, model
+
+        def run(self, tensor: Any) -> Any:
+            runs.append(len(tensor))
+            return self._model.run(tensor)
+
+    found = replace(detector, model=Noting(detector.model)).detect_images(images)
+    assert max(runs) == detector.together
+    alone = replace(detector, model=Noting(detector.model), together=1).detect_images(images)
+    assert sum(map(len, found)) > 0
+    for one, other in zip(found, alone, strict=True):
+        np.testing.assert_array_equal(one.box_px, other.box_px)
+        np.testing.assert_array_equal(one.score, other.score)
+        np.testing.assert_array_equal(one.category, other.category)
 
 
 @pytest.mark.slow

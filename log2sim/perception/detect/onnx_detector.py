@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -17,6 +18,7 @@ from log2sim.perception.detect.classes import TRAFFIC_LIGHT, Classes, choose_cla
 from log2sim.perception.detect.layout import Layout, Outputs, describe_outputs
 from log2sim.perception.detect.layouts import LAYOUTS, named_layout
 from log2sim.perception.detect.onnx_model import OnnxModel, load_model
+from log2sim.perception.detect.preprocessing import Placement
 from log2sim.perception.detect.riders import join_riders
 from log2sim.perception.detect.suppression import suppress
 from log2sim.perception.detect.tiling import Tile, merge, plan_tiles
@@ -50,6 +52,8 @@ class OnnxDetector:
     tiles : int or "auto"
     default_min_score : float
         Lowest score where none is set.
+    together : int
+        Tiles in one run of a model of one size that takes any number of inputs; 1 for all others.
     """
 
     name: str
@@ -61,6 +65,7 @@ class OnnxDetector:
     max_overlap: float
     tiles: Literal["auto"] | int
     default_min_score: float
+    together: int = 1
 
     @property
     def cache_key(self) -> str | None:
@@ -68,7 +73,7 @@ class OnnxDetector:
         import onnxruntime
 
         digest = self.model.digest()
-        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model")}
+        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model", "together")}
         return None if digest is None else f"{digest} onnxruntime {onnxruntime.__version__} {settings!r}"
 
     def detect(self, frame: Frame) -> Detections:
@@ -86,8 +91,10 @@ class OnnxDetector:
         """
         tiles = [self._tiles_of(image) for image in images]
         jobs = [(image, tile) for image, planned in zip(images, tiles) for tile in planned]
+        together = max(1, min(self.together, -(-len(jobs) // self.model.threads)))
+        runs = [jobs[i : i + together] for i in range(0, len(jobs), together)]
         with ThreadPoolExecutor(self.model.threads) as pool:
-            found = pool.map(lambda job: suppress(self._detect_tile(*job), self.max_overlap), jobs)
+            found = chain.from_iterable(pool.map(self._detect_tiles, runs))
             return [
                 self._merged([(tile, next(found)) for tile in planned], image) for image, planned in zip(images, tiles)
             ]
@@ -105,10 +112,21 @@ class OnnxDetector:
         users = join_riders(merged.take(~light), sure_score=self.min_score)
         return replace(users, traffic_lights=np.column_stack([merged.box_px[light], merged.score[light]]))
 
-    def _detect_tile(self, image: NDArray[np.uint8], tile: Tile) -> Detections:
-        """Detect in one tile; boxes in px of the whole image, clipped to the tile."""
-        tensor, placement = self.layout.preprocessing(tile.cut(image), self.model.spec)
-        outputs = self.model.run(tensor)
+    def _detect_tiles(self, jobs: Sequence[tuple[NDArray[np.uint8], Tile]]) -> list[Detections]:
+        """Detect in tiles of images by one run of the model, each without duplicates."""
+        inputs = [self.layout.preprocessing(tile.cut(image), self.model.spec) for image, tile in jobs]
+        if len(inputs) == 1:
+            outputs = [self.model.run(inputs[0][0])]
+        else:
+            joined = self.model.run(np.concatenate([tensor for tensor, _ in inputs]))
+            outputs = [{name: array[k : k + 1] for name, array in joined.items()} for k in range(len(inputs))]
+        return [
+            suppress(self._boxes_of(of_tile, tile, placement), self.max_overlap)
+            for of_tile, (_, tile), (_, placement) in zip(outputs, jobs, inputs, strict=True)
+        ]
+
+    def _boxes_of(self, outputs: Outputs, tile: Tile, placement: Placement) -> Detections:
+        """Decode the outputs of one tile; boxes in px of the whole image, clipped to the tile."""
         found = self.layout.decode(outputs, placement.input_px, self.classes, min(self.min_score, self.min_weak_score))
         box = placement.to_image(found.box_input)
         finite = np.isfinite(box).all(axis=1) & np.isfinite(found.score)

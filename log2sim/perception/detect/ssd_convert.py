@@ -107,7 +107,7 @@ class Converter:
             # Both heads end in one; its target shape is computed in the graph, but only the last dimension matters.
             last = len(CLASS_NAMES) if node.name.endswith("_1") else 4
             moved = self.add("Transpose", [self.translate(node.inputs[0])], f"{node.name}/nhwc", perm=[0, 2, 3, 1])
-            shape = self.store(f"{node.name}/shape", np.array([1, -1, last], dtype=np.int64))
+            shape = self.store(f"{node.name}/shape", np.array([0, -1, last], dtype=np.int64))
             return self.add("Reshape", [moved, shape], node.name)
         if node.op == "ConcatV2":
             return self.add("Concat", [self.translate(i) for i in node.inputs[:-1]], node.name, axis=1)
@@ -143,7 +143,7 @@ class Converter:
 
 
 def convert(graph: bytes) -> onnx.ModelProto:
-    """Convert the frozen graph: `images` (1, 300, 300, 3) uint8 RGB to `boxes` (1, 1917, 4) and `scores` (1, 1917, 7).
+    """Convert the frozen graph: `images` (N, 300, 300, 3) uint8 RGB to `boxes` (N, 1917, 4) and `scores` (N, 1917, 7).
 
     Raises
     ------
@@ -162,9 +162,9 @@ def convert(graph: bytes) -> onnx.ModelProto:
     anchors = anchor_boxes()
     decode_boxes(converter, encoded, anchors)
     converter.add("Sigmoid", [logits], "scores")
-    picture = helper.make_tensor_value_info("images", TensorProto.UINT8, [1, INPUT_PX, INPUT_PX, 3])
+    picture = helper.make_tensor_value_info("images", TensorProto.UINT8, ["N", INPUT_PX, INPUT_PX, 3])
     outputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, len(anchors), columns])
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", len(anchors), columns])
         for name, columns in (("boxes", 4), ("scores", len(CLASS_NAMES)))
     ]
     body = helper.make_graph(converter.onnx_nodes, "ssd_mobilenet_v2_coco", [picture], outputs, converter.initializers)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,9 @@ GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad
 GRAPH_LIMIT_BYTES = 256 * 1024**2
 MAX_DIGEST_BYTES = 1024
 # To be raised when the conversion changes, so that cached models of older versions are not used.
-CONVERSION = 3
+CONVERSION = 4
+# The weights are larger than the caches near a core; more inputs at once gain no more.
+TOGETHER = 3
 PROCESSOR = Path("/proc/cpuinfo")
 PROCESSOR_LIMIT_BYTES = 16 * 1024**2
 # Processors that add up products of bytes in 32 bits; others saturate at 16.
@@ -45,7 +48,8 @@ def create(
     ConfigError
         When the weights are others than the ones known, or the cache cannot be written.
     """
-    return open_onnx(converted_model(), min_score=min_score, max_overlap=max_overlap, tiles=tiles, name=NAME)
+    detector = open_onnx(converted_model(), min_score=min_score, max_overlap=max_overlap, tiles=tiles, name=NAME)
+    return replace(detector, together=TOGETHER)
 
 
 def converted_model() -> Path:
