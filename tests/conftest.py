@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.util
+import os
 import shutil
 import subprocess
 import sys
@@ -20,26 +22,42 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in slow)
 
 
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A temporary folder of all processes that run the tests of this session."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 @pytest.fixture(scope="session", autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A cache folder of the tests, for processes that they start, too; the user's is neither read nor written."""
-    folder = tmp_path_factory.mktemp("cache")
+def own_cache(shared_folder: Path) -> Iterator[Path]:
+    """A cache folder of the tests, for processes that they start, too; the user's is neither read nor written.
+
+    Models are converted into it once, and the same picture is searched once.
+    """
+    folder = shared_folder / "cache"
+    folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LOG2SIM_CACHE", str(folder))
         yield folder
 
 
 @pytest.fixture(scope="session")
-def real_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recorded logs in their native layout; skips where they are not at hand."""
+def real_data(shared_folder: Path) -> Path:
+    """The recorded logs in their native layout, laid out once; skips where they are not at hand."""
     restore = SHARED / "data" / "restore.py"
     if not restore.is_file():
         pytest.skip("recorded logs are not beside this checkout (../shared/data)")
     if importlib.util.find_spec("pandas") is None:
         pytest.skip("laying out the recorded logs needs pandas")
-    out = tmp_path_factory.mktemp("real") / "data"
-    subprocess.run([sys.executable, str(restore), str(out)], check=True, capture_output=True)
-    return out
+    out = shared_folder / "real"
+    out.mkdir(exist_ok=True)
+    with open(out / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (out / "complete").exists():
+            subprocess.run([sys.executable, str(restore), str(out / "data")], check=True, capture_output=True)
+            (out / "complete").touch()
+    return out / "data"
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from carla_courses import SIZES, agent, left_turn, of
 from command_line import run
+from plain_settings import AGENTS_ALONE
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Scenario
@@ -82,7 +83,7 @@ def test_vehicles_follow_in_carla_as_in_the_shim(server: Client) -> None:
 @pytest.mark.parametrize("log", ["sample", "pandaset", "kitti_tracking"])
 def test_reconstructed_logs_are_followed_in_carla(log: str, server: Client, request: pytest.FixtureRequest) -> None:
     folder = SAMPLE.parent if log == "sample" else request.getfixturevalue("real_data") / log
-    made = reconstruct(open_log(folder), Config.load(detect={"name": "labels"})).scenario
+    made = reconstruct(open_log(folder), Config.load(detect={"name": "labels"}, **AGENTS_ALONE)).scenario
     metrics = in_carla(made).metrics
     assert metrics["cross_track_max_m"] < 0.3
     assert metrics["cross_track_rms_m"] < 0.05

@@ -11,6 +11,7 @@ import pytest
 from command_line import names, run
 from log_encoders import argoverse, kitti, native, nuscenes, pandaset, waymo, waymo_parquet
 from log_encoders.world import make_world, world_log
+from plain_settings import AGENTS_ALONE
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario, Stream
@@ -27,7 +28,7 @@ TWO_CAMERAS = [
 
 
 def scenario_of(path: Path, **changes: object) -> Scenario:
-    return reconstruct(open_log(path), Config.load(detect={"name": "labels"}, **changes)).scenario
+    return reconstruct(open_log(path), Config.load(detect={"name": "labels"}, **AGENTS_ALONE, **changes)).scenario
 
 
 def assert_same(ours: Scenario, theirs: Scenario, atol_m: float) -> None:

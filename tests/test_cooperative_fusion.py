@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain_settings import AGENTS_ALONE
 from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.agents.ends import Ends, _better_ends
@@ -253,7 +254,8 @@ def test_lidars_of_the_road_are_grouped_by_their_places(both_ends) -> None:
 @pytest.mark.parametrize("level", ["points", "boxes", "tracks"])
 def test_every_level_finds_every_object_once(both_ends, level) -> None:
     chosen = Config.load(
-        settings=["detect.name=lidar:labels", f"cooperation.fusion={level}", "cooperation.register_road=false"]
+        settings=["detect.name=lidar:labels", f"cooperation.fusion={level}", "cooperation.register_road=false"],
+        **AGENTS_ALONE,
     )
     result = reconstruct(both_ends, chosen)
     agents = [a for a in result.scenario.agents if a.id != "ego"]

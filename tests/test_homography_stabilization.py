@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_settings import AGENTS_ALONE
 from worlds import camera_ahead, outline_px, scan, standing
 
 import log2sim.pipeline
@@ -98,7 +99,7 @@ def outcome(log: Log, monkeypatch: pytest.MonkeyPatch) -> Outcome:
 
     with monkeypatch.context() as patch:
         patch.setattr(log2sim.pipeline, "track_ends", spy)
-        scenario = reconstruct(log, Config.load(detect={"name": "labels"})).scenario
+        scenario = reconstruct(log, Config.load(detect={"name": "labels"}, **AGENTS_ALONE)).scenario
     rows = Measurements.join(placed)
     rows = rows.take(rows.source == "topdown")
     truth = np.array([s.center_m[:2] for s in UNSEEN])

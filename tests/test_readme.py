@@ -148,6 +148,7 @@ def fresh_environment(tmp_path: Path) -> dict[str, str]:
     home = tmp_path / "home"
     home.mkdir()
     variables |= {"HOME": str(home), "PATH": f"{sys.base_prefix}/bin:/usr/local/bin:/usr/bin:/bin", "LANG": "C.UTF-8"}
+    variables["PIP_COMPILE"] = "0"  # Python compiles what is imported, which is a small part of what is installed
     settings = Path.home() / ".config/pip/pip.conf"
     if settings.is_file():
         variables.setdefault("PIP_CONFIG_FILE", str(settings))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from plain_settings import AGENTS_ALONE
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.evaluation.metrics.evaluator import evaluate
@@ -17,7 +18,7 @@ RANGE_M = 40.0
 
 
 def run(detector: str) -> Result:
-    return reconstruct(open_log(SAMPLE), Config.load(detect={"name": detector}))
+    return reconstruct(open_log(SAMPLE), Config.load(detect={"name": detector}, **AGENTS_ALONE))
 
 
 def figures(result: Result) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from mutation.text_lines import cut_is_visible
 from mutation.watch import ROOT, Watch
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks, and reads /proc")
+INPUTS, KILLS = 64, 10
 SCENARIO_AT = CYCLE.index("scenario")
 GOOD = Outcome("reconstruct", 0, "", frozenset(), "other")
 SOUND = Outcome("reconstruct", 0, "", frozenset(["note: one"]), "same")
@@ -261,8 +262,9 @@ def test_what_a_kill_may_leave(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_nothing_crashes_hangs_or_is_swallowed(tmp_path: Path) -> None:
+    """Some inputs of each kind; `tools/mutate.py --count N` runs more."""
     harness = Harness(tmp_path.resolve())
-    rows = list(run_many(harness, 20, list(indices(200))))
+    rows = list(run_many(harness, 20, list(indices(INPUTS))))
     counts = Counter(row.verdict for row in rows)
     bad = [
         f"{row.verdict}: {row.replay} {row.kind}: {row.damage}: {row.reason}"
@@ -270,11 +272,11 @@ def test_nothing_crashes_hangs_or_is_swallowed(tmp_path: Path) -> None:
         if row.verdict in verdict.BAD
     ]
     assert not bad, "\n".join(bad)
-    assert sum(counts.values()) == 200
-    assert min(counts[name] for name in verdict.GOOD) > 5
+    assert sum(counts.values()) == INPUTS
+    assert min(counts[name] for name in verdict.GOOD) > 1
 
 
 @pytest.mark.slow
 def test_what_is_killed_leaves_nothing_torn(tmp_path: Path) -> None:
-    torn = [k for k in killing.kill_many(tmp_path.resolve(), 24) if k.left == "torn"]
+    torn = [k for k in killing.kill_many(tmp_path.resolve(), KILLS) if k.left == "torn"]
     assert not torn
