@@ -106,9 +106,11 @@ class PoseTrack:
         """Rows (N,) before and after stamps; outside the track its end and a row some time away, never two at nearly one time."""
         last = len(self.t_ns) - 1
         after = np.clip(np.searchsorted(self.t_ns, t_ns, side="right"), 1, last)
+        start, end = t_ns < self.t_ns[0], t_ns > self.t_ns[-1]
+        if not (start.any() or end.any()):
+            return after - 1, after
         second = min(int(np.searchsorted(self.t_ns, self.t_ns[0] + MIN_EXTRAPOLATION_BASE_NS)), last)
         second_last = max(
             int(np.searchsorted(self.t_ns, self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS, side="right")) - 1, 0
         )
-        start, end = t_ns < self.t_ns[0], t_ns > self.t_ns[-1]
         return np.where(end, second_last, after - 1), np.where(start, second, after)
