@@ -13,6 +13,7 @@ READER_MODULE = '''
 """Folders with a file told.txt: the log of a path, and what happens when it is opened for the first time."""
 import os
 import signal
+import time
 from pathlib import Path
 
 from log2sim.logs.native.reader import READER as NATIVE
@@ -30,7 +31,10 @@ class ToldReader:
     def open(self, path, sequence):
         word, place = (path / "told.txt").read_text().split()
         marker = path / "opened"
-        if word != "good" and not (word.endswith("once") and marker.exists()):
+        while word == "wait" and not (path / "go").exists():
+            marker.write_text("")
+            time.sleep(0.05)
+        if word not in ("good", "wait") and not (word.endswith("once") and marker.exists()):
             marker.write_text("")
             if word.startswith("die"):
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -55,7 +59,7 @@ def damage(log: Path) -> None:
 
 
 def tell(folder: Path, word: str, log: Path) -> None:
-    """Make a log of the format "told": "good", or "fail", "fail-once", "die" or "die-once" at its opening."""
+    """Make a log of the format "told": "good", or "fail", "fail-once", "die" or "die-once" at its opening, or "wait" for a file "go"."""
     folder.mkdir(parents=True)
     (folder / "told.txt").write_text(f"{word} {log}")
 

@@ -106,9 +106,13 @@ def test_workers_that_die_lose_no_log_but_the_one_that_kills_them(
 def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
     tiny_folder: Path, tmp_path: Path, site: Path
 ) -> None:
-    root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"abcdefghijklmnopqrstuvwx"), tmp_path / "out"
+    root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"abc"), tmp_path / "out"
+    waiting = [root / name for name in ("x-waits", "y-waits", "z-waits")]
+    for log in waiting:
+        tell(log, "wait", tiny_folder)
     process = start(root, out, site)
-    wait_until(lambda: any(out.glob("logs/?/row.json")), process)
+    # Both workers are at a log that does not end: interrupted, the batch does not wait for them.
+    wait_until(lambda: sum((log / "opened").exists() for log in waiting) == 2, process)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 130, errors
@@ -117,8 +121,10 @@ def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
     assert sorted(p.name for p in out.iterdir()) == ["batch.json", "logs", "table.html", "table.parquet"]
     assert [p for p in (out / "logs").iterdir() if p.name.startswith(".")] == []
     first = {path: path.stat().st_mtime_ns for path in out.glob("logs/*/row.json")}
-    assert 1 <= len(first) < 24
+    assert len(first) == 3
 
+    for log in waiting:
+        (log / "go").touch()
     again = start(root, out, site)
     printed, errors = again.communicate(timeout=LIMIT_S)
     assert again.returncode == 0, errors

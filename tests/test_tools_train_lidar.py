@@ -184,13 +184,11 @@ def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, m
 
 
 @pytest.mark.slow
-def test_a_toy_learns_to_find_vehicles(tmp_path, monkeypatch) -> None:
-    """Half a minute from nothing, on small windows: it finds some vehicles of fresh scenes; untrained it finds none."""
-    monkeypatch.setattr(train_lidar, "CELLS", {"roadside": 64})
-    rounds = [train_lidar.Round(5, 80, 420)]
-    train_lidar.generate("roadside", tmp_path / "data", 80, 5)
-    train_lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
-    train_lidar.finish("roadside", tmp_path, rounds, examples=8)
+def test_a_toy_learns_to_find_vehicles(tmp_path) -> None:
+    """A minute from nothing: what it finds on fresh scenes is mostly right."""
+    train_lidar.generate("roadside", tmp_path / "data", 100, 5)
+    train_lidar.fit("roadside", tmp_path / "data", tmp_path, [train_lidar.Round(5, 100, 420)])
+    train_lidar.finish("roadside", tmp_path, [train_lidar.Round(5, 100, 420)], examples=12)
     card = json.loads((tmp_path / "roadside.json").read_text())
-    assert card["simulated"]["vehicle"]["average_precision"] > 0.05
+    assert card["simulated"]["vehicle"]["average_precision"] > 0.15
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000
