@@ -29,6 +29,7 @@ MAX_GRAY_DIFFERENCE = 4  # between channels of a picture without color, by the e
 # The road from here to there around a vehicle lies in the same light, outside of the shade under it.
 GROUND_FROM_M, GROUND_TO_M, GROUND_STEPS = 0.7, 2.5, 4
 GROUND_PER_SIDE = 12
+# Angles from inverse cosines near 1 are off by less than this.
 ROUNDING_RAD = 1e-6
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -48,15 +49,63 @@ def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = Non
     low, high : (2,) float64, m
         Ends along the length and the width axis, relative to the viewpoint.
     """
-    if known_yaw_rad is not None:
-        yaw_rad = corrected_yaw(points, known_yaw_rad)
-        return yaw_rad, *extents(points, yaw_rad, max_trim_m=MAX_TRIM_M)
-    yaw_rad, _ = fit_yaw(points)
-    low, high = extents(points, yaw_rad, max_trim_m=MAX_TRIM_M)
-    if axes_swapped(high - low, -(low + high) / 2, typical):
-        yaw_rad += np.pi / 2
-        low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
-    return float(yaw_rad), low, high
+    known = np.array([np.nan if known_yaw_rad is None else known_yaw_rad])
+    yaw, low, high = fit_extents_of_clusters(points, np.array([len(points)]), typical[None], known)
+    return float(yaw[0]), low[0], high[0]
+
+
+def fit_extents_of_clusters(
+    xy_m: Array, count: NDArray[np.intp], typical: Array, known_yaw_rad: Array
+) -> tuple[Array, Array, Array]:
+    """Fit the length axes and the extents of several clusters, as `fit_extents` does for one.
+
+    Parameters
+    ----------
+    xy_m : (N, 2) float64, m
+        Points of the first cluster, then those of the next, relative to the viewpoint.
+    count : (R,) int
+        Number of points of each cluster, at least 1.
+    typical : (R, 3) float64, m
+    known_yaw_rad : (R,) float64
+        NaN where it is not known.
+
+    Returns
+    -------
+    yaw_rad : (R,) float64
+    low, high : (R, 2) float64, m
+    """
+    known = np.isfinite(known_yaw_rad)
+    yaw, of_known = known_yaw_rad.copy(), np.repeat(known, count)
+    if known.any():
+        yaw[known] = correct_yaws(xy_m[of_known], count[known], yaw[known])
+    if not known.all():
+        yaw[~known] = fit_yaws(xy_m[~of_known], count[~known])[0]
+    local = np.ascontiguousarray(rotate(xy_m, -np.repeat(yaw, count)).T)
+    sort_clusters(local, count)
+    start, third = np.cumsum(count) - count, np.minimum(2, (count - 1) // 2)
+    low = np.minimum(quantile_of_clusters(local, count, TRIM), local[:, start + third] + MAX_TRIM_M).T
+    last = start + count - 1
+    high = np.maximum(quantile_of_clusters(local, count, 1 - TRIM), local[:, last - third] - MAX_TRIM_M).T
+    for k in np.flatnonzero(~known).tolist():
+        if axes_swapped(high[k] - low[k], -(low[k] + high[k]) / 2, typical[k]):
+            yaw[k] += np.pi / 2
+            low[k], high[k] = [low[k, 1], -high[k, 0]], [high[k, 1], -low[k, 0]]
+    return yaw, low, high
+
+
+def sort_clusters(values: Array, count: NDArray[np.intp]) -> None:
+    """Sort values (V, N) in place within successive clusters of so many (R,) values."""
+    edges = np.concatenate([[0], np.cumsum(count)]).tolist()
+    for a, b in pairwise(edges):
+        values[:, a:b].sort(axis=1)
+
+
+def quantile_of_clusters(ordered: Array, count: NDArray[np.intp], share: float) -> Array:
+    """Interpolate a quantile (V, R) of values (V, N) that `sort_clusters` sorted."""
+    start, place = np.cumsum(count) - count, share * (count - 1)
+    below = place.astype(np.intp)
+    first, second = ordered[:, start + below], ordered[:, start + np.minimum(below + 1, count - 1)]
+    return np.asarray(first + (place - below) * (second - first))
 
 
 def corrected_yaw(points: Array, yaw_rad: float) -> float:

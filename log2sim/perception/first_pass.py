@@ -14,6 +14,7 @@ from log2sim.array_file import ArrayFile
 from log2sim.datatypes import ENDS, Boxes3D, Detections, Fault, Log, Measurements, Obstacles, end_of
 from log2sim.fusion_level import FusionLevel
 from log2sim.geometry import Array, inverse
+from log2sim.perception.background import BACKGROUND_THREADS
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.detection_cache import DetectionCache
@@ -34,7 +35,6 @@ from log2sim.plan import Plan, Stage
 from log2sim.stage_clock import StageClock
 
 MAX_GROUND_POINTS_PER_FRAME = 40
-BACKGROUND_THREADS = 2
 
 
 @dataclass(eq=False)

@@ -123,7 +123,7 @@ def _join_all(rows: Measurements, leaders: NDArray[np.intp], owner: NDArray[np.i
     return Measurements.join([out.take(others), *joined.values()]).take(place)
 
 
-def _join(rows: Measurements, row: Measurements, merged: Sequence[int]) -> Measurements:
+def _join(rows: Measurements, row: Measurements, merged: list[int]) -> Measurements:
     """Return a leader's row with the points that it, the first of `merged`, and other cameras have of its object."""
     leader = merged[0]
     boxed = rows.take([next((m for m in merged if np.isfinite(rows.box_yaw_rad[m])), leader)])
@@ -136,8 +136,8 @@ def _join(rows: Measurements, row: Measurements, merged: Sequence[int]) -> Measu
         row, cluster=(cluster,), yaw_rad=np.array([yaw]), low_m=low[None], high_m=high[None],
         top_m=np.array([top_of(cluster[:, 2])]),
         # Where one camera's box cut the object, another's may show its end.
-        ends_visible=np.asarray(rows.ends_visible[list(merged)].any(axis=0, keepdims=True)),
-        truncated=np.array([rows.truncated[list(merged)].all()]), points=rows.points[list(merged)].max(keepdims=True),
+        ends_visible=np.asarray(rows.ends_visible[merged].any(axis=0, keepdims=True)),
+        truncated=np.array([rows.truncated[merged].all()]), points=rows.points[merged].max(keepdims=True),
     ))  # fmt: skip
 
 

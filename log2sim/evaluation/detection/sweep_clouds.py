@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Boxes3D
+from log2sim.perception.background import BACKGROUND_THREADS
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.first_pass import BACKGROUND_THREADS
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher

@@ -155,7 +155,7 @@ class _Clusters:
 
     def ranges_near(self, edge: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the upper median (R, 2) of the ranges of a cluster's points around azimuths (R, 2)."""
-        # Clusters are in one order with their azimuths if each has a turn, and a part of one before and after, of its own.
+        # Azimuths of different clusters are so far apart that those of all clusters are sorted, windows across their ends included.
         own = 3 * STEPS_PER_TURN
         ordered, first = self.group * own + self.azimuth, own * np.arange(len(edge))[:, None] + edge
         low = np.searchsorted(ordered, first - MIN_WINDOW_STEPS + 1).ravel().tolist()
