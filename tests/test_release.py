@@ -11,6 +11,7 @@ import sys
 import sysconfig
 import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -41,10 +42,10 @@ print(json.dumps([log2sim.__file__, log2sim.__version__, load_schema("scenario-1
 
 def test_the_version_is_what_the_build_wrote(tmp_path: Path) -> None:
     file = tmp_path / "version.txt"
-    assert read_version(file) == FALLBACK == PROJECT["tool"]["setuptools_scm"]["fallback_version"]
+    assert read_version(file) == FALLBACK == PROJECT["tool"]["hatch"]["version"]["fallback-version"]
     file.write_text("1.2.3.dev4+gabcdef\n", encoding="ascii")
     assert read_version(file) == "1.2.3.dev4+gabcdef"
-    written = ROOT / PROJECT["tool"]["setuptools_scm"]["version_file"]
+    written = ROOT / PROJECT["tool"]["hatch"]["build"]["hooks"]["vcs"]["version-file"]
     assert log2sim.__version__ == read_version(written)
 
 
@@ -97,11 +98,11 @@ def call(*command: str | Path, cwd: Path, **variables: str) -> str:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository with the files of this one and a tag."""
-    pytest.importorskip("setuptools_scm")
+    """A repository with the files of this one, in a folder that has the name of the package, as a clone has."""
+    pytest.importorskip("hatch_vcs")
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git to tell the files of the checkout from others")
-    folder = tmp_path_factory.mktemp("release") / "checkout"
+    folder = tmp_path_factory.mktemp("release") / "log2sim"
     listed = call("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=ROOT)
     wanted = ("log2sim/", "schemas/", "pyproject.toml", "README.md", "LICENSE", ".gitignore")
     for name in filter(None, listed.split("\0")):
@@ -114,28 +115,29 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_a_checkout_without_tags_and_a_copy_without_git_have_a_version(checkout: Path, tmp_path: Path) -> None:
-    ask = "import setuptools_scm; print(setuptools_scm.get_version(root='.', fallback_version='0.1.dev0'))"
-    assert re.match(r"0\.1\.dev1\+g[0-9a-f]+", call(sys.executable, "-c", ask, cwd=checkout))
-    shutil.copy(checkout / "pyproject.toml", tmp_path)
-    build = "import setuptools.build_meta as b; print(b.prepare_metadata_for_build_wheel('.'))"
-    (tmp_path / "pyproject.toml").write_text(
-        re.sub(
-            r"(?m)^(packages|readme|license-files) = .*$|^log2sim_schemas = .*$",
-            "",
-            (tmp_path / "pyproject.toml").read_text(),
-        )
-    )
-    (tmp_path / "log2sim").mkdir()
-    call(sys.executable, "-c", build, cwd=tmp_path)
-    assert (tmp_path / "log2sim/version.txt").read_text().strip() == FALLBACK
+    ask = "from hatchling.build import prepare_metadata_for_build_wheel as ask; print(ask({!r}))"
+    named = call(sys.executable, "-c", ask.format(str(tmp_path)), cwd=checkout)
+    assert re.match(r"log2sim-0\.1\.dev1\+g[0-9a-f]+\.dist-info", named)
+    shutil.copytree(checkout, tmp_path / "copy", ignore=shutil.ignore_patterns(".git"))
+    named = call(sys.executable, "-c", ask.format(str(tmp_path)), cwd=tmp_path / "copy")
+    assert named.strip() == f"log2sim-{FALLBACK}.dist-info"
+
+
+def test_an_editable_installation_works_beside_the_checkout(checkout: Path, tmp_path: Path) -> None:
+    build = "from hatchling.build import build_editable as build; print(build({!r}))"
+    wheel = tmp_path / call(sys.executable, "-c", build.format(str(tmp_path)), cwd=checkout).strip()
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(tmp_path / "site")
+    code = f"import site; site.addsitedir({str(tmp_path / 'site')!r}); import log2sim; print(log2sim.__file__)"
+    # The folder above the checkout, from where the checkout looks like a package without a module.
+    assert Path(call(sys.executable, "-S", "-c", code, cwd=checkout.parent).strip()).is_relative_to(checkout)
 
 
 @pytest.mark.slow
 def test_a_wheel_of_the_sdist_works_outside_the_checkout(checkout: Path, tiny_folder: Path, tmp_path: Path) -> None:
     call("git", "tag", "v1.2.3", cwd=checkout)
-    build = "import setuptools.build_meta as b; b.build_sdist({!r})"
+    build = "from hatchling.build import build_sdist as build; build({!r})"
     call(sys.executable, "-c", build.format(str(tmp_path)), cwd=checkout)
     with tarfile.open(tmp_path / "log2sim-1.2.3.tar.gz") as packed:
         packed.extractall(tmp_path, filter="data")
