@@ -114,7 +114,7 @@ def test_the_ego_is_told_apart_from_the_agents(ids: list[str], words: str) -> No
 
 def test_categories_are_counted_with_those_that_stand() -> None:
     agents = [straight("a"), parked("b", 0, 0), straight("c")]
-    assert say_categories(agents) == "3 cars (1 standing)"
+    assert say_categories(agents) == "3 cars (1 static)"
     assert say_categories([]) == ""
 
 
@@ -181,10 +181,10 @@ def test_what_was_missing_is_said_once_for_each_reason() -> None:
     plan = tuple(
         {"stage": stage, "kept": False, "reason": reason} for stage in ("colors of vehicles", "traffic lights")
     )
-    spared = {"stage": "smoothing of parked agents", "kept": False, "reason": "1 of 2"}
+    spared = {"stage": "smoothing of static agents", "kept": False, "reason": "1 of 2"}
     scenario = scenario_of(straight("a"))
     told = Scenario(
-        "s", 0, 1.0, scenario.agents, plan=(*plan, spared), map_features=MapFeatures(notes=("no intensity",))
+        "s", 0, 1.0, scenario.agents, stages=(*plan, spared), map_features=MapFeatures(notes=("no intensity",))
     )
     assert missing_lines(told) == ["colors of vehicles, traffic lights: no camera is used", "no intensity"]
     assert missing_lines(world(straight("a"))) == []

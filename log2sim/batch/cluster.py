@@ -70,7 +70,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     MissingExtra
         Without Dask.
     """
-    distributed, dask = _import_dask()
+    distributed, dask = import_dask()
     from distributed.system import MEMORY_LIMIT
 
     environment = {**thread_limits(max(1, usable_threads() // count)), "DASK_LOGGING__DISTRIBUTED": "critical"}
@@ -111,7 +111,7 @@ def workers_of(address: str) -> Iterator[Workers]:
     """
     if not address.startswith(PROTOCOLS):
         raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")
-    distributed, _ = _import_dask()
+    distributed, _ = import_dask()
     try:
         client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
@@ -122,7 +122,8 @@ def workers_of(address: str) -> Iterator[Workers]:
         yield Workers(client, are_ours=False)
 
 
-def _import_dask() -> tuple[Any, Any]:
+def import_dask() -> tuple[Any, Any]:
+    """Return `distributed` and `dask`; raise `MissingExtra` where one of the packages that a batch needs is missing."""
     try:
         import cryptography  # noqa: F401  (for the certificates of a local cluster)
         import dask

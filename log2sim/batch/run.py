@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from log2sim.batch.cluster import Workers
+from log2sim.batch.cluster import Workers, import_dask
 from log2sim.batch.discovery import find_logs
 from log2sim.batch.folder import BatchFolder, BatchSettings
 from log2sim.batch.jobs import Job, make_jobs
@@ -106,8 +106,9 @@ def plan_batch(
         For an output folder that holds the logs, something else, or a batch of other settings, and for detectors that could
         search no log.
     MissingExtra
-        Where a detector needs what is not installed.
+        Where a detector, or the batch itself, needs what is not installed.
     """
+    import_dask()
     check_detectors(config)
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ConfigError(f"{out}: holds the logs; choose another folder for the results")

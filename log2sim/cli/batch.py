@@ -41,7 +41,7 @@ def batch(
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     no_cache: NoCache = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Start over: first remove the results that DIR holds.")
+        bool, typer.Option("--overwrite", "-f", help="Start over: first remove the results that DIR holds.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:

@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import AsJson, Cameras, Format, Overwrite, Quiet, Sequence, Verbose, camera_names, say
+from log2sim.cli.options import (
+    AsJson,
+    Cameras,
+    Format,
+    Overwrite,
+    Quiet,
+    Sequence,
+    Verbose,
+    camera_names,
+    say,
+    say_written,
+)
 from log2sim.errors import ConfigError
 
 
@@ -71,7 +82,7 @@ def inspect(
     from log2sim.visualization.overlay.picture import write_overlay
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-    say(f"{overlay}: written", quiet=quiet)
+    say_written(overlay, quiet=quiet)
 
 
 def _summary_of_scenario(path: Path) -> dict[str, Any]:
