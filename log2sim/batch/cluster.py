@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -59,6 +59,11 @@ class Workers:
     def others_than(self, address: str) -> list[str]:
         """Return the addresses of all workers but one."""
         return [a for a in self.client.scheduler_info(n_workers=-1)["workers"] if a != address]
+
+
+def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:
+    """Return so many worker processes on this machine, one for each core by default, or the workers of a scheduler."""
+    return local_workers(jobs or usable_threads()) if scheduler is None else workers_of(scheduler)
 
 
 @contextmanager
