@@ -15,8 +15,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from worlds import tiny_log
 
 import log2sim
+from log2sim.cli import app
+from log2sim.registry import BUILT_IN
 from log2sim.version import FALLBACK, read_version
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -169,6 +172,88 @@ def test_a_wheel_of_the_sdist_works_outside_the_checkout(checkout: Path, tiny_fo
     assert python("-m", "log2sim", "--version") == "1.2.3\n"
     python("-m", "log2sim", "reconstruct", tiny_folder, "--detector", "labels", "--out", away / "s.json", "--quiet")
     assert json.loads((away / "s.json").read_text())["provenance"]["log2sim_version"] == "1.2.3"
+
+
+BASE_ONLY: dict[str, str | None] = {
+    "doctor": None,
+    "config": None,
+    "cache": None,
+    "inspect LOG": None,
+    "inspect LOG --overlay moment.png": None,
+    "inspect BAG": "ros",
+    "inspect FEATHER": "parquet",
+    "validate LOG": None,
+    "convert LOG --stop 0.3 --out part": None,
+    "detect LOG --detector lidar:labels --out boxes.json": None,
+    "map LOG --cell 0.5 --out map.png": None,
+    "reconstruct LOG --detector labels --out s.json": None,
+    "reconstruct LOG --detector labels --poses lidar --out lidar.json": "odometry",
+    "reconstruct LOG --detector ssd-mobilenet-v2 --out ssd.json": "coco",
+    "bench LOG --detector ssd-mobilenet-v2 --out bench": "coco",
+    "bench LOG --stop 0.3 --detector labels --out bench": None,
+    "batch LOG --out batch": "cluster",
+    "batch LOG --out batch --scheduler tcp://127.0.0.1:1": "cluster",
+    "validate s.json": None,
+    "evaluate s.json --truth LOG": None,
+    "evaluate boxes.json --truth LOG": None,
+    "predict s.json": None,
+    "edit s.json --drop-doubtful --out edited.json": None,
+    "replay s.json --out replay.json": None,
+    "replay s.json --simulator carla": "carla",
+    "plot s.json --out plot.svg": None,
+    "plot s.json --out film.mp4 --stop 0.2": None,
+    "view s.json --log LOG --out page.html": None,
+    "synth --traffic vehicle --scenes 1 --out traffic": None,
+    "export s.json --to openscenario --out openscenario": None,
+    "export s.json --to carla --out carla": None,
+    "export s.json --to csv --out csv": None,
+    "export s.json --to scenarionet --out scenarionet": None,
+    "export s.json --to commonroad --out commonroad": None,
+    "export s.json --to osi --out osi": "osi",
+    "export s.json --to mcap --out mcap": "mcap",
+    "export s.json --to rerun --out rerun": "rerun",
+    "import openscenario/scenario.xosc --out imported.json": None,
+}
+"""Commands, and the extra that each needs. LOG, BAG and FEATHER stand for paths."""
+
+
+@pytest.mark.slow
+def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    from log_encoders import ros
+
+    feather = tmp_path / "av2" / "city_SE3_egovehicle.feather"
+    (feather.parent / "calibration").mkdir(parents=True)
+    feather.write_bytes(b"ARROW1\0\0ARROW1")
+    paths = {
+        "LOG": str(tiny_folder),
+        "BAG": str(ros.encode(tiny_log()[0], tmp_path / "bag")),
+        "FEATHER": str(feather.parent),
+    }
+    commands = [[paths.get(word, word) for word in line.split()] for line in BASE_ONLY]
+    program = Path(__file__).with_name("base_only.py")
+    printed = call(
+        sys.executable,
+        program,
+        json.dumps(commands),
+        cwd=tmp_path,
+        LOG2SIM_CACHE=str(tmp_path / "cache"),
+        MPLBACKEND="agg",
+    )
+    wrong = {}
+    for (line, extra), (code, err) in zip(BASE_ONLY.items(), json.loads(printed), strict=True):
+        last = (err.splitlines() or [""])[-1]
+        if (extra is None and code != 0) or (
+            extra is not None and (code != 5 or f"needs the extra '{extra}': pip install" not in last)
+        ):
+            wrong[line] = (code, err[-500:])
+    assert not wrong, "\n".join(f"{line}: {code} {err}" for line, (code, err) in wrong.items())
+    assert {line.split()[0] for line in BASE_ONLY} == {
+        (c.name or c.callback.__name__).rstrip("_") for c in app.registered_commands if c.callback is not None
+    }
+    formats = {line.split()[3] for line in BASE_ONLY if line.startswith("export")}
+    assert formats == set(BUILT_IN["export"])
+    assert not list((tmp_path / "cache").glob("**/*.onnx"))
 
 
 @pytest.mark.slow
