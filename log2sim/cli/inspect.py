@@ -54,10 +54,11 @@ def inspect(
     import json
 
     from log2sim.cli.inspect_tables import describe_log, describe_scenario
-    from log2sim.cli.progress import OPENING, progress
+    from log2sim.cli.progress import progress
     from log2sim.documents import check_targets
     from log2sim.logs.opening import open_log
     from log2sim.logs.summary import summarize
+    from log2sim.visualization.notebook.progress import OPENING
 
     if overlay is None and (at is not None or cameras is not None):
         raise ConfigError("--at and --cameras choose what --overlay FILE.png draws; name the picture too")

@@ -100,9 +100,10 @@ def reconstruct(
     log2sim reconstruct drive.mcap -o s.json --poses auto --stop 20
     log2sim reconstruct pandaset/ --sequence 002 --detector lidar:vehicle -o s.json
     """
-    from log2sim.cli.progress import OPENING, progress
+    from log2sim.cli.progress import progress
     from log2sim.documents import check_targets, write_json
     from log2sim.outputs import together
+    from log2sim.visualization.notebook.progress import OPENING
 
     check_targets(out, report, topdown, overwrite=overwrite)
     changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "seed": seed}
