@@ -307,11 +307,41 @@ def test_sumo_8445_local_plus_offset_are_coordinates_of_the_projection(tmp_path:
     """eclipse-sumo/sumo#8445, #12802; esmini#189; carla#2383: where the local origin lies has to be in the file."""
     export(scenario(agent(bend() + np.array([25_300.0, 0.0]))), "openscenario", tmp_path)
     header = ElementTree.parse(tmp_path / "road.xodr").find("header")
-    assert header.findtext("geoReference") == UTM.projection
     offset = [float(header.find("offset").attrib[k]) for k in "xyz"]
     assert offset == [456000.0 + 25000.0, 5428000.0, 100.0]
     (road,) = roads(tmp_path / "road.xodr")
     assert road.line[0, 0] == pytest.approx(290.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [
+        UTM.projection,
+        "+proj=utm +zone=56 +south +ellps=WGS84 +units=m +no_defs +type=crs",
+        "+proj=tmerc +lat_0=49.0069 +lon_0=8.4037 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs",
+        "+proj=merc +R=6378137 +lon_0=8.4228 +k_0=0.6559 +x_0=0 +y_0=-4117000.7 +units=m +no_defs",
+        "+proj=aeqd +R=6371000 +lat_0=1.29 +lon_0=103.78 +x_0=0 +y_0=0 +units=m +no_defs",
+    ],
+)
+def test_the_geo_reference_gives_latitude_and_longitude_in_the_words_of_esmini(projection: str, tmp_path: Path) -> None:
+    """A position of the road's file has within 1 mm the place that PROJ computes from the scenario."""
+    from pyproj import Geod, Proj
+
+    offset = (456000.0, 5428000.0, 100.0) if "utm" in projection else (0.0, 0.0, 0.0)
+    world = scenario(agent(bend() + np.array([25_300.0, 0.0])), map=MapFrame(projection=projection, offset_m=offset))
+    export(world, "openscenario", tmp_path)
+    header = ElementTree.parse(tmp_path / "road.xodr").find("header")
+    words = dict(word.partition("=")[::2] for word in header.findtext("geoReference").split())
+    known = "a axis b ellps k k_0 lat_0 lon_0 lon_wrap over pm proj units vunits x_0 y_0 datum geoidgrids zone towgs84"
+    assert {w.removeprefix("+") for w in words} <= set(known.split())
+    assert {"+lat_0", "+lon_0"} <= set(words)
+    shift = np.array([float(header.find("offset").attrib[k]) for k in "xy"])
+    (_, x, y, *_), *_ = play(tmp_path / "scenario.xosc")["ego"].vertices
+    own = Proj(header.findtext("geoReference"))(x + shift[0], y + shift[1], inverse=True)
+    to_scenario = shift - offset[:2]
+    truth = Proj(projection)(x + to_scenario[0] + offset[0], y + to_scenario[1] + offset[1], inverse=True)
+    assert Geod(ellps="WGS84").inv(*own, *truth)[2] < 1e-3
+    assert abs(own[1]) > 1
 
 
 def test_scenarionet_103_the_shift_is_in_the_files_and_undone_by_an_import(tmp_path: Path) -> None:

@@ -15,7 +15,10 @@ from log2sim.export.checks import require_exportable
 from log2sim.output_folders import unfinished_folder
 from log2sim.outputs import expect_new, place_all, temporary_beside, written_meanwhile
 
-__all__ = ["Exporter", "Options", "export", "formats"]
+__all__ = ["EXTERNAL", "Exporter", "Options", "export", "formats"]
+
+EXTERNAL = "external"
+"""As the ego of an export: another program drives it, from its place and speed in the scenario."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,15 @@ class Options:
         "exact" or "pid", for scripts that move agents.
     log : Log or None
         The opened log, for formats that also hold its images and points.
+    ego : str or None
+        `EXTERNAL`, for an ego without a trajectory.
     """
 
     revision: str | None = None
     map: Path | None = None
     mode: str | None = None
     log: Log | None = None
+    ego: str | None = None
 
 
 class Exporter(Protocol):

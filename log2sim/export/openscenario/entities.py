@@ -51,8 +51,8 @@ PEDESTRIAN_MASS_KG = 75.0
 WHEELBASE_SHARE, TRACK_SHARE = 0.6, 0.85
 
 
-def add_entity(parent: Element, agent: Agent, name: str, minor: int) -> None:
-    """Add the `ScenarioObject` of an agent for revision 1.`minor`."""
+def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external: bool = False) -> None:
+    """Add the `ScenarioObject` of an agent for revision 1.`minor`; an `external` one is driven from outside."""
     scenario_object = element("ScenarioObject", parent, name=name)
     if agent.category == "pedestrian":
         about = {"model": "walker"} if minor == 0 else {}  # required by 1.0, deprecated since
@@ -65,7 +65,12 @@ def add_entity(parent: Element, agent: Agent, name: str, minor: int) -> None:
         body = element("Vehicle", scenario_object, name=agent.category, vehicleCategory=kind.category)
         _add_box(body, agent)
         _add_limits(body, agent, kind)
-    _add_properties(body, agent)
+    _add_properties(body, agent, minor)
+    if external and minor > 0:
+        controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
+        properties = element("Properties", controller)
+        element("Property", properties, name="esminiController", value="ExternalController")
+        element("Property", properties, name="useGhost", value="false")
 
 
 def _add_box(parent: Element, agent: Agent) -> None:
@@ -93,12 +98,13 @@ def _add_limits(parent: Element, agent: Agent, kind: VehicleDefaults) -> None:
     element("RearAxle", axles, maxSteering="0", positionX="0", **shared)
 
 
-def _add_properties(parent: Element, agent: Agent) -> None:
-    """Add the properties that players use (`type` and `color` as in ScenarioRunner), then those for an import."""
+def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
+    """Add the properties that players use (`type` of ScenarioRunner, `color` in its form or esmini's), then those for an import."""
     w = agent.waypoints
     values = {"type": "ego_vehicle" if agent.id == "ego" else "simulation"}
     if agent.color is not None:
-        values["color"] = ",".join(str(int(v)) for v in agent.color["rgb"])
+        rgb = [int(v) for v in agent.color["rgb"]]
+        values["color"] = ",".join(map(str, rgb)) if minor == 0 else "#" + "".join(f"{v:02X}" for v in rgb)
         values[PREFIX + "color_name"] = escaped(str(agent.color["name"]))
     values |= {
         PREFIX + "id": escaped(agent.id),

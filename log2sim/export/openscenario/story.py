@@ -65,6 +65,8 @@ class AgentStory:
         Whether it is absent before and after the vertices.
     hidden_m : float
         How far below it waits in revisions without spawning.
+    external : bool
+        Whether it is driven from outside: it gets a place and a speed at the start, and nothing else.
     """
 
     name: str
@@ -73,6 +75,7 @@ class AgentStory:
     enters: bool
     leaves: bool
     hidden_m: float = HIDDEN_DEPTH_M
+    external: bool = False
 
     @property
     def first_s(self) -> float:
@@ -129,9 +132,12 @@ def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float
     for story in stories:
         if not story.enters or not revision.spawns:
             _add_start(actions, story)
+        if story.external:
+            _add_external_control(actions[-1], revision)
     act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
     for story in stories:
-        _add_group(act, story, revision)
+        if not story.external:
+            _add_group(act, story, revision)
     _add_trigger(act, "StartTrigger", "at the start", 0.0, revision)
     _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, revision)
 
@@ -141,6 +147,20 @@ def _add_start(actions: Element, story: AgentStory) -> None:
     below_m = story.hidden_m if story.enters else 0.0
     _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
     _add_speed(private, "PrivateAction", 0.0 if story.enters else story.speed_mps)
+
+
+def _add_external_control(private: Element, revision: Revision) -> None:
+    """Hand the control over: to who reports states to esmini from 1.1 on, to who drives the vehicle in CARLA in 1.0."""
+    control = element("ControllerAction", element("PrivateAction", private))
+    if revision.minor > 0:
+        element("ActivateControllerAction", control, longitudinal="true", lateral="true")
+        return
+    controller = element("Controller", element("AssignControllerAction", control), name="external control")
+    element("Property", element("Properties", controller), name="module", value="external_control")
+    overridden = element("OverrideControllerValueAction", control)
+    for pedal in ("Throttle", "Brake", "Clutch", "ParkingBrake", "SteeringWheel"):
+        element(pedal, overridden, value="0", active="false")
+    element("Gear", overridden, number="0", active="false")
 
 
 def _add_group(act: Element, story: AgentStory, revision: Revision) -> None:

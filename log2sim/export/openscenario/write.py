@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import EGO, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.checks import require_start_as_in_scenario
-from log2sim.export.exporters import Options
+from log2sim.export.exporters import EXTERNAL, Options
 from log2sim.export.openscenario.entities import add_entity
-from log2sim.export.openscenario.story import Revision, add_storyboard, agent_stories, start_poses
+from log2sim.export.openscenario.story import SAME_TIME_S, Revision, add_storyboard, agent_stories, start_poses
 from log2sim.export.placement import ExportPlacement
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
@@ -27,7 +28,7 @@ NEWEST = "1.2"
 class OpenScenario:
     """`scenario.xosc` and its road."""
 
-    options: tuple[str, ...] = ("revision", "map")
+    options: tuple[str, ...] = ("revision", "map", "ego")
     loses = (
         "states of traffic lights, confidences of lanes and markings, cameras, quality, stages and provenance; players take a"
         " cyclist for a bicycle and what is 'other' for a van (an import does not), and ScenarioRunner takes over no sizes"
@@ -39,18 +40,37 @@ class OpenScenario:
         if revision is None:
             known = ", ".join(REVISIONS)
             raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
+        external = options.ego is not None
+        if external:
+            _require_drivable_ego(scenario, str(options.ego))
         road, placement = add_road_file(scenario, folder, options.map)
-        write(document(scenario, road, placement, revision), folder / "scenario.xosc")
+        write(document(scenario, road, placement, revision, external=external), folder / "scenario.xosc")
 
 
 EXPORTER = OpenScenario()
 
 
-def document(scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision) -> Element:
-    """Return the document of a scenario whose road is in the file `road` beside it."""
+def _require_drivable_ego(scenario: Scenario, driver: str) -> None:
+    """Raise unless there is an ego on wheels from the start, which another program can drive."""
+    if driver != EXTERNAL:
+        raise ConfigError(f"--ego {driver}: expected '{EXTERNAL}', an ego that another program drives")
+    ego = scenario.ego
+    if ego is None or ego.category == "pedestrian":
+        raise ConfigError(f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
+    if ego.waypoints.t_s[0] > SAME_TIME_S:
+        first_s = float(ego.waypoints.t_s[0])
+        raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
+
+
+def document(
+    scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision, *, external: bool = False
+) -> Element:
+    """Return the document of a scenario whose road is in the file `road` beside it; an `external` ego is driven from outside."""
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
     stories = agent_stories(scenario.agents, names, duration_s, placement)
+    driven = [external and agent.id == EGO for agent in scenario.agents]
+    stories = [replace(story, external=flag) for story, flag in zip(stories, driven)]
     require_start_as_in_scenario(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
     root = element("OpenSCENARIO")
     element(
@@ -61,8 +81,8 @@ def document(scenario: Scenario, road: str, placement: ExportPlacement, revision
     element("CatalogLocations", root)
     element("LogicFile", element("RoadNetwork", root), filepath=road)
     entities = element("Entities", root)
-    for agent, name in zip(scenario.agents, names):
-        add_entity(entities, agent, name, revision.minor)
+    for agent, name, flag in zip(scenario.agents, names, driven):
+        add_entity(entities, agent, name, revision.minor, external=flag)
     add_storyboard(root, stories, duration_s, revision)
     return root
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import MapFrame, Scenario
 from log2sim.errors import ConfigError
-from log2sim.export.placement import ExportPlacement, near_origin, on_map
+from log2sim.export.placement import ExportPlacement, geo_reference, near_origin, on_map
 from log2sim.export.roads.checks import require_roads
 from log2sim.export.roads.lanes import lanes
 from log2sim.export.roads.marks import MarkFinder, RoadMark
@@ -107,7 +107,7 @@ def document(scenario: Scenario, placement: ExportPlacement) -> Element:
 def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> None:
     """Add the geographic reference: projected coordinates are those of the file plus its offset."""
     if frame.projection is not None:
-        element("geoReference", header).text = frame.projection
+        element("geoReference", header).text = geo_reference(frame.projection)
     x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
     if (x, y, z) != (0.0, 0.0, 0.0):
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
