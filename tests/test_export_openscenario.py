@@ -176,11 +176,11 @@ def test_an_external_ego_has_to_be_there_on_wheels_from_the_start(tmp_path: Path
         export(scenario(agent(line())), "csv", tmp_path, Options(ego="external"))
     scenario(agent(line())).save(tmp_path / "s.json")
     result = run("export", tmp_path / "s.json", "--to", "openscenario", "--ego", "external", "--out", tmp_path / "out")
-    assert result.exit_code == 0
+    assert result.code == 0
     assert len(play(tmp_path / "out" / "scenario.xosc")["ego"].vertices) == 0
     scenario(agent(line(), "external")).save(tmp_path / "named.json")
     result = run("export", tmp_path / "named.json", "--to", "csv", "--ego", "external", "--out", tmp_path / "csv")
-    assert result.exit_code == 0
+    assert result.code == 0
 
 
 def test_ids_become_unique_names_and_stay_known(tmp_path: Path) -> None:

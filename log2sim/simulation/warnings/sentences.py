@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from log2sim.datatypes import EGO
 from log2sim.simulation.warnings.warning import CollisionWarning, Warnings
 
 MAX_LISTED = 5
@@ -14,8 +15,9 @@ def describe_warnings(warnings: Warnings) -> str:
     whose = (
         _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not distinguish by end"
     )
+    others = "agents" if any(w.driver != EGO for w in warnings.events) else "other agents"
     lines = [
-        f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}: they know {warnings.known_agents} of {warnings.agents} other agents"
+        f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}: they know {warnings.known_agents} of {warnings.agents} {others}"
     ]
     lines += [f"  {describe_warning(w, warnings)}" for w in warnings.events[:MAX_LISTED]]
     if len(warnings.events) > MAX_LISTED:
@@ -43,11 +45,15 @@ def describe_briefly(warning: CollisionWarning) -> str:
     """Say who is warned of, when, and how soon and how far off the collision is."""
     at = warning.warned
     if at is None or warning.ttc_s is None:
-        return f"{warning.agent}: no warning before the collision at {warning.begin_s:.2f} s"
+        return f"{_pair(warning)}: no warning before the collision at {warning.begin_s:.2f} s"
     return (
-        f"{warning.agent}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
+        f"{_pair(warning)}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
         f"{warning.probability:.2f}, {at.distance_m:.1f} m apart"
     )
+
+
+def _pair(warning: CollisionWarning) -> str:
+    return warning.agent if warning.driver == EGO else f"{warning.driver} and {warning.agent}"
 
 
 def _braking(warning: CollisionWarning, warnings: Warnings) -> str:
@@ -56,8 +62,9 @@ def _braking(warning: CollisionWarning, warnings: Warnings) -> str:
         return ""
     verdict = "braking suffices" if warning.braking_suffices else "braking comes too late"
     needed = "" if warning.needed_mps2 is None else f", {warning.needed_mps2:.1f} m/s2 would be needed"
+    driver = "The ego" if warning.driver == EGO else warning.driver
     return (
-        f"The ego drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the collision, and stands after "
+        f"{driver} drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the collision, and stands after "
         f"{at.stopping_m:.1f} m ({warnings.reaction_s:g} s to react, then {warnings.brake_mps2:g} m/s2): {verdict}{needed}."
     )
 

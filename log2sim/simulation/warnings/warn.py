@@ -1,9 +1,10 @@
-"""Warns of collisions with the ego of a scenario or of its replay."""
+"""Warns of collisions in a scenario or in its replay: the ego, or without one each vehicle."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import fields, replace
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +14,12 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.prediction.motion_table import TICK_S, table_of
 from log2sim.simulation.result import Replay, to_scenario
+from log2sim.simulation.vehicles.parameters import WHEELED
 from log2sim.simulation.warnings.ego_path import EgoStates
 from log2sim.simulation.warnings.known import ends_of, known_agents, observed_spans
 from log2sim.simulation.warnings.settings import WarningSettings
 from log2sim.simulation.warnings.warning import CollisionWarning, Moment, Warnings
-from log2sim.simulation.warnings.watch import Courses, Watch
+from log2sim.simulation.warnings.watch import MIN_EGO_MPS, Courses, Watch
 
 BRAKING_SEEN_S = 0.3
 """The ego's deceleration is that of its speed over this time: three ticks give it to 0.5 m/s2 where a speed is good to 0.1 m/s."""
@@ -31,7 +33,7 @@ _DIGITS = 3
 def warn(
     scenario: Scenario, replay: Replay | None = None, *, ends: str = "both", settings: WarningSettings | None = None
 ) -> Warnings:
-    """Find the agents on a collision course with the ego: since when they are known, and when they are warned of.
+    """Find the agents on a collision course with the ego, or without one with any vehicle: since when they are known, and when they are warned of.
 
     Parameters
     ----------
@@ -47,38 +49,63 @@ def warn(
     Raises
     ------
     ConfigError
-        For a scenario without an ego, or unknown ends.
+        For a scenario without an ego and without vehicles that move, or unknown ends.
 
     Notes
     -----
     At every tick of 0.1 s agents are expected where `log2sim.prediction` sees them by what the ends have observed up to then, and
     the ego on its path at its speed, or braking as it does. An agent with which the ego collides by that, with at least
     `min_probability` within `horizon_s`, is warned of from when the ego has to react within `margin_s`. Nothing later is used but the ego's path: its route. States of a
-    reconstruction were smoothed over the whole log, so that they depend a little on what came next.
+    reconstruction were smoothed over the whole log, so that they depend a little on what came next. In scenarios without an ego
+    every vehicle that moves is warned as the ego would be, on a route of its own, while the ends know it.
     """
     settings = replace(settings or WarningSettings(), ends=ends)
+    drivers = warnable(scenario)
     moved = to_scenario(replay, scenario) if replay is not None else scenario
-    if scenario.ego is None or moved.ego is None:
-        raise ConfigError(f"warnings: scenario '{scenario.name}' has no agent '{EGO}' that could be warned")
+    now = {a.id: a for a in moved.agents}
     table = table_of(moved)
-    ticks = np.flatnonzero(table.present[[a.id for a in moved.agents].index(EGO)])
-    watch = Watch(scenario, moved.others, settings, table.t_s)
-    drive = _Drive(watch, ego_states(moved.ego, watch, table.t_s[ticks]), table.t_s[ticks])
-    events = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), _collisions(replay), drive)
-    if len(ends_of(scenario)) > 1:
-        sources = {a.id: a for a in scenario.agents}
-        events = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in events]
-    driven_s = float((np.abs(drive.ego.speed_mps[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
+    everybody = Watch(scenario, moved.others, settings, table.t_s)
+    collisions = _collisions(replay, {driver.id for driver in drivers})
+    sources = {a.id: a for a in scenario.agents}
+    events, driven_s = [], 0.0
+    for driver in drivers:
+        watch = everybody.of_driver(driver)
+        ticks = np.flatnonzero(table.present[list(now).index(driver.id)])
+        drive = _Drive(watch, ego_states(now[driver.id], watch, table.t_s[ticks]), table.t_s[ticks], driver.id)
+        own = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), collisions.get(driver.id, {}), drive)
+        if len(ends_of(scenario)) > 1:
+            own = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in own]
+        events += own
+        driven_s += float((np.abs(drive.ego.speed_mps[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
     used = {f.name: getattr(settings, f.name) for f in fields(settings)}
-    in_order = tuple(sorted(events, key=lambda e: (e.begin_s, e.agent)))
+    in_order = tuple(sorted(_once(events), key=lambda e: (e.begin_s, e.driver, e.agent)))
     return Warnings(
         tells_ends=bool(ends_of(scenario)),
-        agents=len(watch.table.agents),
-        known_agents=int(np.isfinite(watch.known.since_s).sum()),
+        agents=len(everybody.table.agents),
+        known_agents=int(np.isfinite(everybody.known.since_s).sum()),
         driven_s=round(driven_s, 1),
         events=in_order,
         **used,
     )
+
+
+def warnable(scenario: Scenario) -> list[Agent]:
+    """Return who is warned: the ego, or in a scenario without one the vehicles that move.
+
+    Raises
+    ------
+    ConfigError
+        When there is nobody.
+    """
+    if scenario.ego is not None:
+        return [scenario.ego]
+    wheeled = [a for a in scenario.agents if a.category in WHEELED and not a.static]
+    drivers = [a for a in wheeled if np.abs(a.waypoints.speed_mps).max(initial=0.0) >= MIN_EGO_MPS]
+    if not drivers:
+        raise ConfigError(
+            f"warnings: scenario '{scenario.name}' has no agent '{EGO}' and no vehicle that moves, so nobody could be warned"
+        )
+    return drivers
 
 
 def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:
@@ -97,6 +124,7 @@ class _Drive(NamedTuple):
     watch: Watch
     ego: EgoStates
     t_s: Array
+    driver: str
 
     def moment(self, agent: int, t_s: float) -> Moment:
         """Compute how far the ego and an agent are from each other at a time."""
@@ -112,10 +140,10 @@ class _Drive(NamedTuple):
         return Moment(*(round(v, _DIGITS) for v in (t_s, gap_m, abs(own_speed), stopping_m)))
 
     def known(self, agent: int) -> Moment | None:
-        """Compute the same for when an agent is first known; None where it never is, or while there was no ego."""
-        since_s = float(self.watch.known.since_s[agent])
-        there = self.t_s[0] - TICK_S <= since_s <= self.t_s[-1] + TICK_S
-        return self.moment(agent, since_s) if there else None
+        """Compute the same for when an agent is first known, and who is warned, too, and there; None where that never is."""
+        own = [] if self.watch.own is None else [self.watch.own]
+        since_s = max(float(self.t_s[0]), *self.watch.known.since_s[[agent, *own]].tolist())
+        return self.moment(agent, since_s) if since_s <= self.t_s[-1] + TICK_S else None
 
 
 def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
@@ -129,6 +157,7 @@ def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
         event = CollisionWarning(
             agent=who.id,
             category=who.category,
+            driver=drive.driver,
             known=drive.known(agent),
             warned=moment,
             probability=round(float(found.probability[first]), _DIGITS),
@@ -156,13 +185,15 @@ def _spans(t_s: Array) -> tuple[tuple[float, float], ...]:
     return tuple((round(float(t_s[a]), _DIGITS), round(float(t_s[b]), _DIGITS)) for a, b in zip(first, last))
 
 
-def _collisions(replay: Replay | None) -> Mapping[str, float]:
-    """Return when the ego first touches others in a replay, by id; boxes that overlap from the start have not collided."""
-    touched: dict[str, float] = {}
+def _collisions(replay: Replay | None, drivers: Set[str]) -> dict[str, dict[str, float]]:
+    """Return when drivers first touch others in a replay, by both ids; boxes that overlap from the start have not collided."""
+    touched: dict[str, dict[str, float]] = {}
     for event in () if replay is None else replay.metrics.get("collisions", ()):
-        if EGO in event["agents"] and not event.get("from_start", False):
-            (other,) = (i for i in event["agents"] if i != EGO)
-            touched[other] = min(touched.get(other, np.inf), round(float(event["t_s"]), _DIGITS))
+        if not event.get("from_start", False):
+            for driver, other in permutations(event["agents"], 2):
+                if driver in drivers:
+                    own = touched.setdefault(driver, {})
+                    own[other] = min(own.get(other, np.inf), round(float(event["t_s"]), _DIGITS))
     return touched
 
 
@@ -175,8 +206,18 @@ def _with_collisions(
     for agent in hit.keys() - {e.agent for e in out}:
         k = row[agent]
         category = drive.watch.table.agents[k].category
-        out.append(CollisionWarning(agent, category, drive.known(k), collision_s=hit[agent]))
+        out.append(CollisionWarning(agent, category, drive.known(k), driver=drive.driver, collision_s=hit[agent]))
     return out
+
+
+def _once(events: Iterable[CollisionWarning]) -> list[CollisionWarning]:
+    """Leave out collisions without a warning of pairs that are there already: two vehicles may both be drivers."""
+    out: dict[Set[str], list[CollisionWarning]] = {}
+    for event in sorted(events, key=lambda e: e.warned is None):
+        pair = out.setdefault(frozenset((event.driver, event.agent)), [])
+        if event.warned is not None or not pair:
+            pair.append(event)
+    return [event for pair in out.values() for event in pair]
 
 
 def _known_by(agent: Agent, t_s: Array, interval_s: float) -> dict[str, float]:

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Self
 
+from log2sim.datatypes import EGO
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -29,7 +31,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class CollisionWarning:
-    """What is known of an agent on a collision course with the ego.
+    """What is known of an agent on a collision course with the ego, or with another vehicle that is warned in its place.
 
     Attributes
     ----------
@@ -54,6 +56,8 @@ class CollisionWarning:
         While it is warned of.
     collision_s : float or None, s
         When the ego touches it in the replay.
+    driver : str
+        Who is warned: the ego, or a vehicle of a scenario without one.
     """
 
     agent: str
@@ -68,6 +72,7 @@ class CollisionWarning:
     braking_suffices: bool = False
     spans_s: tuple[tuple[float, float], ...] = ()
     collision_s: float | None = None
+    driver: str = EGO
 
     @property
     def begin_s(self) -> float:
@@ -95,9 +100,9 @@ class Warnings:
     horizon_s, min_probability, early_probability, margin_s, reaction_s, brake_mps2 : float
         As in `WarningSettings`.
     agents, known_agents : int
-        Other agents, and how many of them the ends get to know.
+        Agents without the ego, and how many of them the ends get to know.
     driven_s : float, s
-        For how long the ego moved.
+        For how long the ego moved, or all together who are warned in its place.
     events : tuple of CollisionWarning
     """
 

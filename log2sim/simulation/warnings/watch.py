@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EGO, STANDSTILL_MPS, Agent, Scenario
-from log2sim.errors import ConfigError
+from log2sim.datatypes import STANDSTILL_MPS, Agent, Scenario
 from log2sim.geometry import Array
 from log2sim.prediction.motion_table import TICK_S, Complex, tabulate
 from log2sim.simulation.warnings.contact import expected_contacts
@@ -56,36 +56,42 @@ class Courses(NamedTuple):
 
 
 class Watch:
-    """All other agents of a scenario, and what chosen ends know of them at common ticks.
+    """All agents of a scenario that somebody may be warned of, and what chosen ends know of them at common ticks.
+
+    The ego is warned; `of_driver` gives the same watch for another vehicle.
 
     Parameters
     ----------
     scenario : Scenario
-        With an ego, and what was observed when.
+        With what was observed when.
     agents : sequence of Agent
-        The other agents, where they are: as in the scenario, or in a replay of it.
+        All but the ego, where they are: as in the scenario, or in a replay of it.
     settings : WarningSettings
     t_s : (T,) float64, s
         Ticks, `TICK_S` apart.
-
-    Raises
-    ------
-    ConfigError
-        For a scenario without an ego.
     """
 
+    ego_path: EgoPath
+
     def __init__(self, scenario: Scenario, agents: Sequence[Agent], settings: WarningSettings, t_s: Array) -> None:
-        if scenario.ego is None:
-            raise ConfigError(f"warnings: scenario '{scenario.name}' has no agent '{EGO}' that could be warned")
         self.settings, self.interval_s = settings, observation_interval_s(scenario)
         source = {a.id: a for a in scenario.agents}
         spans = [observed_spans(source[a.id], settings.used_ends) for a in agents]
         self.table = tabulate(agents, t_s, TICK_S)
         self.known = known_agents(agents, spans, t_s, self.interval_s, self.table.present)
-        self.ego_path = EgoPath(scenario.ego)
+        self.own: int | None = None
+        if scenario.ego is not None:
+            self.ego_path = EgoPath(scenario.ego)
         self._expected = ExpectedAgents(self.table, self.known, self.interval_s, settings.horizon_s)
         self._height_m = np.array([a.size_m[2] for a in agents])
         self._radius_m = np.array([np.hypot(*a.size_m[:2]) / 2 for a in agents])
+
+    def of_driver(self, driver: Agent) -> Watch:
+        """Return a watch that warns a vehicle of the scenario in place of the ego, while the ends know it."""
+        view = copy(self)
+        view.ego_path = EgoPath(driver)
+        view.own = next((k for k, a in enumerate(self.table.agents) if a.id == driver.id), None)
+        return view
 
     def courses(self, ego: EgoStates, ticks: Index, seen: tuple[Complex, Array] | None = None) -> Courses:
         """Find who may collide with the ego, whose states are those at ticks (T,).
@@ -100,6 +106,8 @@ class Watch:
         """
         row, agent = np.nonzero(self.known.source[:, ticks].T >= 0)
         kept = np.abs(ego.speed_mps[row]) >= MIN_EGO_MPS
+        if self.own is not None:
+            kept &= (agent != self.own) & (self.known.source[self.own, ticks[row]] >= 0)
         row, agent = row[kept], agent[kept]
         kept = self._may_meet(ego.take(row), agent, ticks[row])
         row, agent = row[kept], agent[kept]
