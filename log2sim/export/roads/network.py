@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from log2sim.datatypes import MapLane
-from log2sim.export.roads.road import Link, Road, connecting_road, cross_heading, road_of_lanes
+from log2sim.export.roads.cutting import ALIGNED_M, cut_together, is_connection
+from log2sim.export.roads.road import Link, Road, connecting_road, cross_heading, road_of_lanes, surest, turned
 from log2sim.lanes.graph.polyline import Polyline
-
-ALIGNED_M = 0.3
-"""Lanes side by side whose ends are farther apart along the road than this are roads of their own."""
 
 
 @dataclass(frozen=True)
@@ -34,42 +32,66 @@ class Network:
     connections: tuple[Connection, ...]
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a lane is: in which road, as which lane of it, and whether it leads along it."""
+
+    road: int
+    lane: int
+
+    @property
+    def start(self) -> int:
+        """Return the end of the road, 0 or -1, at which the lane starts."""
+        return 0 if self.lane < 0 else -1
+
+    @property
+    def end(self) -> int:
+        """Return the end of the road, 0 or -1, at which the lane ends."""
+        return -1 - self.start
+
+
 def build_network(lanes: Sequence[MapLane]) -> Network:
     """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
+    lanes = cut_together(lanes)
     by_id = {lane.id: lane for lane in lanes}
-    crossing = {lane.id for lane in lanes if _is_connection(lane, by_id)}
-    groups = _groups([lane for lane in lanes if lane.id not in crossing], by_id)
-    place = {lane.id: (k + 1, -1 - row) for k, group in enumerate(groups) for row, lane in enumerate(group)}
-    place |= {name: (len(groups) + k + 1, -1) for k, name in enumerate(sorted(crossing, key=list(by_id).index))}
-    names = list(dict.fromkeys(str(by_id[name].junction) for name in by_id if name in crossing))
+    crossing = {lane.id for lane in lanes if is_connection(lane, by_id)}
+    sides = _with_opposites(_groups([lane for lane in lanes if lane.id not in crossing], by_id))
+    plain = {k + 1: pair for k, pair in enumerate(sides)}
+    place = {}
+    for number, (group, opposite) in plain.items():
+        place |= {lane.id: _Place(number, -1 - row) for row, lane in enumerate(group)}
+        place |= {lane.id: _Place(number, 1 + row) for row, lane in enumerate(opposite)}
+    inside = sorted(crossing, key=list(by_id).index)
+    place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
+    names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
-    plain = {k + 1: group for k, group in enumerate(groups)}
     headings = _shared_headings(plain, place, by_id)
     roads, ends = [], {}
-    for number, group in plain.items():
-        before, after = (_link(group, place, by_id, number_of, way) for way in ("predecessors", "successors"))
+    for number, (group, opposite) in plain.items():
+        before, after = (_link([*group, *opposite], place, by_id, number_of, at) for at in (0, -1))
         road, own = road_of_lanes(
-            number, group, (headings.get((number, 0)), headings.get((number, -1))), (before is None, after is None)
+            number,
+            group,
+            opposite,
+            (headings.get((number, 0)), headings.get((number, -1))),
+            (before is None, after is None),
         )
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
     connections = []
-    for name in sorted(crossing, key=list(by_id).index):
+    for name in inside:
         lane = by_id[name]
         origin, target = lane.predecessors[0], lane.successors[0]
-        road = connecting_road(place[name][0], lane, ends[origin, -1], ends[target, 0])
-        links = [Link("road", place[other][0], {-1: place[other][1]}) for other in (origin, target)]
+        one, two = place[origin], place[target]
+        road = connecting_road(place[name].road, lane, ends[origin, -1], ends[target, 0])
+        before, after = (
+            Link("road", one.road, {-1: one.lane}, one.end),
+            Link("road", two.road, {-1: two.lane}, two.start),
+        )
         junction = number_of[str(lane.junction)]
-        roads.append(replace(road, junction=junction, before=links[0], after=links[1]))
-        connections.append(Connection(junction, place[origin][0], road.number, place[origin][1]))
+        roads.append(replace(road, junction=junction, before=before, after=after))
+        connections.append(Connection(junction, one.road, road.number, one.lane))
     return Network(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
-
-
-def _is_connection(lane: MapLane, by_id: Mapping[str, MapLane]) -> bool:
-    """Whether a lane of a junction leads from one lane outside to another."""
-    if lane.junction is None or len(lane.predecessors) != 1 or len(lane.successors) != 1:
-        return False
-    return all(by_id[name].junction is None for name in (*lane.predecessors, *lane.successors))
 
 
 def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list[MapLane]]:
@@ -94,6 +116,21 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
     return found
 
 
+def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane], list[MapLane]]]:
+    """Join groups whose leftmost lanes lead opposite ways side by side; the reference line will be that of the surest lane."""
+    by_left = {group[0].id: group for group in groups}
+    found, taken = [], set()
+    for group in groups:
+        if group[0].id in taken:
+            continue
+        other = by_left.get(str(group[0].opposite), [])
+        if other and (other[0].opposite != group[0].id or not _aligned(group[0], turned(other[0]))):
+            other = []
+        taken |= {lane[0].id for lane in (group, other) if lane}
+        found.append((group, other) if surest([*group, *other]) in group else (other, group))
+    return found
+
+
 def _aligned(one: MapLane, two: MapLane) -> bool:
     """Whether two lanes begin and end at the same line across the road."""
     for at in (0, -1):
@@ -106,46 +143,62 @@ def _aligned(one: MapLane, two: MapLane) -> bool:
 
 def _link(
     group: Sequence[MapLane],
-    place: Mapping[str, tuple[int, int]],
+    place: Mapping[str, _Place],
     by_id: Mapping[str, MapLane],
     number_of: Mapping[str, int],
-    way: str,
+    at: int,
 ) -> Link | None:
-    """Return what follows a road: a junction, the one road to which its lanes go on and from which no other comes, or None."""
-    back = "successors" if way == "predecessors" else "predecessors"
-    names = [(lane, name) for lane in group for name in getattr(lane, way)]
+    """Return what adjoins a road at its start (0) or end (-1).
+
+    That is a junction, the one road with which its lanes are linked there one to one, and no others there, or None.
+    """
+    names = _linked(group, place, at)
     for _, name in names:
-        junction = by_id[name].junction
-        if _is_connection(by_id[name], by_id):
-            return Link("junction", number_of[str(junction)])
-    roads = {place[name][0] for _, name in names}
-    if (
-        len(roads) != 1
-        or len({lane.id for lane, _ in names}) < len(names)
-        or len({name for _, name in names}) < len(names)
-    ):
+        if is_connection(by_id[name], by_id):
+            return Link("junction", number_of[str(by_id[name].junction)])
+    own = place[group[0].id].road
+    there = {(place[name].road, _met_at(lane, name, place, at)) for lane, name in names}
+    if len(there) != 1 or any(len(set(side)) < len(names) for side in zip(*((a.id, b) for a, b in names))):
         return None
-    (number,) = roads
-    others = [lane for name, lane in by_id.items() if place[name][0] == number]
-    sources = {place[name][0] for lane in others for name in getattr(lane, back)}
-    if sources != {place[group[0].id][0]} or any(len(getattr(lane, back)) > 1 for lane in others):
+    ((number, point),) = there
+    others = [lane for name, lane in by_id.items() if place[name].road == number]
+    back = {(name, lane.id) for lane, name in _linked(others, place, point)}
+    if back != {(lane.id, name) for lane, name in names} or number == own:
         return None
-    return Link("road", number, {place[lane.id][1]: place[name][1] for lane, name in names})
+    return Link("road", number, {place[lane.id].lane: place[name].lane for lane, name in names}, point)
+
+
+def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> list[tuple[MapLane, str]]:
+    """Return the lanes of a road with those that adjoin them at its start (0) or end (-1)."""
+    return [
+        (lane, name) for lane in group for name in (lane.successors if place[lane.id].end == at else lane.predecessors)
+    ]
+
+
+def _met_at(lane: MapLane, name: str, place: Mapping[str, _Place], at: int) -> int:
+    """Return at which end, 0 or -1, of its road a lane adjoins another one whose road meets it at `at`."""
+    return place[name].start if place[lane.id].end == at else place[name].end
 
 
 def _shared_headings(
-    plain: Mapping[int, Sequence[MapLane]], place: Mapping[str, tuple[int, int]], by_id: Mapping[str, MapLane]
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
 ) -> dict[tuple[int, int], float]:
     """Return the headings of cross sections where two roads meet, by road and end (0 or -1)."""
     found: dict[tuple[int, int], float] = {}
-    for number, group in plain.items():
-        for lane in group:
+    across = {number: [*map(turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
+    for number, sides in plain.items():
+        for lane in (*sides[0], *sides[1]):
             for name in lane.successors:
-                if by_id[name].junction is not None or (number, -1) in found:
+                one, two = place[lane.id], place[name]
+                if two.road not in plain or (number, one.end) in found or (two.road, two.start) in found:
                     continue
-                other = place[name][0]
-                one, two = cross_heading(group, -1), cross_heading(plain[other], 0)
-                turn = float(np.angle(np.exp(1j * (two - one))))
-                share = 0.5 if (len(group) > 1) == (len(plain[other]) > 1) else 0.0 if len(group) > 1 else 1.0
-                found[number, -1] = found[other, 0] = one + share * turn
+                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
+                first = cross_heading(across[number], one.end) + turns[0]
+                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
+                wide = [len(across[k]) > 1 for k in (number, two.road)]
+                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
+                found[number, one.end] = first + share * turn - turns[0]
+                found[two.road, two.start] = first + share * turn - turns[1]
     return found

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import MapFrame, Scenario
+from log2sim.datatypes import MapFrame, MapLane, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.placement import ExportPlacement, geo_reference, near_origin, on_map
 from log2sim.export.roads.checks import require_roads
@@ -18,6 +18,7 @@ from log2sim.export.roads.network import Network, build_network
 from log2sim.export.roads.road import Road
 from log2sim.export.roads.road_objects import RoadObjects, add_objects, add_signals
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
+from log2sim.geometry import Array
 
 FILE_NAME = "road.xodr"
 # Positions to 10 nm and angles to 1e-12 rad: no checker finds a gap between consecutive pieces.
@@ -116,13 +117,13 @@ def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> 
 def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> Element:
     x0, y0, z0 = placement.origin_m
     parent = element(
-        "road", root, name=escaped(" ".join(lane.id for lane in road.lanes)), length=number(road.line.length_m, LENGTH_DIGITS),
+        "road", root, name=escaped(" ".join(lane.id for lane in (*road.opposite[::-1], *road.lanes))), length=number(road.line.length_m, LENGTH_DIGITS),
         id=str(road.number), junction=str(road.junction or -1), rule="RHT",
     )  # fmt: skip
     links = element("link", parent)
-    for tag, link, point in (("predecessor", road.before, "end"), ("successor", road.after, "start")):
+    for tag, link in (("predecessor", road.before), ("successor", road.after)):
         if link is not None:
-            there = {"contactPoint": point} if link.kind == "road" else {}
+            there = {"contactPoint": "end" if link.point else "start"} if link.kind == "road" else {}
             element(tag, links, elementType=link.kind, elementId=str(link.number), **there)
     plan = element("planView", parent)
     for piece in road.line.pieces:
@@ -143,23 +144,31 @@ def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: Mark
 
 
 def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
-    """Add lanes -1, -2, ... to the right of the left edge of the first."""
+    """Add lanes -1, -2, ... to the right of the left edge of the first, and 1, 2, ... to the left of it."""
     parts = element("lanes", parent)
     for s, *rest in road.offset:
         _add_cubic(parts, "laneOffset", "s", s, rest)
     section = element("laneSection", parts, s="0")
+    if road.opposite:
+        left = element("left", section)
+        for row in reversed(range(len(road.opposite))):
+            _add_lane(left, road, 1 + row, road.opposite[row], road.opposite_widths[row], marks)
     middle = element("lane", element("center", section), id="0", type="none", level="false")
     _add_mark(middle, marks.left_of(road.lanes[0]))
     right = element("right", section)
     for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
-        node = element("lane", right, id=str(-1 - row), type="driving", level="false")
-        links = element("link", node)
-        for tag, link in (("predecessor", road.before), ("successor", road.after)):
-            if link is not None and -1 - row in link.lanes:
-                element(tag, links, id=str(link.lanes[-1 - row]))
-        for s, *rest in widths:
-            _add_cubic(node, "width", "sOffset", s, rest)
-        _add_mark(node, marks.right_of(lane))
+        _add_lane(right, road, -1 - row, lane, widths, marks)
+
+
+def _add_lane(parent: Element, road: Road, id: int, lane: MapLane, widths: Array, marks: MarkFinder) -> None:
+    node = element("lane", parent, id=str(id), type="driving", level="false")
+    links = element("link", node)
+    for tag, link in (("predecessor", road.before), ("successor", road.after)):
+        if link is not None and id in link.lanes:
+            element(tag, links, id=str(link.lanes[id]))
+    for s, *rest in widths:
+        _add_cubic(node, "width", "sOffset", s, rest)
+    _add_mark(node, marks.right_of(lane))
 
 
 def _add_mark(lane: Element, mark: RoadMark) -> None:

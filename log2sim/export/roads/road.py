@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,28 +40,33 @@ class Link:
         Its id.
     lanes : mapping of int to int
         Lane ids of this road and those of the other, empty for a junction.
+    point : int
+        Start (0) or end (-1) of the other road.
     """
 
     kind: str
     number: int
     lanes: Mapping[int, int] = field(default_factory=dict)
+    point: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A road whose lanes all lead along its reference line, which is the middle of one of them.
+    """A road whose reference line is the middle of one of the lanes that lead along it.
 
     Attributes
     ----------
     number : int
         Its id.
     lanes : tuple of MapLane
-        From the left to the right: lane -1, -2, ...
+        Along the line, from the left to the right: lane -1, -2, ...
     line : ReferenceLine
     elevation, offset : (K, 5) float64
         Stations and coefficients a, b, c, d of cubics: the height, and how far the left edge of lane -1 is left of the line.
-    widths : tuple of (K, 5) float64
-        Of the lanes.
+    widths, opposite_widths : tuple of (K, 5) float64
+        Of the lanes, along the line.
+    opposite : tuple of MapLane
+        Against the line, from the right to the left: lane 1, 2, ...
     junction : int or None
     before, after : Link or None
     """
@@ -72,36 +77,53 @@ class Road:
     elevation: Array
     offset: Array
     widths: tuple[Array, ...]
+    opposite: tuple[MapLane, ...] = ()
+    opposite_widths: tuple[Array, ...] = ()
     junction: int | None = None
     before: Link | None = None
     after: Link | None = None
 
 
 def road_of_lanes(
-    number: int, group: Sequence[MapLane], headings: tuple[float | None, float | None], free: tuple[bool, bool]
+    number: int,
+    group: Sequence[MapLane],
+    opposite: Sequence[MapLane],
+    headings: tuple[float | None, float | None],
+    free: tuple[bool, bool],
 ) -> tuple[Road, dict[tuple[str, int], End]]:
-    """Return a road of lanes side by side, and the ends of its lanes."""
-    base = _base(group)
-    turned = [cross_heading(group, at) if h is None else h for at, h in zip((0, -1), headings)]
-    poses = [None if f else np.array([*p[:2], h]) for f, p, h in zip(free, base.points_m[[0, -1]], turned)]
+    """Return a road of lanes side by side, some of which may lead the opposite way, and the ends of its lanes in their own direction."""
+    across = [*map(turned, opposite[::-1]), *group]
+    base = surest(group)
+    shared = [cross_heading(across, at) if h is None else h for at, h in zip((0, -1), headings)]
+    poses = [None if f else np.array([*p[:2], h]) for f, p, h in zip(free, base.points_m[[0, -1]], shared)]
     line, stations = fit(base.points_m[:, :2], poses[0], poses[1])
     s = _width_stations(line)
-    edges = _edges(group, base, line.at(s))
+    edges = _edges(across, base, line.at(s))
     ends = {}
     for at in (0, -1):
         x, y, z = base.points_m[at]
-        heading = turned[at] if not free[at] else float(line.at(np.array([0.0, line.length_m]))[at, 2])
-        for row, lane in enumerate(group):
+        heading = shared[at] if not free[at] else float(line.at(np.array([0.0, line.length_m]))[at, 2])
+        for row, lane in enumerate(across):
             middle, width = edges[row : row + 2, at].mean(), edges[row, at] - edges[row + 1, at]
-            pose = np.array([x - middle * np.sin(heading), y + middle * np.cos(heading), z, heading])
-            ends[lane.id, at] = End(pose, float(width))
+            own, turn = (-1 - at, np.pi) if row < len(opposite) else (at, 0.0)
+            pose = np.array([x - middle * np.sin(heading), y + middle * np.cos(heading), z, heading + turn])
+            ends[lane.id, own] = End(pose, float(width))
     before, after = (EXTENSION_M if f else 0.0 for f in free)
     line = line.extended(before, after)
     stations = stations + before
     at_m = s + before
-    widths = tuple(cubics_through(at_m, edges[row] - edges[row + 1]) for row in range(len(group)))
+    widths = tuple(cubics_through(at_m, edges[row] - edges[row + 1]) for row in range(len(across)))
     elevation = elevation_profile(stations, base.points_m[:, 2], line.length_m)
-    return Road(number, tuple(group), line, elevation, cubics_through(at_m, edges[0]), widths), ends
+    middle = len(opposite)
+    return Road(
+        number, tuple(group), line, elevation, cubics_through(at_m, edges[middle]), widths[middle:], tuple(opposite),
+        widths[:middle][::-1],
+    ), ends  # fmt: skip
+
+
+def turned(lane: MapLane) -> MapLane:
+    """Return a lane from its end to its start."""
+    return replace(lane, points_m=lane.points_m[::-1], width_m=lane.width_m[::-1])
 
 
 def connecting_road(number: int, lane: MapLane, start: End, end: End) -> Road:
@@ -122,8 +144,8 @@ def cross_heading(group: Sequence[MapLane], at: int) -> float:
     return float(Polyline(group[0].points_m).heading_rad[at])
 
 
-def _base(group: Sequence[MapLane]) -> MapLane:
-    """Return the lane whose middle is the reference line: the surest."""
+def surest(group: Sequence[MapLane]) -> MapLane:
+    """Return the lane whose middle is the reference line of a road."""
     return max(group, key=lambda lane: (lane.confidence, -len(lane.id), lane.id))
 
 

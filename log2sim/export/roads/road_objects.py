@@ -49,10 +49,10 @@ class RoadObjects:
                 if abs(t) <= MAX_ASIDE_M:
                     crosswalks.setdefault(number_, []).append((marking, s, t))
         signals: dict[int, list[Signal]] = {}
-        lanes = [lane for road in roads for lane in road.lanes]
+        lanes = [lane for road in roads for lane in (*road.lanes, *road.opposite)]
         for signal in scenario.signals:
             for lane in signal_lanes(signal, lanes)[:1]:
-                own = next(road.number for road in roads if lane in road.lanes)
+                own = next(road.number for road in roads if any(lane is own for own in (*road.lanes, *road.opposite)))
                 signals.setdefault(own, []).append(signal)
         return cls(crosswalks, signals)
 
