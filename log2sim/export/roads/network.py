@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -52,15 +53,21 @@ class _Place:
 
 def build_network(lanes: Sequence[MapLane]) -> Network:
     """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
-    lanes = cut_together(lanes)
-    by_id = {lane.id: lane for lane in lanes}
-    crossing = {lane.id for lane in lanes if is_connection(lane, by_id)}
-    sides = _with_opposites(_groups([lane for lane in lanes if lane.id not in crossing], by_id))
-    plain = {k + 1: pair for k, pair in enumerate(sides)}
-    place = {}
-    for number, (group, opposite) in plain.items():
-        place |= {lane.id: _Place(number, -1 - row) for row, lane in enumerate(group)}
-        place |= {lane.id: _Place(number, 1 + row) for row, lane in enumerate(opposite)}
+    refused: set[frozenset[str]] = set()
+    while True:
+        parts = cut_together(lanes, refused)
+        by_id = {lane.id: lane for lane in parts}
+        crossing = {lane.id for lane in parts if is_connection(lane, by_id)}
+        sides = _with_opposites(_groups([lane for lane in parts if lane.id not in crossing], by_id))
+        plain = {k + 1: pair for k, pair in enumerate(sides)}
+        place = {}
+        for number, (group, opposite) in plain.items():
+            place |= {lane.id: _Place(number, -1 - row) for row, lane in enumerate(group)}
+            place |= {lane.id: _Place(number, 1 + row) for row, lane in enumerate(opposite)}
+        torn = _torn(plain, place, crossing) - refused
+        if not torn:
+            break
+        refused |= torn
     inside = sorted(crossing, key=list(by_id).index)
     place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
     names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
@@ -117,26 +124,55 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
 
 
 def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane], list[MapLane]]]:
-    """Join groups whose leftmost lanes lead opposite ways side by side; the reference line will be that of the surest lane."""
+    """Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road."""
     by_left = {group[0].id: group for group in groups}
-    found, taken = [], set()
+    found: list[tuple[list[MapLane], list[MapLane]]] = []
+    taken: set[str] = set()
     for group in groups:
         if group[0].id in taken:
             continue
         other = by_left.get(str(group[0].opposite), [])
-        if other and (other[0].opposite != group[0].id or not _aligned(group[0], turned(other[0]))):
+        if other and not (other[0].opposite == group[0].id and _faces(group[0], turned(other[0]))):
             other = []
-        taken |= {lane[0].id for lane in (group, other) if lane}
+        taken |= {side[0].id for side in (group, other) if side}
         found.append((group, other) if surest([*group, *other]) in group else (other, group))
     return found
 
 
+def _faces(lane: MapLane, other: MapLane) -> bool:
+    """Whether another lane begins and ends with a lane, to the left of it."""
+    heading = float(Polyline(lane.points_m).heading_rad[0])
+    gap = other.points_m[0] - lane.points_m[0]
+    return bool(gap[1] * np.cos(heading) > gap[0] * np.sin(heading)) and _aligned(lane, other)
+
+
+def _torn(
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]], place: Mapping[str, _Place], crossing: Set[str]
+) -> set[frozenset[str]]:
+    """Return pairs of lanes that share a road, by their names before cuts, and at one end of it go on in different roads.
+
+    A road has one neighbor at each end, so that such lanes would lose their links.
+    """
+    found: set[frozenset[str]] = set()
+    for group, opposite in plain.values():
+        across = [*opposite[::-1], *group]
+        for at in (0, -1):
+            reached: dict[str, set[int | None]] = {lane.id: set() for lane in across}
+            for lane, name in _linked(across, place, at):
+                reached[lane.id].add(None if name in crossing else place[name].road)
+            linked = [lane for lane in across if reached[lane.id]]
+            for one, two in pairwise(linked):
+                if reached[one.id] != reached[two.id]:
+                    found |= {frozenset(n.id.partition("/")[0] for n in pair) for pair in pairwise(across)}
+    return found
+
+
 def _aligned(one: MapLane, two: MapLane) -> bool:
-    """Whether two lanes begin and end at the same line across the road."""
+    """Whether two lanes begin and end at the same line across the road, seen from either."""
     for at in (0, -1):
-        heading = Polyline(one.points_m).heading_rad[at]
         gap = two.points_m[at] - one.points_m[at]
-        if abs(gap[0] * np.cos(heading) + gap[1] * np.sin(heading)) > ALIGNED_M:
+        headings = [float(Polyline(lane.points_m).heading_rad[at]) for lane in (one, two)]
+        if min(abs(gap[0] * np.cos(h) + gap[1] * np.sin(h)) for h in headings) > ALIGNED_M:
             return False
     return True
 

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Marking, Scenario, Signal
+from log2sim.datatypes import MapLane, Marking, Scenario, Signal
 from log2sim.export.placement import ExportPlacement
 from log2sim.export.roads.road import Road
 from log2sim.export.roads.signal_lanes import signal_lanes
@@ -32,10 +32,10 @@ MAX_ASIDE_M = 15.0
 
 @dataclass(frozen=True)
 class RoadObjects:
-    """Crosswalks with their stations and offsets, and traffic lights, by the number of the road that names them."""
+    """Crosswalks with their stations and offsets, and traffic lights with their lanes, by the number of the road that names them."""
 
     crosswalks: Mapping[int, Sequence[tuple[Marking, float, float]]]
-    signals: Mapping[int, Sequence[Signal]]
+    signals: Mapping[int, Sequence[tuple[Signal, MapLane]]]
 
     @classmethod
     def of(cls, scenario: Scenario, roads: Sequence[Road]) -> RoadObjects:
@@ -48,12 +48,12 @@ class RoadObjects:
                 (s, t), number_ = min(places, key=lambda place: abs(place[0][1]))
                 if abs(t) <= MAX_ASIDE_M:
                     crosswalks.setdefault(number_, []).append((marking, s, t))
-        signals: dict[int, list[Signal]] = {}
+        signals: dict[int, list[tuple[Signal, MapLane]]] = {}
         lanes = [lane for road in roads for lane in (*road.lanes, *road.opposite)]
         for signal in scenario.signals:
             for lane in signal_lanes(signal, lanes)[:1]:
-                own = next(road.number for road in roads if any(lane is own for own in (*road.lanes, *road.opposite)))
-                signals.setdefault(own, []).append(signal)
+                owner = next(road.number for road in roads if any(lane is o for o in (*road.lanes, *road.opposite)))
+                signals.setdefault(owner, []).append((signal, lane))
         return cls(crosswalks, signals)
 
 
@@ -98,18 +98,20 @@ def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float,
 
 
 def add_signals(parent: Element, road: Road, objects: RoadObjects, placement: ExportPlacement) -> None:
-    """Add the traffic lights at the end of a road."""
+    """Add the traffic lights where the lanes end that they are for: at the end of the road, or for lanes against it at its start."""
     own = objects.signals.get(road.number, ())
     nodes = element("signals", parent) if own else parent
-    x, y, heading = road.line.at(np.array([road.line.length_m]))[0]
-    for signal in own:
-        dx, dy, height = signal.position_m - [x, y, road.lanes[0].points_m[-1, 2]]
+    for signal, lane in own:
+        along = any(lane is other for other in road.lanes)
+        s = road.line.length_m if along else 0.0
+        x, y, heading = road.line.at(np.array([s]))[0]
+        dx, dy, height = signal.position_m - [x, y, lane.points_m[-1, 2]]
         aside = float(dy * np.cos(heading) - dx * np.sin(heading))
         node = element(
-            "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(road.line.length_m, DIGITS),
-            t=number(aside, DIGITS), dynamic="yes", orientation="+", zOffset=number(float(height), DIGITS), country="OpenDRIVE",
-            type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2), width=number(LIGHT_WIDTH_M, 2),
-            hOffset="0", pitch="0", roll="0",
+            "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(s, DIGITS),
+            t=number(aside, DIGITS), dynamic="yes", orientation="+" if along else "-", zOffset=number(float(height), DIGITS),
+            country="OpenDRIVE", type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2),
+            width=number(LIGHT_WIDTH_M, 2), hOffset="0", pitch="0", roll="0",
         )  # fmt: skip
         at = signal.position_m - placement.origin_m
         place = {key: number(float(v), DIGITS) for key, v in zip("xyz", at)}
