@@ -52,6 +52,14 @@ def reconstruct(
     start: Start = None,
     stop: Stop = None,
     poses: Poses = None,
+    static_for_all: Annotated[
+        bool | None,
+        typer.Option(
+            "--static-for-all/--as-observed",
+            help="Static agents exist all the time unless the log shows their place free, or only while observed.",
+            show_default="--static-for-all",
+        ),
+    ] = None,
     fix_time: Annotated[
         bool, typer.Option("--fix-time", help="Correct stamps of sensors by the offsets that the log shows.")
     ] = False,
@@ -110,6 +118,8 @@ def reconstruct(
     changes["cameras"] = None if cameras is None else camera_names(cameras)
     if detector is not None:
         changes["detect"] = {"name": detector}
+    if static_for_all is not None:
+        changes["track"] = {"static_for_all": static_for_all}
     if poses is not None:
         changes["poses"] = {"source": poses}
     changes["cooperation"] = {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None}
