@@ -252,7 +252,7 @@ def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> 
         seen = run.schedule.without_frames(observations.unseen)
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
-        rated = rate_agents(judged, timeline)
+        rated = rate_agents(judged, timeline, lidar=bool(log.lidars))
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         return ego, simplify(agents) if ego is not None else agents

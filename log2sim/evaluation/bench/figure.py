@@ -16,6 +16,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from log2sim.documents import replaced
 from log2sim.evaluation.bench.benchmark import Benchmark
+from log2sim.evaluation.bench.bootstrap import error_interval
 from log2sim.evaluation.bench.label_placement import place_labels
 from log2sim.evaluation.bench.panels import Panel
 from log2sim.evaluation.bench.pareto import Point
@@ -97,6 +98,9 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     _limits(ax, x, y)
     front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
     ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
+    ranges = [(p, error_interval(p.by_object)) for p in points]
+    known = [(p.ms_per_tick, *found) for p, found in ranges if found is not None]
+    ax.vlines(*np.array(known).reshape(-1, 3).T, color=CROWD_COLOR, lw=0.8, alpha=0.5, zorder=1.8)
     for point, on_front in shown:
         _mark(ax, point, on_front=on_front, chosen=point.setting == panel.recommendation.supported)
     corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
@@ -146,9 +150,11 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
     mark: dict[str, Any] = {"ls": "none", "mew": 1.1}
     handles = [
         (Line2D([], [], marker="D", ms=6.5, mfc=FRONT, mec=PAPER, **mark), "present setting, on the front"),
+        (Line2D([], [], marker="D", ms=6.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "present setting, behind it"),
+        (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
         (Line2D([], [], marker="o", ms=5.5, mfc=FRONT, mec=PAPER, **mark), "on the Pareto front"),
         (Line2D([], [], marker="o", ms=5.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "behind it"),
-        (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
+        (Line2D([], [], color=CROWD_COLOR, lw=0.8, alpha=0.5), "5 to 95 % of resamples of objects"),
     ]
     ax.legend(
         [h for h, _ in handles], [t for _, t in handles], loc="upper left", bbox_to_anchor=(-0.03, 1.14), frameon=False,
