@@ -100,7 +100,7 @@ def format_table(result: Benchmark) -> str:
     """Format one block for each stage, then the recommendations."""
     lines = [
         "* present setting   + on the Pareto front: no setting is as accurate in less time",
-        "5-95 %: error of that share of resamples of the objects",
+        "5-95 %: error over resamples of the objects, '-' with fewer than five of them",
         "",
     ]
     for panel in result.panels:

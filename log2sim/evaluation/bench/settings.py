@@ -103,7 +103,7 @@ def default_settings(log: Log, config: Config) -> tuple[Setting, ...]:
     chosen = choose_detector(log, config)
     if config.detect.name != AUTO or not chosen.detect.in_sweeps:
         return ()
-    return (Setting("whole run", f"default: {chosen.detect.name}", chosen, True),)
+    return (Setting("whole run", f"reconstruct's default, {chosen.detect.name}", chosen, True),)
 
 
 def _methods_apart(config: Config) -> list[Setting]:
