@@ -332,7 +332,7 @@ def test_without_pictures_sweeps_and_labels_are_those_with_pictures(tmp_path: Pa
     assert [len(log.cameras) for log in both] == [1, 0]
     for a, b in zip(*(log.streams["lidar"].t_ns for log in both), strict=True):
         assert a == b
-    np.testing.assert_array_equal(*(log.streams["lidar"].read(1).points for log in both))
+    np.testing.assert_array_equal(*(log.streams["lidar"].read(1).xyz_m for log in both))
     np.testing.assert_array_equal(*(log.labels.center_m for log in both))
     assert sorted(p.name for p in (tmp_path / "without").rglob("*.jpg")) == []
     with pytest.raises(ConfigError, match="log2sim"):

@@ -223,7 +223,7 @@ def fit_all(agents: Sequence[Rated]) -> tuple[dict[bool, Table], dict[str, Table
         ticks = np.sqrt([a.ticks for a in own])
         signs = [SIGNS[name] for name in names]
         bias, weights = fit_weights(matrix_of(own, names), targets_of(own), ticks / ticks.mean(), signs)
-        tables[lidar] = {"bias": bias, **dict(zip(names, weights.tolist()))}
+        tables[lidar] = {**dict(zip(names, weights.tolist())), "bias": bias}
     p = probabilities(agents, tables)
     by_kind = {}
     for kind in ("position", "yaw", "speed"):

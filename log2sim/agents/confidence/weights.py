@@ -7,7 +7,6 @@ agents of 120 synthetic logs; all else with `--seed 3`, 1369 agents of 70.
 from __future__ import annotations
 
 WITH_LIDAR = {
-    "bias": 2.424,
     "image": 0.1081,
     "sweep": 0.08424,
     "few": -0.8772,
@@ -26,9 +25,9 @@ WITH_LIDAR = {
     "two_wheeler": -0.4416,
     "pedestrian": -0.2002,
     "other": -2.952,
+    "bias": 2.424,
 }
 WITHOUT_LIDAR = {
-    "bias": 0.8547,
     "image": 0.1793,
     "few": -0.6211,
     "brief": -0.8314,
@@ -43,6 +42,7 @@ WITHOUT_LIDAR = {
     "two_wheeler": 0.07761,
     "pedestrian": 0.5601,
     "other": -2.914,
+    "bias": 0.8547,
 }
 POSITION_VARIANCE = {
     "given": 1.599,
