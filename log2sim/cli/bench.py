@@ -20,7 +20,6 @@ from log2sim.cli.options import (
     complete_detectors,
     say,
 )
-from log2sim.cli.truth import truth_at
 
 
 def bench(
@@ -70,6 +69,7 @@ def bench(
     from log2sim.evaluation.bench.document import document, format_table
     from log2sim.evaluation.bench.figure import write_picture
     from log2sim.evaluation.bench.scores import Scope
+    from log2sim.evaluation.metrics.truth import truth_at
     from log2sim.localization.choice import localize
     from log2sim.logs.opening import open_log
     from log2sim.outputs import together

@@ -67,7 +67,7 @@ def view(
     log2sim view s.json --replay replay.json --truth samples/crossing -o s.html
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay, load_truth
+    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario, say_agents
     from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
@@ -82,9 +82,14 @@ def view(
     loaded = Scenario.load(scenario)
     layers: dict[str, Any] = {
         "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
-        "truth": load_truth(truth, loaded, sequence) if truth is not None else None,
+        "truth": None,
         "metrics": [] if metrics is None else [_metrics(metrics)],
     }
+    if truth is not None:
+        from log2sim.evaluation.metrics.placing import place_truth
+        from log2sim.evaluation.metrics.truth import load_truth
+
+        layers["truth"] = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
