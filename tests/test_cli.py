@@ -198,7 +198,9 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     assert "recall" in whole.out
     by_log = run("evaluate", tiny_scenario, "--truth", tiny_folder, "--out", tmp_path / "b.json", "--quiet")
     assert by_log.out == ""
-    assert read(tmp_path / "a.json") == read(tmp_path / "b.json")
+    by_file, points = read(tmp_path / "a.json"), read(tmp_path / "b.json")["coverage"]
+    assert (by_file["coverage"]["hit"], by_file["correctness"]) == (None, read(tmp_path / "b.json")["correctness"])
+    assert points["counted"] <= points["hit"] <= points["labeled"]  # the log has the sweeps, too
     narrowed = run(
         "evaluate", tiny_scenario, "--truth", tiny_folder, "--range", "40", "--categories", "pedestrian",
         "--out", tmp_path / "c.json",
@@ -207,8 +209,10 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     document = read(tmp_path / "c.json")
     assert document["max_range_m"] == 40.0
     assert document["categories"] == ["pedestrian"]
-    assert list(read(tmp_path / "a.json")["by_category"]) == ["car"]  # the pedestrian is in sight for less than 1 s
-    assert document["by_category"] == {}
+    walker = document["by_category"]["pedestrian"]  # in sight for less than 1 s
+    assert (walker["recall"], walker["coverage"]["counted"]) == (None, 0)
+    assert 0 < walker["coverage"]["why_not"]["short"] <= walker["coverage"]["labeled"]
+    assert list(document["by_category"]) == ["pedestrian"]
     # A scenario is its own truth without error.
     assert run("evaluate", tiny_scenario, "--truth", tiny_scenario, "--out", tmp_path / "d.json").code == 0
     assert read(tmp_path / "d.json")["position_rmse_m"] == 0.0

@@ -232,11 +232,12 @@ def format_batch_table(document: Figures, *, max_rows: int) -> str:
     return "\n".join([*columns_text(cells), *notes, "medians and HOTA of all are medians over the logs"])
 
 
-_TITLES = ("recall", "precis.", "rms m", "med m", "yaw deg", "m/s", "size m", "id sw", "MOTA", "HOTA")
-_DECIMALS = (3, 3, 2, 2, 1, 2, 2, 0, 3, 3)
+_TITLES = ("recall %", "precis. %", "rms m", "med m", "yaw deg", "m/s", "size m", "id sw", "MOTA", "HOTA")
+_DECIMALS = (1, 1, 2, 2, 1, 2, 2, 0, 3, 3)
 
 
 def _cells(name: str, figures: Figures) -> list[str]:
     values = [figures[key] for key in OF_A_LOG]
+    values[:2] = [None if share is None else 100 * share for share in values[:2]]
     numbers = ["-" if value is None else f"{value:.{digits}f}" for value, digits in zip(values, _DECIMALS)]
     return [name, str(figures["counts"].get("truth_agents", 0)), *numbers]

@@ -120,14 +120,16 @@ def evaluate(
         if poses is not None:
             stated = _stated(scenario.provenance.get("poses"), poses)
             scenario = replace(scenario, provenance={**scenario.provenance, **stated})
-        if (note := _other_map(scenario, truth)) is not None:
-            say(f"note: {note}", quiet=quiet)
         with progress(quiet=quiet) as report_progress:
             known = load_truth(
                 truth, scenario, sequence=sequence, labels=labels, points=True,
                 progress=lambda done, total: report_progress("count points", done, total),
             )  # fmt: skip
+        for note in known.provenance.get("notes", ()) if labels is not None else ():
+            say(f"note: {note}", quiet=quiet)
         result = run(scenario, known, max_range_m=range, categories=wanted)
+        if result["placement"]["method"] == "same_map" and (note := _other_map(scenario, truth)) is not None:
+            say(f"note: {note}", quiet=quiet)
         table = format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
     with together():
         if out is not None:

@@ -77,9 +77,8 @@ def with_label_file(log: Log, path: Path) -> Log:
         row = int(np.argmin(possible))
         raise LogError(f"{path}: box of '{labels.track_id[row]}': no object has this size or place")
     _require_common_time(log, labels, path)
-    return log.changed(
-        labels=labels, ignored_regions=regions, notes=lambda: (*log.notes, f"labels: {path.name}", *notes)
-    )
+    said = [f"{path.name}: {note}" for note in notes]
+    return log.changed(labels=labels, ignored_regions=regions, notes=lambda: (*log.notes, *said))
 
 
 @dataclass(frozen=True, eq=False)

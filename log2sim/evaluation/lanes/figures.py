@@ -47,7 +47,7 @@ def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     if figures is not None:
         named = (("lane lines", figures["lane_lines"]), ("borders", figures["borders"]), ("lanes", figures["lanes"]))
         parts = [
-            f"{name} {_percent(f['recall'])} found, {_percent(f['precision'])} right"
+            f"{name} {_percent(f['recall'])} found" + f", {_percent(f['precision'])} right" * bool(f["found_m"])
             for name, f in named
             if f["true_m"]
         ]

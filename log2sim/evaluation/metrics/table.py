@@ -18,7 +18,6 @@ MAX_NAMED = 3
 MAX_NAME = 16
 """Characters of the id of a labeled object; some logs use 36."""
 
-_EMPTY = ("", "-", "0", "0.0", "0.00")
 _COLUMNS = (
     ("recall", "recall %", 1), ("precision", "precis. %", 1), ("position_rmse_m", "rms m", 2), ("position_median_m", "med m", 2),
     ("yaw_median_deg", "yaw deg", 1), ("speed_rmse_mps", "m/s", 2), ("size_median_m", "size m", 2), ("id_switches", "id sw", 0),
@@ -119,7 +118,8 @@ def format_table(result: Mapping[str, Any]) -> str:
             part = figures["coverage"]
             if part["labeled"]:
                 hit = [_cell(part["hit"], 0), _cell(part["hit_recall"], 1, 100)]
-                cells.append([name, *map(str, (part["labeled"], part["counted"], *part["why_not"].values())), *hit])
+                why_not = [str(count or "-") for count in part["why_not"].values()]
+                cells.append([name, str(part["labeled"]), str(part["counted"]), *why_not, *hit])
         blocks += columns_text(cells)
     cells = [["", "agents", *(title for _, title, _ in _COLUMNS)]]
     for name, figures in lines:
@@ -133,16 +133,19 @@ def format_table(result: Mapping[str, Any]) -> str:
 
 def _values(figures: Mapping[str, Any]) -> list[str]:
     scale = {"recall": 100, "precision": 100}
-    return [_cell(figures[key], n, scale.get(key, 1)) if key in figures else "" for key, _, n in _COLUMNS]
+    found = {**figures, "id_switches": figures.get("id_switches") or None}
+    return [_cell(found[key], n, scale.get(key, 1)) if key in found else "" for key, _, n in _COLUMNS]
 
 
 def columns_text(cells: Sequence[Sequence[str]], heads: int = 1, columns: int = MAX_COLUMNS) -> list[str]:
     """Format rows, the first of titles, within a number of characters.
 
-    Columns of zeros and dashes alone are left out. What does not fit goes into a further table below, which repeats the
+    Columns of dashes alone are left out. What does not fit goes into a further table below, which repeats the
     first `heads` columns; these are aligned to the left.
     """
-    used = [k for k in range(len(cells[0])) if k < heads or any(row[k].strip() not in _EMPTY for row in cells[1:])]
+    if len(cells) < 2:
+        return []
+    used = [k for k in range(len(cells[0])) if k < heads or any(row[k] not in ("", "-") for row in cells[1:])]
     widths = {k: max(len(row[k]) for row in cells) for k in used}
     # A name may be of any length; it takes half of a line at most.
     for k in range(heads):

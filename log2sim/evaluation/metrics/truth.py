@@ -100,7 +100,11 @@ def truth_at(
     names = None if used is None else list(used)
     known = None if names is None else [name for name in names if name in log.cameras]
     cameras = None if names and not known else known
-    return truth_from_log(log, cameras=cameras, points=points, progress=progress)
+    truth = truth_from_log(log, cameras=cameras, points=points, progress=progress)
+    if labels is None:
+        return truth
+    notes = [note for note in log.notes if note.startswith(f"{labels.name}: ")]
+    return replace(truth, provenance={**truth.provenance, "labels": labels.name, "notes": notes})
 
 
 def truth_from_log(
