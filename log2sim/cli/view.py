@@ -143,11 +143,11 @@ def _metrics(path: Path) -> tuple[str, str]:
     """
     from log2sim.documents import read_json
     from log2sim.errors import LogError
-    from log2sim.evaluation.metrics.table import format_table
+    from log2sim.evaluation.metrics.table import format_table, format_verdict
 
     document = read_json(path, LogError)
     try:
-        return f"Metrics against {document['truth']}", format_table(document)
+        return f"Metrics against {document['truth']}", f"{format_verdict(document)}\n\n{format_table(document)}"
     except (KeyError, TypeError, AttributeError, ValueError):
         raise LogError(
             f"{path}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"

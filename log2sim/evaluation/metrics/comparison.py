@@ -26,7 +26,7 @@ REASONS = {
     "out_of_range": "out of range",
     "few_points": f"fewer than {MIN_POINTS} LiDAR points",
     "not_in_picture": "less than half in a picture",
-    "hidden": "hidden by what the truth states",
+    "hidden": "hidden according to the truth",
     "short": f"in sight for less than {MIN_COUNTED_S:g} s",
 }
 """Why a labeled object does not count at a tick; the first that applies."""

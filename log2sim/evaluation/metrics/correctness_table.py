@@ -35,11 +35,9 @@ def wrong_parts(found: Mapping[str, Any]) -> list[str]:
     doubted = found["doubted"]
     lines = [text.replace("%", " %") + (f": {', '.join(parts)}" if parts else "")]
     if parts:
-        lines.append(
-            f"doubted are {_share(doubted['wrong_ticks'])} of it and {_share(doubted['right_ticks'])} of the right"
-        )
+        lines.append(f"{_share(doubted['wrong_ticks'])} of it doubted, {_share(doubted['right_ticks'])} of the right")
     elif doubted["right_ticks"]:
-        lines.append(f"doubted are {_share(doubted['right_ticks'])} of the right")
+        lines.append(f"{_share(doubted['right_ticks'])} of the right doubted")
     return lines
 
 

@@ -66,7 +66,7 @@ def recall_text(result: Mapping[str, Any]) -> str:
 
 def error_text(result: Mapping[str, Any]) -> str:
     """Give the errors of position, yaw, speed and size."""
-    parts = [f"position {result['position_median_m']:.2f} m (median), {result['position_rmse_m']:.2f} m (RMS)"]
+    parts = [f"position {result['position_median_m']:.2f} m (median; RMS {result['position_rmse_m']:.2f})"]
     for key, name, digits, unit in (
         ("yaw_median_deg", "yaw", 1, "deg"), ("speed_rmse_mps", "speed", 2, "m/s"), ("size_median_m", "size", 2, "m"),
     ):  # fmt: skip
