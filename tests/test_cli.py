@@ -95,6 +95,7 @@ def test_the_same_seed_gives_the_same_bytes(tiny_folder: Path, tmp_path: Path) -
     assert (tmp_path / "a.replay").read_bytes() == (tmp_path / "b.replay").read_bytes()
 
 
+@pytest.mark.slow
 def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text('seed = 5\n[measure]\nmode = "paper"\nmax_range_m = 30.0\n')
     ran = run(
@@ -119,6 +120,7 @@ def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
     assert not decoding["kept"]
 
 
+@pytest.mark.slow
 def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> None:
     import cv2
 
@@ -138,6 +140,7 @@ def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> 
     assert picture[picture[..., 3] > 0][:, :3].std() > 5
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(("name", "magic"), [("t.png", PNG), ("t.gif", GIF), ("t.svg", b"<?xml"), ("t.pdf", b"%PDF")])
 def test_plot_writes_what_the_suffix_says(tiny_scenario: Path, tmp_path: Path, name: str, magic: bytes) -> None:
     assert run("plot", tiny_scenario, "--out", tmp_path / name).code == 0
@@ -247,6 +250,7 @@ def test_config_prints_toml_that_it_reads_again(tmp_path: Path) -> None:
     assert run("config").out != first.out
 
 
+@pytest.mark.slow
 def test_synth_is_the_same_for_a_seed_and_replaces_only_when_asked(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(tiny_toml(agents=[], duration_s=0.3))
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -331,6 +335,7 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
 
+@pytest.mark.slow
 def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
     source = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
     arguments = ("edit", source, "--lateral", "ego=3.5", "--overwrite", "--out", tmp_path / "e.json")

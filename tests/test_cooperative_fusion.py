@@ -251,6 +251,7 @@ def test_lidars_of_the_road_are_grouped_by_their_places(both_ends) -> None:
     assert group_by_viewpoint(road, list(road.lidars)) == [["post", "beside", "far"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["points", "boxes", "tracks"])
 def test_every_level_finds_every_object_once(both_ends, level) -> None:
     chosen = Config.load(

@@ -163,6 +163,7 @@ def test_a_broken_shift_moves_the_whole_scene_and_nothing_else(tiny_folder: Path
     assert_same_agents(near, far, within=1e-3, shift_m=shift)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     "shift_ns", [-1_700_000_000_000_000_000, -3_400_000_000_000_000_000, 5_000_000_000_000_000_000]
 )

@@ -141,6 +141,7 @@ def test_the_figures_of_a_braking_ego_are_those_of_the_closed_form() -> None:
     assert "collisions none" in said
 
 
+@pytest.mark.slow
 def test_an_ego_that_hits_something_has_no_gap_and_says_whom() -> None:
     result = braked_at(15.0)
     assert result.metrics["ego"]["min_gap"]["m"] == 0.0

@@ -170,6 +170,7 @@ def test_a_box_is_drawn_as_corners_only_where_its_edges_are_straight() -> None:
     assert outline_of(straight, near - [0.0, 0.0, 5.0])[0] == SEGMENTS  # a part is behind the camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_bytes", [260_000, 1_200_000])
 def test_the_page_keeps_to_its_size_and_uses_it(tmp_path: Path, max_bytes: int) -> None:
     log = roadside(camera_of("a"), camera_of("b", yaw_rad=0.5))
