@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, ImageRegions, Labels, Log
 from log2sim.documents import JSON_LIMIT_BYTES, read_json
@@ -128,7 +129,7 @@ def _labels_of(log: Log, path: Path, boxes: Iterator[_Box], notes: list[str]) ->
     )
 
 
-def _frame_poses(log: Log, frame: str, t_ns: Array, where: str) -> tuple[Array, Array]:
+def _frame_poses(log: Log, frame: str, t_ns: NDArray[np.int64], where: str) -> tuple[Array, NDArray[np.bool_]]:
     """Return the poses (N, 4, 4) of the ego or of a sensor, and where they are known (N,)."""
     if frame == "ego":
         if log.ego is None:
@@ -283,7 +284,7 @@ def _unit(quaternion: Array, where: str) -> Array:
 
 def _reference(log: Log, path: Path) -> tuple[str, Any]:
     """Return the sensor whose records number the frames of label files, and their stamps."""
-    names = [log.reference_camera, *log.cameras, *log.lidars]
+    names = [*([log.reference_camera] if log.reference_camera else []), *log.cameras, *log.lidars]
     name = next((n for n in names if n in log.streams and len(log.streams[n].t_ns)), None)
     if name is None:
         raise LogError(f"{path}: counts frames, and {log.name} has neither pictures nor sweeps")

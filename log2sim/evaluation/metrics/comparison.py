@@ -93,7 +93,7 @@ class Comparison:
     @property
     def asked_for(self) -> Mask:
         """Mark (A, T) the labeled ticks of the truth that are within range and of a selected category."""
-        return (self.why_not == COUNTED) | (self.why_not > list(REASONS).index("out_of_range") + 1)
+        return np.asarray((self.why_not == COUNTED) | (self.why_not > list(REASONS).index("out_of_range") + 1))
 
 
 def compare(

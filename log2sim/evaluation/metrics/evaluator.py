@@ -91,7 +91,10 @@ def evaluate(
     """
     if isinstance(scenario, Log):
         raise TypeError("evaluate takes the scenario first, then the log with its truth")
-    scenario = Scenario.load(scenario) if isinstance(scenario, (str, Path)) else getattr(scenario, "scenario", scenario)
+    if isinstance(scenario, (str, Path)):
+        scenario = Scenario.load(scenario)
+    elif not isinstance(scenario, Scenario):
+        scenario = scenario.scenario
     truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
     compared, ticks_s, ego = compare_scenarios(scenario, truth, Selection(max_range_m, _selected(categories)))
     ours, tick_s = compared.other, _tick_s(ticks_s)

@@ -58,7 +58,9 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
         def reproject(states: Array, _t_s: Array) -> Array:
             return np.asarray(target.forward(states) + np.array([0, 0, rise_m, 0]))
 
-        method, near, far = "projection", reproject if truth.ego is None else _around(truth.ego, reproject), reproject
+        method = "projection"
+        far: Move = reproject
+        near: Move = far if truth.ego is None else _around(truth.ego, far)
     else:
         apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
         if apart_m is None or apart_m <= GATE_M:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Labels, Log, Scenario, Sweep, Waypoints
-from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.visibility import PointGrid, image_shares
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, wrap_angle, yaw_of
@@ -88,15 +88,16 @@ def truth_at(
         if labels is not None:
             raise ConfigError(f"--labels {labels}: the labels are of a log; {path} is none")
         return Scenario.load(path)
-    stated = None
     if path is not None and labels is None and (path / "truth.json").is_file():
         stated = Scenario.load(path / "truth.json")
         if not points:
             return stated
-    opened = open_log(path, sequence=sequence, labels=labels) if path is not None else source
-    log: Log = localize_like(opened, provenance or {})
-    if stated is not None:
-        return with_points(stated, log, progress)
+        try:  # by the poses of the log, in whose map its truth is
+            return with_points(stated, open_log(path, sequence=sequence), progress)
+        except (LogError, ConfigError, MissingExtra):  # what can be compared does not need the sweeps
+            return stated
+    opened = source if isinstance(source, Log) else open_log(source, sequence=sequence, labels=labels)
+    log = localize_like(opened, provenance or {})
     names = None if used is None else list(used)
     known = None if names is None else [name for name in names if name in log.cameras]
     cameras = None if names and not known else known
@@ -253,8 +254,8 @@ def with_points(truth: Scenario, log: Log, progress: Progress | None = None) -> 
                 mapped = sweep_to_map(log, name, stream.read(i), compensate=True) if rows else None
             except RecordError:
                 mapped = None
-            grid = None if mapped is None else PointGrid(mapped[0])
-            for k in rows if grid is not None else ():
+            grid = PointGrid(np.zeros((0, 3)) if mapped is None else mapped[0])
+            for k in rows:
                 s = states[k]
                 center = np.array([s.x_m[i], s.y_m[i], s.z_m[i]])
                 counts[k, i] = grid.count(center, np.array(truth.others[k].size_m), float(s.yaw_rad[i]))
