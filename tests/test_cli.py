@@ -232,6 +232,32 @@ def test_evaluate_takes_labels_where_a_log_has_no_truth_file(
     assert metrics["position_rmse_m"] < 0.4
 
 
+def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
+    log_folder: Path, tiny_scenario: Path, tmp_path: Path
+) -> None:
+    rows = (log_folder / "labels" / "boxes_3d.csv").read_text().splitlines()
+    (tmp_path / "cars.csv").write_text("\n".join([rows[0], *(row for row in rows[1:] if ",car," in row)]))
+    ran = run(
+        "evaluate",
+        tiny_scenario,
+        "--truth",
+        log_folder,
+        "--labels",
+        tmp_path / "cars.csv",
+        "-v",
+        "-o",
+        tmp_path / "m.json",
+    )
+    assert ran.code == 0, ran.err
+    assert max(map(len, ran.out.splitlines())) <= 100
+    metrics = read(tmp_path / "m.json")
+    assert (metrics["recall"], list(metrics["by_category"])) == (1.0, ["car", "pedestrian"])  # one that is now false
+    assert metrics["by_category"]["pedestrian"]["coverage"]["labeled"] == 0
+    assert metrics["coverage"]["hit"] >= metrics["coverage"]["counted"] > 0
+    truth = log_folder / "truth.json"
+    assert run("evaluate", tiny_scenario, "--truth", truth, "--labels", tmp_path / "cars.csv").code == 2
+
+
 def test_inspect_prints_json(tiny_folder: Path) -> None:
     document = json.loads(run("inspect", tiny_folder, "--json").out)
     assert document["format"] == "log2sim"
