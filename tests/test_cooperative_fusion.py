@@ -266,7 +266,7 @@ def test_every_level_finds_every_object_once(both_ends, level) -> None:
     parked = min(agents, key=lambda a: abs(a.waypoints.y_m[0] + 4))
     assert parked.size_m[0] == pytest.approx(4.2, abs=0.08)
     assert (parked.waypoints.x_m[0], parked.waypoints.y_m[0]) == pytest.approx((14, -4), abs=0.06)
-    (entry,) = [e for e in result.scenario.plan if e["stage"] == "fusion of vehicle and road"]
+    (entry,) = [e for e in result.scenario.stages if e["stage"] == "fusion of vehicle and road"]
     assert entry["kept"]
     assert entry["reason"].startswith(level)
 

@@ -477,13 +477,13 @@ def test_one_camera_gives_the_same_scenario_with_fusion(tiny: Log, monkeypatch: 
 
 def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     without = run(tiny)
-    step = entry(without, "smoothing of parked agents")
+    step = entry(without, "smoothing of static agents")
     assert not step["kept"]
     assert step["reason"].startswith("1 of 3 agents")
     (parked,) = [a for a in without.scenario.others if a.static]
     monkeypatch.setattr(log2sim.agents.estimate, "explain_track", lambda track: [Part(track, static=False)])
     full = run(tiny)
-    assert entry(full, "smoothing of parked agents")["kept"]
+    assert entry(full, "smoothing of static agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))
     w = smoothed.waypoints
     assert len(w) >= len(parked.waypoints) == 2

@@ -254,7 +254,7 @@ def test_labels_say_what_the_legend_then_leaves_out() -> None:
     labels = {t.get_text() for t in layout.ax.texts}
     assert {"ego · 18 km/h", "car-1 · 29 km/h"} <= labels
     rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
-    assert rows[:2] == ["km/h: highest speed of each", "1 stationary"]
+    assert rows[:2] == ["km/h: highest speed of each", "1 static"]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,8 @@ class Waypoints:
     lidar_points : (T,) float64 or None
         LiDAR points in the agent's box, of all LiDARs together; only in truth.
     """
+
+    __repr__ = short_repr
 
     t_s: Array
     x_m: Array
