@@ -250,7 +250,7 @@ def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
         tmp_path / "m.json",
     )
     assert ran.code == 0, ran.err
-    assert max(map(len, ran.out.splitlines())) <= 100
+    assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
     metrics = read(tmp_path / "m.json")
     assert (metrics["recall"], list(metrics["by_category"])) == (1.0, ["car", "pedestrian"])  # one that is now false
     assert metrics["by_category"]["pedestrian"]["coverage"]["labeled"] == 0

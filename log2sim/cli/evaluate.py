@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, Verbose, complete, say
+from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, Verbose, complete, say, say_written
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -100,6 +100,7 @@ def evaluate(
         if out is not None:
             write_json(out, result)
         say(table, quiet=quiet)
+        say_written(out, quiet=quiet)
         return
     document = read_json(path, ScenarioError)
     if is_boxes_document(document):
@@ -137,6 +138,7 @@ def evaluate(
         if plot is not None:
             _plot_reliability(result, plot)
     say(table, quiet=quiet)
+    say_written(out, plot, quiet=quiet)
 
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
