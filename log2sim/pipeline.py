@@ -253,7 +253,7 @@ def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> 
         seen = run.schedule.without_frames(observations.unseen)
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
-        rated = rate_agents(judged, timeline)
+        rated = rate_agents(judged, timeline, lidar=bool(log.lidars))
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
         if run.config.track.static_for_all:
             agents = extend_static(agents, ego, observations.obstacles, timeline)

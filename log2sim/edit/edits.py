@@ -117,12 +117,12 @@ class DropDoubtful(Edit):
 
 @dataclass(frozen=True)
 class _WaypointEdit(_AgentEdit):
-    """A change to the waypoints of one agent; `visible` is dropped, since it is unknown at the new positions."""
+    """A change to the waypoints of one agent; what sensors saw of it is dropped, since it is unknown at the new positions."""
 
     def applied(self, agents: Agents) -> Agents:
         """Replace the waypoints of the agent."""
         agent = agents[self.agent]
-        waypoints = replace(self.moved(agent), visible=None)
+        waypoints = replace(self.moved(agent), visible=None, lidar_points=None)
         moved = replace(agent, waypoints=waypoints, doubts=self.doubts(agent), observed_by=self.observed_by(agent))
         return {**agents, self.agent: moved}
 
