@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +88,9 @@ def evaluate(
     Notes
     -----
     CLEAR MOT (Bernardin and Stiefelhagen, 2008) and HOTA (Luiten et al., 2021) with matches by the distance of box centers.
-    Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks.
+    Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks. Quarantined agents, which
+    replays and exports leave out, are left out here too, and listed; static agents are compared from their first to their last
+    observation.
     """
     if isinstance(scenario, Log):
         raise TypeError("evaluate takes the scenario first, then the log with its truth")
@@ -95,6 +98,8 @@ def evaluate(
         scenario = Scenario.load(scenario)
     elif not isinstance(scenario, Scenario):
         scenario = scenario.scenario
+    quarantined = [agent.id for agent in scenario.agents if agent.quarantined]
+    scenario = replace(scenario, agents=tuple(_while_observed(agent) for agent in scenario.active.agents))
     truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
     compared, ticks_s, ego = compare_scenarios(scenario, truth, Selection(max_range_m, _selected(categories)))
     ours, tick_s = compared.other, _tick_s(ticks_s)
@@ -109,6 +114,7 @@ def evaluate(
         "ticks": len(ticks_s),
         "tick_s": tick_s,
         "placement": placement,
+        "quarantined": quarantined,
         **_figures(compared, *everywhere),
         "by_range": None if ego is None else _by_range(compared),
         "by_category": _by_category(compared),
@@ -233,6 +239,14 @@ def _by_category(c: Comparison) -> dict[str, Any]:
 
 def _rows(which: Mask, like: Mask) -> Mask:
     return np.broadcast_to(which[:, None], like.shape)
+
+
+def _while_observed(agent: Agent) -> Agent:
+    """Return a static agent without the time before its first and after its last observation."""
+    rows = np.flatnonzero(agent.waypoints.observed)
+    if not agent.static or not len(rows):
+        return agent
+    return replace(agent, waypoints=agent.waypoints.take(slice(rows[0], rows[-1] + 1)))
 
 
 def _selected(categories: Sequence[str] | None) -> frozenset[str]:

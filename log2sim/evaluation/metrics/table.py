@@ -29,6 +29,8 @@ def format_verdict(result: Mapping[str, Any]) -> str:
     """Say what counted, what was found and how well, and what is wrong, in lines of at most 100 characters."""
     placement = describe_placement(result["placement"]) if "placement" in result else None
     lines = [] if placement is None else [("map", placement)]
+    if result.get("quarantined"):
+        lines.append(("left out", f"quarantined: {', '.join(result['quarantined'])}"))
     if "coverage" in result:
         lines.append(("counted", counted_text(result["coverage"], f" of {result['counts']['truth_agents']} agents")))
     lines += [("recall", recall_text(result)), *_missed(result["agents"])]
