@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.plausibility.free_space import SOLID, Ending, classify_rays
+from log2sim.agents.plausibility.free_space import Ending, classify_rays
 from log2sim.datatypes import Obstacles, Rays
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.box_completion import (
@@ -20,7 +20,7 @@ from log2sim.perception.box_completion import (
     facing_ends,
     oriented_covariance,
 )
-from log2sim.perception.box_fitting import MAX_TRIM_M, align_to, extents_of_rotated, rotate
+from log2sim.perception.box_fitting import MAX_TRIM_M, align_to, corrected_yaw, extents_of_rotated, rotate
 from log2sim.perception.prefetch import OBSTACLE_REACH_M
 
 MIN_POINTS = 8
@@ -29,8 +29,8 @@ MARGIN_M = 0.5
 SHELL_M = 0.5
 # With more points in the shell, relative to those in the box, the box is a part of a larger structure.
 MAX_SHELL_RATIO = 0.6
-# Largest distance of a match from its prediction.
-MAX_SHIFT_M = 0.8
+# Largest distance of a match from its prediction along each side, and as a share of it: the box of a detector may be off so far.
+MAX_SHIFT_M, MAX_SHIFT_SHARE = 0.8, 0.1
 MAX_MISSES = 2
 # A match is rejected when a larger share of the box's length or width is unobserved: its position along that axis is
 # undetermined.
@@ -39,8 +39,14 @@ MAX_HIDDEN_SHARE = 0.7
 SIDE_DEPTH_M, MAX_THROUGH_SHARE = 0.3, 0.5
 # An end is where a ray passes within this distance of the last point.
 MAX_GAP_M = 1.5
+# Quantiles of the heights of points between which a side is: below a truck and above a hood rays pass.
+LEVELS = 0.25, 0.75
+# What ends on both sides and is shorter than this share of the box is something else.
+MIN_SIZE_SHARE = 0.5
 # Gains of the constant-velocity filter.
 POSITION_GAIN, VELOCITY_GAIN, YAW_GAIN = 0.6, 0.15, 0.3
+# What is longer than so many widths moves along its length.
+LONG_WIDTHS = 1.5
 # Slower objects keep their yaw.
 MIN_COURSE_SPEED_MPS = 2.0
 
@@ -58,6 +64,8 @@ class LidarMatch:
         Center, map frame.
     covariance : (2, 2) float64
         Of the center, m2.
+    turn_rad : float
+        Direction of its sides relative to the prediction; 0 where its points do not show it.
     points : int
     """
 
@@ -65,6 +73,7 @@ class LidarMatch:
     t_ns: int
     xy_m: Array
     covariance: Array
+    turn_rad: float
     points: int
 
 
@@ -172,7 +181,10 @@ def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
     velocity, yaw_rad = state.velocity_mps, state.yaw_rad
     if abs(dt_s) > 1e-3:
         velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-        yaw_rad = _turned(yaw_rad, velocity)
+        yaw_rad = _turned(yaw_rad + match.turn_rad, velocity)
+        if match.turn_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
+            axis = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+            velocity = (velocity @ axis) * axis
     position = expected + POSITION_GAIN * innovation
     return replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=yaw_rad)
 
@@ -195,30 +207,40 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     local = rotate(cloud.xyz[near, :2] + (cloud.origin[:2] - box.xy_m) - late_s * box.velocity_mps, -yaw_rad)
     outside_m = (np.abs(local) - size[:2] / 2).max(axis=1)
     inside = outside_m <= MARGIN_M
-    if inside.sum() < MIN_POINTS or (outside_m > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
+    in_shell = ~inside & (outside_m <= MARGIN_M + SHELL_M)
+    if inside.sum() < MIN_POINTS or in_shell.sum() > MAX_SHELL_RATIO * inside.sum():
         return None
-    low, high = extents_of_rotated(local[inside], max_trim_m=MAX_TRIM_M)
+    # The pose of what stands is known from all ticks.
+    turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
+    box = replace(box, yaw_rad=yaw_rad + turn_rad)
+    low, high = extents_of_rotated(rotate(local[inside], -turn_rad), max_trim_m=MAX_TRIM_M)
     if np.any(high - low > size[:2] + 0.6):
         return None
-    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
+    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
     real, gap_m, rays = facing_ends(low, high, sensor), np.zeros((2, 2)), None
-    if np.any(size[:2] - (high - low) > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)):
-        if cloud.free is None:
-            return None
+    hidden = size[:2] - (high - low) > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)
+    if cloud.free is None and hidden.any():
+        return None
+    if cloud.free is not None and np.any(hidden | ~real.any(axis=1)):
         rays = _rays_to(box, cloud.origin, cloud.free)
-        real, gap_m = _ends_by_rays(*rays, size[2], low, high, real)
-        if not real.any(axis=1).all():
+        levels = np.quantile(cloud.xyz[near[inside], 2] + np.float32(cloud.origin[2] - box.bottom_m), LEVELS)
+        real, gap_m = _ends_by_rays(*rays, levels, low, high, real)
+        smaller = real.all(axis=1) & (high - low + gap_m.sum(axis=1) < MIN_SIZE_SHARE * size[:2])
+        if smaller.any() or (hidden.any() and not real.any(axis=1).all()):
             return None
     center, sigma = complete_box(low, high, size[:2], real, gap_m=gap_m)
-    if np.hypot(*center) > MAX_SHIFT_M or (rays is not None and _passes(*rays, center, size)):
+    if np.any(np.abs(center) > np.maximum(MAX_SHIFT_M, MAX_SHIFT_SHARE * size[:2])) or (
+        rays is not None and _passes(*rays, center, size)
+    ):
         return None
     sigma = np.hypot(sigma, UNIFORM_SIGMA * np.where(real.all(axis=1), gap_m.min(axis=1), gap_m.max(axis=1)))
     mean_s = float(late_s[inside].mean())
     return LidarMatch(
         tick,
         cloud.stamp_ns + round(mean_s * NS_PER_S),
-        rotate(center, yaw_rad) + box.xy_m + mean_s * box.velocity_mps,
-        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), yaw_rad),
+        rotate(center, box.yaw_rad) + box.xy_m + mean_s * box.velocity_mps,
+        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), box.yaw_rad),
+        turn_rad,
         int(inside.sum()),
     )
 
@@ -232,9 +254,9 @@ def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
 
 
 def _ends_by_rays(
-    start: Array, end: Array, height_m: float, low: Array, high: Array, real: NDArray[np.int64]
+    start: Array, end: Array, levels_m: Array, low: Array, high: Array, real: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Array]:
-    """Find the ends next to which rays (K, 3) pass the sides that face the sensor.
+    """Find the ends next to which rays (K, 3) pass the sides that face the sensor, between two levels (2,).
 
     Returns
     -------
@@ -250,7 +272,7 @@ def _ends_by_rays(
         passing = np.flatnonzero((before > 0) & (behind > SIDE_DEPTH_M))
         share = (before / (before + behind))[passing, None]
         at = start[passing] + share * (end - start)[passing]
-        at = at[(at[:, 2] > SOLID.low * height_m) & (at[:, 2] < SOLID.high * height_m), along]
+        at = at[(at[:, 2] > levels_m[0]) & (at[:, 2] < levels_m[1]), along]
         for k, beyond in enumerate((low[along] - at, at - high[along])):
             gap = float(beyond[beyond > 0].min(initial=np.inf))
             if gap < MAX_GAP_M and not ends[along, k]:
