@@ -9,7 +9,14 @@ import pytest
 from worlds import Solid, scan, standing
 
 from log2sim.agents.confirmation import MIN_SWEEP_CONFIDENCE, followed_confidence
-from log2sim.agents.lidar_tracking import BoxState, match_box, match_standing, track_with_lidar
+from log2sim.agents.lidar_tracking import (
+    BoxState,
+    LidarMatch,
+    left_free,
+    match_box,
+    match_standing,
+    track_with_lidar,
+)
 from log2sim.datatypes import Boxes3D, Measurements, Obstacles, Rays, Track
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.box_completion import place_boxes
@@ -297,8 +304,15 @@ def straight_track(*, score, count=10):
 def test_what_moves_on_and_fits_its_points_is_an_object_though_its_scores_are_low():
     track = straight_track(score=0.3)
     places = np.stack([10.0 + np.arange(10) * 1.4, np.full(10, 3.0)], axis=1)
-    ticks = np.arange(10) + 10
-    assert followed_confidence(track, ticks, places) >= MIN_SWEEP_CONFIDENCE
-    assert followed_confidence(track, ticks, np.tile(places[:1], (10, 1))) == 0.0
-    assert followed_confidence(track, ticks[:3], places[:3]) == 0.0
-    assert followed_confidence(straight_track(score=0.05), ticks, places) < MIN_SWEEP_CONFIDENCE
+    assert followed_confidence(track, places) >= MIN_SWEEP_CONFIDENCE
+    assert followed_confidence(track, places[:3]) == 0.0
+    assert followed_confidence(straight_track(score=0.05), places) < MIN_SWEEP_CONFIDENCE
+
+
+def test_what_moves_leaves_its_place_free_and_clutter_does_not():
+    x = 16.0 - 1.4 * np.arange(20)
+    matches = [LidarMatch(k, T0_NS + k * STEP_NS, np.array([p, 3.0]), np.eye(2), np.pi, 50) for k, p in enumerate(x)]
+    bus = [around([standing(p, 3.0, 180, BUS)]) for p in x]
+    assert left_free(bus, matches, np.array(BUS), 0.0)[[0, -1]].all()
+    row = [around([WALL])] * len(x)
+    assert not left_free(row, matches, np.array(BUS), 0.0).any()

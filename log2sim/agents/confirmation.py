@@ -106,27 +106,24 @@ def moving_confidence(track: Track) -> float:
     return detection_rate(m.t_ns, track.tick, track.unrecorded) * float(probability_of(log_odds))
 
 
-def followed_confidence(track: Track, tick: NDArray[np.int64], xy_m: Array) -> float:
-    """Return the probability that a track is an object, from its boxes in LiDAR sweeps and the points that its box met elsewhere.
+def followed_confidence(track: Track, xy_m: Array) -> float:
+    """Return the probability that a track is a vehicle, from its boxes in LiDAR sweeps and the points that its box met elsewhere.
 
     Parameters
     ----------
     track : Track
-    tick : (n,) int64
-        Ticks without a detection at which the points fit its box.
     xy_m : (n, 2) float64
-        Where that was, in rising time.
+        Places in rising time that were free when the box was not there, and where points fit it without a detection.
 
     Notes
     -----
-    A box of one size that is moved on by its velocity alone fits the points of other places by chance seldom. One that does
-    not get farther than its own length may fit what stands there, which says nothing.
+    A box of one size that is moved on by its velocity alone seldom fits the points of such places by chance.
     """
     m = track.measurements
     in_sweep = np.flatnonzero(np.isfinite(m.box_yaw_rad) & np.isfinite(m.center_m[:, 0]))
-    length_m = TYPICAL_SIZE_M[track.category][0]
-    if not len(in_sweep) or len(tick) < SMOOTHED_TICKS or float(np.hypot(*(xy_m[-1] - xy_m[0]))) < length_m:
+    if not len(in_sweep) or len(xy_m) < SMOOTHED_TICKS or GROUP_OF[track.category] != "vehicle":
         return 0.0
+    length_m = TYPICAL_SIZE_M[track.category][0]
     detected = float(logit(m.score[in_sweep]).mean()) * independent_along(m.center_m[in_sweep, :2], length_m)
     return float(probability_of(detected + MATCH_NATS * independent_along(xy_m, length_m)))
 

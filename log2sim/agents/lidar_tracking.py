@@ -64,8 +64,8 @@ class LidarMatch:
         Center, map frame.
     covariance : (2, 2) float64
         Of the center, m2.
-    turn_rad : float
-        Direction of its sides relative to the prediction; 0 where its points do not show it.
+    yaw_rad : float
+        Direction of its sides; the predicted one where its points do not show it.
     points : int
     """
 
@@ -73,7 +73,7 @@ class LidarMatch:
     t_ns: int
     xy_m: Array
     covariance: Array
-    turn_rad: float
+    yaw_rad: float
     points: int
 
 
@@ -181,8 +181,8 @@ def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
     velocity, yaw_rad = state.velocity_mps, state.yaw_rad
     if abs(dt_s) > 1e-3:
         velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-        yaw_rad = _turned(yaw_rad + match.turn_rad, velocity)
-        if match.turn_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
+        yaw_rad = _turned(match.yaw_rad, velocity)
+        if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
             axis = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
             velocity = (velocity @ axis) * axis
     position = expected + POSITION_GAIN * innovation
@@ -240,9 +240,29 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
         cloud.stamp_ns + round(mean_s * NS_PER_S),
         rotate(center, box.yaw_rad) + box.xy_m + mean_s * box.velocity_mps,
         oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), box.yaw_rad),
-        turn_rad,
+        box.yaw_rad,
         int(inside.sum()),
     )
+
+
+def left_free(
+    obstacles: Sequence[Obstacles | None], matches: Sequence[LidarMatch], size_m: Array, bottom_m: float
+) -> NDArray[np.bool_]:
+    """Mark the matches (n,), in rising time, whose place rays pass when the box is more than its length from there.
+
+    What a moving object was taken for does so; clutter along which a box drifts stays where it is.
+    """
+    places = np.array([match.xy_m for match in matches]).reshape(-1, 2)
+    marked = np.zeros(len(matches), dtype=bool)
+    for k, match in enumerate(matches):
+        away = np.flatnonzero(np.hypot(*(places - match.xy_m).T) > size_m[0])
+        # The last moment before it came, the first one after it went.
+        for other in (*away[away < k][-1:].tolist(), *away[away > k][:1].tolist()):
+            cloud = obstacles[matches[other].tick]
+            if cloud is not None and cloud.free is not None and not marked[k]:
+                box = BoxState(match.t_ns, match.xy_m, np.zeros(2), match.yaw_rad, size_m, bottom_m)
+                marked[k] = _passes(*_rays_to(box, cloud.origin, cloud.free), np.zeros(2), size_m)
+    return marked
 
 
 def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
@@ -281,10 +301,11 @@ def _ends_by_rays(
 
 
 def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
-    """Return whether most rays toward the solid part of a box of a size (3,) at a center (2,) go on behind it."""
+    """Return whether most of several rays toward the solid part of a box of a size (3,) at a center (2,) go on behind it."""
     first = start - np.append(center, size[2] / 2)
     (ending,) = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
-    return bool((ending == Ending.THROUGH).sum() > MAX_THROUGH_SHARE * (ending <= Ending.THROUGH).sum())
+    passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
+    return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
 
 
 def _turned(yaw_rad: float, velocity: Array) -> float:

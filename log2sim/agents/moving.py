@@ -13,7 +13,7 @@ from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, 
 from log2sim.agents.confirmation import SAME_MOMENT_S, followed_confidence
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.heading.course import forward_log_odds
-from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
+from log2sim.agents.lidar_tracking import BoxState, LidarMatch, left_free, track_with_lidar
 from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth import feasibility
@@ -120,8 +120,8 @@ def moving_candidate(
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
     ordered = sorted(matches, key=lambda match: match.tick)
-    places = np.array([match.xy_m for match in ordered]).reshape(-1, 2)
-    followed = followed_confidence(track, np.array([match.tick for match in ordered], dtype=np.int64), places)
+    free = left_free(obstacles, ordered, geometry.size_m, float(np.median(geometry.z_m)) - geometry.size_m[2] / 2)
+    followed = followed_confidence(track, np.array([match.xy_m for match in ordered]).reshape(-1, 2)[free])
     return candidate_of(track, geometry, waypoints, quality, static=False, followed=followed).doubted(doubts)
 
 
