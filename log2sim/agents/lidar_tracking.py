@@ -26,7 +26,7 @@ from log2sim.perception.prefetch import OBSTACLE_REACH_M
 MIN_POINTS = 8
 # Points up to this far outside the predicted box count as its own; a shell of this width around them is compared with it.
 MARGIN_M = 0.5
-SHELL_M = 0.5
+SHELL_M = 1.0
 # With more points in the shell, relative to those in the box, the box is a part of a larger structure.
 MAX_SHELL_RATIO = 0.6
 # Largest distance of a match from its prediction along each side, and as a share of it: the box of a detector may be off so far.
