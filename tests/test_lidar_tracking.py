@@ -275,8 +275,7 @@ def test_what_is_no_bus_beside_the_sensor_is_not_taken_for_it(name):
     assert seen(around(solids, azimuth_deg), (0.0, 3.0), size=np.array(BUS)) is None
 
 
-@pytest.mark.parametrize("azimuth_deg", [ALL_AROUND, AHEAD])
-@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize(("azimuth_deg", "forward"), [(ALL_AROUND, True), (ALL_AROUND, False), (AHEAD, True)])
 def test_a_bus_is_followed_past_the_sensor_for_as_long_as_points_show_it(azimuth_deg, forward):
     x = 16.0 - 1.4 * np.arange(20)
     t_ns = T0_NS + np.arange(20) * STEP_NS
@@ -284,8 +283,6 @@ def test_a_bus_is_followed_past_the_sensor_for_as_long_as_points_show_it(azimuth
     shown = [k for k in range(20) if (np.abs(clouds[k].xyz[:, 0] - x[k]) < 6.1).sum() >= 50]
     first, rest = (shown[0], shown[1:]) if forward else (shown[-1], shown[-2::-1])
     start = BoxState(int(t_ns[first]), np.array([x[first], 3.0]), np.array([-14.0, 0.0]), np.pi, np.array(BUS), 0.0)
-    if not forward and azimuth_deg == AHEAD:
-        pytest.skip("its last view is a meter of its rear")
     found = track_with_lidar(clouds, [*rest, *range(shown[-1] + 1, 20)] if forward else rest, t_ns, start)
     assert [m.tick for m in found] == rest
     assert max(np.hypot(*(m.xy_m - [x[m.tick], 3.0])) for m in found) < 0.6
