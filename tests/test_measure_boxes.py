@@ -16,7 +16,7 @@ from log2sim.agents.box_votes import (
     typical_box_size,
     weighted_median,
 )
-from log2sim.agents.confirmation import agent_confidence, image_confidence, is_confirmed, sweep_confidence
+from log2sim.agents.confirmation import HIDDEN_S, agent_confidence, image_confidence, is_confirmed, sweep_confidence
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.size import moving_geometry, static_geometry
 from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
@@ -212,14 +212,21 @@ def test_what_the_image_confirms_needs_no_sweep() -> None:
     assert not is_confirmed(track_of(20, 0.45), typical=True)
 
 
-def test_a_track_seen_at_every_third_tick_is_no_object() -> None:
-    whole = track_of(60, 0.7)
+@pytest.mark.parametrize("camera", ["", "front"])
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.5])
+def test_a_track_seen_at_every_third_tick_is_no_object(camera: str, period_s: float) -> None:
+    whole = track_of(60, 0.7, camera=camera)
+    stamps = (np.arange(60) * period_s * NS_PER_S).astype(np.int64)
+    whole = replace(whole, measurements=replace(whole.measurements, t_ns=stamps))
     rows = np.arange(0, 60, 3)
-    sparse = Track("car", whole.tick[rows], replace(whole.measurements.take(rows)))
-    # The stamps of every third tick alone look complete; the gaps show against two neighbors.
+    sparse = Track("car", whole.tick[rows], whole.measurements.take(rows))
     pairs = np.sort(np.r_[rows, rows[::3] + 1])
     gappy = Track("car", whole.tick[pairs], whole.measurements.take(pairs))
-    assert sweep_confidence(gappy) < sweep_confidence(sparse) <= sweep_confidence(whole)
+    confidence = image_confidence if camera else sweep_confidence
+    # Gaps of more than a second may be occlusions.
+    limit = 0.5 if period_s < HIDDEN_S / 3 else 0.7
+    for missed in (sparse, gappy):
+        assert confidence(missed) < limit * confidence(whole)
 
 
 def test_ticks_at_which_nothing_was_recorded_do_not_count_against_a_track() -> None:

@@ -25,7 +25,8 @@ WEAK_GROUPS, MIN_COUNTED_SCORE = ("pedestrian", "two_wheeler"), 0.3
 HIDDEN_S = 1.0
 # Over so many ticks, half a second of usual logs, errors of positions average to less than the length of a person.
 SMOOTHED_TICKS = 5
-SAME_MOMENT_S = 1e-3
+# Stamps of cameras and sweeps jitter; ticks are not nearer to each other than this.
+MIN_PERIOD_S = 0.01
 
 
 def is_confirmed(track: Track, *, typical: bool) -> bool:
@@ -102,24 +103,19 @@ def moving_confidence(track: Track) -> float:
 
 
 def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded: NDArray[np.int64]) -> float:
-    """Return the share of ticks with a detection between the first and the last of stamps (n,), which belong to ticks (n,).
+    """Return the share of ticks with a detection between the first and the last of ticks (n,), which have stamps (n,).
 
-    A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate. Ticks (U,) at which
-    nothing was recorded do not count.
+    A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate, at least one tick
+    without a detection. Ticks (U,) at which nothing was recorded do not count.
     """
-    order = np.argsort(t_ns, kind="stable")
-    t, tick = (t_ns[order] - t_ns[0]) / NS_PER_S, tick[order]
-    # Frames that share a sweep measure at the same time, which counts once.
-    rows = np.r_[True, np.diff(t) > SAME_MOMENT_S]
-    t, tick = t[rows], tick[rows]
-    steps = np.diff(t)
-    if len(steps) == 0:
+    ticks = np.diff(tick)
+    if len(ticks) == 0:
         return 1.0
-    between = np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right")
-    steps = steps * (1.0 - between / np.maximum(np.diff(tick), 1))
-    period = float(np.median(steps[steps <= np.median(steps)]))
-    expected = 1 + float(np.where(steps > HIDDEN_S, HIDDEN_S / 2, steps).sum()) / max(period, 1e-3)
-    return min(len(t) / expected, 1.0)
+    # Not the time between detections: something that is detected at every fifth tick has a rate of a fifth.
+    period_s = max(float(np.median(np.diff(t_ns) / NS_PER_S / ticks)), MIN_PERIOD_S)
+    recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
+    hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
+    return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))
 
 
 def _strongest(score: Array) -> Array:
