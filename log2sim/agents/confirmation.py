@@ -108,11 +108,13 @@ def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded:
     A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate, at least one tick
     without a detection. Ticks (U,) at which nothing was recorded do not count.
     """
+    # Both ends may measure an object at one tick.
+    tick, first = np.unique(tick, return_index=True)
     ticks = np.diff(tick)
     if len(ticks) == 0:
         return 1.0
     # Not the time between detections: something that is detected at every fifth tick has a rate of a fifth.
-    period_s = max(float(np.median(np.diff(t_ns) / NS_PER_S / ticks)), MIN_PERIOD_S)
+    period_s = max(float(np.median(np.diff(t_ns[first]) / NS_PER_S / ticks)), MIN_PERIOD_S)
     recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
     hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
     return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))
