@@ -20,9 +20,10 @@ class Support:
     beside_structure : float
         Likewise, of most of its points.
     unreached : bool
-        Whether it is pointless, most rays toward it do not end in it, and the cameras that detect it are where the LiDARs are.
+        Whether the LiDAR looks toward it, most of its detections have no point and most rays do not end in it, and the cameras
+        that detect it are where the LiDARs are.
     pointless : bool
-        Whether the LiDAR looks toward it and most of its detections have no point.
+        Whether the LiDAR looks toward it and none of its detections has a point.
     shown_ticks : int
         Ticks at which it is not hidden and a searched camera shows it well.
     detected_ticks : int

@@ -66,15 +66,15 @@ def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) 
     weighed = []
     for k, candidate in enumerate(candidates):
         rays = int(whole.before[k].sum() + met[k].sum())
-        pointless = rays >= MIN_LOOKING_RAYS and _share_without_points(candidate, clouds) > MOSTLY
+        without = _share_without_points(candidate, clouds) if rays >= MIN_LOOKING_RAYS else 0.0
         # Where points of it went to something beside it, rays still end in it.
-        unreached = pointless and whole.inside[k].sum() <= (1 - MOSTLY) * rays
+        unreached = without > MOSTLY and whole.inside[k].sum() <= (1 - MOSTLY) * rays
         support = replace(
             _support(solid, k),
             in_structure=float(in_structure[k]),
             beside_structure=float(beside[k]),
-            pointless=pointless,
-            unreached=bool(unreached) and _same_view(candidate, clouds),
+            pointless=without == 1,
+            unreached=bool(unreached and _same_view(candidate, clouds)),
             shown_ticks=int(shown[k].sum()),
             detected_ticks=int(shown[k, candidate.track.tick].sum()),
             image_ticks=int(shown[k, candidate.track.tick[candidate.track.measurements.camera != ""]].sum()),

@@ -71,7 +71,7 @@ def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Doubt]:
     if _through_more_than(MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS), s):
         doubts.append(Doubt("empty", f"{s.through_share:.0%} of the LiDAR's rays pass through its place"))
     if s.pointless:
-        doubts.append(Doubt("hardly_observed", "the LiDAR looks toward it and has no point of most of its detections"))
+        doubts.append(Doubt("hardly_observed", "the LiDAR looks toward it and has no point of it"))
     if missing_nats(s, usual_rate) > 0:
         doubts.append(
             Doubt("hardly_observed", f"is detected at {s.detected_ticks} of {s.shown_ticks} ticks that show it well")
