@@ -229,6 +229,17 @@ def test_a_track_seen_at_every_third_tick_is_no_object(camera: str, period_s: fl
         assert confidence(missed) < limit * confidence(whole)
 
 
+def test_weak_detections_of_a_person_are_no_occlusion() -> None:
+    # Three looks of two sure detections each, 2 s apart; in between a building hides the person, or it is detected weakly.
+    sure = np.isin(np.arange(62) % 20, (0, 1))
+    whole = track_of(62, np.where(sure, 0.7, 0.2), camera="front")
+    boxless = replace(whole.measurements, box_yaw_rad=np.full(62, np.nan), category=np.full(62, "pedestrian"))
+    weak = Track("pedestrian", whole.tick, boxless)
+    hidden = Track("pedestrian", whole.tick[sure], boxless.take(sure))
+    assert image_confidence(weak) == pytest.approx(0.7 * sure.mean(), rel=0.02)
+    assert image_confidence(hidden) > 2 * image_confidence(weak)
+
+
 def test_ticks_at_which_nothing_was_recorded_do_not_count_against_a_track() -> None:
     whole = track_of(60, 0.7)
     rows = np.r_[0:20, 29:60]  # 0.9 s without

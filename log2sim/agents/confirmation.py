@@ -54,18 +54,16 @@ def agent_confidence(track: Track) -> float:
 
 def image_confidence(track: Track) -> float:
     """Return the share of its searched ticks at which a track is detected in images, times the mean of the best scores there."""
-    m, tick = track.measurements, track.tick
+    m = track.measurements
     weak = (m.score < MIN_COUNTED_SCORE) & (GROUP_OF[track.category] in WEAK_GROUPS)
-    counted = ~(weak & np.isnan(m.box_yaw_rad))
-    m, tick, weak = m.take(counted), tick[counted], weak[counted]
-    in_image = (np.isnan(m.box_yaw_rad) | (m.camera != "")) & ~weak
-    if not in_image.any():
+    counted = np.flatnonzero(~(weak & np.isnan(m.box_yaw_rad)))
+    in_image = counted[((np.isnan(m.box_yaw_rad) | (m.camera != "")) & ~weak)[counted]]
+    if not len(in_image):
         return 0.0
-    return (
-        detection_rate(m.t_ns, tick, track.unrecorded)
-        * min(float(in_image.mean()) / track.searched, 1.0)
-        * float(_strongest(m.score[in_image]).mean())
-    )
+    # A tick with a weak detection is none with an occlusion.
+    between = slice(counted[0], counted[-1] + 1)
+    rate = detection_rate(m.t_ns[between], track.tick[between], track.unrecorded) * len(counted) / len(m.t_ns[between])
+    return rate * min(len(in_image) / len(counted) / track.searched, 1.0) * float(_strongest(m.score[in_image]).mean())
 
 
 def sweep_confidence(track: Track) -> float:
