@@ -212,6 +212,15 @@ def test_what_the_image_confirms_needs_no_sweep() -> None:
     assert not is_confirmed(track_of(20, 0.45), typical=True)
 
 
+@pytest.mark.parametrize(("score", "confirmed"), [(0.5, False), (0.7, True)])
+def test_people_whom_images_alone_show_have_to_be_surer_than_vehicles(score: float, confirmed: bool) -> None:
+    car = track_of(20, score, camera="front")
+    boxless = replace(car.measurements, box_yaw_rad=np.full(20, np.nan))
+    person = Track("pedestrian", car.tick, replace(boxless, category=np.full(20, "pedestrian")))
+    assert is_confirmed(Track("car", car.tick, boxless), typical=True)
+    assert is_confirmed(person, typical=True) is confirmed
+
+
 @pytest.mark.parametrize("camera", ["", "front"])
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.5])
 def test_a_track_seen_at_every_third_tick_is_no_object(camera: str, period_s: float) -> None:
