@@ -8,35 +8,70 @@ from typing import TYPE_CHECKING, Any
 from log2sim.version import __version__
 
 if TYPE_CHECKING:
+    from log2sim.batch.run import reconstruct_all
+    from log2sim.cli.installation import examine as examine_installation
     from log2sim.config import Config
     from log2sim.datatypes.scenario import Scenario
+    from log2sim.edit.apply import edit as edit_scenario
     from log2sim.errors import Log2SimError
+    from log2sim.evaluation.bench.benchmark import bench
+    from log2sim.evaluation.detection.detect_log import detect_log
     from log2sim.evaluation.metrics.evaluator import evaluate
+    from log2sim.export.exporters import export as export_scenario
+    from log2sim.export.openscenario.read import load as import_scenario
+    from log2sim.logs.native.writer import write_log
     from log2sim.logs.opening import open_log
+    from log2sim.logs.summary import summarize as summarize_log
+    from log2sim.logs.validation import validate_log
+    from log2sim.mapping.builder import map_ground
     from log2sim.pipeline import reconstruct
+    from log2sim.prediction.prediction import predict_scenario
     from log2sim.simulation.runner import replay
+    from log2sim.synth.write import write_synthetic
+    from log2sim.visualization.notebook.progress import show_progress
+    from log2sim.visualization.page.writer import write_page as view
     from log2sim.visualization.plot.axes import plot
 
-__all__ = ["Config", "Log2SimError", "Scenario", "__version__", "evaluate", "open_log", "plot", "reconstruct", "replay"]
-
-_MODULE_OF = {
-    "Config": "log2sim.config",
-    "Log2SimError": "log2sim.errors",
-    "Scenario": "log2sim.datatypes.scenario",
-    "evaluate": "log2sim.evaluation.metrics.evaluator",
-    "open_log": "log2sim.logs.opening",
-    "plot": "log2sim.visualization.plot.axes",
-    "reconstruct": "log2sim.pipeline",
-    "replay": "log2sim.simulation.runner",
+_PLACES = {
+    "Config": "log2sim.config:Config",
+    "Log2SimError": "log2sim.errors:Log2SimError",
+    "Scenario": "log2sim.datatypes.scenario:Scenario",
+    "bench": "log2sim.evaluation.bench.benchmark:bench",
+    "detect_log": "log2sim.evaluation.detection.detect_log:detect_log",
+    "edit_scenario": "log2sim.edit.apply:edit",
+    "evaluate": "log2sim.evaluation.metrics.evaluator:evaluate",
+    "examine_installation": "log2sim.cli.installation:examine",
+    "export_scenario": "log2sim.export.exporters:export",
+    "import_scenario": "log2sim.export.openscenario.read:load",
+    "map_ground": "log2sim.mapping.builder:map_ground",
+    "open_log": "log2sim.logs.opening:open_log",
+    "plot": "log2sim.visualization.plot.axes:plot",
+    "predict_scenario": "log2sim.prediction.prediction:predict_scenario",
+    "reconstruct": "log2sim.pipeline:reconstruct",
+    "reconstruct_all": "log2sim.batch.run:reconstruct_all",
+    "replay": "log2sim.simulation.runner:replay",
+    "show_progress": "log2sim.visualization.notebook.progress:show_progress",
+    "summarize_log": "log2sim.logs.summary:summarize",
+    "validate_log": "log2sim.logs.validation:validate_log",
+    "view": "log2sim.visualization.page.writer:write_page",
+    "write_log": "log2sim.logs.native.writer:write_log",
+    "write_synthetic": "log2sim.synth.write:write_synthetic",
 }
+"""The functions of commands whose names are folders of the package have longer names."""
+
+__all__ = [
+    "Config", "Log2SimError", "Scenario", "__version__", "bench", "detect_log", "edit_scenario", "evaluate", "examine_installation",
+    "export_scenario", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
+    "replay", "show_progress", "summarize_log", "validate_log", "view", "write_log", "write_synthetic",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that `import log2sim` stays fast."""
-    if name not in _MODULE_OF:
+    if name not in _PLACES:
         raise AttributeError(f"module 'log2sim' has no attribute '{name}'")
-    value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    globals()[name] = value
+    module, _, attribute = _PLACES[name].partition(":")
+    value = globals()[name] = getattr(importlib.import_module(module), attribute)
     return value
 
 

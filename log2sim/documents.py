@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -198,9 +197,9 @@ def rounded(value: float, digits: int) -> float | None:
 @cache
 def load_schema(name: str) -> dict[str, Any]:
     """Load a schema by name, such as "scenario-1"."""
-    beside_source = Path(__file__).resolve().parent.parent / "schemas" / f"{name}.json"
-    installed = resources.files("log2sim_schemas") if not beside_source.is_file() else None
-    file = installed.joinpath(f"{name}.json") if installed is not None else beside_source
+    package = Path(__file__).resolve().parent
+    folder = package / "schemas"  # of an installation; a checkout has them at its top level
+    file = (folder if folder.is_dir() else package.parent / "schemas") / f"{name}.json"
     document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return document
 

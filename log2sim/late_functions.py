@@ -10,8 +10,10 @@ import importlib
 from typing import Any
 
 FUNCTIONS = {
+    "find_logs": "log2sim.batch.discovery:find_logs",
     "html_of": "log2sim.visualization.notebook.html:html_of",
     "show_log": "log2sim.visualization.notebook.show:show_log",
+    "truth_of": "log2sim.evaluation.metrics.truth:truth_from_log",
     "ticks_of": "log2sim.perception.ticks:ticks_of",
 }
 

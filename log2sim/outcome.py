@@ -70,7 +70,7 @@ def stage_outcomes(plan: Plan, outputs: RunOutputs) -> tuple[Outcome, ...]:
         Stage.MOTION_COMPENSATION: lambda d: _compensation(d, outputs.observations),
         Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, plan.picture_stride, outputs),
         Stage.HOMOGRAPHY: lambda d: _homography(d, plan.homography, outputs.homographies),
-        Stage.SMOOTHING_OF_PARKED_AGENTS: lambda d: _parked(outputs.agents),
+        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(outputs.agents),
         Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(outputs.agents),
     }
     return tuple(found.get(d.stage, Outcome)(d) for d in plan.decisions if d.stage not in DESCRIBING)
@@ -114,10 +114,10 @@ def _homography(planned: Decision, scope: HomographyScope, homographies: Mapping
     return Outcome(Decision(planned.stage, True, f"{planned.reason}: {', '.join(homographies)}"))
 
 
-def _parked(agents: tuple[Agent, ...]) -> Outcome:
-    parked = sum(a.static for a in agents)
-    reason = f"{parked} of {len(agents)} agents are parked: one pose for each" if parked else "no agent is parked"
-    return Outcome(Decision(Stage.SMOOTHING_OF_PARKED_AGENTS, not parked, reason))
+def _static(agents: tuple[Agent, ...]) -> Outcome:
+    static = sum(a.static for a in agents)
+    reason = f"{static} of {len(agents)} agents are static: one pose for each" if static else "no agent is static"
+    return Outcome(Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, not static, reason))
 
 
 def _waypoints(agents: tuple[Agent, ...]) -> Outcome:

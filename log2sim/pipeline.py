@@ -268,7 +268,7 @@ def result_of(run: Run, ego: Agent | None, outputs: RunOutputs) -> Result:
         t_ns,
         [ego, *outputs.agents] if ego is not None else outputs.agents,
         cameras=camera_entries(log, run.plan.cameras, outputs.homographies),
-        plan=[outcome.to_dict() for outcome in outcomes],
+        stages=[outcome.to_dict() for outcome in outcomes],
         provenance={
             **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
             **({"faults": faults} if faults else {}),
@@ -285,6 +285,6 @@ def look_around(run: Run, observations: Observations, result: Result) -> Result:
     used = run.log.changed(cameras={name: run.log.cameras[name] for name in run.plan.cameras})
     recorded = Recorded(used, run.config, run.plan, observations, run.clock, run.report_progress)
     description = describe(result.scenario, recorded)
-    plan = [*result.scenario.plan, *(outcome.to_dict() for outcome in description.outcomes)]
-    scenario = replace(description.scenario, plan=tuple(plan))
+    stages = [*result.scenario.stages, *(outcome.to_dict() for outcome in description.outcomes)]
+    scenario = replace(description.scenario, stages=tuple(stages))
     return replace(result, scenario=scenario, report=extended_report(result.report, description, run.clock))

@@ -38,7 +38,7 @@ class Stage(StrEnum):
     FUSION_OF_ENDS = "fusion of vehicle and road"
     TRACKING = "tracking"
     SMOOTHING = "smoothing"
-    SMOOTHING_OF_PARKED_AGENTS = "smoothing of parked agents"
+    SMOOTHING_OF_STATIC_AGENTS = "smoothing of static agents"
     WAYPOINT_AT_EVERY_TICK = "waypoint at every tick"
     LANES = "markings and lanes"
     COLORS = "colors of vehicles"
@@ -137,7 +137,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         *([Decision(Stage.FUSION_OF_ENDS, ends.level is not None, ends.reason)] if ends.reason else []),
         Decision(Stage.TRACKING, True, "identities over time are the result"),
         Decision(Stage.SMOOTHING, smooth, "measured positions are noisy" if smooth else "smooth.enabled=false"),
-        Decision(Stage.SMOOTHING_OF_PARKED_AGENTS, False, "a parked agent has one pose"),
+        Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, False, "a static agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
         _lanes(log, config, sensors),
         _colors(config, sensors),

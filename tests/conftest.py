@@ -16,8 +16,18 @@ import pytest
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put files with slow tests first, so that no process is left with a long one at the end."""
+    """Leave the first case of each test marked `matrix` to the default suite, and put files with slow tests first.
+
+    Then no process is left with a long one at the end.
+    """
+    first = set[str]()
+    for item in items:
+        function = f"{item.path}::{item.originalname}" if isinstance(item, pytest.Function) else item.nodeid
+        if item.get_closest_marker("matrix") and function in first:
+            item.add_marker(pytest.mark.slow)
+        first.add(function)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
 

@@ -74,6 +74,7 @@ def test_gray_pictures_give_no_color_and_say_so() -> None:
     assert "front are gray" in sampler.notes()[0]
 
 
+@pytest.mark.slow
 def test_what_is_hidden_is_not_looked_at() -> None:
     log, truth = street()
     red = next(agent for agent in truth.others if agent.id == "a")

@@ -14,6 +14,7 @@ from log2sim.datatypes import COLOR_NAMES
 from log2sim.geometry import NS_PER_S, inverse, project_boxes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a", "b", "d"])
 def test_a_crop_of_a_scene_gets_the_name_of_its_paint(name: str) -> None:
     log, truth = street()

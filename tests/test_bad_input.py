@@ -148,6 +148,7 @@ LOG_FAULTS: dict[str, tuple[Change, tuple[str, ...], int, list[str]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("fault", LOG_FAULTS)
 def test_a_bad_log_or_setting_is_one_clear_line_and_writes_nothing(log_folder: Path, fault: str) -> None:
     change, options, code, words = LOG_FAULTS[fault]
@@ -184,6 +185,7 @@ RECORD_FAULTS: dict[str, tuple[Change, tuple[str, ...], str, list[str]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("fault", RECORD_FAULTS)
 def test_one_bad_record_is_counted_and_the_run_goes_on(log_folder: Path, fault: str) -> None:
     change, options, stream, words = RECORD_FAULTS[fault]
@@ -204,6 +206,7 @@ def test_one_bad_record_is_counted_and_the_run_goes_on(log_folder: Path, fault: 
     assert all(word in problems.err for word in words if "finite" not in word)
 
 
+@pytest.mark.slow
 def test_scattered_nan_points_are_left_out_without_a_word(log_folder: Path, tiny_scenario: Path) -> None:
     for file in (log_folder / "top").glob("*.npz"):
         data = dict(np.load(file))
@@ -219,6 +222,7 @@ def test_scattered_nan_points_are_left_out_without_a_word(log_folder: Path, tiny
     assert found["agents"] == json.loads(tiny_scenario.read_text())["agents"]
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     ("stamp", "words"),
     [(FIRST_NS + 1, ["front: 1 of 10 records out of order", "sorted"]), (FIRST_NS + 100_000_000, ["front: 1 of 10 records repeat a stamp", "dropped"])],
@@ -234,6 +238,7 @@ def test_a_stamp_out_of_order_is_put_in_place_and_told(log_folder: Path, stamp: 
     assert run("validate", log_folder).code == 3
 
 
+@pytest.mark.slow
 def test_frames_without_ego_pose_are_told(log_folder: Path) -> None:
     poses = log_folder / "ego/poses.csv"
     poses.write_text("\n".join(poses.read_text().split("\n")[:40]) + "\n")  # the header and 39 poses, 10 ms apart
@@ -265,6 +270,7 @@ SCENARIO_FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = 
 }  # fmt: skip
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("fault", SCENARIO_FAULTS)
 def test_a_bad_scenario_is_one_clear_line_in_every_command(tmp_path: Path, tiny_scenario: Path, fault: str) -> None:
     change, words = SCENARIO_FAULTS[fault]
@@ -325,6 +331,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(log_folder: 
     assert names(base) == before
 
 
+@pytest.mark.slow
 def test_a_failing_last_step_leaves_what_was_there(
     log_folder: Path, monkeypatch: pytest.MonkeyPatch, tiny_scenario: Path
 ) -> None:

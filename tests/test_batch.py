@@ -15,6 +15,7 @@ from command_line import names, run
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from log2sim import reconstruct_all
 from log2sim.batch import cluster
 from log2sim.batch.discovery import FoundLog, find_logs
 from log2sim.batch.evaluation import pool
@@ -263,6 +264,12 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     assert "2 of them done before" in ran.out
     assert names(bad) == ["report.json", "row.json", "scenario.json"]
     assert (out / "logs" / "good" / "row.json").stat().st_mtime_ns == before
+
+    steps: list[tuple[int, int]] = []
+    config = Config.load(settings=FAST[3::2], detect={"name": FAST[1]})
+    again = reconstruct_all(root, out, config, progress=lambda done, total: steps.append((done, total)))
+    assert [row.status for row in again] == ["done"] * 3
+    assert steps == []  # nothing was left to do
 
     ran = run("evaluate", out, "--truth", root, "--out", tmp_path / "metrics.json")
     assert ran.code == 0, ran.err

@@ -490,6 +490,18 @@ def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> N
         assert all(p["error"] == p["figures"][entry["error"]["figure"]] for p in entry["points"])
 
 
+def test_the_dataframe_has_a_row_for_each_setting_with_its_figures(result: Benchmark) -> None:
+    pytest.importorskip("pandas")
+    table = result.to_dataframe()
+    points = [(panel.stage, point) for panel in result.panels for point in panel.points]
+    assert list(zip(table.stage, table.setting)) == [(stage, point.setting) for stage, point in points]
+    assert table.present.sum() == sum(point.present for _, point in points)
+    for row, (_, point) in zip(table.to_dict("records"), points, strict=True):
+        assert row["ms_per_tick"] == point.ms_per_tick
+        known = {name: value for name, value in point.figures.items() if value is not None}
+        assert {k: row[k] for k in known} == known
+
+
 def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) -> None:
     lines = format_table(result).split("\n")
     for panel in result.panels:

@@ -214,6 +214,7 @@ def test_points_move_as_the_own_mount_says_and_exchanged_mounts_show() -> None:
     assert flow_agreement(rig["left"], pairs["left"][:2]) is None
 
 
+@pytest.mark.slow
 def test_exchanged_mounts_are_told_without_a_lidar(sample: Log) -> None:
     blind = sample.changed(lidars={})
     assert checked(blind) == (blind, ())
@@ -345,6 +346,7 @@ def test_slips_of_one_mount_are_told_and_mended(sample: Log) -> None:
         np.testing.assert_allclose(mended.cameras[name].mount_T_cam, sample.cameras[name].mount_T_cam, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_turn_of_all_cameras_is_one_of_the_lidar(sample: Log) -> None:
     turned = with_cameras(sample, *(yawed(camera, -1.2) for camera in sample.cameras.values()))
     _, (fault,) = checked(turned)

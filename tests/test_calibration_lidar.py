@@ -112,6 +112,7 @@ def test_both_are_found_together_in_the_sweeps(lively: Log) -> None:
     assert np.degrees(found.values[YAW]) == pytest.approx(-3.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_at_constant_speed_straight_on_the_offset_is_not_seen_and_the_yaw_is(steady: Log) -> None:
     found = fit_clock_and_mount(wrong(seen_in(steady), offset_s=0.1, yaw_deg=1.0))
     assert not found.shows_offset

@@ -64,6 +64,7 @@ def test_the_path_of_the_camera_is_that_of_the_ego_within_some_percent() -> None
     assert not found.predicted.any()
 
 
+@pytest.mark.slow
 def test_nodding_of_the_car_is_not_taken_for_motion() -> None:
     nodding, stamps = street(0.4).streams["front"], street().streams["front"].t_ns[:7]
     images = [nodding.read(i) if i % 2 else frames()[i] for i in range(len(stamps))]
@@ -143,6 +144,7 @@ def test_a_log_without_any_sensor_that_shows_motion_is_refused() -> None:
         motion_camera(log)
 
 
+@pytest.mark.slow
 def test_a_scenario_of_a_camera_alone_holds_the_ego() -> None:
     nothing = ImageLabels(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), np.zeros(0, dtype="<U16"))
     log = replace(filmed(), image_labels={"front": nothing})

@@ -209,6 +209,7 @@ def test_a_policy_drives_the_ego_in_carla(server: Client) -> None:
     assert np.hypot(driven.x_m[-1] - driven.x_m[0], driven.y_m[-1] - driven.y_m[0]) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["pid", "exact"])
 def test_reactive_agents_react_in_carla(server: Client, mode: str) -> None:
     """carla#8637: who follows an ego that stops does not drive into it, and is shown where it is stored."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,7 @@ def test_the_same_seed_gives_the_same_bytes(tiny_folder: Path, tmp_path: Path) -
     assert (tmp_path / "a.replay").read_bytes() == (tmp_path / "b.replay").read_bytes()
 
 
+@pytest.mark.slow
 def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text('seed = 5\n[measure]\nmode = "paper"\nmax_range_m = 30.0\n')
     ran = run(
@@ -119,6 +121,7 @@ def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
     assert not decoding["kept"]
 
 
+@pytest.mark.slow
 def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> None:
     import cv2
 
@@ -138,6 +141,7 @@ def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> 
     assert picture[picture[..., 3] > 0][:, :3].std() > 5
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(("name", "magic"), [("t.png", PNG), ("t.gif", GIF), ("t.svg", b"<?xml"), ("t.pdf", b"%PDF")])
 def test_plot_writes_what_the_suffix_says(tiny_scenario: Path, tmp_path: Path, name: str, magic: bytes) -> None:
     assert run("plot", tiny_scenario, "--out", tmp_path / name).code == 0
@@ -243,6 +247,7 @@ def test_config_prints_toml_that_it_reads_again(tmp_path: Path) -> None:
     assert run("config").out != first.out
 
 
+@pytest.mark.slow
 def test_synth_is_the_same_for_a_seed_and_replaces_only_when_asked(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(tiny_toml(agents=[], duration_s=0.3))
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -327,6 +332,7 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
 
+@pytest.mark.slow
 def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
     source = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
     arguments = ("edit", source, "--lateral", "ego=3.5", "--overwrite", "--out", tmp_path / "e.json")
@@ -394,3 +400,72 @@ def test_edit_refuses_what_makes_no_sense_and_writes_nothing(
     assert ran.code == 2
     assert message in ran.line
     assert names(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_every_command_names_the_files_it_wrote(
+    tiny_folder: Path, tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenario = tiny_scenario
+    commands = [
+        (
+            "reconstruct",
+            tiny_folder,
+            "--detector",
+            "labels",
+            "-o",
+            "s.json",
+            "--report",
+            "r.json",
+            "--topdown",
+            "t.png",
+        ),
+        ("detect", tiny_folder, "--detector", "lidar:labels", "-o", "boxes.json"),
+        ("replay", scenario, "-o", "replay.json"),
+        ("plot", scenario, "-o", "plot.svg"),
+        ("view", scenario, "-o", "page.html"),
+        ("predict", scenario, "-o", "prediction.json"),
+        ("edit", scenario, "--drop-doubtful", "-o", "edited.json"),
+        ("export", scenario, "--to", "openscenario", "-o", "xosc"),
+        ("import", "xosc/scenario.xosc", "-o", "imported.json"),
+        ("convert", tiny_folder, "--stop", "0.2", "-o", "part"),
+        ("map", tiny_folder, "--cell", "0.5", "-o", "map.png"),
+        ("inspect", tiny_folder, "--overlay", "moment.png"),
+    ]
+    for command in commands:
+        before = names(tmp_path)
+        ran = run(*command)
+        assert ran.code == 0, (command, ran.err)
+        new = set(names(tmp_path)) - set(before)
+        assert new
+        assert [name for name in new if name not in ran.out] == [], command
+
+
+def test_files_are_replaced_where_the_command_or_the_environment_says_so(
+    tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export = ("export", tiny_scenario, "--to", "csv", "-o", tmp_path / "csv", "-q")
+    assert run(*export).code == 0
+    assert run(*export).code == 2
+    assert run(*export, "-f").code == 0
+    monkeypatch.setenv("LOG2SIM_OVERWRITE", "1")
+    assert run(*export).code == 0
+    monkeypatch.setenv("LOG2SIM_OVERWRITE", "0")
+    assert run(*export).code == 2
+
+
+def test_a_folder_of_logs_is_told_from_a_folder_without_any(tiny_folder: Path, tmp_path: Path) -> None:
+    for name in ("a/x/y/z", "b/x/y/z", "c/x/y/z"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        shutil.copytree(tiny_folder, tmp_path / name)
+    ran = run("inspect", tmp_path)
+    assert (ran.code, "3 logs below: `log2sim batch`" in ran.line) == (3, True)
+    assert str(tmp_path / "b/x/y/z") in ran.line
+
+
+def test_an_unknown_detector_is_told_before_the_log_is_opened_with_all_there_are(tmp_path: Path) -> None:
+    ran = run("reconstruct", tmp_path / "no log", "--detector", "lidr:vehicle", "-o", tmp_path / "s.json")
+    assert ran.code == 2
+    for name in (*BUILT_IN["detector"], *(f"lidar:{name}" for name in BUILT_IN["lidar_detector"])):
+        assert name in ran.line

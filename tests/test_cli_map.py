@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import tifffile
 from command_line import names, run
 
@@ -44,6 +45,7 @@ def test_what_cannot_be_written_is_said_before_any_work(tiny_folder: Path, tmp_p
     assert names(tmp_path) == ["m.pgw"]
 
 
+@pytest.mark.slow
 def test_a_plot_and_a_page_take_a_map_as_background(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
     ground = tmp_path / "m.png"
     assert run("map", tiny_folder, "--out", ground, "--cell", "0.1", "--quiet").out == ""

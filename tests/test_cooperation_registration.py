@@ -41,6 +41,7 @@ def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: World) -> Non
     assert found.figures[0]["treatment"] == "corrected"
 
 
+@pytest.mark.slow
 def test_a_healthy_log_comes_out_as_it_is(street: World) -> None:
     found = register(street.log)
     assert found.log is street.log
@@ -48,6 +49,7 @@ def test_a_healthy_log_comes_out_as_it_is(street: World) -> None:
     assert found.figures[0]["verified"]
 
 
+@pytest.mark.slow
 def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World) -> None:
     found = register(misplaced(street.log, POLE, 8.0, 90.0))
     assert [(fault.kind, fault.sensor, fault.treatment) for fault in found.faults] == [

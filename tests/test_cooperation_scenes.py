@@ -67,6 +67,7 @@ def test_scene_files_have_a_lidar_at_each_end_with_the_ranges_of_the_paper(name:
     assert len(truth.agents) == len(scene.agent) + 1
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("name", list(DRAW))
 def test_a_seed_draws_the_same_world_again_and_another_one_another(name: str) -> None:
     world, again, other = drawn(name, 1), DRAW[name](1), drawn(name, 5)
@@ -76,6 +77,7 @@ def test_a_seed_draws_the_same_world_again_and_another_one_another(name: str) ->
     np.testing.assert_array_equal(streams[0].read(3).xyz_m, streams[1].read(3).xyz_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_walker_hides_from_the_vehicle_and_not_from_the_pole(seed: int) -> None:
     world = drawn("blind_area", seed)
@@ -188,6 +190,7 @@ def test_a_range_ends_where_the_target_is_seen_less_than_half_of_the_time() -> N
     assert figures["recall_30m"] == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_true_boxes_of_random_traffic_score_1_and_those_of_the_vehicle_alone_less() -> None:
     traffic = draw_traffic(3, 0)
     view = seen(traffic)

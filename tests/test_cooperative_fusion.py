@@ -251,6 +251,7 @@ def test_lidars_of_the_road_are_grouped_by_their_places(both_ends) -> None:
     assert group_by_viewpoint(road, list(road.lidars)) == [["post", "beside", "far"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["points", "boxes", "tracks"])
 def test_every_level_finds_every_object_once(both_ends, level) -> None:
     chosen = Config.load(
@@ -265,7 +266,7 @@ def test_every_level_finds_every_object_once(both_ends, level) -> None:
     parked = min(agents, key=lambda a: abs(a.waypoints.y_m[0] + 4))
     assert parked.size_m[0] == pytest.approx(4.2, abs=0.08)
     assert (parked.waypoints.x_m[0], parked.waypoints.y_m[0]) == pytest.approx((14, -4), abs=0.06)
-    (entry,) = [e for e in result.scenario.plan if e["stage"] == "fusion of vehicle and road"]
+    (entry,) = [e for e in result.scenario.stages if e["stage"] == "fusion of vehicle and road"]
     assert entry["kept"]
     assert entry["reason"].startswith(level)
 

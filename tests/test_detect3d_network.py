@@ -247,6 +247,7 @@ def test_a_sensor_that_is_nowhere_is_taken_to_be_at_the_origin(detector: LidarDe
     assert len(detector.detect(cloud)) == 3
 
 
+@pytest.mark.slow
 def test_five_million_points_are_thinned_out(detector: LidarDetector) -> None:
     rng = np.random.default_rng(0)
     level = rng.uniform(-60, 60, (5_000_000, 3)).astype(np.float32) * np.array([1, 1, 0.01], np.float32)

@@ -80,6 +80,7 @@ def test_ssd_finds_van_cyclist_and_pedestrian(in_cache: Path, real_data: Path) -
     assert found_as(found, "pedestrian", PEDESTRIAN)
 
 
+@pytest.mark.slow
 @needs_weights
 def test_ssd_gives_1917_boxes_and_nothing_on_gray(in_cache: Path) -> None:
     detector = create_detector("ssd-mobilenet-v2", LOG)

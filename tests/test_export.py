@@ -47,6 +47,7 @@ def test_a_format_writes_files_into_the_folder_and_nothing_beside_it(
     assert names(tmp_path) == ["out"]
 
 
+@pytest.mark.matrix
 def test_a_format_writes_the_same_bytes_again(name: str, scenario: Scenario, tmp_path: Path) -> None:
     if name == "rerun":
         pytest.skip("Rerun draws ids for what it stores; that the data are the same is tested with its own comparison")
@@ -54,6 +55,7 @@ def test_a_format_writes_the_same_bytes_again(name: str, scenario: Scenario, tmp
     assert [f.read_bytes() for f in first] == [f.read_bytes() for f in second]
 
 
+@pytest.mark.matrix
 def test_a_format_does_not_replace_files_unasked(name: str, scenario: Scenario, tmp_path: Path) -> None:
     export(scenario, name, tmp_path / "out")
     with pytest.raises(ConfigError, match="exists already"):

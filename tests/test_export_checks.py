@@ -147,6 +147,7 @@ def stacked(count: int, later_s: float = 0.0) -> list[Agent]:
     return [replace(base, id=f"a{k}", waypoints=replace(first, t_s=first.t_s + later_s * k)) for k in range(count)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("later_s", [0.0, 1e-5], ids=["at once", "one after the other"])
 def test_many_agents_in_one_place_are_listed_up_to_a_limit(later_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """4.5 million pairs overlap; the areas of one batch of them are computed."""

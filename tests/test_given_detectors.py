@@ -143,6 +143,7 @@ def test_an_incomplete_object_names_what_it_lacks() -> None:
         sort_detectors(Incomplete(), Config())
 
 
+@pytest.mark.slow
 def test_an_object_finds_what_the_detector_of_its_name_finds(log: Log) -> None:
     config = Config(stop_s=0.6, map={"lanes": False}, appearance={"colors": False, "signals": False})
     named = reconstruct(log, config.changed(detect="labels")).scenario

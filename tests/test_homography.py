@@ -124,6 +124,7 @@ def test_exact_data_give_the_exact_homography_as_opencv_finds_it(method: str) ->
     assert fit.error_m < 1e-8
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     ("outliers", "each", "above_limit"), [(0.0, 6, 1.4), (0.3, 6, 1.4), (0.3, 12, 1.2), (0.6, 12, 1.4)]
 )

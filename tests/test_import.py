@@ -34,6 +34,7 @@ WORLDS = {
 }  # fmt: skip
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("revision", ["1.0", "1.1", "1.2"])
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_scenario_comes_back_within_a_micrometer(world: str, revision: str, tmp_path: Path) -> None:

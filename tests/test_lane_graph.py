@@ -148,6 +148,7 @@ def test_lanes_turn_and_move_with_the_world(turn: float, east: float, north: flo
         )  # a sample of a path at a threshold
 
 
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(order=st.permutations(range(6)))
 def test_the_order_of_agents_does_not_matter(order: list[int]) -> None:

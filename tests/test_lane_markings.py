@@ -95,6 +95,7 @@ def paving(painter: Painter) -> None:
 SENSORS = [True, pytest.param(False, marks=pytest.mark.slow)]  # with LiDAR or without
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("lidar", SENSORS)
 @pytest.mark.parametrize(
     "change", [None, shadows, sun_through_a_fence, wet_glare, night], ids=lambda c: c.__name__ if c else "day"
@@ -141,6 +142,7 @@ def test_what_is_left_of_removed_lines_is_no_marking() -> None:
     assert compare(find_markings(painter.ground(lidar=False))[0], truth)[0] >= 0.95
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("lidar", SENSORS)
 @pytest.mark.parametrize("change", [shadows, sun_through_a_fence, wet_glare, paving], ids=lambda c: c.__name__)
 def test_nothing_is_found_where_nothing_is_painted(change, lidar: bool) -> None:

@@ -101,6 +101,7 @@ def swaying(log: Log, amplitude_m: float) -> Log:
     return replace(log, ego=PoseTrack(log.ego.t_ns, pose))
 
 
+@pytest.mark.slow
 def test_an_ego_that_stands_needs_no_compensation(still: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     log = swaying(still, 0.01)
     without = run(log)
@@ -238,6 +239,7 @@ def test_boxes_of_the_log_need_no_image(tiny: Log) -> None:
     assert not entry(full, "image decoding")["kept"]
 
 
+@pytest.mark.slow
 def test_lanes_and_colors_are_left_out_when_asked(tiny: Log) -> None:
     without = run(tiny)
     assert without.scenario.map_features is None
@@ -302,6 +304,7 @@ def passing() -> Log:
     return with_blank_images(tiny_log([car, PARKED], ego=ego, duration_s=2.0, camera=[FRONT, BACK], lidar=[lidar])[0])
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_nothing_is_looked_at_now_and_then(both: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     few, looked = run_counting(both, monkeypatch)
     step = entry(few, "detection in every frame")
@@ -355,6 +358,7 @@ def test_pictures_are_searched_less_often_only_where_sweeps_are_searched_and_a_n
     assert plan.decision(Stage.DETECTION_IN_EVERY_FRAME).kept is (stride == 1 and plan.detector_stride == 1)
 
 
+@pytest.mark.slow
 def test_a_look_that_could_not_be_read_found_nothing_out(both: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     sound = both.streams["back"]
 
@@ -398,6 +402,7 @@ def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> Non
         assert set(fits) == wanted
 
 
+@pytest.mark.slow
 def test_correspondences_that_nobody_reads_are_not_gathered(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Observations] = []
     monkeypatch.setattr(log2sim.pipeline, "fit_homographies", lambda log, s, *_, **__: (seen.append(s), {})[1])
@@ -472,13 +477,13 @@ def test_one_camera_gives_the_same_scenario_with_fusion(tiny: Log, monkeypatch: 
 
 def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     without = run(tiny)
-    step = entry(without, "smoothing of parked agents")
+    step = entry(without, "smoothing of static agents")
     assert not step["kept"]
     assert step["reason"].startswith("1 of 3 agents")
     (parked,) = [a for a in without.scenario.others if a.static]
     monkeypatch.setattr(log2sim.agents.estimate, "explain_track", lambda track: [Part(track, static=False)])
     full = run(tiny)
-    assert entry(full, "smoothing of parked agents")["kept"]
+    assert entry(full, "smoothing of static agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))
     w = smoothed.waypoints
     assert len(w) >= len(parked.waypoints) == 2

@@ -148,6 +148,7 @@ FORMATS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
 }
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_link_to_another_file_needs_the_option_in_every_format(tmp_path: Path, name: str) -> None:
     encode, pattern = FORMATS[name]

@@ -76,6 +76,7 @@ def other_track(track: PoseTrack) -> PoseTrack:
     return replace(track, map_T_ego=transform(turn, drift) @ track.map_T_ego)
 
 
+@pytest.mark.slow
 def test_odometry_stays_within_centimeters_over_twenty_meters_around_a_bend() -> None:
     found = along_bend()
     off_m, off_rad = relative_errors(track_of(found), bend()[1])
@@ -317,6 +318,7 @@ def test_a_log_without_poses_becomes_a_scenario_in_the_frame_of_the_first_sweep(
     assert path_m == pytest.approx(19.0, abs=0.5)
 
 
+@pytest.mark.slow
 def test_truth_of_labels_moves_with_the_poses_of_the_scenario() -> None:
     log, _ = drive(HOUSES, BEND, duration_s=1.5, sigma_m=0.3, observe=True)
     new, choice = localize(log, Config.load(poses=LIDAR, start_s=0.2, stop_s=0.9))

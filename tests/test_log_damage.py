@@ -59,6 +59,7 @@ def test_a_sound_log_has_no_problems() -> None:
         assert list_calibration_problems(log) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start_s", "stop_s"), [(None, None), (0.7, 2.0), (1.0, 1.0), (3.5, 100.0)])
 def test_a_part_of_a_sound_log_has_no_problems_either(start_s: float | None, stop_s: float | None) -> None:
     assert list_time_problems(cut_log(sound(), start_s=start_s, stop_s=stop_s)) == []
@@ -255,6 +256,7 @@ def test_a_roadside_camera_may_be_anywhere_in_the_map() -> None:
     assert list_calibration_problems(with_camera(sound(), mount="map", mount_T_cam=far)) == []
 
 
+@pytest.mark.slow
 def test_reconstruct_inspect_and_validate_tell_the_same(log_folder: Path, tmp_path: Path) -> None:
     boxes = log_folder / "labels/boxes_2d.csv"
     lines = boxes.read_text().split("\n")

@@ -192,6 +192,7 @@ def test_every_built_in_reader_is_under_contract() -> None:
     assert set(ENCODERS) == set(registry.BUILT_IN["log"])
 
 
+@pytest.mark.matrix
 def test_a_sound_log_gets_no_line_of_damage(log: Log) -> None:
     assert list_time_problems(log) == []
     assert list_calibration_problems(log) == []
@@ -221,6 +222,7 @@ def test_its_format_is_recognized(name: str, path: Path) -> None:
     assert open_log(path).format == name
 
 
+@pytest.mark.matrix
 def test_several_sequences_are_listed_and_each_opens(name: str, case: Encoder, tmp_path: Path) -> None:
     if case.several is None:
         pytest.skip("the layout has one sequence")
@@ -340,6 +342,7 @@ def test_labels_are_of_the_world(case: Encoder, log: Log) -> None:
     assert {(4.4, 1.8, 1.5), (4.2, 1.7, 1.6)} <= sizes
 
 
+@pytest.mark.matrix
 def test_points_of_labeled_objects_lie_in_their_boxes(case: Encoder, log: Log) -> None:
     if not case.labels or log.labels is None:
         pytest.skip("the format has no labels")
@@ -471,6 +474,7 @@ def is_readable(stream: Stream, i: int) -> bool:
     return True
 
 
+@pytest.mark.matrix
 def test_threads_read_what_one_reads(name: str, path: Path, log: Log) -> None:
     fresh = open_log(path, format=name)
     asked = [(s, i) for s, stream in fresh.streams.items() for i in range(len(stream.t_ns))] * 2

@@ -104,6 +104,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, P
 SUPPRESSED = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("name", ENCODERS)
 @settings(max_examples=4, deadline=None, suppress_health_check=SUPPRESSED)
 @given(data=st.data())

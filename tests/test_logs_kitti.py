@@ -322,6 +322,7 @@ def count_points(log: Log, category: str, within_m: float) -> tuple[np.ndarray, 
     return np.array(inside), np.array(around)
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_label_boxes_of_the_recorded_drive_hold_the_points_of_their_cars(real_data: Path) -> None:
     log = open_log(real_data / "kitti_tracking")

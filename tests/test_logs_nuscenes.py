@@ -86,6 +86,7 @@ def test_scanning_finds_what_parsing_the_whole_table_finds(
             assert found == [row for row in rows if row.get(key) in wanted]
 
 
+@pytest.mark.slow
 def test_scanning_a_large_table_takes_little_memory(tmp_path: Path) -> None:
     row = {"token": "0" * 32, "sample_token": "1" * 32, "filename": "sweeps/" + "x" * 300, "prev": "", "next": ""}
     one = json.dumps(row, indent=0)
@@ -441,6 +442,7 @@ def test_errors_name_the_table_and_what_was_expected(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(max_examples=40, deadline=None)
 def test_damaged_tables_never_end_in_anything_but_a_log_error(root: Path, data: st.DataObject) -> None:
@@ -574,6 +576,7 @@ def test_the_recorded_road_is_at_the_ego_s_origin_and_boxes_hold_points(scene: L
     assert min(counts) >= 10
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_a_scenario_lasts_as_long_as_the_recorded_images_that_are_there(scene: Log) -> None:
     result = reconstruct(scene, Config.load(detect={"name": "labels"}))

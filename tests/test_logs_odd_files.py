@@ -56,6 +56,7 @@ def encode_nuscenes(log: Log, folder: Path) -> Path:
     return nuscenes.encode_world(replace(log), folder)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     ("encode", "name"),
     [

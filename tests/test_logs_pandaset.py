@@ -151,6 +151,7 @@ def sequence(real_data: Path) -> Path:
     return real_data / "pandaset" / "002"
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_label_boxes_hold_the_points_of_their_cars_at_their_own_time(sequence: Path) -> None:
     log = open_log(sequence)

@@ -70,11 +70,13 @@ def assert_same_record(ours: Any, theirs: Any) -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("style", CONTAINERS, ids=IDS)
 def test_every_container_gives_back_the_log_that_was_written(style: Style, tmp_path: Path) -> None:
     assert_same_log(open_log(written(world_log(), tmp_path, style)), world_log())
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("style", CONTAINERS, ids=IDS)
 def test_messages_are_those_that_another_library_reads(style: Style, tmp_path: Path) -> None:
     path = ros.encode_as(world_log(), tmp_path, style)

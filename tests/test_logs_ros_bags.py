@@ -224,6 +224,7 @@ def test_data_that_unpack_to_more_than_they_say_are_refused() -> None:
         decompress(b"", "rar", 100)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     "style",
     [Style("bag"), Style("bag", "lz4"), Style("mcap", "storage"), Style("db3")],
@@ -656,6 +657,7 @@ def write_mcap(path: Path, ros1: bool, **options: Any) -> Path:
     return path
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("options", ["chunks", "lz4", "no chunks", "no index", "no summary"])
 @pytest.mark.parametrize("ros1", [True, False], ids=["ros1", "ros2"])
 def test_mcap_files_of_its_own_writer_are_read(ros1: bool, options: str, tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def test_exposures_are_balanced_over_the_overlap(ground: GroundMap) -> None:
     assert 0.93 < float(np.median(left)) / float(np.median(right)) < 1.07  # 1.43 without gains
 
 
+@pytest.mark.slow
 def test_parked_cars_are_unknown_ground() -> None:
     log = world_log()
     ground = map_ground(log, empty_scenario(log, parked_car(8.0, 2.5)), SETTINGS)
@@ -117,6 +118,7 @@ def test_cameras_alone_lie_on_the_ground_under_the_ego() -> None:
     assert ((ground.color_bgr[..., 1][seen] > 120) != is_paint(xy[seen])).mean() < 0.02
 
 
+@pytest.mark.slow
 def test_a_log_of_lidars_alone_has_no_color() -> None:
     log = world_log(World(gains=()))
     ground = map_ground(log, empty_scenario(log), SETTINGS)
@@ -141,6 +143,7 @@ def test_a_log_without_poses_is_refused_with_the_reason() -> None:
         map_ground(log.changed(ego=None), empty_scenario(log), SETTINGS)
 
 
+@pytest.mark.slow
 def test_a_long_log_gets_coarser_cells_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("log2sim.mapping.raster.MAX_CELLS", 100_000)
     log = world_log(World(gains=()))
@@ -149,6 +152,7 @@ def test_a_long_log_gets_coarser_cells_and_says_so(monkeypatch: pytest.MonkeyPat
     assert any("cells of 0." in note for note in ground.notes)
 
 
+@pytest.mark.slow
 def test_sweeps_without_intensity_leave_the_heights() -> None:
     log = world_log(World(gains=()))
     read = log.streams["l0"].read
@@ -177,6 +181,7 @@ def roadside_log(passing: bool) -> Log:
     return Log("pole", "log2sim", {"pole": camera}, {}, {"pole": Stream("pole", stamps, read)})
 
 
+@pytest.mark.slow
 def test_what_passes_a_roadside_camera_is_not_mapped() -> None:
     plain, passed = (
         map_ground(log, Scenario("pole", 10**18, 3.0, ()), SETTINGS)

@@ -102,6 +102,7 @@ def test_a_shift_of_15_cm_would_be_noticed(two_cameras: list[GroundView]) -> Non
     assert wrong_cells(render_birdseye(moved, extent_m=(0, 10, -8, 8)), edge_m=0.05) > 0.02
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("axis", [0, 1])
 def test_cells_show_their_own_center(axis: int) -> None:
     """On ground that brightens by 30 a meter, a shift of half a cell would show as 0.75."""

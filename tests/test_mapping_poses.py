@@ -68,6 +68,7 @@ def relative_errors(poses: Array) -> Array:
     return log_of(inverse(true) @ (inverse(poses[:1]) @ poses))
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("frame", ["lidar", "map"])
 def test_drift_is_taken_out(frame: str) -> None:
     log = street_log(drifted(), frame)
@@ -79,6 +80,7 @@ def test_drift_is_taken_out(frame: str) -> None:
     assert np.degrees(after[3:]).max() < 0.15
 
 
+@pytest.mark.slow
 def test_what_the_sweeps_hold_moves_with_the_poses() -> None:
     """A sweep in the map, as some logs have it, lies where its refined pose puts it."""
     log = street_log(drifted(), "map")
@@ -89,6 +91,7 @@ def test_what_the_sweeps_hold_moves_with_the_poses() -> None:
     np.testing.assert_allclose(sweep.xyz_m, apply(refined.ego.map_T_ego[30], local), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_poses_that_are_right_stay() -> None:
     log = street_log(true_poses())
     refined = refine_poses(log, whole(), RecordReader(log))
@@ -124,6 +127,7 @@ def test_logs_without_lidar_or_way_stay_as_they_are() -> None:
     assert refine_poses(standing, whole(), RecordReader(standing)) is standing
 
 
+@pytest.mark.slow
 def test_a_map_of_refined_poses_is_put_back_where_the_agents_are() -> None:
     log = street_log(drifted())
     refined = refine_poses(log, whole(), RecordReader(log))

@@ -94,6 +94,23 @@ def test_a_repr_is_one_short_line(log: Log, scenario: Scenario, replayed: Replay
     assert repr(replace(scenario, agents=scenario.others[:1])) == "<Scenario 'tiny': 1 agent, 1.0 s>"
 
 
+def test_what_holds_columns_shows_them_by_their_shapes(log: Log, scenario: Scenario) -> None:
+    agent = scenario.agents[0]
+    values = (agent, agent.waypoints, log.labels, log.ego, log.cameras["front"], log.streams["front"], log.lidars)
+    shown = [repr(value) for value in values]
+    assert max(map(len, shown)) < 500
+    assert not any("array(" in text or "\n" in text for text in shown)
+    assert repr(agent).startswith(f"<Agent {agent.id!r}: {agent.category}")
+    assert f"t_s=<({len(agent.waypoints)},) float64>" in shown[1]
+
+
+def test_the_labels_of_a_log_are_its_truth(log: Log) -> None:
+    truth = log.truth()
+    assert {a.id for a in truth.others} <= set(log.labels.track_id)
+    with pytest.raises(LogError, match="label"):
+        log.changed(labels=None).truth()
+
+
 def test_a_repr_reads_no_stamps(log: Log) -> None:
     def never() -> Any:
         raise AssertionError

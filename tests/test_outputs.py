@@ -211,6 +211,7 @@ def test_what_a_terminal_cannot_show_is_escaped() -> None:
     TolerantStream(closed).write("nobody")
 
 
+@pytest.mark.matrix
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
 @pytest.mark.parametrize("end", ["> /dev/full", ">&-", "| true", "2> /dev/full > /dev/full"])
 def test_output_that_nobody_can_read_changes_no_exit_code(end: str) -> None:
@@ -327,6 +328,7 @@ with holding_claims():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="no such locks there")
 @pytest.mark.parametrize("command", ["edit", "convert", "export", "synth", "traffic"])
 def test_of_two_runs_the_second_is_refused_before_its_work(command: str, tmp_path: Path) -> None:

@@ -270,6 +270,7 @@ def read_all(path: Path) -> None:
     assert log.notes is not None
 
 
+@pytest.mark.matrix
 @fewer
 @given(data=st.data())
 def test_a_log_with_a_damaged_file_is_an_error_or_a_log(

@@ -95,14 +95,14 @@ def test_a_report_that_breaks_its_schema_is_noticed(result: Result) -> None:
 def test_every_camera_and_every_decision_is_stated(result: Result) -> None:
     assert [c["name"] for c in result.scenario.cameras] == ["front"]
     assert all(c["used"] for c in result.scenario.cameras)
-    steps = {p["stage"]: p for p in result.scenario.plan}
+    steps = {p["stage"]: p for p in result.scenario.stages}
     assert not steps["fusion of cameras"]["kept"]  # one camera
     assert "one camera" in steps["fusion of cameras"]["reason"]
     assert steps["motion compensation"]["kept"]
-    assert all(p["reason"] for p in result.scenario.plan)
+    assert all(p["reason"] for p in result.scenario.stages)
     # Times differ from run to run, so they stand in the report alone.
     timed = ("saved_s", "saved_how")
-    assert [dict(p) for p in result.scenario.plan] == [
+    assert [dict(p) for p in result.scenario.stages] == [
         {k: v for k, v in p.items() if k not in timed} for p in result.report["plan"]
     ]
 
@@ -163,6 +163,7 @@ def test_a_broken_shift_moves_the_whole_scene_and_nothing_else(tiny_folder: Path
     assert_same_agents(near, far, within=1e-3, shift_m=shift)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     "shift_ns", [-1_700_000_000_000_000_000, -3_400_000_000_000_000_000, 5_000_000_000_000_000_000]
 )
@@ -203,7 +204,7 @@ def test_without_lidar_the_cameras_alone_find_who_is_there(tiny: tuple[Log, Scen
     again = run(blind)  # places come from the homography, and that from random samples
     assert again.report["homography"] == got.report["homography"]
     assert again.scenario.to_dict() == got.scenario.to_dict()
-    step = next(p for p in got.scenario.plan if p["stage"] == "homography")
+    step = next(p for p in got.scenario.stages if p["stage"] == "homography")
     assert step["kept"]
     assert "without LiDAR" in step["reason"]
 

@@ -132,6 +132,7 @@ def test_an_animation_hatches_only_while_the_doubt_holds() -> None:
     assert counts[1] >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".svg", ".png"])
 def test_the_same_doubts_give_the_same_bytes(suffix: str, tmp_path: Path) -> None:
     for name in ("a", "b"):

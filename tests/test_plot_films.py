@@ -61,6 +61,7 @@ def test_an_mp4_is_h264_of_the_size_and_rate_that_were_asked_for(tmp_path: Path)
     assert ink.sum() > 40  # BT.709 both ways; the colors of BT.601 are off by up to 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["film.mp4", "film.webm", "film.gif"])
 def test_the_same_scenario_gives_the_same_film(tmp_path: Path, name: str) -> None:
     written = [plot_tracks(scene(), tmp_path / folder / name, options=SMALL) for folder in "ab"]
@@ -202,6 +203,7 @@ def test_a_picture_shows_the_agents_and_the_part_of_the_map_that_it_is_asked_for
         select_shown(scenario, None, PlotOptions(agents=("car1",)))
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("size", [(640, 360), (360, 640), (1920, 1080), (300, 300)])
 def test_a_picture_has_the_size_that_was_asked_for_and_room_for_all(tmp_path: Path, size: tuple[int, int]) -> None:
     from PIL import Image
@@ -252,9 +254,10 @@ def test_labels_say_what_the_legend_then_leaves_out() -> None:
     labels = {t.get_text() for t in layout.ax.texts}
     assert {"ego · 18 km/h", "car-1 · 29 km/h"} <= labels
     rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
-    assert rows[:2] == ["km/h: highest speed of each", "1 stationary"]
+    assert rows[:2] == ["km/h: highest speed of each", "1 static"]
 
 
+@pytest.mark.slow
 def test_a_full_label_is_nearest_to_its_own_track_and_else_the_legend_has_it() -> None:
     lanes = [
         dataclasses.replace(straight(f"vehicle-{k}", start=(0.0, 1.2 * k)), size_m=(4.0, 1.0, 1.5)) for k in range(12)

@@ -52,6 +52,7 @@ def chart_axes(layout: FigureLayout) -> list:
     return [ax for ax in layout.figure.axes if ax.get_legend() is not None]
 
 
+@pytest.mark.slow
 def test_the_charts_are_of_the_ego_and_else_of_the_worst_follower() -> None:
     scenario = scene()
     timeline = timeline_of(replay(scenario), scenario, assign_roles(scenario))

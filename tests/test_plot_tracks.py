@@ -53,6 +53,7 @@ def crossing() -> Scenario:
     )
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     ("suffix", "magic"),
     [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF"), (".gif", b"GIF89a"), (".MP4", b"")],
@@ -83,6 +84,7 @@ def test_a_gif_runs_in_real_time(tmp_path: Path) -> None:
         assert max(image.size) <= 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".svg", ".png"])
 def test_the_same_scenario_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     for name in ("a", "b"):
@@ -180,6 +182,7 @@ def many(count: int) -> Scenario:
     )
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     "scenario",
     [
@@ -199,6 +202,7 @@ def test_every_kind_of_scene_can_be_drawn(tmp_path: Path, scenario: Scenario, su
     plot_tracks(scenario, tmp_path / f"a{suffix}", dpi=60)
 
 
+@pytest.mark.slow
 def test_a_crowd_of_500_is_summed_up_in_the_legend() -> None:
     rows = texts(draw(many(500)))
     assert f"{500 - len(PALETTE)} more moving, farther away" in rows
@@ -225,6 +229,7 @@ def test_labels_do_not_overlap(scenario: Scenario) -> None:
         )
 
 
+@pytest.mark.slow
 def test_the_legend_stands_beside_the_map() -> None:
     sheet = draw(many(500))
     sheet.canvas.draw()
@@ -240,6 +245,7 @@ def test_overlays_get_a_line_in_the_legend() -> None:
     assert {"truth", "replay"} <= set(texts(draw(scenario, truth=scenario, replay=replay(scenario))))
 
 
+@pytest.mark.slow
 def test_overlays_can_be_animated(tmp_path: Path) -> None:
     scenario = crossing()
     plot_tracks(scenario, tmp_path / "a.gif", truth=scenario, replay=replay(scenario))

@@ -70,6 +70,7 @@ def test_a_truth_in_a_map_of_its_own_is_pointed_out(noisy: Path, by_lidar: Path,
     assert "note: " not in run("evaluate", by_lidar, "--truth", noisy).out
 
 
+@pytest.mark.slow
 def test_boxes_say_by_which_poses_they_are_placed(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     boxes = noisy.parent / "boxes.json"
     assert run("detect", noisy, "--detector", "lidar:labels", "--poses", "lidar", "--out", boxes).code == 0
@@ -91,6 +92,7 @@ def nearest_m(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - others[None], axis=2).min(axis=1)
 
 
+@pytest.mark.slow
 def test_a_log_without_poses_needs_no_option(noisy: Path, tmp_path: Path) -> None:
     write_log(replace(open_log(noisy), ego=None, labels=None), tmp_path / "log")
     assert open_log(tmp_path / "log").ego is None

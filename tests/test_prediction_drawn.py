@@ -55,6 +55,7 @@ def test_who_stands_or_is_absent_has_no_way() -> None:
     assert ways.at("b", -1.0) is None
 
 
+@pytest.mark.slow
 def test_the_legend_tells_what_is_drawn(tmp_path: Path) -> None:
     world = scene(corner("ego", 3.0), corner("a", 0.0))
     legend = still(world, assign_roles(world), Overlays(predicted=PredictedPaths(world, 2.5))).figure.legends[0]
@@ -75,6 +76,7 @@ def test_a_wrong_horizon_leaves_no_file(tmp_path: Path) -> None:
     assert names(tmp_path) == ["scenario.json"]
 
 
+@pytest.mark.slow
 def test_animations_show_what_is_expected_at_each_moment(tmp_path: Path) -> None:
     world = scene(circle(12.0, 5.0, 1.0), duration_s=1.0)
     world.save(tmp_path / "scenario.json")

@@ -11,11 +11,15 @@ import sys
 import sysconfig
 import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
+from worlds import tiny_log
 
 import log2sim
+from log2sim.cli import app
+from log2sim.registry import BUILT_IN
 from log2sim.version import FALLBACK, read_version
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,10 +45,10 @@ print(json.dumps([log2sim.__file__, log2sim.__version__, load_schema("scenario-1
 
 def test_the_version_is_what_the_build_wrote(tmp_path: Path) -> None:
     file = tmp_path / "version.txt"
-    assert read_version(file) == FALLBACK == PROJECT["tool"]["setuptools_scm"]["fallback_version"]
+    assert read_version(file) == FALLBACK == PROJECT["tool"]["hatch"]["version"]["fallback-version"]
     file.write_text("1.2.3.dev4+gabcdef\n", encoding="ascii")
     assert read_version(file) == "1.2.3.dev4+gabcdef"
-    written = ROOT / PROJECT["tool"]["setuptools_scm"]["version_file"]
+    written = ROOT / PROJECT["tool"]["hatch"]["build"]["hooks"]["vcs"]["version-file"]
     assert log2sim.__version__ == read_version(written)
 
 
@@ -97,11 +101,11 @@ def call(*command: str | Path, cwd: Path, **variables: str) -> str:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository with the files of this one and a tag."""
-    pytest.importorskip("setuptools_scm")
+    """A repository with the files of this one, in a folder that has the name of the package, as a clone has."""
+    pytest.importorskip("hatch_vcs")
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git to tell the files of the checkout from others")
-    folder = tmp_path_factory.mktemp("release") / "checkout"
+    folder = tmp_path_factory.mktemp("release") / "log2sim"
     listed = call("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=ROOT)
     wanted = ("log2sim/", "schemas/", "pyproject.toml", "README.md", "LICENSE", ".gitignore")
     for name in filter(None, listed.split("\0")):
@@ -114,28 +118,29 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_a_checkout_without_tags_and_a_copy_without_git_have_a_version(checkout: Path, tmp_path: Path) -> None:
-    ask = "import setuptools_scm; print(setuptools_scm.get_version(root='.', fallback_version='0.1.dev0'))"
-    assert re.match(r"0\.1\.dev1\+g[0-9a-f]+", call(sys.executable, "-c", ask, cwd=checkout))
-    shutil.copy(checkout / "pyproject.toml", tmp_path)
-    build = "import setuptools.build_meta as b; print(b.prepare_metadata_for_build_wheel('.'))"
-    (tmp_path / "pyproject.toml").write_text(
-        re.sub(
-            r"(?m)^(packages|readme|license-files) = .*$|^log2sim_schemas = .*$",
-            "",
-            (tmp_path / "pyproject.toml").read_text(),
-        )
-    )
-    (tmp_path / "log2sim").mkdir()
-    call(sys.executable, "-c", build, cwd=tmp_path)
-    assert (tmp_path / "log2sim/version.txt").read_text().strip() == FALLBACK
+    ask = "from hatchling.build import prepare_metadata_for_build_wheel as ask; print(ask({!r}))"
+    named = call(sys.executable, "-c", ask.format(str(tmp_path)), cwd=checkout)
+    assert re.match(r"log2sim-0\.1\.dev1\+g[0-9a-f]+\.dist-info", named)
+    shutil.copytree(checkout, tmp_path / "copy", ignore=shutil.ignore_patterns(".git"))
+    named = call(sys.executable, "-c", ask.format(str(tmp_path)), cwd=tmp_path / "copy")
+    assert named.strip() == f"log2sim-{FALLBACK}.dist-info"
+
+
+def test_an_editable_installation_works_beside_the_checkout(checkout: Path, tmp_path: Path) -> None:
+    build = "from hatchling.build import build_editable as build; print(build({!r}))"
+    wheel = tmp_path / call(sys.executable, "-c", build.format(str(tmp_path)), cwd=checkout).strip()
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(tmp_path / "site")
+    code = f"import site; site.addsitedir({str(tmp_path / 'site')!r}); import log2sim; print(log2sim.__file__)"
+    # The folder above the checkout, from where the checkout looks like a package without a module.
+    assert Path(call(sys.executable, "-S", "-c", code, cwd=checkout.parent).strip()).is_relative_to(checkout)
 
 
 @pytest.mark.slow
 def test_a_wheel_of_the_sdist_works_outside_the_checkout(checkout: Path, tiny_folder: Path, tmp_path: Path) -> None:
     call("git", "tag", "v1.2.3", cwd=checkout)
-    build = "import setuptools.build_meta as b; b.build_sdist({!r})"
+    build = "from hatchling.build import build_sdist as build; build({!r})"
     call(sys.executable, "-c", build.format(str(tmp_path)), cwd=checkout)
     with tarfile.open(tmp_path / "log2sim-1.2.3.tar.gz") as packed:
         packed.extractall(tmp_path, filter="data")
@@ -167,6 +172,88 @@ def test_a_wheel_of_the_sdist_works_outside_the_checkout(checkout: Path, tiny_fo
     assert python("-m", "log2sim", "--version") == "1.2.3\n"
     python("-m", "log2sim", "reconstruct", tiny_folder, "--detector", "labels", "--out", away / "s.json", "--quiet")
     assert json.loads((away / "s.json").read_text())["provenance"]["log2sim_version"] == "1.2.3"
+
+
+BASE_ONLY: dict[str, str | None] = {
+    "doctor": None,
+    "config": None,
+    "cache": None,
+    "inspect LOG": None,
+    "inspect LOG --overlay moment.png": None,
+    "inspect BAG": "ros",
+    "inspect FEATHER": "parquet",
+    "validate LOG": None,
+    "convert LOG --stop 0.3 --out part": None,
+    "detect LOG --detector lidar:labels --out boxes.json": None,
+    "map LOG --cell 0.5 --out map.png": None,
+    "reconstruct LOG --detector labels --out s.json": None,
+    "reconstruct LOG --detector labels --poses lidar --out lidar.json": "odometry",
+    "reconstruct LOG --detector ssd-mobilenet-v2 --out ssd.json": "coco",
+    "bench LOG --detector ssd-mobilenet-v2 --out bench": "coco",
+    "bench LOG --stop 0.3 --detector labels --out bench": None,
+    "batch LOG --out batch": "cluster",
+    "batch LOG --out batch --scheduler tcp://127.0.0.1:1": "cluster",
+    "validate s.json": None,
+    "evaluate s.json --truth LOG": None,
+    "evaluate boxes.json --truth LOG": None,
+    "predict s.json": None,
+    "edit s.json --drop-doubtful --out edited.json": None,
+    "replay s.json --out replay.json": None,
+    "replay s.json --simulator carla": "carla",
+    "plot s.json --out plot.svg": None,
+    "plot s.json --out film.mp4 --stop 0.2": None,
+    "view s.json --log LOG --out page.html": None,
+    "synth --traffic vehicle --scenes 1 --out traffic": None,
+    "export s.json --to openscenario --out openscenario": None,
+    "export s.json --to carla --out carla": None,
+    "export s.json --to csv --out csv": None,
+    "export s.json --to scenarionet --out scenarionet": None,
+    "export s.json --to commonroad --out commonroad": None,
+    "export s.json --to osi --out osi": "osi",
+    "export s.json --to mcap --out mcap": "mcap",
+    "export s.json --to rerun --out rerun": "rerun",
+    "import openscenario/scenario.xosc --out imported.json": None,
+}
+"""Commands, and the extra that each needs. LOG, BAG and FEATHER stand for paths."""
+
+
+@pytest.mark.slow
+def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    from log_encoders import ros
+
+    feather = tmp_path / "av2" / "city_SE3_egovehicle.feather"
+    (feather.parent / "calibration").mkdir(parents=True)
+    feather.write_bytes(b"ARROW1\0\0ARROW1")
+    paths = {
+        "LOG": str(tiny_folder),
+        "BAG": str(ros.encode(tiny_log()[0], tmp_path / "bag")),
+        "FEATHER": str(feather.parent),
+    }
+    commands = [[paths.get(word, word) for word in line.split()] for line in BASE_ONLY]
+    program = Path(__file__).with_name("base_only.py")
+    printed = call(
+        sys.executable,
+        program,
+        json.dumps(commands),
+        cwd=tmp_path,
+        LOG2SIM_CACHE=str(tmp_path / "cache"),
+        MPLBACKEND="agg",
+    )
+    wrong = {}
+    for (line, extra), (code, err) in zip(BASE_ONLY.items(), json.loads(printed), strict=True):
+        last = (err.splitlines() or [""])[-1]
+        if (extra is None and code != 0) or (
+            extra is not None and (code != 5 or f"needs the extra '{extra}': pip install" not in last)
+        ):
+            wrong[line] = (code, err[-500:])
+    assert not wrong, "\n".join(f"{line}: {code} {err}" for line, (code, err) in wrong.items())
+    assert {line.split()[0] for line in BASE_ONLY} == {
+        (c.name or c.callback.__name__).rstrip("_") for c in app.registered_commands if c.callback is not None
+    }
+    formats = {line.split()[3] for line in BASE_ONLY if line.startswith("export")}
+    assert formats == set(BUILT_IN["export"])
+    assert not list((tmp_path / "cache").glob("**/*.onnx"))
 
 
 @pytest.mark.slow

@@ -181,6 +181,7 @@ def test_only_who_is_seen_to_leave_and_who_is_seen_to_come_counts():
     assert pairs_of((straight, 0.0, 0.0)) == 0
 
 
+@pytest.mark.slow
 def test_the_shortest_post_encroachment_times_are_those_of_all_rows():
     boxes = town(30, seed=11)
     found = post_encroachment_times(boxes, SPACING_S)

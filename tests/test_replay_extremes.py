@@ -77,6 +77,7 @@ def test_a_stop_stays_a_stop_without_creeping_or_turning_the_wheels_back_and_for
     assert np.ptp(r.steer_rad[r.t_s >= 10.0]) < 1e-3
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("noise_m", [0.03, 0.1])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_vehicle_that_stands_does_not_creep_after_its_jittering_box(noise_m, seed):
@@ -216,6 +217,7 @@ def test_a_gap_of_ten_seconds_in_a_turn_is_crossed_by_one_arc():
     assert np.abs(late).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", [0.001, 0.01, 0.1])
 def test_waypoints_a_microsecond_apart_change_nothing(dt_s):
     plain = on_circle(8.0, 30.0, 3.5)
@@ -242,6 +244,7 @@ def test_duplicate_times_are_refused_by_agent_and_index(same_pose):
         followed(changed(agent, waypoints=changed(w, t_s=t, x_m=x)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", STEPS_S)
 @pytest.mark.parametrize("category", ["car", "pedestrian"])
 def test_a_teleport_is_flagged_and_not_chased(dt_s, category):

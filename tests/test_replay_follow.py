@@ -33,6 +33,7 @@ def followed(agent, **options):
     return result.agents[0], result.metrics["by_agent"][agent.id], result
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("name", MANEUVERS)
 def test_maneuvers_are_followed_within_limits(name):
     across, along, speed = LIMITS[name]
@@ -175,6 +176,7 @@ def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
     return np.array(out)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("speed", [1.0, 5.0, 15.0, 40.0, 60.0])
 @pytest.mark.parametrize("dt_s", [0.01, 0.1])
 def test_being_off_the_path_dies_out_at_any_speed(speed, dt_s):

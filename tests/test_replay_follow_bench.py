@@ -10,6 +10,8 @@ from replay_maneuvers import MANEUVERS, scenario_of
 
 from log2sim.simulation.runner import replay
 
+pytestmark = pytest.mark.slow
+
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
 

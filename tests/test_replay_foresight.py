@@ -52,6 +52,7 @@ def test_who_does_not_turn_off_as_in_the_scenario_is_braked_for_earlier_by_those
     assert at["motion"] > 4.0  # the ego is within 3 s of the street from then on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("foresight", ["path", "motion"])
 def test_where_nobody_interferes_the_scenario_is_kept(foresight: str) -> None:
     scene = scenario_of(line("a", 0.0, speed=12.0), line("f", -20.0, speed=12.0), circle(30.0, 8.0, 20.0, id="c"))

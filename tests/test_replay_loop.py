@@ -64,6 +64,7 @@ def test_a_world_that_is_stepped_by_hand_gives_the_tracks_of_a_replay():
         world.advance()
 
 
+@pytest.mark.slow
 def test_a_world_that_is_restarted_repeats_itself():
     scene = scenario_of(line("ego", 25, speed=12, duration_s=11), line("f", 0, speed=12, duration_s=11))
     world = open_world(scene, dt_s=0.05, agents="reactive")
@@ -149,6 +150,7 @@ def test_the_path_ahead_begins_beside_the_ego_however_late_it_is():
         np.testing.assert_allclose(p.speed_mps, 5.0, atol=0.01)
 
 
+@pytest.mark.slow
 def test_the_path_of_a_way_that_crosses_itself_does_not_jump_to_the_other_branch():
     t = np.arange(0, 24.01, 0.1)
     yaw = np.clip((t - 4) / 12, 0, 1) * 2.5 * np.pi  # straight, a loop and a quarter, straight
@@ -183,6 +185,7 @@ def test_an_ego_that_falls_behind_its_log_has_the_height_of_its_place_and_is_hit
     assert slope.metrics["new_collisions"] == 1
 
 
+@pytest.mark.slow
 def test_an_observation_tells_the_height_of_the_ego_and_of_others_also_of_late_ones():
     agents = [line("ego", 60, speed=10, duration_s=8), line("late", 30, speed=10, duration_s=8)]
     agents += [line("x", 50, 3.5, 10, 8), parked("p", 90, 5)]
@@ -270,6 +273,7 @@ def test_policies_are_found_in_files_and_classes_are_made(tmp_path):
             load_policy(name)
 
 
+@pytest.mark.slow
 def test_a_module_in_the_current_folder_is_found_from_a_plain_shell(tmp_path):
     (tmp_path / "my_driver.py").write_text(
         "from log2sim.simulation import Controls\ndef brake_late(seen):\n    return Controls(-5.0 * (seen.t_s > 1), 0.0)\n"
@@ -290,6 +294,7 @@ def test_a_module_in_the_current_folder_is_found_from_a_plain_shell(tmp_path):
 # The command line.
 
 
+@pytest.mark.slow
 def test_the_command_line_lets_agents_react(tmp_path):
     scene = scenario_of(*(line(k, -30.0 * n, duration_s=6) for n, k in enumerate(("ego", "f", "g"))))
     scene.save(tmp_path / "s.json")
@@ -337,6 +342,7 @@ def test_the_ego_that_brakes_in_time_brakes_hard_and_stops_short_of_what_stands(
     assert gap(result, "f").min() > 1.0
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("speed", [8.0, 15.0, 25.0])
 def test_the_ego_that_changes_lane_moves_by_a_lane_smoothly(speed):
     scene = scenario_of(line("ego", 0, speed=speed, duration_s=12))
@@ -363,6 +369,7 @@ def test_the_ego_that_changes_lane_takes_the_free_side_or_stays():
         assert result.metrics["collisions"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["BrakeInTime", "ChangeLane"])
 def test_the_example_egos_drive_the_sample(name, tmp_path):
     ran = run("replay", SAMPLE, "--ego", f"{EGOS}:{name}", "--agents", "reactive", "--dt", 0.05, "--strict",
@@ -370,6 +377,7 @@ def test_the_example_egos_drive_the_sample(name, tmp_path):
     assert ran.code == 0, ran.err
 
 
+@pytest.mark.slow
 def test_of_the_example_egos_one_brakes_too_late_and_one_in_time():
     blocked = edit(Scenario.load(SAMPLE), [Lateral("car_parked", 3.0)]).scenario
     late, in_time = (

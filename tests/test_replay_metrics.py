@@ -114,6 +114,7 @@ def test_bridges_and_absent_agents_are_not_hit():
     assert len(contacts(boxes((0, x), (0, x)), np.array([False, False])).a) == 0
 
 
+@pytest.mark.slow
 def test_all_pairs_are_found_as_by_trying_each():
     rng = np.random.default_rng(2)
     n = 40

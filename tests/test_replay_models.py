@@ -61,6 +61,7 @@ def test_what_leans_is_kinematic_and_what_a_policy_drives_is_dynamic():
     assert (policed.driver, policed.model) == ("policy", "dynamic")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [-6.0, -12.0])
 def test_what_reverses_fast_rolls_and_keeps_to_its_way_where_slips_would_lead_it_off(speed):
     swerve = cruise(speed, lambda s: 4.5 / speed**2 * np.sin(2 * np.pi * s / 30))
@@ -83,6 +84,7 @@ def test_an_unknown_model_is_refused_with_the_nearest_known():
         replay(scenario_of(cruise(10.0)), model="dynamc")
 
 
+@pytest.mark.matrix
 @SLIPPING
 @pytest.mark.parametrize("dt_s", [0.01, 0.05])
 @pytest.mark.parametrize(

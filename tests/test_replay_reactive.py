@@ -111,6 +111,7 @@ def test_a_stopped_follower_drives_on_when_the_way_is_free_and_makes_up_nothing(
     assert np.count_nonzero(jerks) <= 4  # brakes once, without hunting
 
 
+@pytest.mark.slow
 def test_an_ego_across_the_way_is_waited_for():
     scene = scenario_of(line("ego", -20, speed=10, duration_s=12), line("c", 2, -50, 10, 12, np.pi / 2))
     ego = Speed(lambda t: 4.0)
@@ -150,6 +151,7 @@ def test_of_two_whose_ways_cross_the_first_in_the_log_goes_first_and_both_get_th
     assert min(a.y_m[-1], b.x_m[-1]) > 50
 
 
+@pytest.mark.slow
 def test_at_the_edge_of_a_conflict_an_agent_does_not_hunt():
     scene = scenario_of(
         line("ego", 0, speed=12, duration_s=9), line("f", -25, speed=12, duration_s=9), parked("p", 80, 0),
@@ -231,6 +233,7 @@ def test_an_ego_that_does_about_as_the_log_moves_nobody():
     assert max(departure(result, log, k) for k in ids) < 0.05
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(
     "other",
     [line("o", 300, 3.5, 25, 12, np.pi), parked("o", 150, -2.3), line("o", -29, 0, 27, 12), line("o", -8, 3.2, 25, 12)],
@@ -258,6 +261,7 @@ def test_who_cuts_in_at_the_same_speed_is_followed_and_not_braked_for_as_if_he_s
     assert columns[3].min() > 18
 
 
+@pytest.mark.slow
 def test_what_the_log_drives_into_is_braked_for():
     scene = scenario_of(line("f", 0, speed=12, duration_s=12), parked("p", 80, 0.5))
     assert replay(scene, dt_s=0.05).metrics["collisions"]
@@ -271,6 +275,7 @@ def test_what_the_log_drives_into_is_braked_for():
 # Choice, invariance, extremes.
 
 
+@pytest.mark.slow
 def test_only_those_named_react():
     scene = scenario_of(*(line(k, -30.0 * n, duration_s=12) for n, k in enumerate(("ego", "f", "g"))))
     result = replay(scene, ego=stops_at(1.0), agents=["f"], dt_s=0.05)
@@ -295,6 +300,7 @@ def test_names_of_agents_that_cannot_react_are_refused(agents, said):
         replay(scene, ego=stops_at(0.5), agents=agents)
 
 
+@pytest.mark.slow
 def test_far_from_the_origin_and_turned_the_reaction_is_the_same():
     def scene(x, y, yaw):
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -312,6 +318,7 @@ def test_the_step_hardly_matters():
     assert np.ptp(ends) < 0.6
 
 
+@pytest.mark.slow
 def test_exact_agents_react_exactly_on_their_way():
     turn = MANEUVERS["turn of radius 8 m"]()
     scene = scenario_of(changed(turn, id="t"), line("ego", 15, 0.0, 5, 8))
@@ -323,6 +330,7 @@ def test_exact_agents_react_exactly_on_their_way():
     assert max(np.hypot(x - a, y - b).min() for a, b in zip(t.x_m, t.y_m)) < 0.01
 
 
+@pytest.mark.slow
 def test_a_leap_of_the_log_comes_when_the_late_agent_is_there():
     f = line("f", 0, speed=10, duration_s=12)
     leap = np.where(f.waypoints.t_s > 5.05, 40.0, 0.0)

@@ -266,6 +266,7 @@ def test_waypoints_a_microsecond_or_half_a_minute_apart_are_followed(gap_s):
     assert np.abs(r.y_m).max() < 1e-6
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(6))
 def test_nonsense_gives_finite_states(seed):
     rng = np.random.default_rng(seed)

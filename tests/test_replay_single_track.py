@@ -261,6 +261,7 @@ def test_steady_cornering_understeers_as_the_stiffness_of_the_axles_says():
     assert end[7] == pytest.approx(speed * steer / (CAR.wheelbase_m[0] + gradient * speed**2), rel=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [1.05, 0.1])
 def test_tires_never_bear_more_than_friction_times_weight(friction):
     p, rng = replace(CAR, friction=np.array([friction])), np.random.default_rng(1)
@@ -288,6 +289,7 @@ def test_the_brakes_of_a_slippery_road_stop_after_a_distance_that_friction_sets(
 # Both, where the equations are stiff or end
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("speed", [0.01, 0.1, 0.5])
 @pytest.mark.parametrize("gear", [1, -1])
 def test_at_walking_pace_and_below_the_saturating_model_is_the_kinematic_bicycle(speed, gear):
@@ -299,6 +301,7 @@ def test_at_walking_pace_and_below_the_saturating_model_is_the_kinematic_bicycle
     np.testing.assert_allclose(slipping[:, 3], rolling[:, 3], rtol=0.01 * speed**2 + 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gear", [1, -1])
 def test_at_walking_pace_the_published_model_drives_the_circle_of_small_angles(gear):
     speed, steer = 0.05, 0.2
@@ -373,6 +376,7 @@ def test_halving_the_step_quarters_the_error(name):
     assert 3.0 < errors[1] / errors[2] < 5.5
 
 
+@pytest.mark.slow
 @ALL
 @pytest.mark.parametrize("friction", [1.05, 0.1])
 def test_who_braked_to_standstill_stays_and_then_starts_the_right_way(name, friction):

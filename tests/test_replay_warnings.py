@@ -340,6 +340,7 @@ def test_the_file_holds_the_warnings(tmp_path: Path) -> None:
     assert "warnings" not in json.loads((SAMPLE.parent / "truth.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_braking_needs_warnings() -> None:
     assert "--brake: brakes when the ego is warned; add --warn" in run_command("replay", str(SAMPLE), "--brake").line
     ran = run_command("replay", str(SAMPLE), "--warn", "vehicle", "--brake", "--dt", "0.1")

@@ -52,7 +52,7 @@ def make_scenario() -> Scenario:
         ),
         map=MapFrame(49.01, 8.43, 115.2, "+proj=utm +zone=32", (457000.0, 5428000.0, 0.0)),
         cameras=({"name": "front", "used": True, "homography": None},),
-        plan=({"stage": "fuse", "kept": False, "reason": "one camera sees no object twice"},),
+        stages=({"stage": "fuse", "kept": False, "reason": "one camera sees no object twice"},),
         provenance={"seed": 3},
     )
 
@@ -61,7 +61,7 @@ def test_what_is_saved_reads_back_to_the_same_numbers(tmp_path: Path) -> None:
     scenario, path = make_scenario(), tmp_path / "deep" / "scenario.json"
     scenario.save(path)
     again = Scenario.load(path)
-    for name in ("name", "t0_ns", "duration_s", "map", "cameras", "plan", "provenance"):
+    for name in ("name", "t0_ns", "duration_s", "map", "cameras", "stages", "provenance"):
         assert getattr(again, name) == getattr(scenario, name), name
     for a, b in zip(scenario.agents, again.agents, strict=True):
         for name in ("id", "category", "size_m", "static", "rear_axle_offset_m", "color", "confidence", "quality"):
@@ -251,3 +251,36 @@ def test_a_single_waypoint_is_a_moment() -> None:
     assert state.valid.tolist() == [False, True, False]
     assert state.x_m[1] == 10.0
     assert drive([1.0]).at(1.0).x_m.tolist() == [10.0]
+
+
+def test_agents_are_looked_up_by_their_ids() -> None:
+    scenario = make_scenario()
+    assert [scenario[id] for id in scenario] == list(scenario.agents)
+    assert "car-1" in scenario
+    assert "car-7" not in scenario
+    with pytest.raises(KeyError, match=r"no agent 'car-7'.*car-1"):
+        scenario["car-7"]
+
+
+def test_the_file_states_its_frame_and_an_older_one_still_loads() -> None:
+    scenario = make_scenario()
+    document = scenario.to_dict()
+    assert (document["map"]["frame"], document["map"]["position"]) == ("enu", "box_center")
+    assert replace(scenario, map=MapFrame()).to_dict()["map"]["frame"] == "local"
+    assert "plan" not in document
+    older = {**document, "plan": document["stages"], "map": {**document["map"]}}
+    del older["stages"], older["map"]["frame"], older["map"]["position"]
+    assert Scenario.from_dict(older).to_dict() == document
+
+
+def test_arrays_along_agents_and_times_hold_the_rows_of_the_table() -> None:
+    pytest.importorskip("xarray")
+    scenario = make_scenario()
+    arrays, table = scenario.to_xarray(), scenario.to_dataframe()
+    for row in table.itertuples():
+        cell = arrays.sel(agent=row.agent, t_s=row.t_s)
+        for name in ("x_m", "yaw_rad", "sigma_xy_m", "observed", "category", "length_m", "confidence"):
+            np.testing.assert_equal(cell[name].item(), getattr(row, name))
+    assert int(np.isfinite(arrays.x_m).sum()) == len(table)
+    assert arrays.x_m.attrs["units"] == "m"
+    assert Scenario("nothing", 0, 0.0, ()).to_xarray().sizes == {"agent": 0, "t_s": 0}

@@ -136,6 +136,7 @@ def test_seams_lie_where_two_cameras_see_the_ground() -> None:
     assert find_seams(apart, roads, MIDDLE, 15.0) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.1, -0.2, 0.2)])
 def test_the_misalignment_of_a_known_mount_error_is_measured(degrees: tuple[float, float, float]) -> None:
     true = turned(CAMERAS["b"], degrees)
@@ -201,6 +202,7 @@ def homographies_of(rig: RigFit) -> dict[str, CameraHomography]:
     return {n: CameraHomography(CAMERAS[n], rig.fits[n], "", "", rig) for n in CAMERAS}
 
 
+@pytest.mark.slow
 def test_mounts_are_turned_until_the_pictures_agree() -> None:
     true = {"a": CAMERAS["a"], "b": turned(CAMERAS["b"], (0.4, -0.2, 0.3))}
     log, schedule, observed = log_of(true, speed_mps=8.0)
@@ -244,6 +246,7 @@ def test_the_picture_of_a_tick_shows_the_ground_without_a_step_between_cameras()
     assert not fuse_tick(log, schedule, {}, 4, RecordReader(log), reach_m=2.0).coverage.any()
 
 
+@pytest.mark.slow
 def test_bench_measures_seams_as_fitted_and_with_mounts_aligned() -> None:
     true = {"a": CAMERAS["a"], "b": turned(CAMERAS["b"], (0.3, 0.0, 0.0))}
     log, schedule, observed = log_of(true, speed_mps=0.0)

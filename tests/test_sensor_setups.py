@@ -70,6 +70,7 @@ def test_a_log_is_described_checked_and_drawn(
     assert run("validate", tmp_path / "part").code == 0
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("name", EACH)
 def test_the_scenario_is_that_of_the_world(made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path) -> None:
     log, scenario = made(name)
@@ -121,6 +122,7 @@ def test_formats_with_an_ego_say_how_to_choose_one(made: Callable[[str], tuple[P
     assert names(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERALESS)
 def test_what_needs_a_camera_says_so(made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path) -> None:
     log, scenario = made(name)
@@ -136,6 +138,7 @@ def test_what_needs_a_camera_says_so(made: Callable[[str], tuple[Path, Path]], n
     assert names(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_what_needs_a_lidar_says_so(made: Callable[[str], tuple[Path, Path]], tmp_path: Path) -> None:
     log, _ = made("roadside-camera")
     for command in ("reconstruct", "detect"):

@@ -37,6 +37,7 @@ def seen_in_passing(category: str, way: str, rate_hz: float, seed: int = 0, ego_
     return Track(category, np.arange(len(rows)), Measurements.join(rows))
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 @pytest.mark.parametrize("category", SIZES)
 @pytest.mark.parametrize("way", WAYS)

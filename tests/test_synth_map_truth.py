@@ -51,6 +51,7 @@ def shapes(truth: MapFeatures) -> tuple[Any, Any]:
     return shapely.union_all(lines), shapely.union_all(closed)
 
 
+@pytest.mark.slow
 def test_all_paint_is_listed_and_all_that_is_listed_is_painted() -> None:
     scene, truth = features()
     xy, share = painted(scene)

@@ -53,11 +53,13 @@ def contrast(log: Log, truth: Scenario, road_half_m: float = 4.6) -> float:
     return float(np.median(intensity[on]) / np.median(intensity[off]))
 
 
+@pytest.mark.slow
 def test_paint_returns_two_to_four_times_as_much_as_asphalt_and_little_more_when_wet() -> None:
     assert 2.0 < contrast(*street()) < 4.0
     assert contrast(*street(environment={"weather": "rain", "rain_mm_h": 5.0})) < 1.5
 
 
+@pytest.mark.slow
 def test_returns_of_worn_paint_are_those_of_asphalt_where_it_is_missing() -> None:
     fresh, worn = contrast(*street()), contrast(*street(road={"worn": 0.9}))
     assert worn < 0.6 * fresh

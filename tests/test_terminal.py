@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from importlib import metadata
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from replay_scenes import LENGTH_M, line, parked
 from test_layers import ROOT
 
 from log2sim.cli import doctor, entry, installation
-from log2sim.cli.progress import WORDS, Bars, progress
+from log2sim.cli.progress import Bars, progress
 from log2sim.cli.run_summary import look_line, missing_lines
 from log2sim.cli.tables import format_rows
 from log2sim.datatypes import MapFeatures, Scenario, say_agents, say_categories
@@ -30,6 +31,7 @@ from log2sim.simulation.metrics.ego_figures import hardest_brake
 from log2sim.simulation.metrics.summary import summarize
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.runner import replay
+from log2sim.visualization.notebook.progress import REDRAWN_EVERY_S, WORDS, show_progress
 
 GROUP = typer.main.get_command(entry.app)
 
@@ -114,7 +116,7 @@ def test_the_ego_is_told_apart_from_the_agents(ids: list[str], words: str) -> No
 
 def test_categories_are_counted_with_those_that_stand() -> None:
     agents = [straight("a"), parked("b", 0, 0), straight("c")]
-    assert say_categories(agents) == "3 cars (1 standing)"
+    assert say_categories(agents) == "3 cars (1 static)"
     assert say_categories([]) == ""
 
 
@@ -141,6 +143,7 @@ def test_the_figures_of_a_braking_ego_are_those_of_the_closed_form() -> None:
     assert "collisions none" in said
 
 
+@pytest.mark.slow
 def test_an_ego_that_hits_something_has_no_gap_and_says_whom() -> None:
     result = braked_at(15.0)
     assert result.metrics["ego"]["min_gap"]["m"] == 0.0
@@ -181,10 +184,10 @@ def test_what_was_missing_is_said_once_for_each_reason() -> None:
     plan = tuple(
         {"stage": stage, "kept": False, "reason": reason} for stage in ("colors of vehicles", "traffic lights")
     )
-    spared = {"stage": "smoothing of parked agents", "kept": False, "reason": "1 of 2"}
+    spared = {"stage": "smoothing of static agents", "kept": False, "reason": "1 of 2"}
     scenario = scenario_of(straight("a"))
     told = Scenario(
-        "s", 0, 1.0, scenario.agents, plan=(*plan, spared), map_features=MapFeatures(notes=("no intensity",))
+        "s", 0, 1.0, scenario.agents, stages=(*plan, spared), map_features=MapFeatures(notes=("no intensity",))
     )
     assert missing_lines(told) == ["colors of vehicles, traffic lights: no camera is used", "no intensity"]
     assert missing_lines(world(straight("a"))) == []
@@ -280,3 +283,20 @@ def test_a_stage_that_ends_early_is_shown_as_done_and_may_come_again() -> None:
     assert [(task.completed, task.total) for task in display.tasks] == [(20, 20), (1, 2)]
     bars("check lidar", 1, 20)
     assert [(task.completed, task.total) for task in display.tasks] == [(1, 20), (2, 2)]
+
+
+def test_progress_of_functions_is_one_line_a_stage_that_is_written_anew(capsys: pytest.CaptureFixture[str]) -> None:
+    show_progress("track", 0, 0)
+    time.sleep(REDRAWN_EVERY_S)
+    for done in range(1, 1001):
+        show_progress("draw", done, 1000)
+    show_progress(3, 3)  # of functions with a single stage
+    lines = capsys.readouterr().out.split("\n")
+    assert [line.rpartition("\r")[2].rstrip() for line in lines] == [
+        "tracking",
+        "drawing: 1000 of 1000",
+        "done: 3 of 3",
+        "",
+    ]
+    assert 1 < lines[1].count("\r") < 1000
+    assert len({len(line) for line in "\r".join(lines[:3]).split("\r")[1:]} - {0}) == 1

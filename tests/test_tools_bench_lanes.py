@@ -12,6 +12,8 @@ from worlds import tiny_log
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import bench_lanes
 
+pytestmark = pytest.mark.slow
+
 
 def result(seed: int, precision: float | None, **colors: Any) -> dict[str, Any]:
     lines = {

@@ -14,6 +14,8 @@ sys.path.insert(0, str(ROOT / "tools"))
 import bench_warnings  # noqa: E402
 from labeled_drives import CAMERA_AHEAD_M, kitti_tracking  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 FRAMES, SPEED_MPS = 30, 10.0
 CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0
 R_rect 1 0 0 0 1 0 0 0 1

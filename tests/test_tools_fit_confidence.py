@@ -15,6 +15,8 @@ import fit_confidence
 
 from log2sim.datatypes import Frame
 
+pytestmark = pytest.mark.slow
+
 
 def test_weights_are_found_again_from_many_agents():
     rng = np.random.default_rng(3)

@@ -15,6 +15,8 @@ from log2sim.perception.late_fusion import PAIR_WEIGHTS, PairWeights
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import fit_late_fusion
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("weights", [PairWeights(-1.0, 0.5, 1.4, 3.0, -0.2), PairWeights(-3.0, 1.2, 0.8, 6.0, 0.1)])
 def test_weights_are_found_again_from_many_pairs(weights: PairWeights) -> None:

@@ -16,6 +16,8 @@ from log2sim.mapping.ground_map import GroundMap
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import map_repeatability as tool
 
+pytestmark = pytest.mark.slow
+
 
 def mapped(world: World) -> GroundMap:
     log = world_log(world)

@@ -13,6 +13,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import sensitivity
 import thresholds
 
+pytestmark = pytest.mark.slow
+
 TOY = """
 from dataclasses import dataclass
 import numpy as np

@@ -28,6 +28,8 @@ from kitti_rows import Rows  # noqa: E402
 from log2sim.errors import LogError  # noqa: E402
 from log2sim.geometry import bev_iou, box_corners_bev, rotation_from_rpy, transform  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 P = np.array([[720.0, 0.0, 610.0, 0.0], [0.0, 720.0, 173.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 KITTI = SHARED / "data" / "kitti_tracking"
 CAR, PERSON = (1.5, 1.6, 4.0), (1.7, 0.6, 0.6)

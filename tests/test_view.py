@@ -644,7 +644,7 @@ def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
     opened(browser, sample)
     shown = "return [...document.querySelectorAll('#agents .id')].map((e) => e.textContent)"
     assert len(browser.run(shown)) == 12
-    browser.press("/", *"stationary car")
+    browser.press("/", *"static car")
     assert browser.run(shown) == ["car_parked", "car_parked_north"]
     assert time_of(browser) == 0.0  # letters of a search are no commands
     browser.press(ENTER)

@@ -170,6 +170,7 @@ def test_a_box_is_drawn_as_corners_only_where_its_edges_are_straight() -> None:
     assert outline_of(straight, near - [0.0, 0.0, 5.0])[0] == SEGMENTS  # a part is behind the camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_bytes", [260_000, 1_200_000])
 def test_the_page_keeps_to_its_size_and_uses_it(tmp_path: Path, max_bytes: int) -> None:
     log = roadside(camera_of("a"), camera_of("b", yaw_rad=0.5))
@@ -179,6 +180,8 @@ def test_the_page_keeps_to_its_size_and_uses_it(tmp_path: Path, max_bytes: int) 
     assert size > 0.35 * max_bytes
     document = document_of(tmp_path / "page.html")["recording"]
     assert tuple(document["notes"]) == notes
+    write_page(scene(), tmp_path / "log.html", recorded=log)  # with all that fits into a page of the usual size
+    assert "pictures" in document_of(tmp_path / "log.html")["recording"]
     shown = document["pictures"]["cameras"]
     assert [camera["name"] for camera in shown] == ["a", "b"]
     for camera in shown:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,6 +21,7 @@ def side_points(rng, count, yaw_rad):
     return rotate(np.stack([x, y], axis=1) + rng.normal(0, NOISE_M, (count, 2)), yaw_rad) + rng.uniform(-80, 80, 2)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), counts=st.lists(st.integers(20, 700), min_size=1, max_size=8))
 def test_clusters_are_fitted_alike_alone_and_together(seed, counts):
     rng = np.random.default_rng(seed)

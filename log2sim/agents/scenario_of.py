@@ -1,4 +1,4 @@
-"""The scenario of a run: agents, cameras, plan and provenance in one record."""
+"""The scenario of a run: agents, cameras, stages and provenance in one record."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def scenario_of(
     agents: Sequence[Agent],
     *,
     cameras: Sequence[Mapping[str, Any]],
-    plan: Sequence[Mapping[str, Any]],
+    stages: Sequence[Mapping[str, Any]],
     provenance: Mapping[str, Any],
 ) -> Scenario:
     """Assemble the record that `scenario.json` holds, of the ticks `t_ns` (T,); the ego, if any, is its first agent."""
@@ -32,7 +32,7 @@ def scenario_of(
         agents=tuple(agents),
         map=log.map,
         cameras=tuple(cameras),
-        plan=tuple(plan),
+        stages=tuple(stages),
         provenance=provenance,
     )
 

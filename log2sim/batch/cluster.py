@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +61,11 @@ class Workers:
         return [a for a in self.client.scheduler_info(n_workers=-1)["workers"] if a != address]
 
 
+def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:
+    """Return so many worker processes on this machine, one for each core by default, or the workers of a scheduler."""
+    return local_workers(jobs or usable_threads()) if scheduler is None else workers_of(scheduler)
+
+
 @contextmanager
 def local_workers(count: int) -> Iterator[Workers]:
     """Start so many worker processes on this machine, each with its share of the cores and of the memory; stop them at the end.
@@ -70,7 +75,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     MissingExtra
         Without Dask.
     """
-    distributed, dask = _import_dask()
+    distributed, dask = import_dask()
     from distributed.system import MEMORY_LIMIT
 
     environment = {**thread_limits(max(1, usable_threads() // count)), "DASK_LOGGING__DISTRIBUTED": "critical"}
@@ -111,7 +116,7 @@ def workers_of(address: str) -> Iterator[Workers]:
     """
     if not address.startswith(PROTOCOLS):
         raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")
-    distributed, _ = _import_dask()
+    distributed, _ = import_dask()
     try:
         client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
@@ -122,7 +127,8 @@ def workers_of(address: str) -> Iterator[Workers]:
         yield Workers(client, are_ours=False)
 
 
-def _import_dask() -> tuple[Any, Any]:
+def import_dask() -> tuple[Any, Any]:
+    """Return `distributed` and `dask`; raise `MissingExtra` where one of the packages that a batch needs is missing."""
     try:
         import cryptography  # noqa: F401  (for the certificates of a local cluster)
         import dask

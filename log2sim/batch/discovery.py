@@ -39,7 +39,9 @@ class FoundLog:
     sequence: str
 
 
-def find_logs(root: Path, *, format: str = "auto", leave_out: Path | None = None) -> list[FoundLog]:
+def find_logs(
+    root: Path, *, format: str = "auto", leave_out: Path | None = None, max_folders: int = MAX_FOLDERS
+) -> list[FoundLog]:
     """Find all logs at and below a folder, in the order of their ids.
 
     Parameters
@@ -50,6 +52,8 @@ def find_logs(root: Path, *, format: str = "auto", leave_out: Path | None = None
         Name of the only format that is looked for, or "auto".
     leave_out : Path, optional
         Folder that is not looked into.
+    max_folders : int
+        That are looked into before the search is given up.
 
     Raises
     ------
@@ -70,7 +74,8 @@ def find_logs(root: Path, *, format: str = "auto", leave_out: Path | None = None
     if root.is_file():
         found = _of_file(root, format)
     else:
-        found = _Search(root, readers, None if leave_out is None else leave_out.resolve()).below(root, MAX_LEVELS)
+        left_out = None if leave_out is None else leave_out.resolve()
+        found = _Search(root, readers, left_out, max_folders).below(root, MAX_LEVELS)
     if not found:
         kind = "of any format" if format == "auto" else f"of format '{format}'"
         raise LogError(f"{root}: holds no log {kind}, down to {MAX_LEVELS} folders below it")
@@ -91,16 +96,19 @@ class _Search:
     root : Path
     readers : mapping of str to Reader
     leave_out : Path or None
+    max_folders : int
     """
 
-    def __init__(self, root: Path, readers: Mapping[str, Reader], leave_out: Path | None) -> None:
-        self.root, self.readers, self.leave_out = root, readers, leave_out
+    def __init__(self, root: Path, readers: Mapping[str, Reader], leave_out: Path | None, max_folders: int) -> None:
+        self.root, self.readers, self.leave_out, self.max_folders = root, readers, leave_out, max_folders
         self._seen: set[Path] = set()
 
     def below(self, folder: Path, levels: int) -> list[FoundLog]:
         """Return the logs at and below a folder, of which `levels` more levels are searched."""
-        if len(self._seen) >= MAX_FOLDERS:
-            raise ConfigError(f"{self.root}: more than {MAX_FOLDERS} folders are below it; give the folder of the logs")
+        if len(self._seen) >= self.max_folders:
+            raise ConfigError(
+                f"{self.root}: more than {self.max_folders} folders are below it; give the folder of the logs"
+            )
         self._seen.add(folder.resolve())
         held = self._held(folder)
         itself = next((name for name, sequences in held.items() if _is_one_log(folder, sequences)), None)

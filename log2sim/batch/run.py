@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from log2sim.batch.cluster import Workers
+from log2sim.batch.cluster import Workers, connect, import_dask
 from log2sim.batch.discovery import find_logs
 from log2sim.batch.folder import BatchFolder, BatchSettings
 from log2sim.batch.jobs import Job, make_jobs
@@ -106,8 +106,9 @@ def plan_batch(
         For an output folder that holds the logs, something else, or a batch of other settings, and for detectors that could
         search no log.
     MissingExtra
-        Where a detector needs what is not installed.
+        Where a detector, or the batch itself, needs what is not installed.
     """
+    import_dask()
     check_detectors(config)
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ConfigError(f"{out}: holds the logs; choose another folder for the results")
@@ -151,6 +152,52 @@ def run_batch(batch: Batch, connect: Connect, *, progress: Progress = lambda don
         write_parquet(batch.folder.path / TABLE_FILE, listed)
         write_batch_page(batch.folder.path / PAGE_FILE, listed, batch.folder.settings, total=len(batch.jobs))
     return listed
+
+
+def reconstruct_all(
+    root: Path | str,
+    out: Path | str,
+    config: Config | None = None,
+    *,
+    format: str = "auto",
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    cache: bool = True,
+    progress: Progress | None = None,
+) -> list[Row]:
+    """Reconstruct all logs below a folder, several at once, or go on with that; see `plan_batch` and `run_batch`.
+
+    Parameters
+    ----------
+    root, out : Path or str
+        Folder with logs, and folder for the results.
+    config : Config, optional
+        Settings of all runs.
+    format : str
+        Format of the logs, or "auto".
+    jobs : int, optional
+        Worker processes on this machine; one for each core by default.
+    scheduler : str, optional
+        Address of a Dask scheduler, whose workers are used instead.
+    overwrite : bool
+        Whether to start over, without the results of earlier runs.
+    cache : bool
+        Whether detections in pictures are taken from the caches of the workers, and kept there.
+    progress : callable, optional
+        Called as `progress(done, total)`.
+
+    Returns
+    -------
+    list of Row
+        Of all logs; those that failed say why.
+
+    Notes
+    -----
+    Worker processes import the script that calls this, which needs `if __name__ == "__main__":` around the call.
+    """
+    planned = plan_batch(Path(root), Path(out), config or Config(), format=format, overwrite=overwrite, cache=cache)
+    return run_batch(planned, lambda: connect(jobs, scheduler), progress=progress or (lambda done, total: None))
 
 
 def run_jobs(connect: Connect, jobs: Iterable[Job], folder: BatchFolder) -> Generator[Finished, None, None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,7 +40,7 @@ def batch(
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     no_cache: NoCache = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Start over: first remove the results that DIR holds.")
+        bool, typer.Option("--overwrite", "-f", help="Start over: first remove the results that DIR holds.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -57,11 +56,10 @@ def batch(
     log2sim batch drives/ -o results/ --scheduler tcp://10.0.0.5:8786
     """
     from log2sim.batch import plan_batch, run_batch
-    from log2sim.batch.cluster import Workers, local_workers, workers_of
+    from log2sim.batch.cluster import connect
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.errors import ConfigError, LogsFailed
-    from log2sim.threads import usable_threads
 
     if scheduler is not None and jobs is not None:
         raise ConfigError("--jobs: the scheduler decides how many workers there are; leave out --jobs or --scheduler")
@@ -75,11 +73,10 @@ def batch(
     found = f"{counted(len(planned.jobs), 'log')} below {root}"
     say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
 
-    def connect() -> AbstractContextManager[Workers]:
-        return local_workers(jobs or usable_threads()) if scheduler is None else workers_of(scheduler)
-
     with progress(quiet=quiet) as report_progress:
-        rows = run_batch(planned, connect, progress=lambda done, total: report_progress("logs", done, total))
+        rows = run_batch(
+            planned, lambda: connect(jobs, scheduler), progress=lambda done, total: report_progress("logs", done, total)
+        )
     for line in _failure_lines(rows):
         say(line, quiet=quiet)
     say(f"{out / 'table.html'}: {_summary(rows)}", quiet=quiet)

@@ -19,6 +19,7 @@ from log2sim.cli.options import (
     Stop,
     complete_detectors,
     say,
+    say_written,
 )
 from log2sim.cli.truth import truth_at
 
@@ -94,3 +95,4 @@ def bench(
         write_json(out / "bench.json", document(result))
         write_picture(result, out / "bench.png")
     say(format_table(result), quiet=quiet)
+    say_written(out / "bench.json", out / "bench.png", quiet=quiet)

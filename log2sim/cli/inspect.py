@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import AsJson, Cameras, Format, Overwrite, Quiet, Sequence, Verbose, camera_names, say
+from log2sim.cli.options import (
+    AsJson,
+    Cameras,
+    Format,
+    Overwrite,
+    Quiet,
+    Sequence,
+    Verbose,
+    camera_names,
+    say,
+    say_written,
+)
 from log2sim.errors import ConfigError
 
 
@@ -43,10 +54,11 @@ def inspect(
     import json
 
     from log2sim.cli.inspect_tables import describe_log, describe_scenario
-    from log2sim.cli.progress import OPENING, progress
+    from log2sim.cli.progress import progress
     from log2sim.documents import check_targets
     from log2sim.logs.opening import open_log
     from log2sim.logs.summary import summarize
+    from log2sim.visualization.notebook.progress import OPENING
 
     if overlay is None and (at is not None or cameras is not None):
         raise ConfigError("--at and --cameras choose what --overlay FILE.png draws; name the picture too")
@@ -71,7 +83,7 @@ def inspect(
     from log2sim.visualization.overlay.picture import write_overlay
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-    say(f"{overlay}: written", quiet=quiet)
+    say_written(overlay, quiet=quiet)
 
 
 def _summary_of_scenario(path: Path) -> dict[str, Any]:

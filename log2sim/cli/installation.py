@@ -37,6 +37,8 @@ PURPOSES = {
     "ros": "ROS bags and MCAP as logs",
     "pandaset": "sweeps of PandaSet in half the time",
     "parquet": "Argoverse 2 and Waymo's parquet as logs, to_parquet",
+    "dataframe": "scenario.to_dataframe",
+    "xarray": "scenario.to_xarray",
     "odometry": "--poses lidar and auto",
     "rerun": "export --to rerun",
     "carla": "replay --simulator carla",

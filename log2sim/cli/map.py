@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, Sequence, choose, say
+from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, Sequence, choose, say, say_written
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -100,6 +100,7 @@ def map_(
         say(f"note: {line}", quiet=quiet)
     rows, columns = ground.alpha.shape
     d = ground.resolution_m
+    say_written(world, quiet=quiet)
     say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
 
 

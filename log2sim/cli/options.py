@@ -66,7 +66,9 @@ def complete_detectors(incomplete: str) -> list[str]:
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", "-f", envvar="LOG2SIM_OVERWRITE", help="Replace files that exist.")
+]
 DropDoubtful = Annotated[
     bool, typer.Option("--drop-doubtful", help="Leave out agents that the scenario itself doubts; the ego stays.")
 ]
@@ -140,6 +142,13 @@ def say(text: str, *, quiet: bool = False) -> None:
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
+
+
+def say_written(*paths: Path | None, quiet: bool) -> None:
+    """Name the files that a command wrote; None stands for one that was not asked for."""
+    written = [str(path) for path in paths if path is not None]
+    if written:
+        say(f"{', '.join(written)}: written", quiet=quiet)
 
 
 def camera_names(text: str | None) -> tuple[str, ...]:

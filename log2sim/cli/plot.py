@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, Truth, say, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, Truth, say, say_written, write_to
 
 
 def plot(
@@ -97,3 +97,4 @@ def plot(
             loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
             overwrite=overwrite, progress=report_progress,
         )  # fmt: skip
+    say_written(picture.path, quiet=quiet)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say, say_written
 
 
 def predict(
@@ -47,3 +47,4 @@ def predict(
     say(format_figures(document), quiet=quiet)
     if loaded.is_reconstruction:
         say("note: the states were smoothed over the whole log and depend a little on what came next", quiet=quiet)
+    say_written(out, quiet=quiet)

@@ -8,46 +8,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from log2sim.visualization.notebook.progress import OPENING, VALIDATING, say_stage
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 LINE_EVERY_S = 5.0
 
-OPENING, VALIDATING = "open", "validate"
 ON_TERMINALS = (OPENING, VALIDATING)
 """Shown on a terminal alone: elsewhere what is wrong with the log is to be the only line."""
-
-WORDS = {
-    OPENING: "opening the log",
-    "odometry": "following the ego in LiDAR sweeps",
-    "camera motion": "following the ego in pictures",
-    "check cameras": "checking the mounts of cameras",
-    "load": "loading the detectors",
-    "detect and measure": "detecting and measuring",
-    "track": "tracking",
-    "smooth": "smoothing trajectories",
-    "judge": "comparing agents with the recording",
-    "map poses": "aligning the map",
-    "pictures": "mapping the ground and reading colors",
-    "lanes": "finding markings and lanes",
-    "map: sweeps": "mapping the ground: LiDAR sweeps",
-    "map: pictures": "mapping the ground: pictures",
-    "replay": "simulating",
-    "convert": "writing records",
-    VALIDATING: "reading every record",
-    "detect": "detecting",
-    "synthesize": "rendering",
-    "scenes": "rendering scenes",
-    "count points": "counting points in boxes",
-    "draw": "drawing",
-    "page: pictures": "reading pictures",
-    "page: sweeps": "reading LiDAR points",
-    "evaluate": "comparing with the truth",
-    "write": "writing",
-}
-"""What people read of a stage; a stage without words of its own shows its name."""
-
-WORDS_BEFORE_SENSORS = {"check ": "checking the clock and mount of ", "register ": "registering "}
 
 Report = Callable[[str, int, int], None]
 """Called as `report(stage, done, total)`; a total of 0 says that the length of the stage is not known."""
@@ -63,14 +32,6 @@ def progress(*, quiet: bool) -> Iterator[Report]:
             yield report_progress
     else:
         yield _lines()
-
-
-def say_stage(stage: str) -> str:
-    """Return the words for a stage."""
-    for start, words in WORDS_BEFORE_SENSORS.items():
-        if stage not in WORDS and stage.startswith(start):
-            return words + stage.removeprefix(start)
-    return WORDS.get(stage, stage)
 
 
 class Bars:

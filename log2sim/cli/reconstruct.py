@@ -25,6 +25,7 @@ from log2sim.cli.options import (
     choose,
     complete_detectors,
     say,
+    say_written,
     write_to,
 )
 
@@ -99,9 +100,10 @@ def reconstruct(
     log2sim reconstruct drive.mcap -o s.json --poses auto --stop 20
     log2sim reconstruct pandaset/ --sequence 002 --detector lidar:vehicle -o s.json
     """
-    from log2sim.cli.progress import OPENING, progress
+    from log2sim.cli.progress import progress
     from log2sim.documents import check_targets, write_json
     from log2sim.outputs import together
+    from log2sim.visualization.notebook.progress import OPENING
 
     check_targets(out, report, topdown, overwrite=overwrite)
     changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "seed": seed}
@@ -120,9 +122,11 @@ def reconstruct(
         from log2sim.errors import ConfigError, MissingExtra
         from log2sim.logs.opening import open_log
         from log2sim.pipeline import reconstruct as run
+        from log2sim.run_detectors import check_detectors
         from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
         chosen = Config.load(config, settings or (), **changes)
+        check_detectors(chosen)
         opened = open_log(log, format=format, sequence=sequence)
     if topdown is not None and not opened.cameras:
         raise ConfigError(f"--topdown: {opened.name}: the log has no camera, so there is no picture of the ground")
@@ -143,6 +147,7 @@ def reconstruct(
         result.scenario.save(out)
     for note in (*unused_records(result.report), *cache_notes(result.report)):
         say(f"note: {note}", quiet=quiet)
+    say_written(report, topdown, quiet=quiet)
     for line in summarize(result, look_line(log, sequence, out), out, verbose=verbose):
         say(line, quiet=quiet)
 

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, Verbose, choose, say, write_to
+from log2sim.cli.options import (
+    DropDoubtful,
+    Overwrite,
+    Quiet,
+    ScenarioPath,
+    Verbose,
+    choose,
+    say,
+    say_written,
+    write_to,
+)
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -160,6 +170,7 @@ def replay(
     if out is not None:
         result.save(out)
     say(summarize(result, limit=None if verbose else MAX_LISTED), quiet=quiet)
+    say_written(out, quiet=quiet)
     if strict:
         require_strict(result, limits)
     for broken in check_limits(result, limits):

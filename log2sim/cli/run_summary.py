@@ -36,7 +36,7 @@ def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = Fals
         *(("doubtful", line) for line in doubt_lines(scenario, verbose=verbose) or ["none"]),
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
-        *(("used", line) for line in (plan_lines(scenario) if verbose else ())),
+        *(("used", line) for line in (stage_lines(scenario) if verbose else ())),
     ]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
     table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
@@ -86,7 +86,7 @@ def doubt_lines(scenario: Scenario, *, verbose: bool = False) -> list[str]:
 def missing_lines(scenario: Scenario) -> list[str]:
     """Say what a scenario lacks and why: what was not looked for, by reason, and what of the road was not found."""
     left_out: dict[str, list[str]] = {}
-    for stage in scenario.plan:
+    for stage in scenario.stages:
         if stage["stage"] in LOOKED_FOR and not stage["kept"]:
             left_out.setdefault(str(stage["reason"]), []).append(str(stage["stage"]))
     features = scenario.map_features
@@ -94,9 +94,9 @@ def missing_lines(scenario: Scenario) -> list[str]:
     return [*(f"{', '.join(stages)}: {reason}" for reason, stages in left_out.items()), *notes]
 
 
-def plan_lines(scenario: Scenario) -> list[str]:
+def stage_lines(scenario: Scenario) -> list[str]:
     """Say of every stage whether it was run, and why."""
-    return [f"{'with' if stage['kept'] else 'no'} {stage['stage']}: {stage['reason']}" for stage in scenario.plan]
+    return [f"{'with' if stage['kept'] else 'no'} {stage['stage']}: {stage['reason']}" for stage in scenario.stages]
 
 
 def look_line(log: Path, sequence: str | None, out: Path) -> str:

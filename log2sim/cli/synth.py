@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, say
+from log2sim.cli.options import Overwrite, Quiet, say_written
 from log2sim.errors import ConfigError
 
 
@@ -105,4 +105,4 @@ def synth(
             write_traffic(
                 settings, out, overwrite=overwrite, progress=lambda done, total: report_progress("scenes", done, total)
             )
-    say(f"{out}: written", quiet=quiet)
+    say_written(out, quiet=quiet)

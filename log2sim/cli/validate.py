@@ -36,9 +36,10 @@ def validate(
     from log2sim.logs.opening import is_log_file, open_log
 
     if path.is_dir() or is_log_file(path):
-        from log2sim.cli.progress import VALIDATING, progress
+        from log2sim.cli.progress import progress
         from log2sim.logs.native.reader import READER
         from log2sim.logs.validation import list_gaps, validate_log
+        from log2sim.visualization.notebook.progress import VALIDATING
 
         opened = open_log(path, format=format, sequence=sequence)
         with progress(quiet=quiet) as report_progress:

@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
     from log2sim.visualization.recording.recording import Recorded
 
-DEFAULT_MAX_MB = 40.0
-"""Of a page with pictures: mail and chat programs take so much, and a phone still opens it."""
-
 
 def view(
     scenario: ScenarioPath,
@@ -88,7 +85,9 @@ def view(
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
-            max_bytes = round((DEFAULT_MAX_MB if max_mb is None else max_mb) * 1e6)
+            from log2sim.visualization.recording.recording import DEFAULT_MAX_BYTES
+
+            max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
             layers["recorded"] = _recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
         if background is not None:
             from log2sim.cli.background import load_background

@@ -18,6 +18,7 @@ from log2sim.datatypes.trajectory import Trajectory
 from log2sim.datatypes.waypoints import Waypoints
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 COLOR_NAMES = ("black", "white", "gray", "silver", "red", "blue", "green", "yellow", "brown", "orange")
 """Names that reconstructed colors of vehicles have."""
@@ -36,6 +37,8 @@ class AgentStates:
     yaw_rad : (T,) float64
     speed_mps : (T,) float64, m/s
     """
+
+    __repr__ = short_repr
 
     valid: NDArray[np.bool_]
     x_m: Array
@@ -86,6 +89,14 @@ class Agent:
     quality: Mapping[str, Any] = field(default_factory=dict)
     doubts: tuple[Doubt, ...] = ()
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return category, size, times and confidence in one line."""
+        size, t = " x ".join(f"{edge_m:.1f}" for edge_m in self.size_m), self.waypoints.t_s
+        times = f"{t[0]:.1f} to {t[-1]:.1f} s" if len(t) > 1 else "the whole time" if self.static else "once"
+        notes = [f"confidence {self.confidence:.2f}", *(["static"] if self.static else [])]
+        notes += [doubt.flag for doubt in self.doubts]
+        return f"<Agent {self.id!r:.80}: {self.category}, {size} m, {times}, {', '.join(notes)}>"
 
     @property
     def is_permanent(self) -> bool:

@@ -20,16 +20,16 @@ def say_agents(ids: Iterable[str]) -> str:
 
 
 def say_categories(agents: Sequence[Agent]) -> str:
-    """Count agents by category, most frequent first, with how many of each stand: "8 cars (3 standing), 1 bus"."""
+    """Count agents by category, most frequent first, with how many of each are static: "8 cars (3 static), 1 bus"."""
     counts: dict[str, list[int]] = {}
     for agent in agents:
         count = counts.setdefault(agent.category, [0, 0])
         count[0] += 1
         count[1] += agent.static
     ordered = sorted(counts.items(), key=lambda entry: (-entry[1][0], entry[0]))
-    return ", ".join(_say_category(category, total, standing) for category, (total, standing) in ordered)
+    return ", ".join(_say_category(category, total, static) for category, (total, static) in ordered)
 
 
-def _say_category(category: str, total: int, standing: int) -> str:
+def _say_category(category: str, total: int, static: int) -> str:
     noun = category if total == 1 else PLURALS.get(category, f"{category}s")
-    return f"{total} {noun}" + (f" ({standing} standing)" if standing else "")
+    return f"{total} {noun}" + (f" ({static} static)" if static else "")

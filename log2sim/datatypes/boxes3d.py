@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,8 @@ class Boxes3D:
     seen_by : (M, 2) bool, optional
         Which of the `ENDS` found it; None where their clouds were searched as one.
     """
+
+    __repr__ = short_repr
 
     t_ns: NDArray[np.int64]
     center_m: Array

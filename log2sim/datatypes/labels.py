@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,8 @@ class Labels:
         Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI.
     """
 
+    __repr__ = short_repr
+
     t_ns: NDArray[np.int64]
     track_id: NDArray[np.str_]
     category: NDArray[np.str_]
@@ -66,6 +69,8 @@ class ImageLabels:
     category : (L,) str
     """
 
+    __repr__ = short_repr
+
     t_ns: NDArray[np.int64]
     box_px: Array
     category: NDArray[np.str_]
@@ -82,6 +87,8 @@ class ImageRegions:
     box_px : (L, 4) float64, px
         u0, v0, u1, v1.
     """
+
+    __repr__ = short_repr
 
     t_ns: NDArray[np.int64]
     box_px: Array

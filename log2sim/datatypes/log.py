@@ -19,6 +19,7 @@ from log2sim.datatypes.deferred import Deferred
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
 from log2sim.datatypes.tick import Tick
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,8 @@ class Lidar:
         Frame that it is fixed in: on the vehicle or at the roadside.
     mount_T_lidar : (4, 4) float64
     """
+
+    __repr__ = short_repr
 
     name: str
     mount: Mount
@@ -55,6 +58,8 @@ class Stream:
         Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it, which hold all that `read`
         returns; None where it holds none.
     """
+
+    __repr__ = short_repr
 
     name: str
     t_ns: Deferred[NDArray[np.int64]] = Deferred()
@@ -194,6 +199,25 @@ class Log:
         """
         ticks: Sequence[Tick] = late_functions.call("ticks_of", self, tuple(cameras), start_s=start_s, stop_s=stop_s)
         return ticks
+
+    def truth(self, cameras: Sequence[str] = ()) -> Any:
+        """Return the labeled objects and the ego as a scenario, for `evaluate`, `plot` and a first look.
+
+        Parameters
+        ----------
+        cameras : sequence of str
+            Cameras that were used: what they show counts as visible; all of the log where it is empty.
+
+        Returns
+        -------
+        log2sim.Scenario
+
+        Raises
+        ------
+        LogError
+            For a log without labels.
+        """
+        return late_functions.call("truth_of", self, cameras=tuple(cameras) or None)
 
     def show(self, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Any = None) -> Any:
         """Draw boxes and LiDAR points on the pictures of one moment.

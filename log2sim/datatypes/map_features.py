@@ -10,6 +10,7 @@ import numpy as np
 
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 MARKING_KINDS = ("solid", "dashed", "stop_line", "crosswalk", "other")
 """Kinds of markings; lane lines are the first two, arrows and letters are "other"."""
@@ -42,6 +43,8 @@ class Marking:
     sources : tuple of str
         What shows it: "camera", "lidar".
     """
+
+    __repr__ = short_repr
 
     id: str
     kind: str
@@ -100,6 +103,8 @@ class RoadBorder:
         What shows it: "camera", "lidar".
     """
 
+    __repr__ = short_repr
+
     id: str
     kind: str
     points_m: Array
@@ -149,6 +154,8 @@ class MapLane:
     confidence : float
         Probability that it is a lane, in this direction, in [0, 1].
     """
+
+    __repr__ = short_repr
 
     id: str
     points_m: Array
@@ -226,6 +233,8 @@ class MapFeatures:
     notes : tuple of str
         What is not there, and why.
     """
+
+    __repr__ = short_repr
 
     markings: tuple[Marking, ...] = ()
     borders: tuple[RoadBorder, ...] = ()

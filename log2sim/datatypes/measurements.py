@@ -13,6 +13,7 @@ from log2sim.array_file import ArrayFile, ArrayList, join_arrays, take_arrays
 from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.ends import seen_from
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 TUPLES = ("cluster", "others")
 """Columns of measurements that are no arrays."""
@@ -32,6 +33,8 @@ class Detections:
     traffic_lights : (K, 5) float64
         Boxes u0, v0, u1, v1 and scores of traffic lights in the frame, which are no road users.
     """
+
+    __repr__ = short_repr
 
     box_px: Array
     score: Array
@@ -118,6 +121,8 @@ class BoxEvidence:
         What a second viewpoint shows, None for rows without; empty where no row has one.
     """
 
+    __repr__ = short_repr
+
     t_ns: NDArray[np.int64]
     category: NDArray[np.str_]
     score: Array
@@ -182,6 +187,8 @@ class Measurements(BoxEvidence):
     source : (M,) str
         "lidar", "topdown", or "" without a position.
     """
+
+    __repr__ = short_repr
 
     center_m: Array
     covariance: Array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ from log2sim.datatypes.ignore_regions import IgnoreRegions
 from log2sim.datatypes.log import MapFrame
 from log2sim.datatypes.map_features import MapFeatures
 from log2sim.datatypes.signals import Signal
-from log2sim.datatypes.waypoint_table import dataframe_of, write_parquet
+from log2sim.datatypes.waypoint_table import dataframe_of, dataset_of, write_parquet
 from log2sim.documents import check, read_json, write_json
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.registry import nearest
 
 VERSION = 1
 EGO = "ego"
@@ -42,8 +43,8 @@ class Scenario:
     map : MapFrame
     cameras : tuple of mapping
         The cameras of the log with the homographies that were fitted.
-    plan : tuple of mapping
-        Stages that were run or left out, each with its reason.
+    stages : tuple of mapping
+        Stages of the reconstruction that were run or left out, each with its reason.
     provenance : mapping
         Log, settings and versions that the scenario came from.
     ignore_regions : IgnoreRegions or None
@@ -59,7 +60,7 @@ class Scenario:
     agents: tuple[Agent, ...]
     map: MapFrame = field(default_factory=MapFrame)
     cameras: tuple[Mapping[str, Any], ...] = ()
-    plan: tuple[Mapping[str, Any], ...] = ()
+    stages: tuple[Mapping[str, Any], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     ignore_regions: IgnoreRegions | None = None
     map_features: MapFeatures | None = None
@@ -75,6 +76,17 @@ class Scenario:
     def _repr_html_(self) -> str | None:
         """Return what a notebook shows: the agents by category, and the tracks from above."""
         return late_functions.html_or_none(self)
+
+    def __getitem__(self, id: str) -> Agent:
+        """Return an agent by its id, as in `scenario["car-1"]`; raises `KeyError` where there is none."""
+        found = next((a for a in self.agents if a.id == id), None)
+        if found is None:
+            raise KeyError(f"no agent {id!r}{nearest(str(id), list(self))}; `for id in scenario` goes over their ids")
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        """Go over the ids of the agents."""
+        return (a.id for a in self.agents)
 
     @property
     def ego(self) -> Agent | None:
@@ -200,6 +212,19 @@ class Scenario:
         """
         return dataframe_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
 
+    def to_xarray(self) -> Any:
+        """Return an xarray Dataset: the columns of `to_dataframe` along `agent` and, where they change with it, `t_s`.
+
+        Times are those of all waypoints; numbers are NaN and `observed` is False where an agent has no waypoint at a time, as
+        static agents with a single one at all others.
+
+        Raises
+        ------
+        MissingExtra
+            When xarray is not installed.
+        """
+        return dataset_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
+
     def to_parquet(self, path: Path | str) -> None:
         """Write the rows of `to_dataframe` as a Parquet file, atomically; its schema states unit and meaning of each column.
 
@@ -221,6 +246,8 @@ class Scenario:
             "t0_ns": int(self.t0_ns),
             "duration_s": float(self.duration_s),
             "map": {
+                "frame": "enu" if m.projection is not None else "local",
+                "position": "box_center",
                 "latitude_deg": m.latitude_deg,
                 "longitude_deg": m.longitude_deg,
                 "altitude_m": m.altitude_m,
@@ -229,7 +256,7 @@ class Scenario:
             },
             "agents": [agent_to_dict(a) for a in self.agents],
             "cameras": [dict(c) for c in self.cameras],
-            "plan": [dict(p) for p in self.plan],
+            "stages": [dict(stage) for stage in self.stages],
             "provenance": dict(self.provenance),
         }
         if self.ignore_regions is not None:
@@ -254,6 +281,9 @@ class Scenario:
             raise ScenarioError(
                 f"scenario_version is {version!r}, expected {VERSION}; is this a scenario file of log2sim?"
             )
+        if "plan" in document and "stages" not in document:  # their name in files up to version 0.1
+            document = {**document, "stages": document["plan"]}
+            del document["plan"]
         check(document, "scenario-1", ScenarioError)
         m = document["map"]
         scenario = cls(
@@ -263,7 +293,7 @@ class Scenario:
             agents=tuple(agent_from_dict(a) for a in document["agents"]),
             map=MapFrame(m["latitude_deg"], m["longitude_deg"], m["altitude_m"], m["projection"], tuple(m["offset_m"])),
             cameras=tuple(document["cameras"]),
-            plan=tuple(document["plan"]),
+            stages=tuple(document["stages"]),
             provenance=document["provenance"],
             ignore_regions=IgnoreRegions.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 SIGNAL_STATES = ("red", "red_yellow", "yellow", "green", "off", "unknown")
 """States of a traffic light; off: no lamp is lit; unknown: no camera shows it."""
@@ -38,6 +39,8 @@ class Signal:
     cameras : tuple of str
         That saw it.
     """
+
+    __repr__ = short_repr
 
     id: str
     position_m: Array

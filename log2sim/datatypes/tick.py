@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes.deferred import Deferred
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,8 @@ class Sweep:
     intensity : (N,) float32 or None
         How strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
     """
+
+    __repr__ = short_repr
 
     stamp_ns: int
     xyz_m: NDArray[np.floating[Any]]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes.measurements import Measurements
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,8 @@ class Track:
     searched : float
         Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone.
     """
+
+    __repr__ = short_repr
 
     category: str
     tick: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""The waypoints of all agents as one table: a pandas DataFrame, or a Parquet file with units in its schema."""
+"""The waypoints of all agents as one table: of pandas, of xarray, or a Parquet file with units in its schema."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
 """Unit and meaning of each column."""
 
 TEXTS, FLAGS = ("agent", "category", "doubts"), ("observed", "static")
+PER_AGENT = ("category", "length_m", "width_m", "height_m", "static", "confidence", "doubts")
 
 
 def columns_of(agents: Sequence[Agent]) -> dict[str, NDArray[Any]]:
@@ -59,6 +60,39 @@ def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
     frame = pd.DataFrame(columns_of(agents))
     frame.attrs = dict(about)
     return frame
+
+
+def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
+    """Return the columns as an xarray Dataset along agents (A,) and the times of all waypoints (T,); `about` becomes its `attrs`.
+
+    Raises
+    ------
+    MissingExtra
+        When xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise MissingExtra("to_xarray", "xarray") from None
+    columns = columns_of(agents)
+    t_s, tick = np.unique(columns["t_s"], return_inverse=True)
+    counts = [len(agent.waypoints) for agent in agents]
+    row = np.repeat(np.arange(len(agents)), counts)
+    first = np.cumsum([0, *counts[:-1]]) if agents else np.zeros(0, dtype=np.intp)
+    along: dict[str, Any] = {}
+    for key, (unit, meaning) in COLUMNS.items():
+        values, about_key = columns[key], {"units": unit, "description": meaning}
+        if key in PER_AGENT:
+            along[key] = ("agent", values[first], about_key)
+        elif key not in ("agent", "t_s"):
+            table = np.full((len(agents), len(t_s)), False if key in FLAGS else np.nan)
+            table[row, tick] = values
+            along[key] = (("agent", "t_s"), table, about_key)
+    coordinates = {
+        "agent": [agent.id for agent in agents],
+        "t_s": ("t_s", t_s, {"units": "s", "description": COLUMNS["t_s"][1]}),
+    }
+    return xarray.Dataset(along, coords=coordinates, attrs=dict(about))
 
 
 def write_parquet(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:

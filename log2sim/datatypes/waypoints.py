@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,8 @@ class Waypoints:
     visible : (T,) bool or None
         Whether the sensors could see the agent; only in truth.
     """
+
+    __repr__ = short_repr
 
     t_s: Array
     x_m: Array

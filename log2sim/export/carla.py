@@ -28,7 +28,7 @@ class Carla:
     options: tuple[str, ...] = ("map", "mode")
     loses = (
         "sizes (CARLA's assets have their own; the data list by how much), states of traffic lights, map origin, cameras, quality,"
-        " plan, provenance"
+        " stages, provenance"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:

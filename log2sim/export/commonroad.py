@@ -59,7 +59,7 @@ class CommonRoad:
     options: tuple[str, ...] = ()
     loses = (
         "colors, uncertainty and observed flags, times between steps of 0.1 s and before the ego's first, the ego's way "
-        "between start and goal, confidences of lanes, crosswalks, states of traffic lights beyond the log, when parked vehicles were first and last seen, cameras, plan; text ids (in agents.csv)"
+        "between start and goal, confidences of lanes, crosswalks, states of traffic lights beyond the log, when static vehicles were first and last seen, cameras, stages; text ids (in agents.csv)"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:

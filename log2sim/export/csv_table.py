@@ -45,9 +45,7 @@ class Csv:
     """
 
     options: tuple[str, ...] = ()
-    loses = (
-        "map origin, colors, cameras, quality, plan and provenance; ids that a spreadsheet would run get an apostrophe"
-    )
+    loses = "map origin, colors, cameras, quality, stages and provenance; ids that a spreadsheet would run get an apostrophe"
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write the table."""

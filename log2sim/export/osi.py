@@ -34,8 +34,8 @@ class Osi:
 
     options: tuple[str, ...] = ()
     loses = (
-        "uncertainty and observed flags, whether vehicles are parked, times between steps of 0.1 s, confidences of lanes and"
-        " markings, cameras, plan"
+        "uncertainty and observed flags, whether vehicles are static, times between steps of 0.1 s, confidences of lanes and"
+        " markings, cameras, stages"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:

@@ -39,7 +39,7 @@ class ScenarioNet:
     options: tuple[str, ...] = ()
     loses = (
         "times between steps of 0.1 s and outside the ego's life, uncertainty and observed flags, stop lines and other markings "
-        "that are no lines, colors of lines where unknown, cameras, plan; MetaDrive itself takes over no height, and shows no agents of category other and cyclists and pedestrians in sizes of its own"
+        "that are no lines, colors of lines where unknown, cameras, stages; MetaDrive itself takes over no height, and shows no agents of category other and cyclists and pedestrians in sizes of its own"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:

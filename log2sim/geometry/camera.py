@@ -15,6 +15,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from log2sim.geometry.transforms import Array
+from log2sim.numerals import short_repr
 
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane, or behind it, are not projected."""
@@ -66,6 +67,8 @@ class Camera:
     rolling_shutter : RollingShutter or None
         None for a global shutter, or where the log does not state it.
     """
+
+    __repr__ = short_repr
 
     name: str
     width_px: int

@@ -16,6 +16,7 @@ from log2sim.geometry.transforms import (
     slerp,
     transform,
 )
+from log2sim.numerals import short_repr
 
 # Poses of some logs are 1 ns apart; beyond the ends of a track motion is taken from poses at least this far apart, if there are.
 MIN_EXTRAPOLATION_BASE_NS = 10_000_000
@@ -37,6 +38,8 @@ class PoseTrack:
     sigma_m, sigma_yaw_rad : (P,) float64, optional
         Standard deviations of the position along each axis, m, and of the yaw, rad; None where they are not known.
     """
+
+    __repr__ = short_repr
 
     t_ns: NDArray[np.int64]
     map_T_ego: Array

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from log2sim import registry
+from log2sim import late_functions, registry
 from log2sim.datatypes import Log
-from log2sim.errors import ConfigError, LogError, PluginError
+from log2sim.errors import ConfigError, Log2SimError, LogError, PluginError
 from log2sim.links import following_links
 from log2sim.logs.calibration_checks import list_calibration_problems
 from log2sim.logs.guarding import guard_log, translate_parser_errors
@@ -21,6 +21,8 @@ __all__ = ["Reader", "find_reader", "open_log"]
 MAX_LISTED = 20
 # From a picture to the folder of its log.
 MAX_LEVELS_ABOVE = 4
+MAX_FOLDERS_BELOW = 2000
+"""That are looked into for logs before an error; a second's work at most."""
 
 
 def open_log(
@@ -88,6 +90,10 @@ def _find_reader(root: Path, usable: _UsableReaders) -> str:
         raise LogError(
             f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root, readers)}{broken}"
         )
+    below = _logs_below(root)
+    if below:
+        count = f"{len(below)} log{'s' * (len(below) != 1)} below"
+        raise LogError(f"{root}: {count}: `log2sim batch` takes them all, other commands one of them: {_joined(below)}")
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
     raise LogError(
         f"{root}: no known log format{_log_above(root, readers)}; a log is one of: {known}. Force one with --format{broken}"
@@ -145,6 +151,14 @@ def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:
     return ""
 
 
+def _logs_below(root: Path) -> list[str]:
+    """Return the logs below a folder, for who gave the folder of many; none where a short search finds none."""
+    try:
+        return [str(log.path) for log in late_functions.call("find_logs", root, max_folders=MAX_FOLDERS_BELOW)]
+    except (Log2SimError, OSError):
+        return []
+
+
 def is_log_file(path: Path) -> bool:
     """Return whether a file has a suffix of a format of which a file is a log."""
     return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers().readers.values())
@@ -166,7 +180,8 @@ def _select_sequence(root: Path, name: str, available: list[str], sequence: str 
         return sequence
     if len(available) > 1:
         raise ConfigError(
-            f"{root}: holds {len(available)} sequences; choose one with --sequence NAME: {_joined(available)}"
+            f"{root}: holds {len(available)} sequences; choose one with --sequence NAME: {_joined(available)}; "
+            "`log2sim batch` takes them all"
         )
     return available[0]
 

@@ -261,7 +261,7 @@ class GroundMapBuilder:
 def map_ground(
     log: Log,
     scenario: Scenario,
-    settings: MapConfig,
+    settings: MapConfig | None = None,
     reader: RecordReader | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
     *,
@@ -274,7 +274,7 @@ def map_ground(
     log : Log
     scenario : Scenario
         Its agents are left out of the map; its span of time is what is mapped.
-    settings : MapConfig
+    settings : MapConfig, optional
     reader : RecordReader, optional
         Counts the records that cannot be read.
     progress : callable, optional
@@ -287,7 +287,7 @@ def map_ground(
     LogError
         When no pose is known, or no record that is wanted can be read.
     """
-    reader = reader or RecordReader(log)
+    reader, settings = reader or RecordReader(log), settings or MapConfig()
     if refine:
         log = refine_poses(log, scenario, reader)
     builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))

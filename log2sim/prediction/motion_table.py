@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 
 TICK_S = 0.1
 """Interval of ticks: the rate of most LiDARs, at which a driver's reaction takes ten ticks."""
@@ -40,6 +41,8 @@ class MotionTable:
     piece : (A, T) int
         Rises by one where the log jumps, from where on it is another object; -1 where the agent is absent.
     """
+
+    __repr__ = short_repr
 
     agents: tuple[Agent, ...]
     t_s: Array

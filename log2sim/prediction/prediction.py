@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
 from log2sim.prediction.paths import Paths, Seekers, follow, kind_of, locate
 from log2sim.prediction.smoothing import MIN_COURSE_MPS, PROOF_S, displacement, smooth_motion, turn_rates
@@ -55,6 +56,8 @@ class Forecast:
         Standard deviations along and across the course.
     """
 
+    __repr__ = short_repr
+
     position_m: Complex
     course: Complex
     sigma_m: Array
@@ -80,6 +83,8 @@ class Predictions:
     on_path : (N,) bool
         Where `path` knows one.
     """
+
+    __repr__ = short_repr
 
     table: MotionTable
     lead_s: Array

@@ -58,7 +58,7 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
     Raises
     ------
     ConfigError
-        When a name is not known, or is that of an agent that cannot react: parked, seen once, or driven by a policy.
+        When a name is not known, or is that of an agent that cannot react: static, seen once, or driven by a policy.
     """
     able = [a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)]
     if isinstance(wanted, str):
@@ -69,7 +69,7 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
         if name in able:
             continue
         if any(a.id == name for a in agents):
-            raise ConfigError(f"agent '{name}': cannot react, it is parked, seen only once, or driven by the policy")
+            raise ConfigError(f"agent '{name}': cannot react, it is static, seen only once, or driven by the policy")
         raise ConfigError(f"agent '{name}': there is none of that id{nearest(name, able)}")
     return frozenset(wanted)
 

@@ -15,6 +15,7 @@ from log2sim.datatypes import Scenario, Waypoints
 from log2sim.documents import check, read_json, write_json
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
+from log2sim.numerals import short_repr
 from log2sim.simulation.warnings.warning import Warnings
 
 VERSION = 1
@@ -35,6 +36,8 @@ class Commands:
     gear : (S,) int8
         1 forward, -1 reverse.
     """
+
+    __repr__ = short_repr
 
     pedal_mps2: Array
     steer_rad: Array
@@ -75,6 +78,8 @@ class AgentReplay:
     cross_track_m, along_track_m : (S,) float64 or None, m
         Distance from the scenario, left and ahead positive; None for static agents.
     """
+
+    __repr__ = short_repr
 
     id: str
     category: str

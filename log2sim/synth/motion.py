@@ -144,7 +144,7 @@ class TimedPath:
 
 def _check_waypoints(w: Array, wait_s: dict[int, float], where: str) -> None:
     if w.ndim != 2 or w.shape[1] != 3 or len(w) < 2:
-        raise ConfigError(f"{where}: waypoints must be two or more rows [x, y, speed]; for a parked agent give 'pose'")
+        raise ConfigError(f"{where}: waypoints must be two or more rows [x, y, speed]; for a static agent give 'pose'")
     step = np.linalg.norm(np.diff(w[:, :2], axis=0), axis=1)
     if np.any(step < 1e-3):
         raise ConfigError(

@@ -54,7 +54,7 @@ class Ego(Table):
 
 
 class AgentSpec(Table):
-    """A road user, moving along `waypoints` or parked at `pose`.
+    """A road user, moving along `waypoints` or static at `pose`.
 
     The waypoints of cars, trucks and buses guide the rear axle, those of the others the center.
     """
@@ -68,7 +68,7 @@ class AgentSpec(Table):
     hair: Color = key("Hair, RGB 0 to 255.", (52, 38, 28))
     shape: Literal["sedan", "hatch"] = key("Body of a car.", "sedan")
     waypoints: tuple[Vec3, ...] = key("Rows [x, y, speed].", (), "m, m, m/s")
-    pose: Vec3 | None = key("Box center and heading [x, y, yaw] of a parked agent.", None, "m, m, deg")
+    pose: Vec3 | None = key("Box center and heading [x, y, yaw] of a static agent.", None, "m, m, deg")
     rounding_m: Number | None = key(
         "Window over which corners of the path are rounded; by default 25 for vehicles, else 3.",
         None,

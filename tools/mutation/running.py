@@ -26,7 +26,7 @@ from mutation.bases import LOGS, SCENARIO, WITHOUT_LABELS, XOSC
 EXPORTS = ("openscenario", "carla", "csv", "scenarionet", "commonroad", "osi", "mcap")
 MEMORY_BYTES = 2 * 1024**3
 # Fields of a scenario that name its source, and others of a report that are measured.
-_NOT_CONTENT = ("provenance", "plan")
+_NOT_CONTENT = ("provenance", "stages")
 _TELLING = re.compile(r"^(note|warning|poses|limit exceeded|the ego is doubtful|left out)")
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
+from log2sim.errors import MissingExtra
 from log2sim.evaluation.bench.ends import ends_points, ends_settings, make_context_of_ends
 from log2sim.evaluation.bench.panels import Panel, make_ends_panel, make_panels
 from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context
@@ -32,6 +34,32 @@ class Benchmark:
     context: BenchContext
     panels: tuple[Panel, ...]
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Return the log and the stages in one line."""
+        return f"<Benchmark of {self.context.log.name!r:.80}: {', '.join(p.stage for p in self.panels)}>"
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with one row for each stage and setting: time, error and the figures of the stage.
+
+        Raises
+        ------
+        MissingExtra
+            When pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise MissingExtra("to_dataframe", "dataframe") from None
+        rows = [
+            {
+                "stage": panel.stage, "setting": point.setting, "present": point.present, "on_front": on_front,
+                "ms_per_tick": point.ms_per_tick, "error": point.error, "unit": panel.unit, **point.figures,
+            }
+            for panel in self.panels
+            for point, on_front in zip(panel.points, panel.on_front, strict=True)
+        ]  # fmt: skip
+        return pd.DataFrame(rows)
 
 
 def bench(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Boxes3D
 from log2sim.documents import check, load_schema, read_json, rounded, write_json
 from log2sim.errors import LogError
+from log2sim.numerals import short_repr
 
 FORMAT, VERSION = "log2sim-boxes", 1
 DIGITS = 4  # 0.1 mm, 0.006 degrees, 0.01 % of a score
@@ -34,6 +35,8 @@ class DetectedBoxes:
     poses : mapping of str to Any
         Where the poses come from that place them there, see `PoseChoice.to_provenance`.
     """
+
+    __repr__ = short_repr
 
     log: str
     detector: str

@@ -41,14 +41,16 @@ class LogDetections:
     poses: PoseChoice
 
 
-def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None] | None = None) -> LogDetections:
+def detect_log(
+    log: Log, config: Config | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> LogDetections:
     """Detect road users in the sweeps of a log.
 
     Parameters
     ----------
     log : Log
-    config : Config
-        `detect.name` is a LiDAR detector, such as "lidar:vehicle"; its settings are in the section `lidar`. Where vehicle and
+    config : Config, optional
+        `detect.name` is a LiDAR detector, "lidar:vehicle" by default; its settings are in the section `lidar`. Where vehicle and
         road are joined as tracks, their boxes are joined as boxes.
     progress : callable, optional
         Called with (sweeps done, all sweeps).
@@ -60,6 +62,7 @@ def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None]
     LogError
         For a log without LiDAR, or when no sweep can be searched.
     """
+    config = config or Config(detect="lidar:vehicle")
     if config.detect.in_images or not config.detect.in_sweeps:
         raise ConfigError(
             f"detector '{config.detect.name}': 3D boxes are detected in LiDAR sweeps alone; expected a name that begins with "

@@ -81,7 +81,7 @@ def _scenario(root: Element, path: Path) -> Scenario:
             "map": {**vars(frame), "offset_m": list(frame.offset_m)},
             "agents": agents,
             "cameras": [],
-            "plan": [],
+            "stages": [],
             "provenance": {"imported_from": path.name},
         }
     )

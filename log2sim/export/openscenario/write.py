@@ -29,7 +29,7 @@ class OpenScenario:
 
     options: tuple[str, ...] = ("revision", "map")
     loses = (
-        "states of traffic lights, confidences of lanes and markings, cameras, quality, plan and provenance; players take a"
+        "states of traffic lights, confidences of lanes and markings, cameras, quality, stages and provenance; players take a"
         " cyclist for a bicycle and what is 'other' for a van (an import does not), and ScenarioRunner takes over no sizes"
     )
 

@@ -31,7 +31,7 @@ class Mcap:
 
     options: tuple[str, ...] = ("log",)
     loses = (
-        "uncertainty and observed flags, times between steps of 0.1 s, colors (boxes are colored by category), plan; of a "
+        "uncertainty and observed flags, times between steps of 0.1 s, colors (boxes are colored by category), stages; of a "
         "log: full resolution of pictures wider than 960 px, and points beyond 10,000 a sweep"
     )
 

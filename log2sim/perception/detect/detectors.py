@@ -112,7 +112,8 @@ def create_detector(
     except PluginError:
         raise
     except ConfigError as error:
-        raise ConfigError(f"{error}, or the path of an ONNX file (ending in .onnx)") from None
+        in_sweeps = ", ".join(f"lidar:{name}" for name in registry.names("lidar_detector"))
+        raise ConfigError(f"{error}; in sweeps: {in_sweeps}; or the path of an ONNX file (ending in .onnx)") from None
     with registry.blaming("detector", name_or_path):
         detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
     if registry.is_built_in("detector", name_or_path):

@@ -39,7 +39,7 @@ class List {
   show() {
     const words = byId("search").value.toLowerCase().split(/\s+/).filter(Boolean);
     const found = this.tracks.filter((track) => {
-      const text = `${track.id} ${track.category} ${track.stationary ? "stationary" : "moving"} ${track.doubts.length ? "doubtful" : ""}`.toLowerCase();
+      const text = `${track.id} ${track.category} ${track.stationary ? "static" : "moving"} ${track.doubts.length ? "doubtful" : ""}`.toLowerCase();
       return words.every((word) => text.includes(word));
     });
     this.rows.clear();
@@ -52,7 +52,7 @@ class List {
 
   row(track) {
     const button = element("button", { type: "button" });
-    const kind = track.stationary ? `${track.category}, stationary` : track.category;
+    const kind = track.stationary ? `${track.category}, static` : track.category;
     button.append(mark(track), element("span", { class: track.doubts.length ? "id doubt" : "id" }, track.id), element("span", { class: "kind" }, kind));
     button.setAttribute("aria-pressed", track === this.chosen);
     button.addEventListener("click", () => this.actions.choose(track === this.chosen ? null : track));

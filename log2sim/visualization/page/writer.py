@@ -12,9 +12,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import Log, Scenario
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
+from log2sim.localization.choice import localize_like
 from log2sim.visualization.page.columns import SCALES
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.plot.drawing import Background
@@ -61,7 +62,7 @@ def write_page(
     replay: Any = None,
     predict_s: float | None = None,
     background: Background | None = None,
-    recorded: Recorded | None = None,
+    recorded: Recorded | Log | None = None,
     metrics: Sequence[tuple[str, str]] = (),
     overwrite: bool = False,
 ) -> tuple[str, ...]:
@@ -77,7 +78,7 @@ def write_page(
         For how long it is shown where agents were expected to go.
     background : Background or None
         Map of the ground to show below everything; the page holds a copy of at most some megabytes.
-    recorded : Recorded or None
+    recorded : Log, Recorded or None
         Log whose pictures and LiDAR points are shown, and the size of the page that they have to fit into.
     metrics : sequence of (str, str)
         Titles and texts, such as tables of `evaluate`; those of the replay are shown too.
@@ -100,6 +101,8 @@ def write_page(
     if out_path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
     refuse_existing(out_path, overwrite=overwrite)
+    if isinstance(recorded, Log):
+        recorded = Recorded(localize_like(recorded, scenario.provenance))
     document = {**page_document(scenario, truth, replay, predict_s, background, metrics), "scales": SCALES}
     if recorded is not None:
         document["recording"] = _recording(scenario, recorded, document)

@@ -149,7 +149,7 @@ def legend_rows(
     if rest:
         rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther away"))
     if roles.stationary:
-        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(roles.stationary)} stationary"))
+        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(roles.stationary)} static"))
     if roles.movers and mark_step_s is not None:
         rows.append((Patch(fc=PAPER, ec=MUTED, lw=0.9), "start (hollow), end (filled)"))
         rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {mark_step_s:g} s"))

@@ -20,6 +20,10 @@ def _silent(stage: str, done: int, total: int) -> None:
     """Report nothing."""
 
 
+DEFAULT_MAX_BYTES = 40_000_000
+"""Of a page with pictures: mail and chat programs take so much, and a phone still opens it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """What to take of a log, and how much of it.
@@ -37,7 +41,7 @@ class Recorded:
     """
 
     log: Log
-    max_bytes: int
+    max_bytes: int = DEFAULT_MAX_BYTES
     cameras: tuple[str, ...] = ()
     progress: Callable[[str, int, int], None] = _silent
 
