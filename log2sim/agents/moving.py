@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of
-from log2sim.agents.confirmation import SAME_MOMENT_S, followed_confidence
+from log2sim.agents.confirmation import followed_confidence
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.heading.course import forward_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, left_free, track_with_lidar
@@ -48,6 +48,7 @@ MIN_COURSE_DISTANCE_M = 0.3
 CERTAIN_COURSE_M = 1.0
 # Standard deviation of the yaw of a single measurement.
 BOX_YAW_SIGMA_RAD = 0.2
+SAME_MOMENT_S = 1e-3
 # A yaw of points that is farther from the course is that of their width.
 MAX_YAW_OFF_RAD = np.pi / 4
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
@@ -127,9 +128,9 @@ def moving_candidate(
 
 def _one_at_a_moment(track: Track) -> Track:
     """Drop measurements at the time of the previous one: frames that share a sweep measure the same points."""
-    t_ns = track.measurements.t_ns
-    rows = np.flatnonzero(np.r_[True, np.diff(t_ns) > SAME_MOMENT_S * 1e9])
-    return replace(track, tick=track.tick[rows], measurements=track.measurements.take(rows))
+    first = np.r_[True, np.diff(track.measurements.t_ns) > SAME_MOMENT_S * NS_PER_S]
+    unrecorded = np.union1d(track.unrecorded, track.tick[~first])
+    return replace(track, tick=track.tick[first], measurements=track.measurements.take(first), unrecorded=unrecorded)
 
 
 def _headings(path: SmoothedTrack, group: str) -> Array:

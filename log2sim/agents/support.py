@@ -19,8 +19,9 @@ class Support:
         Share of the searched ticks at which nearly all of its points are part of something longer than any of its kind.
     beside_structure : float
         Likewise, of most of its points.
-    hidden : bool
-        Whether the LiDAR looks toward it and no ray ever reaches any part of it.
+    unreached : bool
+        Whether the LiDAR looks toward it, most of its detections have no point and most rays do not end in it, and the cameras
+        that detect it are where the LiDARs are.
     pointless : bool
         Whether the LiDAR looks toward it and none of its detections has a point.
     shown_ticks : int
@@ -39,7 +40,7 @@ class Support:
     seen_ticks: int = 0
     in_structure: float = 0.0
     beside_structure: float = 0.0
-    hidden: bool = False
+    unreached: bool = False
     pointless: bool = False
     shown_ticks: int = 0
     detected_ticks: int = 0

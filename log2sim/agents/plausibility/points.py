@@ -57,7 +57,7 @@ def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
         return False
     if s.image_height_share is not None and s.image_height_share < MIN_IMAGE_HEIGHT_SHARE:
         return True
-    if s.hidden or s.in_structure > MOSTLY or _through_more_than(EMPTY_SHARE, s):
+    if s.unreached or s.in_structure > MOSTLY or _through_more_than(EMPTY_SHARE, s):
         return True
     beside = BESIDE_STRUCTURE_NATS if s.beside_structure > MOSTLY else 0.0
     return missing_nats(s, usual_rate) + beside > REFUTED_NATS
