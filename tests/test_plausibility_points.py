@@ -233,15 +233,17 @@ def test_what_no_ray_reaches_is_refuted_and_what_has_no_point_doubted():
     assert doubt.flag == "hardly_observed"
 
 
-VAN, BACK = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5)
+VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)
 
 
 @pytest.mark.parametrize(
     ("thing", "points", "pointless", "unreached"),
     [
-        # Images show a car behind a van; once the van is taken for it.
-        (VAN, [0, 0, 0, 30, 0], False, True),
-        (VAN, [0, 30, 0, 30, 30], False, False),
+        # Images show a car where the LiDAR sees a van before it, or look past its corner once.
+        (VAN, [0, 0, 0, 0, 0], True, True),
+        (VAN, [0, 0, 0, 30, 0], False, False),
+        # Of some rays that reach its place most go on.
+        (CORNER, [0, 0, 0, 0, 0], True, True),
         # Its points are those of what stands beside it, but rays end in it.
         (BACK, [0, 0, 0, 0, 0], True, False),
         (BACK, [9, 9, 9, 9, 9], False, False),

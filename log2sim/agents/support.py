@@ -20,8 +20,7 @@ class Support:
     beside_structure : float
         Likewise, of most of its points.
     unreached : bool
-        Whether the LiDAR looks toward it, most of its detections have no point and most rays do not end in it, and the cameras
-        that detect it are where the LiDARs are.
+        Whether it is pointless, most rays toward it do not end in it, and the cameras that detect it are where the LiDARs are.
     pointless : bool
         Whether the LiDAR looks toward it and none of its detections has a point.
     shown_ticks : int

@@ -30,8 +30,6 @@ MOTION_NATS = 1.0
 MAX_CELLS = 400_000
 # Rays toward a place before it is said that the LiDAR looks there.
 MIN_LOOKING_RAYS = 30
-# A detection now and then has the points of something else in its box.
-MOSTLY = 0.5
 # Fewer image boxes with points may each be wrong.
 MIN_HEIGHTS = 3
 
@@ -66,14 +64,14 @@ def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) 
     weighed = []
     for k, candidate in enumerate(candidates):
         rays = int(whole.before[k].sum() + met[k].sum())
-        without = _share_without_points(candidate, clouds) if rays >= MIN_LOOKING_RAYS else 0.0
+        pointless = bool(rays >= MIN_LOOKING_RAYS and not (candidate.track.measurements.points > 0).any())
         # Where points of it went to something beside it, rays still end in it.
-        unreached = without > MOSTLY and whole.inside[k].sum() <= (1 - MOSTLY) * rays
+        unreached = pointless and whole.inside[k].sum() <= rays / 2
         support = replace(
             _support(solid, k),
             in_structure=float(in_structure[k]),
             beside_structure=float(beside[k]),
-            pointless=without == 1,
+            pointless=pointless,
             unreached=bool(unreached and _same_view(candidate, clouds)),
             shown_ticks=int(shown[k].sum()),
             detected_ticks=int(shown[k, candidate.track.tick].sum()),
@@ -102,13 +100,6 @@ def image_height_share(m: Measurements) -> float | None:
     """Return the median height of the image boxes of a track at its distance over that of its points; None with few of both."""
     rows = ~m.truncated & (m.points > 0) & (m.top_m > m.bottom_m) & np.isfinite(m.height_px_m)
     return float(np.median(m.height_px_m[rows] / (m.top_m - m.bottom_m)[rows])) if rows.sum() >= MIN_HEIGHTS else None
-
-
-def _share_without_points(candidate: AgentCandidate, clouds: Sequence[Obstacles | None]) -> float:
-    """Return the share of the measurements of a candidate at ticks with a sweep that have no point; 0 without sweeps."""
-    track = candidate.track
-    swept = np.array([clouds[tick] is not None for tick in track.tick.tolist()], dtype=bool)
-    return float((track.measurements.points[swept] == 0).mean()) if swept.any() else 0.0
 
 
 def _same_view(candidate: AgentCandidate, clouds: Sequence[Obstacles | None]) -> bool:
