@@ -195,6 +195,15 @@ class TrackConfig(Section):
     birth_score: float = setting(0.4, "Lowest score of a detection that can start a track.", ge=0.0, le=1.0)
     max_gap_s: float = setting(3.0, "Longest occlusion that a track bridges.", unit="s", ge=0.0, le=60.0)
     min_life_s: float = setting(0.3, "Shortest track that is kept.", unit="s", ge=0.0, le=60.0)
+    static_for_all: bool = setting(
+        True, "Whether static agents exist for the whole scenario, but where the log shows their place free."
+    )
+    quarantine_confidence: float = setting(
+        0.2,
+        "Agents of a lower confidence stay in the file, but are left out of replays and exports. At 0.2 four of five are wrong.",
+        ge=0.0,
+        le=1.0,
+    )
 
 
 class SmoothConfig(Section):

@@ -16,6 +16,7 @@ from log2sim.agents.heading.decide import decide_headings
 from log2sim.agents.observers import with_observers
 from log2sim.agents.plausibility.judge import judge
 from log2sim.agents.plausibility.recording import Recording
+from log2sim.agents.plausibility.static_life import extend_static
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.calibration.check import check_calibration
@@ -252,8 +253,12 @@ def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> 
         seen = run.schedule.without_frames(observations.unseen)
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
-        rated = rate_agents(judged, timeline)
+        rated = rate_agents(judged, timeline, lidar=bool(log.lidars))
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
+        if run.config.track.static_for_all:
+            agents = extend_static(agents, ego, observations.obstacles, timeline)
+        limit = run.config.track.quarantine_confidence
+        agents = [replace(a, quarantined=True) if a.confidence < limit else a for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         return ego, simplify(agents) if ego is not None else agents
 

@@ -116,4 +116,5 @@ def _agent_counts(scenario: Scenario) -> dict[str, Any]:
         "by_category": {c: sum(a.category == c for a in agents) for c in categories},
         "smoothing_residual_median_m": rounded(float(np.median(residuals)), 4) if residuals else None,
         "doubtful": doubtful,
+        "quarantined": [a.id for a in agents if a.quarantined],
     }

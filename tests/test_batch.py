@@ -279,6 +279,11 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     ticks = [entry["counts"]["truth_ticks"] for entry in document["logs"]]
     assert ticks[0] == ticks[1] > 0
     assert document["total"]["counts"]["truth_ticks"] == sum(ticks)
+    for key in ("labeled", "counted", "hit", "hit_matched"):
+        assert document["total"]["coverage"][key] == sum(
+            e["coverage"][key] for e in document["logs"] if "error" not in e
+        )
+    assert max(map(len, run("evaluate", out, "--truth", root, "-v").out.splitlines())) <= 100
 
 
 @pytest.mark.parametrize(

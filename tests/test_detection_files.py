@@ -327,9 +327,15 @@ def test_detect_and_evaluate_as_commands(tiny_folder: Path, tmp_path: Path) -> N
     assert ran.code == 0, ran.err
     assert "in 4 sweeps by lidar:labels" in ran.out
     assert run("validate", boxes).code == 0
-    ran = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture)
+    ran = run(
+        "evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture, "-v"
+    )
     assert ran.code == 0, ran.err
     assert "IoU 3D > 0.5" in ran.out
+    assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
+    brief = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair").out
+    assert ran.out.startswith(brief.rstrip("\n"))
+    assert "100 % of" in brief
     assert "expected calibration error of the scores 0.000" in ran.out
     assert run("validate", metrics).code == 0
     assert picture.read_bytes()[:4] == b"\x89PNG"

@@ -194,7 +194,7 @@ def test_paths_of_several_vehicles_in_one_lane_make_one_middle() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pandaset/002", "kitti_tracking"])
 def test_lanes_of_recorded_traffic_hold_every_path(name: str, real_data: Path) -> None:
-    from log2sim.cli.truth import truth_at
+    from log2sim.evaluation.metrics.truth import truth_at
 
     world = truth_at(real_data / name, None, None)
     lanes = lanes_of(world)

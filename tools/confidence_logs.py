@@ -3,7 +3,7 @@
     python tools/confidence_logs.py --logs 40 --seed 1 --out FOLDER
 
 Each log is random traffic (either side of the road, weather, LiDARs of the market, on a vehicle or at the roadside), with a
-detector in sweeps, a simulated one in images, or both; some are seen a second time without LiDAR. Simulated are the errors that detectors in images have: boxes that jitter and are off, misses and scores that depend on the object and its
+detector in sweeps, a simulated one in images, or both, and a second time without LiDAR. Simulated are the errors that detectors in images have: boxes that jitter and are off, misses and scores that depend on the object and its
 height in the image, swapped categories, one box over two objects, two boxes on one, boxes on what is no road user or on a
 fixed part of the image, and boxes that appear for one frame. Files that exist are left as they are.
 """
@@ -36,7 +36,7 @@ from log2sim.synth.traffic_log import log_of
 
 # Ticks a second, and how long a log of that rate lasts, s.
 RATES = ((10.0, 2.5), (10.0, 4.5), (5.0, 6.0), (2.0, 9.0))
-ROADSIDE_EVERY, WITHOUT_LIDAR_EVERY = 6, 5
+ROADSIDE_EVERY = 6
 # Random traffic drives at up to 18 m/s; so many times as fast it is that of a motorway, on roads as straight as one.
 FAST_EVERY, FAST, MAX_FAST_CURVATURE_PM = 3, 2.0, 0.003
 # Shares of logs by what is searched.
@@ -242,11 +242,11 @@ def cases_of(seed: int, index: int) -> list[Case]:
     names = {"images and sweeps": f"labels+{sweeps}", "sweeps": sweeps, "images": "labels"}
     rng = np.random.default_rng([seed, index, 10])
     searched = names[str(rng.choice(list(SEARCHED), p=list(SEARCHED.values())))]
-    out = [_case(log, scene, truth, searched, seed + index)]
-    if index % WITHOUT_LIDAR_EVERY == 0:
-        blind = log.changed(lidars={}, streams={"camera": log.streams["camera"]})
-        out.append(_case(blind, scene, truth, "labels", seed + index))
-    return out
+    blind = log.changed(lidars={}, streams={"camera": log.streams["camera"]})
+    return [
+        _case(log, scene, truth, searched, seed + index),
+        _case(blind, scene, truth, "labels", seed + index),
+    ]
 
 
 def _case(log: Log, scene: TrafficScene, truth: Scenario, detector: str, seed: int) -> Case:

@@ -70,9 +70,15 @@ class AgentCandidate:
 
 
 def candidate_of(
-    track: Track, geometry: TrackGeometry, waypoints: Waypoints, quality: dict[str, Any], *, static: bool
+    track: Track,
+    geometry: TrackGeometry,
+    waypoints: Waypoints,
+    quality: dict[str, Any],
+    *,
+    static: bool,
+    followed: float = 0.0,
 ) -> AgentCandidate:
-    """Make a candidate of a track, its geometry and its waypoints; `quality` is added to that of the track."""
+    """Make a candidate of a track, its geometry, waypoints and `followed_confidence`; `quality` is added to that of the track."""
     m = track.measurements
     length, width, height = (float(v) for v in geometry.size_m)
     agent = Agent(
@@ -82,10 +88,12 @@ def candidate_of(
         waypoints=waypoints,
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
-        confidence=float(np.clip(agent_confidence(track), 0.0, 1.0)),
+        confidence=float(np.clip(agent_confidence(track, followed), 0.0, 1.0)),
         quality=_quality_of(track) | quality,
     )
-    return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely), track, geometry)
+    return AgentCandidate(
+        agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely, followed=followed), track, geometry
+    )
 
 
 def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:

@@ -8,26 +8,45 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Obstacles
+from log2sim.agents.plausibility.free_space import Ending, classify_rays
+from log2sim.datatypes import Obstacles, Rays
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.box_completion import SENSOR_SIGMA_M, complete_box, facing_ends, oriented_covariance
-from log2sim.perception.box_fitting import align_to, quantile_of_sorted, rotate
+from log2sim.perception.box_completion import (
+    FACING_END,
+    SENSOR_SIGMA_M,
+    SIDE_END,
+    UNIFORM_SIGMA,
+    complete_box,
+    facing_ends,
+    oriented_covariance,
+)
+from log2sim.perception.box_fitting import MAX_TRIM_M, align_to, corrected_yaw, extents_of_rotated, rotate
 from log2sim.perception.prefetch import OBSTACLE_REACH_M
 
 MIN_POINTS = 8
 # Points up to this far outside the predicted box count as its own; a shell of this width around them is compared with it.
 MARGIN_M = 0.5
-SHELL_M = 0.5
+SHELL_M = 1.0
 # With more points in the shell, relative to those in the box, the box is a part of a larger structure.
 MAX_SHELL_RATIO = 0.6
-# Largest distance of a match from its prediction.
-MAX_SHIFT_M = 0.8
+# Largest distance of a match from its prediction along each side, and as a share of it: the box of a detector may be off so far.
+MAX_SHIFT_M, MAX_SHIFT_SHARE = 0.8, 0.1
 MAX_MISSES = 2
 # A match is rejected when a larger share of the box's length or width is unobserved: its position along that axis is
 # undetermined.
 MAX_HIDDEN_SHARE = 0.7
+# A ray that goes on behind a side by this passed it. Where more than this share of those toward a box go on, nothing is there.
+SIDE_DEPTH_M, MAX_THROUGH_SHARE = 0.3, 0.5
+# An end is where a ray passes within this distance of the last point.
+MAX_GAP_M = 1.5
+# Quantiles of the heights of points between which a side is: below a truck and above a hood rays pass.
+LEVELS = 0.25, 0.75
+# What ends on both sides and is shorter than this share of the box is something else.
+MIN_SIZE_SHARE = 0.5
 # Gains of the constant-velocity filter.
 POSITION_GAIN, VELOCITY_GAIN, YAW_GAIN = 0.6, 0.15, 0.3
+# What is longer than so many widths moves along its length.
+LONG_WIDTHS = 1.5
 # Slower objects keep their yaw.
 MIN_COURSE_SPEED_MPS = 2.0
 
@@ -45,6 +64,8 @@ class LidarMatch:
         Center, map frame.
     covariance : (2, 2) float64
         Of the center, m2.
+    yaw_rad : float
+        Direction of its sides; the predicted one where its points do not show it.
     points : int
     """
 
@@ -52,6 +73,7 @@ class LidarMatch:
     t_ns: int
     xy_m: Array
     covariance: Array
+    yaw_rad: float
     points: int
 
 
@@ -102,7 +124,8 @@ def track_with_lidar(
     state, misses, is_static = start, 0, not start.velocity_mps.any()
     for tick in ticks:
         cloud = obstacles[tick]
-        predicted = state.xy_m + state.velocity_mps * ((int(t_ns[tick]) - state.t_ns) / NS_PER_S)
+        stamp_ns = int(t_ns[tick]) if cloud is None else cloud.stamp_ns
+        predicted = state.xy_m + state.velocity_mps * ((stamp_ns - state.t_ns) / NS_PER_S)
         reached = cloud is not None and float(np.hypot(*(predicted - cloud.origin[:2]))) <= reach_of(state.size_m)
         match = match_box(cloud, tick, replace(state, xy_m=predicted)) if cloud is not None and reached else None
         if match is None:
@@ -158,42 +181,131 @@ def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
     velocity, yaw_rad = state.velocity_mps, state.yaw_rad
     if abs(dt_s) > 1e-3:
         velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-        yaw_rad = _turned(yaw_rad, velocity)
+        yaw_rad = _turned(match.yaw_rad, velocity)
+        if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
+            axis = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+            velocity = (velocity @ axis) * axis
     position = expected + POSITION_GAIN * innovation
     return replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=yaw_rad)
 
 
 def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
-    """Match a predicted box against the points of a tick; None where they do not determine its position."""
+    """Match a predicted box, at the stamp of a cloud, against its points; None where they do not determine its position.
+
+    Notes
+    -----
+    Of a vehicle beside the sensor only a flank is seen, and of a long one not even all of that. It has the place across
+    from the flank, and the place along from an end behind which rays go on. A wall has no such ends.
+    """
     size, yaw_rad = box.size_m, box.yaw_rad
-    x, y = (box.xy_m - cloud.origin[:2]).astype(np.float32)
     near = cloud.near(box.xy_m, _reach_around(size))
     z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - box.bottom_m)
     near = near[(z > 0.15) & (z < size[2] + 0.4)]
     if len(near) < MIN_POINTS:
         return None
-    local = rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
+    late_s = cloud.t_s[near, None].astype(np.float64)
+    local = rotate(cloud.xyz[near, :2] + (cloud.origin[:2] - box.xy_m) - late_s * box.velocity_mps, -yaw_rad)
     outside_m = (np.abs(local) - size[:2] / 2).max(axis=1)
     inside = outside_m <= MARGIN_M
-    if inside.sum() < MIN_POINTS or (outside_m > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
+    in_shell = ~inside & (outside_m <= MARGIN_M + SHELL_M)
+    if inside.sum() < MIN_POINTS or in_shell.sum() > MAX_SHELL_RATIO * inside.sum():
         return None
-    ordered = np.sort(local[inside], axis=0)
-    low, high = quantile_of_sorted(ordered, 0.01), quantile_of_sorted(ordered, 0.99)
+    # The pose of what stands is known from all ticks.
+    turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
+    box = replace(box, yaw_rad=yaw_rad + turn_rad)
+    low, high = extents_of_rotated(rotate(local[inside], -turn_rad), max_trim_m=MAX_TRIM_M)
     if np.any(high - low > size[:2] + 0.6):
         return None
-    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
-    center, sigma = complete_box(low, high, size[:2], facing_ends(low, high, sensor))
-    hidden = size[:2] - (high - low)
-    if np.hypot(*center) > MAX_SHIFT_M or np.any(hidden > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)):
+    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
+    real, gap_m, rays = facing_ends(low, high, sensor), np.zeros((2, 2)), None
+    hidden = size[:2] - (high - low) > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)
+    if cloud.free is None and hidden.any():
         return None
-    mean_s = float(cloud.t_s[near[inside]].mean())
+    if cloud.free is not None and np.any(hidden | ~real.any(axis=1)):
+        rays = _rays_to(box, cloud.origin, cloud.free)
+        levels = np.quantile(cloud.xyz[near[inside], 2] + np.float32(cloud.origin[2] - box.bottom_m), LEVELS)
+        real, gap_m = _ends_by_rays(*rays, levels, low, high, real)
+        smaller = real.all(axis=1) & (high - low + gap_m.sum(axis=1) < MIN_SIZE_SHARE * size[:2])
+        if smaller.any() or (hidden.any() and not real.any(axis=1).all()):
+            return None
+    center, sigma = complete_box(low, high, size[:2], real, gap_m=gap_m)
+    if np.any(np.abs(center) > np.maximum(MAX_SHIFT_M, MAX_SHIFT_SHARE * size[:2])) or (
+        rays is not None and _passes(*rays, center, size)
+    ):
+        return None
+    sigma = np.hypot(sigma, UNIFORM_SIGMA * np.where(real.all(axis=1), gap_m.min(axis=1), gap_m.max(axis=1)))
+    mean_s = float(late_s[inside].mean())
     return LidarMatch(
         tick,
         cloud.stamp_ns + round(mean_s * NS_PER_S),
-        rotate(center, yaw_rad) + box.xy_m,
-        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), yaw_rad),
+        rotate(center, box.yaw_rad) + box.xy_m + mean_s * box.velocity_mps,
+        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), box.yaw_rad),
+        box.yaw_rad,
         int(inside.sum()),
     )
+
+
+def left_free(
+    obstacles: Sequence[Obstacles | None], matches: Sequence[LidarMatch], size_m: Array, bottom_m: float
+) -> NDArray[np.bool_]:
+    """Mark the matches (n,), in rising time, whose place rays pass when the box is more than its length from there.
+
+    What a moving object was taken for does so; clutter along which a box drifts stays where it is.
+    """
+    places = np.array([match.xy_m for match in matches]).reshape(-1, 2)
+    marked = np.zeros(len(matches), dtype=bool)
+    for k, match in enumerate(matches):
+        away = np.flatnonzero(np.hypot(*(places - match.xy_m).T) > size_m[0])
+        # The last moment before it came, the first one after it went.
+        for other in (*away[away < k][-1:].tolist(), *away[away > k][:1].tolist()):
+            cloud = obstacles[matches[other].tick]
+            if cloud is not None and cloud.free is not None and not marked[k]:
+                box = BoxState(match.t_ns, match.xy_m, np.zeros(2), match.yaw_rad, size_m, bottom_m)
+                marked[k] = _passes(*_rays_to(box, cloud.origin, cloud.free), np.zeros(2), size_m)
+    return marked
+
+
+def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
+    """Return where rays start and end (K, 3) along the axes of a box, relative to the middle of its bottom at their times."""
+    place = np.append(box.xy_m, box.bottom_m) - origin + rays.t_s[:, None] * np.append(box.velocity_mps, 0.0)
+    start, end = rays.start - place, rays.end - place
+    start[:, :2], end[:, :2] = rotate(start[:, :2], -box.yaw_rad), rotate(end[:, :2], -box.yaw_rad)
+    return start, end
+
+
+def _ends_by_rays(
+    start: Array, end: Array, levels_m: Array, low: Array, high: Array, real: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array]:
+    """Find the ends next to which rays (K, 3) pass the sides that face the sensor, between two levels (2,).
+
+    Returns
+    -------
+    real : (2, 2) int
+        Kinds of the ends of the points, with those that face the sensor, `real`.
+    gap_m : (2, 2) float64
+        How far beyond the points the first ray passes.
+    """
+    ends, gap_m = real.copy(), np.zeros((2, 2))
+    for across, side in np.argwhere(real == FACING_END).tolist():
+        along, face, inward = 1 - across, (low, high)[side][across], (1.0, -1.0)[side]
+        before, behind = inward * (face - start[:, across]), inward * (end[:, across] - face)
+        passing = np.flatnonzero((before > 0) & (behind > SIDE_DEPTH_M))
+        share = (before / (before + behind))[passing, None]
+        at = start[passing] + share * (end - start)[passing]
+        at = at[(at[:, 2] > levels_m[0]) & (at[:, 2] < levels_m[1]), along]
+        for k, beyond in enumerate((low[along] - at, at - high[along])):
+            gap = float(beyond[beyond > 0].min(initial=np.inf))
+            if gap < MAX_GAP_M and not ends[along, k]:
+                ends[along, k], gap_m[along, k] = SIDE_END, gap
+    return ends, gap_m
+
+
+def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
+    """Return whether most of several rays toward the solid part of a box of a size (3,) at a center (2,) go on behind it."""
+    first = start - np.append(center, size[2] / 2)
+    (ending,) = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
+    passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
+    return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
 
 
 def _turned(yaw_rad: float, velocity: Array) -> float:

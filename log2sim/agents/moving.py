@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of
+from log2sim.agents.confirmation import followed_confidence
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.heading.course import forward_log_odds
-from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
+from log2sim.agents.lidar_tracking import BoxState, LidarMatch, left_free, track_with_lidar
 from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth import feasibility
@@ -48,6 +49,8 @@ CERTAIN_COURSE_M = 1.0
 # Standard deviation of the yaw of a single measurement.
 BOX_YAW_SIGMA_RAD = 0.2
 SAME_MOMENT_S = 1e-3
+# A yaw of points that is farther from the course is that of their width.
+MAX_YAW_OFF_RAD = np.pi / 4
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
 HEIGHT_MEDIAN_HALF = 4
 
@@ -117,7 +120,10 @@ def moving_candidate(
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
-    return candidate_of(track, geometry, waypoints, quality, static=False).doubted(doubts)
+    ordered = sorted(matches, key=lambda match: match.tick)
+    free = left_free(obstacles, ordered, geometry.size_m, float(np.median(geometry.z_m)) - geometry.size_m[2] / 2)
+    followed = followed_confidence(track, np.array([match.xy_m for match in ordered]).reshape(-1, 2)[free])
+    return candidate_of(track, geometry, waypoints, quality, static=False, followed=followed).doubted(doubts)
 
 
 def _one_at_a_moment(track: Track) -> Track:
@@ -174,9 +180,14 @@ def _lidar_matches(
     spans += [(k, range(a + 1, b)) for k, (a, b) in enumerate(pairwise(tick))]
     bottom_m = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2
     matches = []
+    yaw_rad = headings.copy()
+    if GROUP_OF[track.category] == "vehicle":
+        # At the end of a track the sides of a box tell its direction better than its course does.
+        off = np.nan_to_num(wrap_angle(2 * (track.measurements.yaw_rad - headings)) / 2)
+        yaw_rad += np.where(np.abs(off) < MAX_YAW_OFF_RAD, off, 0.0)
     for k, wanted in spans:
         start = BoxState(
-            int(track.measurements.t_ns[k]), path.xy_m[k], path.velocity_mps[k], float(headings[k]),
+            int(track.measurements.t_ns[k]), path.xy_m[k], path.velocity_mps[k], float(yaw_rad[k]),
             geometry.size_m, bottom_m,
         )  # fmt: skip
         matches += track_with_lidar(obstacles, wanted, timeline.t_ns, start)

@@ -207,7 +207,8 @@ def _height(track: Track) -> tuple[float, Array]:
     """Estimate the height of the object and z (n,) of its center: points reach its top where the LiDAR sees that high."""
     m = track.measurements
     by_lidar_m = (m.top_m - m.bottom_m)[[len(c) >= MIN_CLUSTER_POINTS for c in m.cluster]]
-    by_image_m = np.where(m.truncated, np.nan, m.height_px_m)
+    # The height of a box without points is only as right as where it was placed.
+    by_image_m = np.where(m.truncated | (m.source == "topdown"), np.nan, m.height_px_m)
     known = typical_box_size(m)
     typical = TYPICAL_SIZE_M[track.category][2] if known is None else float(known[2])
     by_lidar = float(np.quantile(by_lidar_m, SIZE_QUANTILE)) if len(by_lidar_m) else typical

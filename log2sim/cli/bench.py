@@ -21,7 +21,6 @@ from log2sim.cli.options import (
     say,
     say_written,
 )
-from log2sim.cli.truth import truth_at
 
 
 def bench(
@@ -71,6 +70,7 @@ def bench(
     from log2sim.evaluation.bench.document import document, format_table
     from log2sim.evaluation.bench.figure import write_picture
     from log2sim.evaluation.bench.scores import Scope
+    from log2sim.evaluation.metrics.truth import truth_at
     from log2sim.localization.choice import localize
     from log2sim.logs.opening import open_log
     from log2sim.outputs import together

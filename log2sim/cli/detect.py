@@ -59,6 +59,7 @@ def detect(
     from log2sim.documents import check_targets
     from log2sim.evaluation.detection.detect_log import detect_log
     from log2sim.logs.opening import open_log
+    from log2sim.perception.detect3d.network_detector import describe_weakness
 
     check_targets(out, overwrite=overwrite)
     changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "detect": {"name": detector}}
@@ -68,6 +69,8 @@ def detect(
     opened = open_log(log, format=format, sequence=sequence)
     for note in opened.notes:
         say(f"note: {note}", quiet=quiet)
+    if weakness := describe_weakness(detector):
+        say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = detect_log(opened, chosen, progress=lambda done, total: report_progress("detect", done, total))
     result.found.save(out)

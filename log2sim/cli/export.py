@@ -37,7 +37,14 @@ def export(
         str | None, typer.Option(metavar="AGENT", help="Agent to take as the ego, where the scenario has none.")
     ] = None,
     doubtful: Annotated[
-        str, choose("--doubtful", "keep", "drop", help="What to do with agents that the scenario itself doubts.")
+        str,
+        choose(
+            "--doubtful",
+            "keep",
+            "drop",
+            "all",
+            help="Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
+        ),
     ] = "keep",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -63,7 +70,9 @@ def export(
         loaded = with_ego(loaded, ego)
     chosen = with_doubtful(loaded, doubtful)
     opened = open_log(log) if log is not None else None
-    files = run(chosen, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
+    files = run(
+        chosen, to, out, Options(revision, map, mode, opened), quarantined=doubtful == "all", overwrite=overwrite
+    )
     for file in files:
         say(f"{file}: written", quiet=quiet)
     notes = export_notes(chosen)

@@ -72,7 +72,7 @@ def plot(
     log2sim plot scenario.json -o film.mp4 --size 1280x720 --start 2 --stop 8
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay, load_truth
+    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
     from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
@@ -84,7 +84,12 @@ def plot(
     check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
-    known = load_truth(truth, loaded, sequence) if truth is not None else None
+    known = None
+    if truth is not None:
+        from log2sim.evaluation.metrics.placing import place_truth
+        from log2sim.evaluation.metrics.truth import load_truth
+
+        known = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     if picture.note is not None:
         say(f"note: {picture.note}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:

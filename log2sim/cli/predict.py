@@ -40,7 +40,7 @@ def predict(
     if positions and out is None:
         raise ConfigError("--positions: there is no file to write them to; name one with --out")
     methods = tuple(METHODS) if method is None else tuple(dict.fromkeys(m.strip() for m in method.split(",")))
-    loaded = Scenario.load(scenario)
+    loaded = Scenario.load(scenario).active
     document = prediction_document(loaded, predict_scenario(loaded, horizon, methods=methods), with_positions=positions)
     if out is not None:
         write_json(out, document)

@@ -52,6 +52,14 @@ def reconstruct(
     start: Start = None,
     stop: Stop = None,
     poses: Poses = None,
+    static_for_all: Annotated[
+        bool | None,
+        typer.Option(
+            "--static-for-all/--as-observed",
+            help="Static agents exist all the time unless the log shows their place free, or only while observed.",
+            show_default="--static-for-all",
+        ),
+    ] = None,
     fix_time: Annotated[
         bool, typer.Option("--fix-time", help="Correct stamps of sensors by the offsets that the log shows.")
     ] = False,
@@ -110,6 +118,8 @@ def reconstruct(
     changes["cameras"] = None if cameras is None else camera_names(cameras)
     if detector is not None:
         changes["detect"] = {"name": detector}
+    if static_for_all is not None:
+        changes["track"] = {"static_for_all": static_for_all}
     if poses is not None:
         changes["poses"] = {"source": poses}
     changes["cooperation"] = {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None}
@@ -121,6 +131,7 @@ def reconstruct(
         from log2sim.config import Config
         from log2sim.errors import ConfigError, MissingExtra
         from log2sim.logs.opening import open_log
+        from log2sim.perception.detect3d.network_detector import describe_weakness
         from log2sim.pipeline import reconstruct as run
         from log2sim.run_detectors import check_detectors
         from log2sim.sensors import IMAGE_DETECTOR, choose_detector
@@ -135,6 +146,8 @@ def reconstruct(
     chosen = choose_detector(opened, chosen)
     if opened.cameras and not chosen.detect.in_images and detector is None:
         say(f"note: no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}", quiet=quiet)
+    if weakness := describe_weakness(chosen.detect.in_sweeps or ""):
+        say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress, cache=not no_cache)
     for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):

@@ -80,7 +80,13 @@ def doubt_lines(scenario: Scenario, *, verbose: bool = False) -> list[str]:
     if not others:
         return lines
     named = list_doubtful(others, None if verbose else MAX_LISTED)
-    return [*lines, f"{len(others)} of {counted(len(scenario.others), 'agent')}: {named}"]
+    gone = [agent for agent in others if agent.quarantined]
+    quarantined = f"not in replays and exports: {', '.join(a.id for a in gone)} (quarantined)"
+    return [
+        *lines,
+        f"{len(others)} of {counted(len(scenario.others), 'agent')}: {named}",
+        *([quarantined] if gone else []),
+    ]
 
 
 def missing_lines(scenario: Scenario) -> list[str]:

@@ -64,7 +64,7 @@ def view(
     log2sim view s.json --replay replay.json --truth samples/crossing -o s.html
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay, load_truth
+    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario, say_agents
     from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
@@ -79,9 +79,14 @@ def view(
     loaded = Scenario.load(scenario)
     layers: dict[str, Any] = {
         "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
-        "truth": load_truth(truth, loaded, sequence) if truth is not None else None,
+        "truth": None,
         "metrics": [] if metrics is None else [_metrics(metrics)],
     }
+    if truth is not None:
+        from log2sim.evaluation.metrics.placing import place_truth
+        from log2sim.evaluation.metrics.truth import load_truth
+
+        layers["truth"] = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
@@ -137,11 +142,11 @@ def _metrics(path: Path) -> tuple[str, str]:
     """
     from log2sim.documents import read_json
     from log2sim.errors import LogError
-    from log2sim.evaluation.metrics.table import format_table
+    from log2sim.evaluation.metrics.table import format_table, format_verdict
 
     document = read_json(path, LogError)
     try:
-        return f"Metrics against {document['truth']}", format_table(document)
+        return f"Metrics against {document['truth']}", f"{format_verdict(document)}\n\n{format_table(document)}"
     except (KeyError, TypeError, AttributeError, ValueError):
         raise LogError(
             f"{path}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"

@@ -70,6 +70,8 @@ class Agent:
         that it is right.
     confidence : float
         In [0, 1].
+    quarantined : bool
+        Whether it is too likely wrong to be replayed or exported unless that is asked for, see `Scenario.active`.
     quality : mapping
         Figures of the reconstruction, such as the number of detections.
     doubts : tuple of Doubt
@@ -86,6 +88,7 @@ class Agent:
     rear_axle_offset_m: float = 0.0
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0
+    quarantined: bool = False
     quality: Mapping[str, Any] = field(default_factory=dict)
     doubts: tuple[Doubt, ...] = ()
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
@@ -151,6 +154,7 @@ def agent_to_dict(agent: Agent) -> dict[str, Any]:
         "static": bool(agent.static),
         "rear_axle_offset_m": float(agent.rear_axle_offset_m),
         "confidence": float(agent.confidence),
+        **({"quarantined": True} if agent.quarantined else {}),
         "doubts": [doubt.to_dict() for doubt in agent.doubts],
         "quality": dict(agent.quality),
         **({"observed_by": observed_by} if observed_by else {}),
@@ -190,6 +194,7 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
         rear_axle_offset_m=float(entry["rear_axle_offset_m"]),
         color=entry["color"],
         confidence=float(entry["confidence"]),
+        quarantined=bool(entry.get("quarantined", False)),
         doubts=_doubts_of(entry),
         quality=entry["quality"],
         observed_by={

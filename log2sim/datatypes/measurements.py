@@ -92,7 +92,8 @@ class BoxEvidence:
     truncated : (M,) bool
         Whether the image border cuts the box.
     height_px_m : (M,) float64
-        Height in m that the image box spans at the object's depth; NaN without points.
+        Height in m that the image box spans at the object's depth, or above where a homography places its foot; NaN where
+        neither is known.
     points : (M,) int64
         Number of LiDAR points on the object.
     cluster : M arrays (n, 4) or (n, 3) float64

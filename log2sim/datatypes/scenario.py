@@ -110,6 +110,13 @@ class Scenario:
         """Return the agents that are doubtful, see `Agent.is_doubtful`."""
         return tuple(a for a in self.agents if a.is_doubtful)
 
+    @property
+    def active(self) -> Scenario:
+        """Return a copy without the quarantined agents, as replays and exports take it; itself where there are none."""
+        if not any(a.quarantined for a in self.agents):
+            return self
+        return replace(self, agents=tuple(a for a in self.agents if not a.quarantined))
+
     def without_doubtful(self) -> Scenario:
         """Return a copy without the doubtful agents; the ego stays."""
         return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or not a.is_doubtful))

@@ -34,6 +34,8 @@ class Waypoints:
         `sigma_yaw_rad`: whether front and back may be swapped is a doubt of the agent.
     visible : (T,) bool or None
         Whether the sensors could see the agent; only in truth.
+    lidar_points : (T,) float64 or None
+        LiDAR points in the agent's box, of all LiDARs together; only in truth.
     """
 
     __repr__ = short_repr
@@ -49,6 +51,7 @@ class Waypoints:
     sigma_yaw_rad: Array | None = None
     sigma_speed_mps: Array | None = None
     visible: NDArray[np.bool_] | None = None
+    lidar_points: Array | None = None
 
     FLOATS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m")
     OPTIONAL_FLOATS = ("sigma_yaw_rad", "sigma_speed_mps")
@@ -65,7 +68,7 @@ class Waypoints:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the columns that there are, by name."""
-        names = (*self.FLOATS, "observed", *self.OPTIONAL_FLOATS, "visible")
+        names = (*self.FLOATS, "observed", *self.OPTIONAL_FLOATS, "visible", "lidar_points")
         return {key: getattr(self, key) for key in names if getattr(self, key) is not None}
 
     def take(self, index: Any) -> Self:

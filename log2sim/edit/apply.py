@@ -8,7 +8,7 @@ from typing import Any
 
 from log2sim.datatypes import Scenario
 from log2sim.edit.checks import warnings_of
-from log2sim.edit.edits import Agents, Edit, Only, Remove
+from log2sim.edit.edits import Add, Agents, Edit, Only, Remove
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.registry import nearest
 
@@ -39,7 +39,7 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     Parameters
     ----------
     scenario : Scenario
-    edits : sequence of Only, Remove, DropDoubtful, Speed, Lateral, Shift
+    edits : sequence of Only, Remove, DropDoubtful, Replace, Add, Speed, Lateral, CutIn, Shift
         Each kind of motion at most once for an agent.
 
     Returns
@@ -82,7 +82,7 @@ def _check_names(scenario: Scenario, edits: Sequence[Edit]) -> None:
         for name in step.names:
             if name not in known:
                 raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {_some(known)}")
-            if (step.kind, name) in seen and not isinstance(step, Only | Remove):
+            if (step.kind, name) in seen and not isinstance(step, Only | Remove | Add):
                 raise ConfigError(f"{step.kind}: agent '{name}' is named twice; give one value")
             seen.add((step.kind, name))
 

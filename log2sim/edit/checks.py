@@ -11,6 +11,7 @@ import numpy as np
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.edit.motion import MIN_PATH_MPS, chords
 from log2sim.geometry import Array
+from log2sim.simulation.metrics.tracking_error import OFF_PATH_M
 from log2sim.simulation.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
 from log2sim.simulation.runner import replay
 
@@ -24,9 +25,10 @@ RELATIVE_TOLERANCE = 1 + 1e-6
 def warnings_of(before: Scenario, after: Scenario) -> tuple[str, ...]:
     """Return what is wrong with the edited scenario and not with its source, a line each, with agent, time and value."""
     source = {a.id: a for a in before.agents}
-    changed = [a for a in after.agents if a is not source[a.id]]
-    infeasible = [line for a in changed for line in _infeasible(source[a.id], a)]
-    return (*_collisions(before, after, {a.id for a in changed}), *infeasible)
+    changed = [a for a in after.agents if a is not source.get(a.id)]
+    infeasible = [line for a in changed for line in _infeasible(source.get(a.id), a)]
+    undrivable = () if infeasible else _undrivable(before, after, changed)
+    return (*_collisions(before, after, {a.id for a in changed}), *infeasible, *undrivable)
 
 
 def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterator[str]:
@@ -62,7 +64,28 @@ class PeakValue:
     t_s: float
 
 
-def _infeasible(before: Agent, after: Agent) -> Iterator[str]:
+def _undrivable(before: Scenario, after: Scenario, changed: Sequence[Agent]) -> Iterator[str]:
+    """Yield the agents that their vehicle model cannot keep on the edited path, though it could on that of the source."""
+    moving = tuple(a for a in changed if not a.static and GROUP_OF[a.category] != "pedestrian")
+    if not moving:
+        return
+    off_path = _off_path(replace(after, agents=moving))
+    same = tuple(a for a in before.agents if a.id in off_path and not a.static)
+    known = _off_path(replace(before, agents=same)) if same else {}
+    for agent in moving:
+        across_m = off_path.get(agent.id, 0.0)
+        if across_m > known.get(agent.id, 0.0):
+            yield f"agent '{agent.id}': its vehicle model leaves the path by {across_m:.2f} m, limit {OFF_PATH_M:g} m"
+
+
+def _off_path(scenario: Scenario) -> dict[str, float]:
+    """Return the agents of a replay that leave their path, with the largest distance across it, m."""
+    figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]
+    across = {name: entry.get("cross_track_max_m") for name, entry in figures.items()}
+    return {name: float(value) for name, value in across.items() if value is not None and value > OFF_PATH_M}
+
+
+def _infeasible(before: Agent | None, after: Agent) -> Iterator[str]:
     """Yield acceleration and curvature beyond their limits and beyond those of the source."""
     curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
     for what, peak_of, limit, unit in (
@@ -70,7 +93,8 @@ def _infeasible(before: Agent, after: Agent) -> Iterator[str]:
         ("curvature", peak_curvature, curvature_limit, "1/m"),
     ):
         peak = peak_of(after)
-        if peak.value > max(limit, peak_of(before).value) * RELATIVE_TOLERANCE:
+        known = 0.0 if before is None else peak_of(before).value
+        if peak.value > max(limit, known) * RELATIVE_TOLERANCE:
             yield f"agent '{after.id}': {what} {peak.value:.3g} {unit} at {peak.t_s:.2f} s, limit {limit:g} {unit}"
 
 

@@ -74,9 +74,17 @@ def formats() -> list[str]:
 
 
 def export(
-    scenario: Scenario, to: str, out: Path | str, options: Options | None = None, *, overwrite: bool = False
+    scenario: Scenario,
+    to: str,
+    out: Path | str,
+    options: Options | None = None,
+    *,
+    quarantined: bool = False,
+    overwrite: bool = False,
 ) -> tuple[Path, ...]:
     """Write a scenario in the format `to` into the folder `out`, all files or none; return them in order of name.
+
+    Agents whose confidence is too low (`Agent.quarantined`) are left out unless `quarantined` says otherwise.
 
     Raises
     ------
@@ -91,6 +99,7 @@ def export(
         if getattr(chosen, field.name) is not None and field.name not in exporter.options:
             known = ", ".join(f"--{name}" for name in exporter.options) or "none"
             raise ConfigError(f"--{field.name}: format '{to}' has no such option; it has {known}")
+    scenario = scenario if quarantined else scenario.active
     require_exportable(scenario)
     folder = Path(out)
     check_folder(folder, overwrite=overwrite)
@@ -121,16 +130,17 @@ def with_ego(scenario: Scenario, agent: str) -> Scenario:
 
 
 def with_doubtful(scenario: Scenario, choice: str) -> Scenario:
-    """Return a scenario with or without its doubtful agents: "keep" or "drop".
+    """Return a scenario with its doubtful agents but the quarantined ("keep"), without ("drop"), or with all of them ("all").
 
     Raises
     ------
     ConfigError
         For another choice.
     """
-    if choice not in ("keep", "drop"):
-        raise ConfigError(f"--doubtful: '{choice}', expected keep or drop")
-    return scenario if choice == "keep" else scenario.without_doubtful()
+    choices = {"keep": scenario.active, "drop": scenario.without_doubtful(), "all": scenario}
+    if choice not in choices:
+        raise ConfigError(f"--doubtful: '{choice}', expected {', '.join(choices)}")
+    return choices[choice]
 
 
 def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path, ...]:

@@ -26,7 +26,12 @@ MAX_FOLDERS_BELOW = 2000
 
 
 def open_log(
-    path: Path | str, *, format: str = "auto", sequence: str | None = None, follow_links: bool | None = None
+    path: Path | str,
+    *,
+    format: str = "auto",
+    sequence: str | None = None,
+    labels: Path | str | None = None,
+    follow_links: bool | None = None,
 ) -> Log:
     """Open a log; only its index, calibration and poses are read, images and sweeps on request.
 
@@ -38,6 +43,8 @@ def open_log(
         Name of a reader (`log2sim.registry.names("log")` lists them), or "auto" to find it.
     sequence : str, optional
         Which sequence of a root; needed only when it holds several.
+    labels : Path or str, optional
+        File with true boxes that take the place of those of the log; `log2sim.logs.label_files` has the formats.
     follow_links : bool, optional
         Whether symbolic links may lead out of the log's folders. By default as in `log2sim.links.following_links`, else not.
 
@@ -49,7 +56,12 @@ def open_log(
         When the format is unknown, or the sequence is missing, unknown or ambiguous.
     """
     with following_links(follow_links):
-        return _open(Path(path), format, sequence)
+        log = _open(Path(path), format, sequence)
+        if labels is None:
+            return log
+        from log2sim.logs.label_files import with_label_file  # reads formats that the log is not of
+
+        return with_label_file(log, Path(labels))
 
 
 def _open(root: Path, format: str, sequence: str | None) -> Log:

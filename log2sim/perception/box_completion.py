@@ -30,6 +30,9 @@ MIN_SIDE_DISTANCE_M = 0.3
 BOX_SIGMA_M, BOX_SIGMA_POINTS = 0.2, 20.0
 # A side seen at a smaller angle than this (sine) shows its near end only.
 MIN_VIEW_SINE = 0.5
+# A side does not face a sensor that is less than this before its plane, and sees it at less than this angle (tangent): a
+# sensor moves on by that while it sweeps, half of 0.1 s at 10 m/s.
+SENSOR_MOTION_M, MIN_FACE_TANGENT = 0.5, 0.25
 # Share of length minus width by which a center is uncertain when its short side may be a front or a part of a flank.
 AXIS_AMBIGUITY_SHARE = 0.25
 # Standard deviation of a uniform error, as a share of its range: a completed side may be wrong by all that was added.
@@ -83,7 +86,10 @@ def real_ends(
 
 def facing_ends(low: Array, high: Array, sensor: Array) -> NDArray[np.int64]:
     """Return the `real_ends` (..., 2, 2) of which no other than those of sides that face the sensor are ends of the object."""
-    return np.where(np.stack([sensor < low, sensor > high], axis=-1), FACING_END, 0)
+    beyond = np.stack([low - sensor, sensor - high], axis=-1)
+    # Of a flank that leaves the field of view level with the sensor, the last point may be ahead of it or behind it.
+    flat = MIN_FACE_TANGENT * np.maximum(beyond.max(axis=-1), 0.0)[..., ::-1, None]
+    return np.where(beyond > np.minimum(flat, SENSOR_MOTION_M), FACING_END, 0)
 
 
 def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.int64]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from log2sim.datatypes import EGO, Agent, Scenario
 from log2sim.errors import ConfigError, ScenarioError
@@ -35,6 +36,7 @@ def replay(
     foresight: str = "path",
     sight_m: float = SIGHT_M,
     host: ExternalSimulator | None = None,
+    quarantined: bool = False,
     progress: Progress | None = None,
 ) -> Replay:
     """Replay a scenario and compare the replay with it.
@@ -65,6 +67,8 @@ def replay(
     host : Host, optional
         External simulator that moves the agents, such as `log2sim.simulation.carla.simulator.CarlaSimulator`. It has its own
         vehicle models, so `model` is not used.
+    quarantined : bool
+        Whether agents whose confidence is too low, see `Agent.quarantined`, are there too.
     progress : callable, optional
         Called now and then with the number of steps done and of all steps.
 
@@ -81,6 +85,8 @@ def replay(
     follow the scenario; those of an ego with a policy are in `metrics["by_agent"]`. Cost: one step moves all agents
     that live within the present 10 s at once.
     """
+    gone = {} if quarantined else {a.id: "quarantined" for a in scenario.agents if a.quarantined}
+    scenario = scenario if quarantined else scenario.active
     if host is not None:
         model = "kinematic"  # its references hold no slip angles of a model, so they suit every simulator
     world = open_world(
@@ -91,10 +97,12 @@ def replay(
         reset_policy(ego, scenario)
     if host is None:
         tracks = rollout(world, ego, progress)
-        return replay_result(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
+        result = replay_result(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
+        return replace(result, left_out=gone)
     tracks = _rollout_externally(world, host, ego, progress)
     choices = {k: ModelChoice(host.name, "the simulator's own") for k in world.choices}
-    return replay_result(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
+    result = replay_result(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
+    return replace(result, left_out=gone)
 
 
 def _rollout_externally(

@@ -48,6 +48,8 @@ class TrafficSettings:
         Of each log; a scene in KITTI's layout is one frame.
     light, weather : str or None
         As in scene files; None draws them for each scene.
+    pictures : bool
+        Whether logs have a camera.
     """
 
     mount: Mount
@@ -58,6 +60,7 @@ class TrafficSettings:
     duration_s: float = 5.0
     light: str | None = None
     weather: str | None = None
+    pictures: bool = True
 
 
 def write_traffic(
@@ -68,8 +71,10 @@ def write_traffic(
     Raises
     ------
     ConfigError
-        For an unknown sensor, or when the folder may not be replaced or cannot be written.
+        For an unknown sensor, KITTI's layout without pictures, or when the folder may not be replaced or cannot be written.
     """
+    if settings.layout == "kitti" and not settings.pictures:
+        raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")
     sensor_named(settings.sensor, settings.mount)
     _refuse(out, overwrite=overwrite)
     check_folder(out, overwrite=overwrite)
@@ -123,7 +128,11 @@ def _write_log(
     from log2sim.logs.native.writer import write_log
 
     name = _scene_name(index)
-    log = log_of(scene, environment, name, settings.duration_s, _scene_seed(settings, index))
+    seed = _scene_seed(settings, index)
+    log = log_of(scene, environment, name, settings.duration_s, seed, image_labels=settings.pictures)
+    if not settings.pictures:
+        sweeps = {name: log.streams[name] for name in log.lidars}
+        log = log.changed(cameras={}, streams=sweeps, image_labels={}, reference_camera=None)
     write_log(log, root / name)
 
 

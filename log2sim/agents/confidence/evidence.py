@@ -21,6 +21,8 @@ MAX_SIZE_SIGMAS = 3.0
 MAX_HEADING_CONFIDENCE = 0.99
 # Beyond these, more evidence adds nothing.
 MAX_SCATTER, MAX_RANGE_M, MAX_DOUBTS = 30.0, 100.0, 2
+# Twice or half the typical height.
+MAX_ODD_HEIGHT = float(np.log(2.0))
 MIN_RANGE_M, MIN_SIGMA_M, MAX_SIGMA_M = 2.0, 0.01, 5.0
 
 
@@ -50,6 +52,9 @@ class Evidence:
         1 when the observed size is none of its category.
     odd_size : float
         By how many standard deviations of the category length and width differ from the typical ones.
+    odd_height : float
+        Root mean square logarithm of the height that its image boxes span where a homography places it, in units of the
+        typical one: at the wrong distance, or on other ground than was thought, it is too high or too low. 0 without any.
     hidden : float
         Share of its length that was never seen at one time.
     heading : float
@@ -72,6 +77,7 @@ class Evidence:
     sigma: float
     unlikely_size: float
     odd_size: float
+    odd_height: float
     hidden: float
     heading: float
     other_category: float
@@ -85,8 +91,8 @@ class Evidence:
 # Whether an agent with more of it is rather right (1) or wrong (-1); 0 where either may be.
 SIGNS = {
     "image": 1, "sweep": 1, "few": -1, "brief": -1, "blind": -1, "range": -1,
-    "scatter": -1, "sigma": -1, "unlikely_size": -1, "odd_size": -1, "hidden": -1, "heading": 1, "other_category": -1,
-    "doubts": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0, "other": 0,
+    "scatter": -1, "sigma": -1, "unlikely_size": -1, "odd_size": -1, "odd_height": -1, "hidden": -1, "heading": 1,
+    "other_category": -1, "doubts": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0, "other": 0,
 }  # fmt: skip
 
 
@@ -110,6 +116,7 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline) -> Evidence:
         sigma=float(np.log(np.clip(np.median(w.sigma_xy_m), MIN_SIGMA_M, MAX_SIGMA_M) / 0.1)),
         unlikely_size=float(not candidate.geometry.is_likely),
         odd_size=float(min(np.hypot(*size), MAX_SIZE_SIGMAS)),
+        odd_height=_odd_height(candidate),
         hidden=1.0 - float(seen_share(candidate, yaw)[0]),
         heading=float(logit(np.clip(heading, 1 - MAX_HEADING_CONFIDENCE, MAX_HEADING_CONFIDENCE))),
         other_category=float((m.category != agent.category).mean()),
@@ -137,6 +144,17 @@ def _scatter(candidate: AgentCandidate, timeline: Timeline) -> float:
     off = centers[0] - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
     squared = np.einsum("na,nab,nb->n", off, np.linalg.pinv(centers[1]), off)
     return float(np.log1p(min(np.median(squared), MAX_SCATTER)))
+
+
+def _odd_height(candidate: AgentCandidate) -> float:
+    """Return the root mean square logarithm of the heights of image boxes over the typical one, of whole boxes if there are any."""
+    m = candidate.track.measurements
+    placed = (m.source == "topdown") & np.isfinite(m.height_px_m)
+    rows = placed & ~m.truncated if (placed & ~m.truncated).any() else placed
+    if not rows.any():
+        return 0.0
+    share = m.height_px_m[rows] / TYPICAL_SIZE_M[candidate.agent.category][2]
+    return float(np.sqrt(np.mean(np.log(np.clip(share, np.exp(-MAX_ODD_HEIGHT), np.exp(MAX_ODD_HEIGHT))) ** 2)))
 
 
 def seen_share(candidate: AgentCandidate, yaw_rad: Array) -> Array:

@@ -96,11 +96,11 @@ def count_rays(
         for tick in np.flatnonzero(boxes.present.any(axis=0)).tolist():
             cloud = clouds[tick]
             if cloud is not None and cloud.free is not None and len(cloud.free):
-                counts[..., tick] = _count_at(boxes, tick, cloud.origin, cloud.free)
+                counts[..., tick] = count_at(boxes, tick, cloud.origin, cloud.free)
     return RayCounts(*counts[0]), RayCounts(*counts[1])
 
 
-def _count_at(boxes: BoxTable, tick: int, origin: Array, rays: Rays) -> NDArray[np.int64]:
+def count_at(boxes: BoxTable, tick: int, origin: Array, rays: Rays) -> NDArray[np.int64]:
     """Count the rays of one tick toward the solid part and the whole by their ending (2, 3, A)."""
     agent = np.flatnonzero(boxes.present[:, tick])
     center, velocity, size = boxes.center_m[agent, tick] - origin, boxes.velocity_mps[agent, tick], boxes.size_m[agent]

@@ -8,11 +8,11 @@ from typing import Any
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import MissingExtra
-from log2sim.evaluation.bench.ends import ends_points, ends_settings, make_context_of_ends
+from log2sim.evaluation.bench.ends import ends_settings, make_context_of_ends, whole_points
 from log2sim.evaluation.bench.panels import Panel, make_ends_panel, make_panels
 from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context
 from log2sim.evaluation.bench.scores import EVERYTHING, Scope
-from log2sim.evaluation.bench.settings import make_grid
+from log2sim.evaluation.bench.settings import default_settings, make_grid
 
 __all__ = ["Benchmark", "Panel", "Scope", "bench"]
 
@@ -73,6 +73,9 @@ def bench(
 ) -> Benchmark:
     """Run a log with the present settings and with every alternative of one stage at a time.
 
+    Methods for images are compared with a detector in images alone. Where `reconstruct` searches sweeps, too, its default
+    is one more whole run, and what the others are measured against.
+
     Of a log with LiDARs on the vehicle and at the road, the ends alone and all levels of their fusion are compared, too.
 
     Parameters
@@ -102,13 +105,14 @@ def bench(
     if log.cameras:
         grid = make_grid(log, config, detectors)
         context = make_context(log, grid, truth, report, scope)
-        panels = make_panels(context, report)
+        default = default_settings(log, config)
+        panels = make_panels(context, report, whole_points(log, default, truth, scope, report))
         notes = _notes(context, panels)
     else:
         context = make_context_of_ends(log, ends, truth, scope)
         panels, notes = [], ["the log has no camera: only vehicle, road, and both are compared"]
     if ends:
-        panels.append(make_ends_panel(ends_points(log, ends, truth, scope, report), truth))
+        panels.append(make_ends_panel(whole_points(log, ends, truth, scope, report), truth))
     return Benchmark(context, tuple(panels), tuple(notes))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from log2sim.documents import check
 from log2sim.errors import ScenarioError
 from log2sim.evaluation.bench.benchmark import Benchmark
+from log2sim.evaluation.bench.bootstrap import error_interval
 from log2sim.evaluation.bench.panels import Panel
 from log2sim.evaluation.bench.pareto import Point, short
 from log2sim.geometry import NS_PER_S
@@ -67,6 +68,7 @@ def _panel(panel: Panel) -> dict[str, Any]:
                 "on_front": on_front,
                 "ms_per_tick": round(p.ms_per_tick, 4),
                 "error": _finite(p.error),
+                "error_interval": _interval(p),
                 "figures": _finite(p.figures),
             }
             for p, on_front in zip(panel.points, panel.on_front, strict=True)
@@ -80,6 +82,11 @@ def _panel(panel: Panel) -> dict[str, Any]:
     }
 
 
+def _interval(point: Point) -> list[float] | None:
+    found = error_interval(point.by_object) if point.error is not None else None
+    return None if found is None else [round(value, 6) for value in found]
+
+
 def _finite(value: Any) -> Any:
     """Round nested figures to six decimals; None for a number that is not finite."""
     if isinstance(value, Mapping):
@@ -90,8 +97,12 @@ def _finite(value: Any) -> Any:
 
 
 def format_table(result: Benchmark) -> str:
-    """Format one block for each stage, then the recommendations; '*' is the present setting, '+' on the Pareto front."""
-    lines = []
+    """Format one block for each stage, then the recommendations."""
+    lines = [
+        "* present setting   + on the Pareto front: no setting is as accurate in less time",
+        "5-95 %: error over resamples of the objects, '-' with fewer than five of them",
+        "",
+    ]
     for panel in result.panels:
         lines += [f"{panel.stage}: {panel.label}", *_rows(panel), ""]
     lines += ["What the figures support:"]
@@ -101,13 +112,14 @@ def format_table(result: Benchmark) -> str:
 
 def _rows(panel: Panel) -> list[str]:
     columns = [c for c in COLUMNS if any(p.figures.get(c[0]) is not None for p in panel.points)]
-    head = ["", "", "ms a tick", f"error {panel.unit}".strip(), *(title for _, title, _ in columns)]
+    head = ["", "", "ms a tick", f"error {panel.unit}".strip(), "5-95 %", *(title for _, title, _ in columns)]
     cells = [head] + [
         [
             f"  {'*' if p.present else ' '}{'+' if on_front else ' '}",
             p.setting,
             short(p.ms_per_tick),
             short(p.error),
+            "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
             *(_cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in _by_time(panel)

@@ -71,20 +71,20 @@ def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:
     return tuple(sorted(out, key=lambda setting: not setting.present))
 
 
-def ends_points(
+def whole_points(
     log: Log,
     settings: Sequence[Setting],
     truth: Scenario | None,
     scope: Scope,
     report: Callable[[str, int, int], None],
 ) -> list[Point]:
-    """Run every setting once and score its scenario.
+    """Run every setting once, as `reconstruct` does, and score its scenario.
 
     The time is that of everything after synchronization: poses, calibration and registration are the same for all.
     """
     out = []
     for k, setting in enumerate(settings):
-        run = start(log, setting.config)
+        run = start(log, setting.config, cache=False)
         begin = time.perf_counter()
         try:
             result = second_pass(run, first_pass(run))
@@ -98,5 +98,5 @@ def ends_points(
         out.append(
             Point(setting.name, setting.present, ms, score.figures.get(error), figures, score.by_object.get(error, {}))
         )
-        report("ends", k + 1, len(settings))
+        report(setting.stage, k + 1, len(settings))
     return out

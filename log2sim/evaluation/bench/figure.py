@@ -16,6 +16,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from log2sim.documents import replaced
 from log2sim.evaluation.bench.benchmark import Benchmark
+from log2sim.evaluation.bench.bootstrap import error_interval
 from log2sim.evaluation.bench.label_placement import place_labels
 from log2sim.evaluation.bench.panels import Panel
 from log2sim.evaluation.bench.pareto import Point
@@ -94,7 +95,11 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     points = [p for p, _ in shown]
     x = np.array([p.ms_per_tick for p in points])
     y = np.array([p.error for p in points], dtype=np.float64)
-    _limits(ax, x, y)
+    present = next((p for p in points if p.present), None)
+    spread = None if present is None else error_interval(present.by_object)
+    if present is not None and spread is not None:
+        ax.vlines(present.ms_per_tick, *spread, color=CROWD_COLOR, lw=1.0, alpha=0.6, zorder=1.8)
+    _limits(ax, x, np.append(y, spread or ()))
     front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
     ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
     for point, on_front in shown:
@@ -146,15 +151,17 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
     mark: dict[str, Any] = {"ls": "none", "mew": 1.1}
     handles = [
         (Line2D([], [], marker="D", ms=6.5, mfc=FRONT, mec=PAPER, **mark), "present setting, on the front"),
+        (Line2D([], [], marker="D", ms=6.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "present setting, behind it"),
+        (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
         (Line2D([], [], marker="o", ms=5.5, mfc=FRONT, mec=PAPER, **mark), "on the Pareto front"),
         (Line2D([], [], marker="o", ms=5.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "behind it"),
-        (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
+        (Line2D([], [], color=CROWD_COLOR, lw=1.0, alpha=0.6), "5 to 95 % of resamples"),
     ]
     ax.legend(
         [h for h, _ in handles], [t for _, t in handles], loc="upper left", bbox_to_anchor=(-0.03, 1.14), frameon=False,
         ncols=2, prop={"family": FONT, "size": 7.0}, labelcolor=INK, handletextpad=0.5, columnspacing=1.2, labelspacing=0.7,
     )  # fmt: skip
-    y = 0.92
+    y = 0.86
     for panel in result.panels:
         for k, line in enumerate(wrap(printable(panel.recommendation.reason, 240), 50)):
             head = panel.stage if k == 0 else ""

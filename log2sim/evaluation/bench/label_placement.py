@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from log2sim.evaluation.bench.pareto import Point
+from log2sim.evaluation.bench.pareto import COVERAGE, Point
 from log2sim.geometry import Array
 from log2sim.visualization.plot.style import CROWD_COLOR, FONT, INK, halo, printable
 
@@ -32,13 +32,14 @@ def place_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> N
     """Label points (K, 2) with their settings, clear of a line with corners `line` (n, 2)."""
     pt = float(ax.figure.dpi) / 72
     at = ax.transData.transform(xy)
+    present = next(p for p in points if p.present) if any(p.present for p in points) else points[0]
     # Covering a point costs three times as much as covering a label.
     taken = 3 * [_around(u, v, POINT_PT * pt) for u, v in at] + _along(ax.transData.transform(line), pt)
     frame = ax.get_window_extent()
     inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
     for members in sorted(_together(at, MAX_SHARED_LABEL_PT * pt), key=lambda m: -float(at[m[0], 1])):
         members = sorted(members, key=lambda k: not points[k].present)
-        names = [printable(short_name(points[k].setting), 30) for k in members]
+        names = [printable(_label(points[k], present), 42) for k in members]
         box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
         taken.append(box)
         _lead(ax, at[members].mean(axis=0), box, pt)
@@ -54,6 +55,15 @@ def short_name(setting: str) -> str:
     """Drop the stage from a setting whose name identifies its stage."""
     stage, _, name = setting.partition(": ")
     return setting if name in ("", "on", "off") or stage == "smooth" else name
+
+
+def _label(point: Point, present: Point) -> str:
+    """Name a point, with the share of objects that it finds or places where the present setting does so with more."""
+    name = short_name(point.setting)
+    if point.covers_as_many_as(present):
+        return name
+    key, share = min(point.coverage.items(), key=lambda item: item[1])
+    return f"{name} ({share:.0%} {COVERAGE[key]})"
 
 
 def _together(at: Array, reach: float) -> list[list[int]]:

@@ -69,18 +69,20 @@ ERRORS = {
 }
 
 
-def make_panels(context: BenchContext, report: Progress) -> list[Panel]:
-    """Run all settings and make one panel for each stage and one for whole runs."""
+def make_panels(context: BenchContext, report: Progress, default: Sequence[Point] = ()) -> list[Panel]:
+    """Run all settings and make one panel for each stage and one for whole runs, with those of the default beside them."""
     runs, observations = run_all(context, report)
     whole_ms = context.ms_per_tick(runs[0].seconds)
     known = context.truth is not None
     by_stage = {stage: [runs[0], *(r for r in runs[1:] if r.setting.stage == stage)] for stage in OWN_STAGES}
+    homographies = homography_points(context, observations, report)
+    whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
     points = {
         "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
         "measure": [_measure_point(context, r) for r in by_stage["measure"]],
-        "homography": homography_points(context, observations, report),
+        "homography": homographies,
         "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
-        "whole run": [_whole_point(context, r) for r in runs],
+        "whole run": _with_placed_shares(whole, homographies),
     }
     return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
 
@@ -119,11 +121,26 @@ def _measure_point(context: BenchContext, run: BenchRun) -> Point:
     return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
 
 
-def _whole_point(context: BenchContext, run: BenchRun) -> Point:
-    name = "present settings" if run.setting.present else run.setting.key
+def _with_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
+    """Add to whole runs the share of the obstacles that their homographies place."""
+    if not homographies:
+        return list(whole)
+    shares = {f"homography: {p.setting}": p.figures["placed_share"] for p in homographies}
+    present = next(p for p in homographies if p.present).figures["placed_share"]
+    return [replace(p, figures={**p.figures, "placed_share": shares.get(p.setting, present)}) for p in whole]
+
+
+def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> Point:
+    """Make the point of a run; where it is `compared` with the others, that of the present settings is marked."""
+    present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
+    name = present if run.setting.present else run.setting.key
     stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
     point = _scored_point(
-        name, run.setting.present, context.ms_per_tick(run.seconds), run.score, _error(context, "whole run")
+        name,
+        run.setting.present and compared,
+        context.ms_per_tick(run.seconds),
+        run.score,
+        _error(context, "whole run"),
     )
     return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
 

@@ -16,6 +16,10 @@ NO_ERROR = "no error of the present setting is known; objects have to be in sigh
 ERROR_TOLERANCE = 0.05
 # Fraction of bootstrap resamples in which a setting must be no worse than the present one to be recommended.
 MIN_CONFIDENCE = 0.9
+# A log has no objects but its own, so resamples of them never make sure.
+MAX_CONFIDENCE = 0.99
+# Figures that say how many of the objects an error is of, in words.
+COVERAGE = {"recall": "found", "placed_share": "placed"}
 # Time saved must exceed this fraction of the whole run's time.
 TIME_TOLERANCE = 0.05
 
@@ -44,6 +48,19 @@ class Point:
     error: float | None
     figures: dict[str, Any] = field(default_factory=dict)
     by_object: ErrorSums = field(default_factory=dict)
+
+    @property
+    def coverage(self) -> dict[str, float]:
+        """Shares of the objects that the setting finds, and that its homographies place, as far as they were measured."""
+        return {name: self.figures[name] for name in COVERAGE if self.figures.get(name) is not None}
+
+    def covers_as_many_as(self, other: Point) -> bool:
+        """Return whether the setting finds and places as many objects as another one, within `ERROR_TOLERANCE`.
+
+        Errors alone do not tell: a homography that places hardly anything invents little in a whole run, either.
+        """
+        mine = self.coverage
+        return all(mine.get(name, 0.0) >= share * (1 - ERROR_TOLERANCE) for name, share in other.coverage.items())
 
 
 @dataclass(frozen=True)
@@ -86,7 +103,7 @@ def front_mask(points: Sequence[Point]) -> NDArray[np.bool_]:
 def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommendation:
     """Recommend a setting of a stage: the fastest of those whose error is within `ERROR_TOLERANCE` of the smallest.
 
-    Another setting replaces the present one only when it is no worse with `MIN_CONFIDENCE`.
+    Another setting replaces the present one only when it finds and places as many objects and is no worse with `MIN_CONFIDENCE`.
 
     Parameters
     ----------
@@ -103,7 +120,7 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
         return Recommendation(None, present.setting, NO_ERROR)
     if not others:
         return Recommendation(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
-    better = [p for p in others if _gains(p, present, whole_ms)]
+    better = [p for p in others if p.covers_as_many_as(present) and _gains(p, present, whole_ms)]
     sure = [p for p in better if _confidence(p, present) >= MIN_CONFIDENCE]
     if sure:
         chosen = _fastest_of_best(sure)
@@ -148,11 +165,13 @@ def _confidence_text(point: Point, present: Point) -> str:
     if not point.by_object:
         return ""
     few = len({*point.by_object, *present.by_object}) < MIN_OBJECTS
-    return ", too few objects to tell" if few else f", {_confidence(point, present):.0%} sure"
+    sure = min(_confidence(point, present), MAX_CONFIDENCE)
+    return ", too few objects to tell" if few else f", no worse in {sure:.0%} of resamples"
 
 
 def _figures(point: Point, unit: str) -> str:
-    return f"{short(point.error)}{f' {unit}' * bool(unit)}, {short(point.ms_per_tick)} ms"
+    shares = "".join(f", {share:.0%} {COVERAGE[name]}" for name, share in point.coverage.items())
+    return f"{short(point.error)}{f' {unit}' * bool(unit)}{shares}, {short(point.ms_per_tick)} ms"
 
 
 def short(value: float | None) -> str:

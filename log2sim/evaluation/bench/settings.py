@@ -14,7 +14,7 @@ from log2sim.errors import ConfigError
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.tiling import plan_tiles
 from log2sim.run_detectors import create_image_detector
-from log2sim.sensors import IMAGE_DETECTOR
+from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
 TILES = (0, 1, 2, 3, 5)
 """Numbers of tiles to try besides the present one; 0 is "auto"."""
@@ -96,6 +96,14 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
         hypotheses=tuple(_hypotheses(config)),
         smooth=tuple(_smooth_settings(config)),
     )
+
+
+def default_settings(log: Log, config: Config) -> tuple[Setting, ...]:
+    """Return what `reconstruct` does with a log by these settings where it does more than search images, else nothing."""
+    chosen = choose_detector(log, config)
+    if config.detect.name != AUTO or not chosen.detect.in_sweeps:
+        return ()
+    return (Setting("whole run", f"reconstruct's default, {chosen.detect.name}", chosen, True),)
 
 
 def _methods_apart(config: Config) -> list[Setting]:

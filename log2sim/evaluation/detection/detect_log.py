@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.agents.heading.course import turn_to_courses
 from log2sim.config import Config
 from log2sim.datatypes import ROAD, Boxes3D, Log, end_of
 from log2sim.errors import ConfigError, LogError
@@ -44,7 +45,7 @@ class LogDetections:
 def detect_log(
     log: Log, config: Config | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> LogDetections:
-    """Detect road users in the sweeps of a log.
+    """Detect road users in the sweeps of a log; the boxes of those that move point where they go.
 
     Parameters
     ----------
@@ -83,9 +84,9 @@ def detect_log(
     records.require_some()
     if not stamps:
         raise LogError(f"{log.name}: none of the {len(run.schedule)} sweeps has a known pose and points")
-    found = DetectedBoxes(
-        log.name, run.detectors.name, np.array(stamps, dtype=np.int64), tuple(boxes), run.poses.to_provenance()
-    )
+    t_ns = np.array(stamps, dtype=np.int64)
+    turned = turn_to_courses(boxes, t_ns, config.track)
+    found = DetectedBoxes(log.name, run.detectors.name, t_ns, tuple(turned), run.poses.to_provenance())
     return LogDetections(found, len(run.schedule) - len(stamps), records.summary(), run.poses)
 
 

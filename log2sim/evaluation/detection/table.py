@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from log2sim.evaluation.detection.matching import Criterion
+from log2sim.evaluation.metrics.table import columns_text, percent, verdict_text
 
 AVERAGES = {
     "kitti": (("ap_r40", "AP R40"), ("ap_r11", "AP R11"), ("ap_r40_published", "publ. R40")),
@@ -19,6 +20,27 @@ AT_SCORE = (
     ("precision_times_recall", "P x R"),
     ("heading_over_90_deg", "> 90 deg"),
 )
+
+
+def format_verdict(result: Mapping[str, Any]) -> str:
+    """Say for each class how many boxes were found, how many of the found are right, and the average precision."""
+    key, title = AVERAGES[result["protocol"]][0]
+    lines, shown = [], list[Any]()
+    for name, figures in result["classes"].items():
+        row = next((row for row in _rows(figures) if row["objects"] == "all"), None)
+        if row is None or figures in shown:
+            continue
+        shown.append(figures)
+        limit = Criterion(**row["match"])
+        if not row["truths"]:
+            lines.append((name, f"none labeled, {row['false_positives']} found ({limit})"))
+            continue
+        text = f"{percent(row['recall'])} of {row['truths']} found, {percent(row['precision'])} of the found right"
+        average = "" if row[key] is None else f", {title} {row[key]:.3f}"
+        turned = row["heading_over_90_deg"]
+        backwards = f", {percent(turned)} backwards" if turned else ""
+        lines.append((name, f"{text}{average}{backwards} ({limit})"))
+    return verdict_text([*lines, ("scope", _scope(result))])
 
 
 def format_table(result: Mapping[str, Any]) -> str:
@@ -43,10 +65,9 @@ def format_table(result: Mapping[str, Any]) -> str:
             if row["truths"]:
                 values = [_cell(row.get(key)) for key, _ in columns]
                 cells.append(["all classes", row["objects"], "each its first", str(row["truths"]), *values])
-    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
-    lines = ["  ".join(_aligned(row, widths)).rstrip() for row in cells]
+    lines = columns_text(cells, heads=3)
     scores = [_score_note(name, result["classes"][name]["calibration"]) for name in shown]
-    return "\n".join([*lines, *filter(None, scores), _scope(result)])
+    return "\n".join([*lines, *filter(None, scores)])
 
 
 def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -81,10 +102,6 @@ def _scope(result: Mapping[str, Any]) -> str:
     if result["max_range_m"] is not None:
         parts.append(f"up to {result['max_range_m']:g} m")
     return f"{'; '.join(parts)}; precision, recall and what follows at scores from {result['min_score']:g}"
-
-
-def _aligned(row: list[str], widths: list[int]) -> list[str]:
-    return [c.ljust(w) if k < 3 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
 
 
 def _cell(value: float | None) -> str:

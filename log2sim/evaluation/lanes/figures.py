@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,8 +40,42 @@ def _lines(features: MapFeatures) -> list[Any]:
     return [marking for marking in features.markings if marking.is_lane_line]
 
 
+def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Say in a line each how well the road, colors and traffic lights are found; nothing where there are none."""
+    out = []
+    figures = result.get("map_features")
+    if figures is not None:
+        named = (("lane lines", figures["lane_lines"]), ("borders", figures["borders"]), ("lanes", figures["lanes"]))
+        parts = [
+            f"{name} {_percent(f['recall'])} found" + f", {_percent(f['precision'])} right" * bool(f["found_m"])
+            for name, f in named
+            if f["true_m"]
+        ]
+        shapes = [f"{_count(figures[key])} {name}" for key, name in _SHAPES if _any(figures[key])]
+        out += [("road", "; ".join([*parts, *shapes]))] if parts or shapes else []
+    colors, signals = result.get("colors"), result.get("signals")
+    if colors is not None and colors["vehicles"]:
+        out.append(
+            (
+                "colors",
+                f"{colors['right']} of {colors['named']} right, {colors['with_color']} of {colors['vehicles']} vehicles have one",
+            )
+        )
+    if signals is not None:
+        right = f", state right {_percent(signals['state_right'])} of the time" if signals["found"] else ""
+        out.append(("signals", f"{signals['found']} of {signals['true']} found, {signals['false']} false{right}"))
+    return out
+
+
 def map_lines(result: Mapping[str, Any]) -> list[str]:
-    """Format the figures of map features, colors and traffic lights; nothing where there are none."""
+    """Format the figures of map features, colors and traffic lights in detail; nothing where there are none."""
+    lines = list[str]()
+    for line in _detailed_lines(result):
+        lines += textwrap.wrap(line, 100, subsequent_indent=" " * 12)
+    return ["", *lines] if lines else []
+
+
+def _detailed_lines(result: Mapping[str, Any]) -> list[str]:
     out = []
     figures = result.get("map_features")
     if figures is not None:

@@ -43,6 +43,8 @@ class StateTable:
         False where the truth does not count.
     labeled : (A, T) bool
         False where the truth's state is interpolated over a gap of its labels or extrapolated.
+    lidar_points : (A, T) float64
+        LiDAR points in the truth's box; NaN where they were not counted.
     """
 
     ids: tuple[str, ...]
@@ -56,6 +58,7 @@ class StateTable:
     range_m: Array
     visible: Mask
     labeled: Mask
+    lidar_points: Array
 
     @property
     def present(self) -> Mask:
@@ -115,8 +118,10 @@ def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Arra
     yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
     speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
     z = _stack([s.z_m for s in sampled], (len(ticks_s),))
-    there = np.isfinite(yaw)
-    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=there, labeled=there)
+    there, unknown = np.isfinite(yaw), np.full(yaw.shape, np.nan)
+    return _table(
+        agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=there, labeled=there, lidar_points=unknown
+    )
 
 
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
@@ -133,9 +138,9 @@ def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_
     yaw = _stack([c[2] for c in columns], (len(ticks_s),))
     speed = _stack([c[3] for c in columns], (len(ticks_s),))
     visible, labeled = (_stack([c[k].astype(np.float64) for c in columns], (len(ticks_s),)) > 0 for k in (4, 5))
-    return _table(
-        agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=visible & labeled, labeled=labeled
-    )
+    points = _stack([c[6] for c in columns], (len(ticks_s),))
+    seen = {"visible": visible & labeled, "labeled": labeled, "lidar_points": points}
+    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, **seen)
 
 
 def ego_states(
@@ -152,20 +157,23 @@ def ego_states(
     return replace(true, xy_m=xy_m, yaw_rad=np.where(true.present, true.yaw_rad, ours.yaw_rad))
 
 
-def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask, Mask]:
+def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask, Mask, Array]:
     w = agent.waypoints
     s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
     outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
     step = s.speed_mps * outside
     xy = np.stack([s.x_m + step * np.cos(s.yaw_rad), s.y_m + step * np.sin(s.yaw_rad)], -1)
     present = np.abs(outside) <= TRUTH_MARGIN_S
-    visible = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest_index(w.t_s, t)]
+    nearest = nearest_index(w.t_s, t)
+    visible = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest]
+    points = np.full(len(t), np.nan) if w.lidar_points is None else w.lidar_points[nearest]
+    points = np.where(np.abs(w.t_s[nearest] - t) <= MAX_TRUTH_GAP_S, points, np.nan)
     # Simplified, a static agent has its first and last waypoint only, and one in straight motion a few.
     simplified = bool(agent.quality.get("waypoints_left_out"))
     max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
     labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
     nan = np.where(present, 0.0, np.nan)
-    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible, labeled
+    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible, labeled, points + nan
 
 
 def _table(agents: tuple[Agent, ...], ego_xy: Array | None, **columns: Any) -> StateTable:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, GROUPS, Agent, Scenario
+from log2sim.datatypes import CATEGORIES, GROUPS, Agent, Log, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.colors import color_figures
 from log2sim.evaluation.lanes.figures import map_figures
@@ -24,6 +26,7 @@ from log2sim.evaluation.metrics.comparison import (
     Comparison,
     Selection,
     compare,
+    coverage,
     matched_ticks,
     without_ignored,
 )
@@ -31,19 +34,24 @@ from log2sim.evaluation.metrics.correctness import correctness
 from log2sim.evaluation.metrics.hota import hota
 from log2sim.evaluation.metrics.pairs import Mask
 from log2sim.evaluation.metrics.per_agent import agent_rows, false_rows, ignored_rows, rounded_tree
+from log2sim.evaluation.metrics.placing import place_truth
 from log2sim.evaluation.metrics.rules import counting_rules, matching_rules
 from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors, summarize
+from log2sim.evaluation.metrics.truth import load_truth
 from log2sim.evaluation.signals import signal_figures
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.registry import nearest
+
+if TYPE_CHECKING:
+    from log2sim.pipeline import Result
 
 VERSION = 1
 RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
 
 
 def evaluate(
-    scenario: Scenario,
-    truth: Scenario,
+    scenario: Scenario | Result | Path | str,
+    truth: Scenario | Log | Path | str,
     *,
     max_range_m: float | None = None,
     categories: Sequence[str] | None = None,
@@ -52,8 +60,11 @@ def evaluate(
 
     Parameters
     ----------
-    scenario, truth : Scenario
-        May have different start times and map offsets. The ego (id "ego") is compared separately from the other agents.
+    scenario : Scenario, Result, Path or str
+        A scenario or its file, or what `log2sim.reconstruct` returns.
+    truth : Scenario, Log, Path or str
+        A scenario or its file, or a log or its path, whose labels in view of the cameras that the scenario used are taken.
+        Start time and map may be others. The ego (id "ego") is compared separately from the other agents.
     max_range_m : float, m, optional
         Only agents within this distance of the ego are compared, in both scenarios.
     categories : sequence of str, optional
@@ -69,16 +80,29 @@ def evaluate(
     ------
     ConfigError
         For an unknown category, a range that is not positive, or a range without an ego to measure it from.
+    LogError
+        When the log has no labels.
     ScenarioError
-        When the two use different map projections or do not overlap in time.
+        When the two do not overlap in time.
 
     Notes
     -----
     CLEAR MOT (Bernardin and Stiefelhagen, 2008) and HOTA (Luiten et al., 2021) with matches by the distance of box centers.
-    Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks.
+    Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks. Quarantined agents, which
+    replays and exports leave out, are left out here too, and listed; static agents are compared from their first to their last
+    observation.
     """
+    if isinstance(scenario, Log):
+        raise TypeError("evaluate takes the scenario first, then the log with its truth")
+    if isinstance(scenario, (str, Path)):
+        scenario = Scenario.load(scenario)
+    elif not isinstance(scenario, Scenario):
+        scenario = scenario.scenario
+    quarantined = [agent.id for agent in scenario.agents if agent.quarantined]
+    scenario = replace(scenario, agents=tuple(_while_observed(agent) for agent in scenario.active.agents))
+    truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
     compared, ticks_s, ego = compare_scenarios(scenario, truth, Selection(max_range_m, _selected(categories)))
-    true, ours, tick_s = compared.truth, compared.other, _tick_s(ticks_s)
+    ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
     result = {
@@ -89,6 +113,8 @@ def evaluate(
         "categories": None if categories is None else sorted(_selected(categories)),
         "ticks": len(ticks_s),
         "tick_s": tick_s,
+        "placement": placement,
+        "quarantined": quarantined,
         **_figures(compared, *everywhere),
         "by_range": None if ego is None else _by_range(compared),
         "by_category": _by_category(compared),
@@ -99,7 +125,7 @@ def evaluate(
         "signals": signal_figures(scenario, truth),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
-        "agents": agent_rows(true, ours, compared.match, compared.counted, compared.switched),
+        "agents": agent_rows(compared),
         "false_agents": false_rows(ours, compared.false, matched_ticks(compared, compared.counted)),
         "ignored_agents": ignored_rows(ours, compared.ignored),
     }
@@ -134,7 +160,8 @@ def compare_scenarios(
     _check_range(selection.max_range_m, ego_xy)
     true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
     ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
-    compared = compare(true, ours, _tick_s(ticks_s), selection)
+    stated = truth.provenance.get("visibility") != "computed"
+    compared = compare(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
     return without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
 
 
@@ -174,6 +201,7 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
         "hota": None if tracking is None else tracking.hota,
         "det_a": None if tracking is None else tracking.det_a,
         "ass_a": None if tracking is None else tracking.ass_a,
+        "coverage": coverage(c, truth_selected),
         "counts": {
             "truth_agents": int(agents.sum()),
             "truth_agents_found": int((agents & found).sum()),
@@ -201,7 +229,7 @@ def _by_range(c: Comparison) -> dict[str, Any]:
 
 def _by_category(c: Comparison) -> dict[str, Any]:
     """Compute the figures by category: of the truth for matched ticks, of the reconstructed agent for false ones."""
-    names = set(c.truth.category[c.counted.any(1)]) | set(c.other.category[c.false.any(1)])
+    names = set(c.truth.category[c.asked_for.any(1)]) | set(c.other.category[c.false.any(1)])
     return {
         name: _figures(c, _rows(c.truth.category == name, c.counted), _rows(c.other.category == name, c.false))
         for name in CATEGORIES
@@ -211,6 +239,14 @@ def _by_category(c: Comparison) -> dict[str, Any]:
 
 def _rows(which: Mask, like: Mask) -> Mask:
     return np.broadcast_to(which[:, None], like.shape)
+
+
+def _while_observed(agent: Agent) -> Agent:
+    """Return a static agent without the time before its first and after its last observation."""
+    rows = np.flatnonzero(agent.waypoints.observed)
+    if not agent.static or not len(rows):
+        return agent
+    return replace(agent, waypoints=agent.waypoints.take(slice(rows[0], rows[-1] + 1)))
 
 
 def _selected(categories: Sequence[str] | None) -> frozenset[str]:

@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 
 from log2sim.evaluation.metrics.align import StateTable
-from log2sim.evaluation.metrics.pairs import Index, Mask
+from log2sim.evaluation.metrics.comparison import Comparison, coverage
+from log2sim.evaluation.metrics.pairs import Mask
 from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors
 
 DIGITS = 6
 
 
-def agent_rows(
-    truth: StateTable, other: StateTable, match: Index, counted: Mask, switched: Mask
-) -> list[dict[str, Any]]:
+def agent_rows(c: Comparison) -> list[dict[str, Any]]:
     """Make one row per counted truth agent: its matches and errors; size errors are signed."""
-    errors = state_errors(truth, other, match, counted)
-    rows = []
+    truth, other, counted, switched = c.truth, c.other, c.counted, c.switched
+    errors = state_errors(truth, other, c.match, counted)
+    rows, rows_of = [], np.broadcast_to(np.arange(len(truth.ids))[:, None], counted.shape)
     for i in np.flatnonzero(counted.any(1)):
-        mine = errors.take(errors.truth == i)
+        mine, covered = errors.take(errors.truth == i), coverage(c, rows_of == i)
         ids, ticks = np.unique(mine.other, return_counts=True)
         size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
         headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
@@ -31,6 +31,7 @@ def agent_rows(
                 "category": str(truth.category[i]),
                 "ticks": int(counted[i].sum()),
                 "matched": len(mine.other),
+                **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
                 "matched_ids": {other.ids[j]: int(n) for j, n in zip(ids, ticks)},
                 "id_switches": int(switched[i].sum()),
                 "mean_range_m": float(truth.range_m[i, counted[i]].mean()),

@@ -6,6 +6,7 @@ from typing import Any
 
 from log2sim.datatypes import GROUPS, Scenario
 from log2sim.evaluation.metrics.align import MAX_TRUTH_GAP_S
+from log2sim.evaluation.metrics.comparison import MIN_HIT_POINTS
 from log2sim.evaluation.metrics.label_coverage import MAX_FRAME_LAG_S, MIN_REGION_SHARE
 from log2sim.evaluation.metrics.pairs import GATE_M, GATE_PER_LENGTH
 from log2sim.evaluation.metrics.state_errors import MIN_WALKING_MPS
@@ -50,6 +51,7 @@ def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
         "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
         "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
         "visible or not, counted or not, matches it, but for the ignored ones",
+        "hit": f"within range, selected and at least {MIN_HIT_POINTS} points of all LiDARs in the box, visible or not",
         "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth states that it is complete",
         "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
     }

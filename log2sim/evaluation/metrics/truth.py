@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Labels, Log, Scenario, Sweep, Waypoints
-from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.visibility import PointGrid, image_shares
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, wrap_angle, yaw_of
+from log2sim.localization.choice import localize_like
+from log2sim.logs.opening import is_log_file, open_log
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.registry import nearest
 
@@ -27,7 +31,86 @@ MAX_STATIC_DRIFT_MPS = 0.2
 Progress = Callable[[int, int], None]
 
 
-def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: Progress | None = None) -> Scenario:
+def load_truth(
+    source: Scenario | Log | Path | str,
+    scenario: Scenario,
+    *,
+    sequence: str | None = None,
+    labels: Path | None = None,
+    points: bool = False,
+    progress: Progress | None = None,
+) -> Scenario:
+    """Load the ground truth of a scenario for the cameras that it used; see `truth_at`."""
+    used = [str(c["name"]) for c in scenario.cameras if c.get("used")]
+    return truth_at(
+        source, used if scenario.cameras else None, sequence, provenance=scenario.provenance, labels=labels,
+        points=points, progress=progress,
+    )  # fmt: skip
+
+
+def truth_at(
+    source: Scenario | Log | Path | str,
+    used: Iterable[str] | None,
+    sequence: str | None,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+    labels: Path | None = None,
+    points: bool = False,
+    progress: Progress | None = None,
+) -> Scenario:
+    """Load ground truth from a scenario or a log: its `truth.json`, else its labels in view of the sensors used.
+
+    Parameters
+    ----------
+    source : Scenario, Log, Path or str
+    used : iterable of str or None
+        Cameras that were used, all of the log for None. Without any camera, what the LiDARs show counts as visible.
+    sequence : str or None
+        Of a folder with several.
+    provenance : mapping, optional
+        States the poses by which labels are placed, so that they are in the map of what is compared.
+    labels : Path, optional
+        File with the true boxes of the log; see `log2sim.logs.label_files`.
+    points : bool
+        Whether LiDAR points are counted in all boxes, also where the truth states what is visible.
+    progress : callable, optional
+        As for `truth_from_log`.
+
+    Raises
+    ------
+    LogError
+        When there are no labels, or they cannot be read.
+    """
+    if isinstance(source, Scenario):
+        return source
+    path = None if isinstance(source, Log) else Path(source)
+    if path is not None and not (path.is_dir() or is_log_file(path)):
+        if labels is not None:
+            raise ConfigError(f"--labels {labels}: the labels are of a log; {path} is none")
+        return Scenario.load(path)
+    if path is not None and labels is None and (path / "truth.json").is_file():
+        stated = Scenario.load(path / "truth.json")
+        if not points:
+            return stated
+        try:  # by the poses of the log, in whose map its truth is
+            return with_points(stated, open_log(path, sequence=sequence), progress)
+        except (LogError, ConfigError, MissingExtra):  # what can be compared does not need the sweeps
+            return stated
+    opened = source if isinstance(source, Log) else open_log(source, sequence=sequence, labels=labels)
+    log = localize_like(opened, provenance or {})
+    names = None if used is None else list(used)
+    known = None if names is None else [name for name in names if name in log.cameras]
+    cameras = None if names and not known else known
+    truth = truth_from_log(log, cameras=cameras, points=points, progress=progress)
+    if labels is None:
+        return truth
+    notes = [note for note in log.notes if note.startswith(f"{labels.name}: ")]
+    return replace(truth, provenance={**truth.provenance, "labels": labels.name, "notes": notes})
+
+
+def truth_from_log(
+    log: Log, *, cameras: Sequence[str] | None = None, points: bool = False, progress: Progress | None = None
+) -> Scenario:
     """Make a truth scenario of a log's labeled 3D boxes and its ego poses.
 
     Parameters
@@ -35,6 +118,8 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
     log : Log
     cameras : sequence of str, optional
         Cameras that were used, all by default; only what they show counts as visible.
+    points : bool
+        Whether LiDAR points are counted also where the log states visibility, which needs none.
     progress : callable, optional
         Called with (sweeps done, all sweeps); every sweep is read once.
 
@@ -59,19 +144,18 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
             raise ConfigError(
                 f"unknown camera '{name}'{nearest(name, list(log.cameras))}; known: {', '.join(log.cameras)}"
             )
-    unreadable = 0
+    counts, unreadable = None, 0
+    if log.lidars and (points or labels.visible is None):
+        counts, unreadable = points_in_labels(log, labels, progress)
     if labels.visible is not None:
         visible = np.asarray(labels.visible, dtype=bool)
     else:
-        visible = np.ones(len(labels.t_ns), dtype=bool)
-        if log.lidars:
-            counts, unreadable = points_in_labels(log, labels, progress)
-            visible &= counts >= MIN_POINTS
+        visible = np.ones(len(labels.t_ns), dtype=bool) if counts is None else counts >= MIN_POINTS
         if used:
             visible &= in_some_image(log, labels, used, visible)
     ego_t_ns, map_T_ego = _ego_poses(log)
     t0_ns = int(min([labels.t_ns.min(), *ego_t_ns[:1]]))
-    agents = [_label_agent(labels, visible, rows, t0_ns) for rows in _rows_by_track(labels)]
+    agents = [_label_agent(labels, visible, counts, rows, t0_ns) for rows in _rows_by_track(labels)]
     if len(ego_t_ns):
         agents.insert(0, _ego_agent(log, ego_t_ns, map_T_ego, t0_ns))
     return Scenario(
@@ -153,7 +237,48 @@ def _rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
     return np.split(order, np.flatnonzero(np.diff(track[order])) + 1)
 
 
-def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.int64], t0_ns: int) -> Agent:
+def with_points(truth: Scenario, log: Log, progress: Progress | None = None) -> Scenario:
+    """Return a truth with the LiDAR points of a log in its boxes, which are put where they were at the time of the sweep.
+
+    A waypoint gets the points of the sweeps nearest to it within `MAX_LAG_S`; where the log has no LiDAR, nothing changes.
+    """
+    streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
+    done, total = 0, sum(len(stream.t_ns) for _, stream in streams)
+    totals = [np.zeros(len(agent.waypoints)) for agent in truth.others]
+    for name, stream in streams:
+        states = [agent.at((stream.t_ns - truth.t0_ns) / NS_PER_S) for agent in truth.others]
+        counts = np.zeros((len(states), len(stream.t_ns)))
+        for i in range(len(stream.t_ns)):
+            rows = [k for k, state in enumerate(states) if state.valid[i]]
+            try:
+                mapped = sweep_to_map(log, name, stream.read(i), compensate=True) if rows else None
+            except RecordError:
+                mapped = None
+            grid = PointGrid(np.zeros((0, 3)) if mapped is None else mapped[0])
+            for k in rows:
+                s = states[k]
+                center = np.array([s.x_m[i], s.y_m[i], s.z_m[i]])
+                counts[k, i] = grid.count(center, np.array(truth.others[k].size_m), float(s.yaw_rad[i]))
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        for k, agent in enumerate(truth.others):
+            t_ns = truth.t0_ns + np.round(agent.waypoints.t_s * NS_PER_S).astype(np.int64)
+            index, near = nearest_record(stream.t_ns, t_ns)
+            totals[k] += np.where(near, counts[k, index], 0) if len(stream.t_ns) else 0
+    if not streams:
+        return truth
+    agents = [replace(a, waypoints=replace(a.waypoints, lidar_points=n)) for a, n in zip(truth.others, totals)]
+    return replace(truth, agents=(*([truth.ego] if truth.ego is not None else []), *agents))
+
+
+def _label_agent(
+    labels: Labels,
+    visible: NDArray[np.bool_],
+    points: NDArray[np.int64] | None,
+    rows: NDArray[np.int64],
+    t0_ns: int,
+) -> Agent:
     center, yaw = labels.center_m[rows], np.asarray(labels.yaw_rad[rows], dtype=np.float64)
     t_s = (labels.t_ns[rows] - t0_ns) / NS_PER_S
     static = is_static(t_s, center[:, :2])
@@ -165,7 +290,10 @@ def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.in
         id=track_id if track_id != "ego" else "label-ego",
         category=str(labels.category[rows[0]]),
         size_m=(length, width, height),
-        waypoints=_waypoints(t_s, center, yaw, speed, visible[rows]),
+        waypoints=replace(
+            _waypoints(t_s, center, yaw, speed, visible[rows]),
+            lidar_points=None if points is None else points[rows].astype(np.float64),
+        ),
         static=static,
     )
 
@@ -263,5 +391,6 @@ def _provenance(log: Log, cameras: Sequence[str], labels: Labels, unreadable: in
         "digest": log.digest,
         "cameras": list(cameras),
         "visible": rule,
+        "visibility": "stated" if stated else "computed",
         "unreadable_sweeps": unreadable,
     }

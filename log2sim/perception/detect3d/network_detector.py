@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config_sections import LidarConfig
-from log2sim.datatypes import Boxes3D, Log
+from log2sim.datatypes import GROUPS, Boxes3D, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach, most_points, points_of_boxes
@@ -26,6 +27,28 @@ from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.ground import ON_GROUND_M
 
 WEIGHTS = Path(__file__).parent / "weights"
+# A network that finds less than half of most groups of road users is named as weak.
+MIN_GROUP_RECALL = 0.5
+
+
+def describe_weakness(name: str) -> str:
+    """State what a shipped network finds and turns round in simulated sweeps if it misses most groups of road users, else nothing.
+
+    The figures are those of the JSON file next to its weights.
+    """
+    file = WEIGHTS / f"{name.removeprefix('lidar:')}.json"
+    if not name.startswith("lidar:") or name.endswith(".onnx") or not file.is_file():
+        return ""
+    card = json.loads(file.read_text(encoding="utf-8"))["simulated"]
+    groups = {group: card[group] for group in GROUPS if group in card}
+    if 2 * sum(row["recall"] < MIN_GROUP_RECALL for row in groups.values()) <= len(groups):
+        return ""
+    found = ", ".join(f"{row['recall']:.0%} of {group.replace('_', '-')}s" for group, row in groups.items())
+    turned = ", ".join(f"{row['headings_flipped']:.0%}" for row in groups.values())
+    return (
+        f"{name} finds {found} within {card['max_range_m']:g} m in a simulated sweep at a score of {card['score']:g}; backwards "
+        f"are {turned} of them, before the motion over several sweeps turns those that move"
+    )
 
 
 @dataclass(frozen=True, eq=False)

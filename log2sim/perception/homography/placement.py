@@ -51,3 +51,18 @@ def place_obstacle(
     covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * GROUND_POSITION_SIGMA_M**2
     covariance = covariance + depth_sigma**2 * np.outer(direction, direction)
     return xy[0] + direction * depth, covariance
+
+
+def spanned_height_m(ground_H_image: Array, camera: Camera, box_px: Array, base_T_cam: Array) -> float:
+    """Return the height that a box (4,) spans above its foot, m; NaN where it is seen straight from above.
+
+    The pose of the camera (4, 4) is that in the frame of the ground positions.
+    """
+    middle = (box_px[0] + box_px[2]) / 2
+    uv = undistorted_pixels(camera, np.array([[middle, box_px[1]], [middle, box_px[3]]]))
+    rays = np.column_stack([uv, np.ones(2)]) @ np.linalg.inv(camera.K).T @ base_T_cam[:3, :3].T
+    across = np.hypot(rays[:, 0], rays[:, 1])
+    if not across.all():
+        return float("nan")
+    foot_xy = apply_homography(ground_H_image, uv[1:])[0][0]
+    return float(-np.diff(rays[:, 2] / across)[0] * np.hypot(*(foot_xy - base_T_cam[:2, 3])))
