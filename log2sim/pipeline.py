@@ -9,39 +9,39 @@ from typing import Any
 import numpy as np
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.confidence.rating import rate_agents
-from log2sim.agents.ego import ego_agent, ego_path, with_pose_errors
-from log2sim.agents.estimate import estimate_agents
-from log2sim.agents.heading.decide import decide_headings
-from log2sim.agents.observers import with_observers
-from log2sim.agents.plausibility.judge import judge
-from log2sim.agents.plausibility.recording import Recording
-from log2sim.agents.plausibility.static_life import extend_static
-from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
-from log2sim.agents.simplify import simplify
-from log2sim.calibration.check import check_calibration
+from log2sim.agents.confidence import rate_agents
+from log2sim.agents.conflicts import extend_static
+from log2sim.agents.estimate import (
+    camera_entries,
+    ego_agent,
+    ego_path,
+    estimate_agents,
+    provenance_of,
+    scenario_of,
+    simplify,
+    with_observers,
+    with_pose_errors,
+)
+from log2sim.agents.evidence import Recording
+from log2sim.agents.heading import decide_headings
+from log2sim.agents.judge import judge
 from log2sim.config import Config
-from log2sim.cooperation.registration import register_road
 from log2sim.datatypes import ENDS, Agent, Fault, Log, Measurements, Scenario, Track
-from log2sim.describe import Recorded, describe
 from log2sim.errors import NothingToReconstruct
-from log2sim.fusion_level import FusionLevel
-from log2sim.localization.choice import localize
-from log2sim.localization.pose_choice import GIVEN, PoseChoice
-from log2sim.logs.time_checks import say_without_pose
-from log2sim.outcome import RunOutputs, stage_outcomes
+from log2sim.files.stages import StageClock
+from log2sim.localization.choice import GIVEN, PoseChoice, localize
+from log2sim.localization.mounts import check_calibration
+from log2sim.localization.roadside import register_road
+from log2sim.logs.checks import say_without_pose
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
-from log2sim.perception.given_detectors import GivenDetector, sort_detectors
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
+from log2sim.perception.run_detectors import Detectors, GivenDetector, create_detectors, sort_detectors
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.plan import Plan, Stage, make_plan
-from log2sim.report import extended_report, report_of
-from log2sim.run_detectors import Detectors, create_detectors
-from log2sim.sensors import Sensors, choose_detector, select_sensors
-from log2sim.stage_clock import StageClock
-from log2sim.tracking.merging import track_ends
-from log2sim.tracking.recorded import mark_unrecorded
+from log2sim.plan import FusionLevel, Plan, Sensors, Stage, choose_detector, make_plan, select_sensors
+from log2sim.report import RunOutputs, extended_report, report_of, stage_outcomes
+from log2sim.road.describe import Recorded, describe
+from log2sim.tracking.tracker import mark_unrecorded, track_ends
 
 Progress = Callable[[str, int, int], None]
 

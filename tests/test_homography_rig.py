@@ -12,11 +12,20 @@ from log2sim.geometry import Camera, PoseTrack, apply, apply_homography, inverse
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
-from log2sim.perception.homography.rig import Rig, RigState, foot_homography, road_homography, rotation_of
-from log2sim.perception.homography.rig_feet import fit_feet
-from log2sim.perception.homography.rig_fit import RigFit, fit_rig
-from log2sim.perception.homography.rig_plane import HeightRows, find_plane, tilt_of_ticks
-from log2sim.perception.homography.rig_rows import RigRows, heights_of, linearize_feet
+from log2sim.perception.homography.rig import (
+    HeightRows,
+    Rig,
+    RigRows,
+    RigState,
+    find_plane,
+    foot_homography,
+    heights_of,
+    linearize_feet,
+    road_homography,
+    rotation_of,
+    tilt_of_ticks,
+)
+from log2sim.perception.homography.rig_fit import RigFit, fit_feet, fit_rig
 from log2sim.perception.homography_stage import fit_homographies, list_rigs
 from log2sim.plan import HomographyScope, Plan
 

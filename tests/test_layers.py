@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import log2sim
-from log2sim import late_functions
 from log2sim.cli import app
+from log2sim.files import plugins
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -110,7 +110,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         log2sim.recontruct  # noqa: B018
 
 
-@pytest.mark.parametrize("place", late_functions.FUNCTIONS.values())
+@pytest.mark.parametrize("place", plugins.LATE_FUNCTIONS.values())
 def test_late_functions_are_of_higher_rooms_and_exist(place: str) -> None:
     module, _, name = place.partition(":")
     assert callable(getattr(importlib.import_module(module), name))

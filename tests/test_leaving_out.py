@@ -14,30 +14,27 @@ from worlds import CAR, PARKED, scan, standing, tiny_log
 
 import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
+import log2sim.perception.run_detectors
 import log2sim.pipeline
 import log2sim.plan
-import log2sim.run_detectors
-import log2sim.sensors
 from log2sim import Config, Scenario, reconstruct, replay
+from log2sim.agents.estimate import simplify_waypoints
 from log2sim.agents.hypotheses import Part
-from log2sim.agents.simplify import simplify_waypoints
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
-from log2sim.documents import check
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.files.documents import check
+from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack, transform
-from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse_tick
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
-from log2sim.perception.lidar.cloud import is_at_rest, sweep_to_map
-from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
 from log2sim.pipeline import Result, first_pass, second_pass, start
-from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan
-from log2sim.sensors import select_sensors
-from log2sim.stage_clock import StageClock
+from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.report import RunOutputs, stage_outcomes
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
@@ -214,7 +211,7 @@ def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyP
     assert not step["kept"]
     assert "post" in step["reason"]
     assert not reads
-    monkeypatch.setattr(log2sim.sensors, "MAX_LIDAR_RANGE_M", 1e9)
+    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
     full = run(log)
     assert entry(full, "use of every LiDAR")["kept"]
     assert sum(reads.values()) > 5
@@ -281,7 +278,7 @@ class Counting:
 
 def run_counting(log: Log, monkeypatch: pytest.MonkeyPatch, stride: int | None = None) -> tuple[Result, Counting]:
     detector = Counting(log)
-    monkeypatch.setattr(log2sim.run_detectors, "create_detector", lambda *a, **k: detector)
+    monkeypatch.setattr(log2sim.perception.run_detectors, "create_detector", lambda *a, **k: detector)
     if stride is not None:
         monkeypatch.setattr(log2sim.plan, "min_hits", lambda *a: stride)
     result = run(log, Config.load(detect={"name": "counting.onnx"}))

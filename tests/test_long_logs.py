@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
-from log2sim import Config, array_file
+from log2sim import Config
 from log2sim.datatypes import Log
+from log2sim.files import arrays
 from log2sim.pipeline import first_pass, second_pass, start
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -52,7 +53,7 @@ def test_a_looped_log_goes_on_where_it_ended() -> None:
 @pytest.mark.slow
 def test_what_is_held_of_a_tick_is_far_less_than_what_is_kept_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     log, _ = tiny_log()
-    monkeypatch.setattr(array_file, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(arrays, "MEMORY_BYTES", 0)
     (few, short), (many, long) = held_after(log, 2), held_after(log, 6)
     # All in memory, it is 90 KB a tick.
     assert (long - short) / (many - few) < 20_000

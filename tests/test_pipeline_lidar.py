@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from worlds import CAR, PARKED, WALKER, tiny_log, tiny_table
 
-from log2sim.config import Config
-from log2sim.config_sections import LidarConfig
+from log2sim.config import Config, LidarConfig
 from log2sim.datatypes import Agent, Boxes3D, Detections, Frame, Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.metrics.evaluator import evaluate

@@ -9,16 +9,21 @@ import pytest
 from test_overlap import agent, candidate
 from worlds import rows_at
 
-from log2sim.agents.candidate import Timeline
-from log2sim.agents.plausibility.box_table import BoxTable
-from log2sim.agents.plausibility.dimensions import doubt_size
-from log2sim.agents.plausibility.evidence import image_height_share, weigh
-from log2sim.agents.plausibility.free_space import Ending, classify_rays, count_rays
-from log2sim.agents.plausibility.points import contradict, is_refuted, missing_nats, usual_detection_rate
-from log2sim.agents.plausibility.recording import Recording
-from log2sim.agents.plausibility.structure import find_surface, structure_shares
-from log2sim.agents.plausibility.views import shown_in_images
-from log2sim.agents.support import Support
+from log2sim.agents.candidate import Support, Timeline
+from log2sim.agents.evidence import (
+    BoxTable,
+    Ending,
+    Recording,
+    classify_rays,
+    count_rays,
+    doubt_size,
+    find_surface,
+    image_height_share,
+    shown_in_images,
+    structure_shares,
+    weigh,
+)
+from log2sim.agents.judge import contradict, is_refuted, missing_nats, usual_detection_rate
 from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Rays, Stream, Track
 from log2sim.geometry import NS_PER_S, Camera, transform
 from log2sim.perception.sync import Schedule

@@ -11,7 +11,7 @@ import pytest
 
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
-from log2sim.logs.guarding import translate_parser_errors
+from log2sim.logs.records import translate_parser_errors
 from log2sim.perception.sync import Schedule
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))

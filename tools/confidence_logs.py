@@ -21,18 +21,17 @@ import numpy as np
 
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Detections, Frame, Log, Scenario, Stream
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.truth import points_in_labels, truth_from_log
+from log2sim.files.stages import StageClock
 from log2sim.geometry import Array, nearest_index
-from log2sim.log_odds import probability_of
-from log2sim.perception.detect.labels import MIN_SIDE_PX
+from log2sim.perception.detect.detectors import MIN_SIDE_PX
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
+from log2sim.perception.run_detectors import Detectors
 from log2sim.pipeline import Run, first_pass, second_pass, start
-from log2sim.run_detectors import Detectors
-from log2sim.stage_clock import StageClock
 from log2sim.synth.traffic import TrafficScene
-from log2sim.synth.traffic_data import TrafficSettings, draw_traffic
-from log2sim.synth.traffic_log import log_of
+from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, log_of
 
 # Ticks a second, and how long a log of that rate lasts, s.
 RATES = ((10.0, 2.5), (10.0, 4.5), (5.0, 6.0), (2.0, 9.0))

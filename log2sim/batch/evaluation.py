@@ -12,9 +12,8 @@ from typing import Any
 from log2sim.batch.discovery import FoundLog, find_logs
 from log2sim.batch.folder import LOGS, SCENARIO_FILE, BatchFolder
 from log2sim.datatypes import Scenario
-from log2sim.documents import rounded
 from log2sim.errors import Log2SimError, LogError
-from log2sim.evaluation.metrics.clear_mot import mota
+from log2sim.evaluation.metrics.comparison import mota
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import (
     MAX_NAMED,
@@ -25,6 +24,7 @@ from log2sim.evaluation.metrics.table import (
     recall_text,
     verdict_text,
 )
+from log2sim.files.documents import rounded
 
 Figures = dict[str, Any]
 LoadTruth = Callable[[FoundLog, Scenario], Scenario]

@@ -58,10 +58,10 @@ def export(
     log2sim export s.json --to rerun --log samples/crossing -o rerun/
     """
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_folder
     from log2sim.export.checks import doubtful_note, export_notes
     from log2sim.export.exporters import Options, with_doubtful, with_ego
     from log2sim.export.exporters import export as run
+    from log2sim.files.documents import check_folder
     from log2sim.logs.opening import open_log
 
     check_folder(out, overwrite=overwrite)

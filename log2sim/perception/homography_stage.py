@@ -8,18 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.config_sections import TopdownConfig
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
 from log2sim.perception.first_pass import Observations, base_pose
-from log2sim.perception.homography.camera_fit import fit_camera
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import STREAM_METHODS, EstimationOptions
+from log2sim.perception.homography.estimate import (
+    STREAM_METHODS,
+    EstimationOptions,
+    fit_camera,
+    place_obstacle,
+    spanned_height_m,
+)
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
-from log2sim.perception.homography.placement import place_obstacle, spanned_height_m
-from log2sim.perception.homography.rig import Rig
+from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
-from log2sim.perception.homography.rig_plane import SAMPLES
 from log2sim.plan import HomographyScope, Plan
 
 # A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Trajectory
-from log2sim.datatypes.trajectory import hermite
+from log2sim.datatypes.agent import hermite
 from log2sim.geometry import Array
 from log2sim.simulation.feasible_trajectory import (
     KNOT_S,

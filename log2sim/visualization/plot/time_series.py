@@ -25,8 +25,8 @@ from log2sim.visualization.plot.layout import (
     TIME_IN,
     FigureLayout,
 )
-from log2sim.visualization.plot.roles import AgentRole, AgentRoles
 from log2sim.visualization.plot.style import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable
+from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 
 KMH = 3.6
 
