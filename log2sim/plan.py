@@ -40,7 +40,6 @@ class Sensors:
         Those of the settings, or all; none where LiDAR sweeps alone are searched.
     lidars : tuple of str
         Those within range of the ego's path.
-    lidars_out_of_range : tuple of str
     """
 
     cameras: tuple[str, ...]
@@ -291,8 +290,6 @@ class Decision:
 
     Attributes
     ----------
-    stage : Stage
-    kept : bool
     reason : str
         For people; nothing is decided by it.
     """
@@ -340,6 +337,11 @@ class Plan:
     def keeps(self, stage: Stage) -> bool:
         """Return whether a stage runs."""
         return any(d.kept for d in self.decisions if d.stage is stage)
+
+    def only_agents(self) -> Plan:
+        """Return a plan without the stages that describe the scenario beyond the motion of its agents."""
+        left_out = (replace(d, kept=False) if d.stage in DESCRIBING else d for d in self.decisions)
+        return replace(self, decisions=tuple(left_out))
 
     def variant(self, decision: Decision) -> Plan:
         """Return a plan with another decision about one stage, for benchmarks that compare plans."""

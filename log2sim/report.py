@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,41 +17,23 @@ from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Outcome, Plan, Stage
-from log2sim.road.describe import Description
 from log2sim.version import __version__
 
 
-@dataclass(frozen=True, eq=False)
-class RunOutputs:
-    """What the stages of a finished run returned.
-
-    Attributes
-    ----------
-    observations : Observations
-    measurements : sequence of Measurements
-        Fused, by tick.
-    homographies : mapping of str to CameraHomography
-        By camera.
-    agents : tuple of Agent
-        Without the ego.
-    clock : StageClock
-    """
-
-    observations: Observations
-    measurements: Sequence[Measurements]
-    homographies: Mapping[str, CameraHomography]
-    agents: tuple[Agent, ...]
-    clock: StageClock
-
-
-def stage_outcomes(plan: Plan, outputs: RunOutputs) -> tuple[Outcome, ...]:
+def stage_outcomes(
+    plan: Plan,
+    observations: Observations,
+    homographies: Mapping[str, CameraHomography],
+    agents: Sequence[Agent],
+    clock: StageClock,
+) -> tuple[Outcome, ...]:
     """Join the decisions of a plan with what the stages did, in the plan's order, but for those that describe the scenario."""
     found: Mapping[Stage, Callable[[Decision], Outcome]] = {
-        Stage.MOTION_COMPENSATION: lambda d: _compensation(d, outputs.observations),
-        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, plan.picture_stride, outputs),
-        Stage.HOMOGRAPHY: lambda d: _homography(d, plan.homography, outputs.homographies),
-        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(outputs.agents),
-        Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(outputs.agents),
+        Stage.MOTION_COMPENSATION: lambda d: _compensation(d, observations),
+        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, plan.picture_stride, observations, clock),
+        Stage.HOMOGRAPHY: lambda d: _homography(d, plan.homography, homographies),
+        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(agents),
+        Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(agents),
     }
     return tuple(found.get(d.stage, Outcome)(d) for d in plan.decisions if d.stage not in DESCRIBING)
 
@@ -71,8 +52,8 @@ def _compensation(planned: Decision, observations: Observations) -> Outcome:
     return Outcome(planned)
 
 
-def _detection(planned: Decision, picture_stride: int, outputs: RunOutputs) -> Outcome:
-    observations, seconds = outputs.observations, outputs.clock.seconds
+def _detection(planned: Decision, picture_stride: int, observations: Observations, clock: StageClock) -> Outcome:
+    seconds = clock.seconds
     skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
     if planned.kept or not detected:
         return Outcome(planned)
@@ -95,13 +76,13 @@ def _homography(planned: Decision, scope: HomographyScope, homographies: Mapping
     return Outcome(Decision(planned.stage, True, f"{planned.reason}: {', '.join(homographies)}"))
 
 
-def _static(agents: tuple[Agent, ...]) -> Outcome:
+def _static(agents: Sequence[Agent]) -> Outcome:
     static = sum(a.static for a in agents)
     reason = f"{static} of {len(agents)} agents are static: one pose for each" if static else "no agent is static"
     return Outcome(Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, not static, reason))
 
 
-def _waypoints(agents: tuple[Agent, ...]) -> Outcome:
+def _waypoints(agents: Sequence[Agent]) -> Outcome:
     stage, left_out = Stage.WAYPOINT_AT_EVERY_TICK, sum(a.quality.get("waypoints_left_out", 0) for a in agents)
     if not left_out:
         return Outcome(Decision(stage, True, "no agent moves straight at constant speed"))
@@ -117,12 +98,14 @@ def report_of(
     log: Log,
     config: Config,
     schedule: Schedule,
-    outputs: RunOutputs,
+    observations: Observations,
+    measurements: Sequence[Measurements],
+    homographies: Mapping[str, CameraHomography],
     outcomes: Sequence[Outcome],
     scenario: Scenario,
+    clock: StageClock,
 ) -> dict[str, Any]:
-    """Assemble the report of a finished run."""
-    clock, observations = outputs.clock, outputs.observations
+    """Assemble what a report says of the stages of a finished run."""
     ticks = len(schedule)
     return {
         "report_version": 1,
@@ -134,22 +117,10 @@ def report_of(
         "plan": [outcome.to_report() for outcome in outcomes],
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
         "without_pose": _without_pose(log, schedule),
-        "unreadable": observations.records.summary() if observations.records is not None else {},
         "detections": observations.detections,
-        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in outputs.homographies.items()},
-        "measurements": _measurement_counts(outputs.measurements),
+        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
+        "measurements": _measurement_counts(measurements),
         "agents": _agent_counts(scenario),
-    }
-
-
-def extended_report(report: dict[str, Any], description: Description, clock: StageClock) -> dict[str, Any]:
-    """Return the report of a run whose scenario was described since, with the times of all stages."""
-    return {
-        **report,
-        **_times(clock, report["ticks"]),
-        "plan": [*report["plan"], *(outcome.to_report() for outcome in description.outcomes)],
-        "unreadable": {**description.reader.summary(), **report["unreadable"]},
-        **description.figures,
     }
 
 

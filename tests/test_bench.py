@@ -47,7 +47,7 @@ from log2sim.perception.detect.onnx_detector import OnnxDetector, OnnxModel
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
-from log2sim.pipeline import schedule_of
+from log2sim.perception.sync import schedule_of
 from log2sim.plan import choose_detector, select_sensors
 
 FirstPass = tuple[BenchContext, Observations, dict[str, float]]
@@ -452,7 +452,7 @@ def test_every_frame_is_decoded_and_detected_once(tiny: tuple[Log, Scenario]) ->
     log = replace(
         log, streams={**log.streams, "front": replace(stream, read=lambda k: (decoded.append(k), stream.read(k))[1])}
     )
-    schedule = schedule_of(log, LABELS, select_sensors(log, LABELS))
+    schedule = schedule_of(log, select_sensors(log, LABELS).cameras, LABELS)
     detectors = {"a": Counting(), "b": Counting()}
     told: list[tuple[int, int]] = []
     found, decoding_s = detect_once(
@@ -488,7 +488,7 @@ def test_unreadable_frames_have_no_detections_and_none_at_all_is_an_error(tiny: 
 
         return replace(log, streams={**log.streams, "front": replace(stream, read=read)})
 
-    schedule = schedule_of(log, LABELS, select_sensors(log, LABELS))
+    schedule = schedule_of(log, select_sensors(log, LABELS).cameras, LABELS)
     found, _ = detect_once(broken(3), schedule, {"a": Counting()}, decode=True, progress=lambda done, total: None)
     assert len(found["a"].found) == len(schedule) - 3
     with pytest.raises(LogError, match="none of the 10 records asked for can be read"):
@@ -649,7 +649,7 @@ def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: p
     def interrupted(*arguments: Any, **options: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("log2sim.evaluation.bench.runs.second_pass", interrupted)
+    monkeypatch.setattr("log2sim.evaluation.bench.runs.infer_scenario", interrupted)
     ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--quiet")
     assert ran.code == 130
     assert "interrupted" in ran.err

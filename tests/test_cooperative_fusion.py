@@ -14,7 +14,7 @@ from plain_settings import AGENTS_ALONE
 from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.agents.size import Ends, _better_ends
-from log2sim.config import Config, LidarConfig
+from log2sim.config import Config, LidarConfig, TrackConfig
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.errors import LogError
 from log2sim.evaluation.bench.benchmark import bench, document
@@ -370,8 +370,8 @@ def test_both_ends_share_the_life_of_a_short_track() -> None:
         return [track.measurements.take(track.tick == k) if k in track.tick else empty for k in ticks]
 
     a, b = track_of([2, 3, 4], line([2, 3, 4], 5.0)), track_of([5, 6, 7], line([5, 6, 7], 5.0), end=1)
-    options = {"birth_score": 0.4, "max_gap_s": 1.0, "min_life_s": 0.5}
-    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), **options)
+    config = TrackConfig(birth_score=0.4, max_gap_s=1.0, min_life_s=0.5)
+    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), config)
     assert found.tick.tolist() == [2, 3, 4, 5, 6, 7]
 
 

@@ -36,7 +36,7 @@ from log2sim.perception.detection_cache import (
     to_bytes,
 )
 from log2sim.perception.first_pass import Observations
-from log2sim.pipeline import Run, first_pass, start
+from log2sim.pipeline import Run, observe_log, start
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = bytes(range(16))
@@ -128,7 +128,7 @@ def entries(folder: Path) -> list[Path]:
 def look(log: Log, settings: Config | None = None, *, cache: bool = True) -> tuple[Run, Observations]:
     """Run the first pass alone."""
     run = start(log, settings or config(), cache=cache)
-    return run, first_pass(run)
+    return run, observe_log(run)
 
 
 def assert_same_observations(one: Observations, other: Observations) -> None:
@@ -247,12 +247,12 @@ def test_a_function_is_asked_once_where_it_states_what_it_depends_on(tiny_folder
 
     log = open_log(tiny_folder)
     for expected in (TICKS, 2 * TICKS):
-        first_pass(start(log, config(), detector=find))
+        observe_log(start(log, config(), detector=find))
         assert len(asked) == expected
     find.cache_key = "find 1"  # type: ignore[attr-defined]
     for min_score, expected in ((0.0, 3 * TICKS), (0.0, 3 * TICKS), (0.5, 4 * TICKS)):
         detect = {"name": "seeing", "min_score": min_score}
-        first_pass(start(log, config(detect=detect), detector=find))
+        observe_log(start(log, config(detect=detect), detector=find))
         assert len(asked) == expected
 
 

@@ -21,9 +21,9 @@ import imports  # noqa: E402
 
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (
-    "errors", "version", "plugin_checks", "registry", "threads", "late_functions", "log_odds", "numerals", "array_file", "input_files", "links", "cache_folder", "disk_cache", "outputs", "output_folders", "output_claims", "json_keys", "documents", "model_errors", "geometry", "datatypes", "color_names", "stage_clock", "config_sections", "config", "logs",
-    "synth", "tracking", "sensors", "fusion_level", "plan", "perception", "localization", "calibration", "cooperation", "agents", "mapping", "lanes", "appearance", "signals", "outcome", "describe", "report", "run_detectors", "pipeline", "prediction", "simulation", "edit", "export",
-    "visualization", "evaluation", "batch", "cli", "__init__", "__main__",
+    "errors", "version", "files", "geometry", "datatypes", "config", "logs", "synth", "tracking", "plan", "perception", "localization",
+    "agents", "road", "report", "pipeline", "prediction", "simulation", "edit", "export", "visualization", "evaluation", "batch", "cli",
+    "__init__", "__main__",
 )  # fmt: skip
 
 

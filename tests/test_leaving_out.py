@@ -20,6 +20,7 @@ import log2sim.plan
 from log2sim import Config, Scenario, reconstruct, replay
 from log2sim.agents.estimate import simplify_waypoints
 from log2sim.agents.hypotheses import Part
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
@@ -29,12 +30,11 @@ from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse_tick
-from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
 from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
-from log2sim.pipeline import Result, first_pass, second_pass, start
+from log2sim.pipeline import Result, infer_scenario, observe_log, start
 from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
-from log2sim.report import RunOutputs, stage_outcomes
+from log2sim.report import stage_outcomes
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
@@ -375,7 +375,7 @@ def test_a_look_that_could_not_be_read_found_nothing_out(both: Log, monkeypatch:
 def test_without_need_no_homography_is_fitted_and_nothing_changes(tiny: Log) -> None:
     without, every_camera = run(tiny), start(tiny, LABELS)
     every_camera = replace(every_camera, plan=replace(every_camera.plan, homography=HomographyScope.ALL_CAMERAS))
-    full = second_pass(every_camera, first_pass(every_camera))
+    full = infer_scenario(every_camera, observe_log(every_camera))
     step = entry(without, "homography")
     assert not step["kept"]
     assert without.report["homography"] == {}
@@ -395,7 +395,7 @@ def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> Non
     plan = plan_of(both)
     for bottom_px, wanted in ((250.0, {"back"}), (297.0, {"back"}), (298.0, set()), (300.0, set())):
         seen = Observations(measurements=[lost("back", bottom_px)], obstacles=[None])
-        fits = fit_homographies(both, seen, plan, EstimationOptions(), rng=np.random.default_rng(0))
+        fits = fit_homographies(both, seen, plan, TopdownConfig(), rng=np.random.default_rng(0))
         assert set(fits) == wanted
 
 
@@ -589,7 +589,7 @@ def test_the_time_saved_by_skipped_frames_is_that_of_the_others() -> None:
     clock.seconds.update({"decode": 1.0, "detect": 3.0})
     observations = Observations(frames_detected=40, frames_skipped={"back": 20})
     plan = Plan(("back",), (Decision(Stage.DETECTION_IN_EVERY_FRAME, False, "empty frames are skipped"),))
-    (outcome,) = stage_outcomes(plan, RunOutputs(observations, [], {}, (), clock))
+    (outcome,) = stage_outcomes(plan, observations, {}, (), clock)
     assert outcome.saved_s == pytest.approx(20 * 4.0 / 40)
     assert "20 of 60 frames" in outcome.decision.reason
 

@@ -14,7 +14,7 @@ from worlds import tiny_log
 from log2sim import Config
 from log2sim.datatypes import Log
 from log2sim.files import arrays
-from log2sim.pipeline import first_pass, second_pass, start
+from log2sim.pipeline import infer_scenario, observe_log, start
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from looped_log import loop_log
@@ -26,8 +26,8 @@ def held_after(log: Log, times: int) -> tuple[int, int]:
     tracemalloc.start()
     run = start(loop_log(log, times), config)
     before = tracemalloc.get_traced_memory()[0]
-    observations = first_pass(run)
-    result = second_pass(run, observations)
+    observations = observe_log(run)
+    result = infer_scenario(run, observations)
     gc.collect()
     held = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()

@@ -21,8 +21,7 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception import first_pass
 from log2sim.perception.fusion import PAIR_WEIGHTS, ImageMatches, PairWeights, logit
 from log2sim.perception.lidar.projection import View
-from log2sim.pipeline import first_pass as run_first_pass
-from log2sim.pipeline import start
+from log2sim.pipeline import observe_log, start
 from log2sim.synth.scene import load_scene
 from log2sim.synth.synthesis import synthesize
 
@@ -45,7 +44,7 @@ def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, N
 
     first_pass.match_boxes = match
     try:
-        run_first_pass(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
+        observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
     finally:
         first_pass.match_boxes = original
     parts = [_features(boxes, matches, truth) for boxes, matches in found]

@@ -98,7 +98,6 @@ def is_confirmed(track: Track, *, typical: bool, followed: float = 0.0) -> bool:
 
     Parameters
     ----------
-    track : Track
     typical : bool
         Whether the size is likely for the category; an unlikely size needs a higher confidence.
     followed : float
@@ -172,7 +171,6 @@ def followed_confidence(track: Track, xy_m: Array) -> float:
 
     Parameters
     ----------
-    track : Track
     xy_m : (n, 2) float64
         Places in rising time that were free when the box was not there, and where points fit it without a detection.
 
@@ -240,7 +238,6 @@ class AgentCandidate:
 
     Attributes
     ----------
-    agent : Agent
     evidence : float
         Sum of the scores of its detections; in nats, with all other evidence, once it is weighed.
     confirmed : bool

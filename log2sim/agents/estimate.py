@@ -23,7 +23,6 @@ from log2sim.datatypes import (
     Agent,
     Log,
     Obstacles,
-    Scenario,
     Span,
     Track,
     Waypoints,
@@ -233,28 +232,6 @@ def _is_linear(t: Array, columns: Array, tolerances: Array, start: int, end: int
     share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])
     line = columns[start] + share[:, None] * (columns[end] - columns[start])
     return bool((np.abs(columns[start + 1 : end] - line) <= tolerances[start + 1 : end]).all())
-
-
-def scenario_of(
-    log: Log,
-    t_ns: NDArray[np.int64],
-    agents: Sequence[Agent],
-    *,
-    cameras: Sequence[Mapping[str, Any]],
-    stages: Sequence[Mapping[str, Any]],
-    provenance: Mapping[str, Any],
-) -> Scenario:
-    """Assemble the record that `scenario.json` holds, of the ticks `t_ns` (T,); the ego, if any, is its first agent."""
-    return Scenario(
-        name=log.name,
-        t0_ns=int(t_ns[0]),
-        duration_s=float((t_ns[-1] - t_ns[0]) / NS_PER_S),
-        agents=tuple(agents),
-        map=log.map,
-        cameras=tuple(cameras),
-        stages=tuple(stages),
-        provenance=provenance,
-    )
 
 
 def provenance_of(log: Log, config: Config, detector: str, poses: Mapping[str, Any]) -> dict[str, Any]:

@@ -87,11 +87,9 @@ class Recording:
 
     Attributes
     ----------
-    log : Log
     schedule : Schedule
         Its cameras are those that were searched.
     clouds : T Obstacles, None at ticks without LiDAR
-    timeline : Timeline
     """
 
     log: Log

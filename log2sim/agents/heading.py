@@ -113,8 +113,6 @@ def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tup
 
     Parameters
     ----------
-    track : Track
-    waypoints : Waypoints
     t_s : (n,) float64, s
         Times of the n measurements of the track since the start.
     size_m : (3,) tuple of float, m
@@ -244,7 +242,6 @@ def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -
         x, y in m and yaw in rad.
     paths : sequence of (K, 3) float64
         As in `side_log_odds`.
-    keeps_right : bool
 
     Notes
     -----
@@ -478,7 +475,6 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
         With a yaw, known up to half a turn, and a speed along it.
     ego_path : (K, 3) float64
         x, y and heading of the ego.
-    timeline : Timeline
 
     Notes
     -----

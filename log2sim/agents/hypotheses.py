@@ -295,7 +295,6 @@ class Part:
 
     Attributes
     ----------
-    track : Track
     static : bool
         Whether it stands.
     at_place : Track, optional

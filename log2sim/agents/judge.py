@@ -205,7 +205,6 @@ def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Re
         Of all tracks.
     ego : Agent, optional
         At its place there is no other agent.
-    recording : Recording
     """
     t_s = recording.t_s
     weighed = weigh(confirm(candidates), recording)

@@ -107,7 +107,6 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
         Map frame.
     t_ns : (T,) int64
         Stamps of the sweeps.
-    config : TrackConfig
 
     Notes
     -----
@@ -168,7 +167,6 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
 
     Parameters
     ----------
-    category : str
     w : Waypoints
         One at every tick.
     """

@@ -66,7 +66,6 @@ class LidarMatch:
 
     Attributes
     ----------
-    tick : int
     t_ns : int
         Mean time of its points.
     xy_m : (2,) float64
@@ -75,7 +74,6 @@ class LidarMatch:
         Of the center, m2.
     yaw_rad : float
         Direction of its sides; the predicted one where its points do not show it.
-    points : int
     """
 
     tick: int
@@ -92,12 +90,10 @@ class BoxState:
 
     Attributes
     ----------
-    t_ns : int
     xy_m : (2,) float64
         Center.
     velocity_mps : (2,) float64
         Zero for a static box, which is expected at the same position at every tick.
-    yaw_rad : float
     size_m : (3,) float64
         Length, width, height.
     bottom_m : float
@@ -127,7 +123,6 @@ def track_with_lidar(
         Forward or backward in time from the state.
     t_ns : (T,) int64
         Stamps of all ticks.
-    start : BoxState
     """
     matches: list[LidarMatch] = []
     state, misses, is_static = start, 0, not start.velocity_mps.any()

@@ -28,8 +28,6 @@ class FoundLog:
         Path of the log below the root, with the sequence where one folder holds several; unique within a format.
     path : Path
         What `open_log` takes.
-    format : str
-    sequence : str
     """
 
     id: str

@@ -46,7 +46,6 @@ class Scope:
     Attributes
     ----------
     max_range_m : float, m, optional
-    categories : sequence of str, optional
     """
 
     max_range_m: float | None = None
@@ -65,12 +64,10 @@ def evaluate_batch(
 
     Parameters
     ----------
-    folder : BatchFolder
     truth : Path
         Folder in which the logs have the same places as in the batch's own.
     load_truth : callable
         Returns the truth of a log for a scenario.
-    scope : Scope
     progress : callable
         Called as `progress(done, total)`.
 

@@ -50,7 +50,6 @@ class Job:
         `FoundLog.id`.
     path : str
         What `open_log` takes, absolute.
-    format, sequence : str
     cache : bool
         Whether detections in pictures are kept, and taken from earlier runs.
     attempts : int
@@ -110,7 +109,6 @@ class Row(BaseModel):
         Of its folder.
     log : str
         Its path below the root, with the sequence where a folder holds several.
-    format, sequence : str
     status : str
         "done" or "failed".
     error_kind : str
@@ -231,12 +229,10 @@ class BatchSettings(BaseModel):
     ----------
     token : str
         Random, so that workers on other machines can tell whether they see the same folder.
-    log2sim_version : str
     root : str
         Folder that is searched for logs, absolute.
     format : str
         Format that is looked for, or "auto".
-    follow_links : bool
     config : dict
         Settings of the reconstruction.
     """
@@ -272,13 +268,7 @@ class BatchSettings(BaseModel):
 
 @dataclass(frozen=True)
 class BatchFolder:
-    """A folder of a batch.
-
-    Attributes
-    ----------
-    path : Path
-    settings : BatchSettings
-    """
+    """A folder of a batch."""
 
     path: Path
     settings: BatchSettings
@@ -403,9 +393,6 @@ def write_batch_page(path: Path, rows: Sequence[Row], settings: BatchSettings, *
 
     Parameters
     ----------
-    path : Path
-    rows : sequence of Row
-    settings : BatchSettings
     total : int
         Logs of the batch; those without a row were not run yet.
     """

@@ -274,7 +274,6 @@ class Batch:
 
     Attributes
     ----------
-    folder : BatchFolder
     jobs : tuple of Job
         One for each log.
     done : mapping of str to Row
@@ -297,8 +296,6 @@ class Finished:
 
     Attributes
     ----------
-    job : Job
-    row : Row
     repetition : Job, optional
         To be run at the end.
     worker : str
@@ -318,7 +315,6 @@ def plan_batch(
 
     Parameters
     ----------
-    root, out : Path
     config : Config
         Settings of all runs.
     format : str
@@ -355,7 +351,6 @@ def run_batch(batch: Batch, connect: Connect, *, progress: Progress = lambda don
 
     Parameters
     ----------
-    batch : Batch
     connect : callable
         Returns a context manager of workers. It is called if there is something to do, and again for what is repeated, so that workers
         that are started for it are fresh ones.

@@ -56,7 +56,6 @@ class Package:
 
     Attributes
     ----------
-    name : str
     version : str or None
         None where it is missing.
     state : {"ok", "missing", "outdated", "broken"}
@@ -77,7 +76,6 @@ class Extra:
 
     Attributes
     ----------
-    name : str
     missing : tuple of str
         Packages of it that are missing or too old.
     purpose : str
@@ -104,7 +102,6 @@ class Installation:
         The Python that runs.
     packages : tuple of Package
         Those that are needed.
-    extras : tuple of Extra
     models : mapping of str to str
         By detector: "ready", or what it needs.
     cache : str

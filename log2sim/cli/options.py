@@ -44,7 +44,6 @@ def choose(flag: str, *choices: str, help: str, default: str | None = None) -> A
     flag : str
         Such as "--mode".
     choices : str
-    help : str
     default : str, optional
         What happens without the option, in words; needed where its default is None.
     """

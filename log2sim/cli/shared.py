@@ -175,7 +175,6 @@ def add_command(app: typer.Typer, command: Callable[..., None], name: str | None
 
     Parameters
     ----------
-    app : typer.Typer
     command : callable
         Its docstring is the help. What stands below the heading "Examples" are lines for the shell.
     name : str, optional

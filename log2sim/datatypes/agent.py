@@ -356,7 +356,6 @@ class Agent:
         One of `CATEGORIES`.
     size_m : (3,) tuple of float, m
         Length, width, height.
-    waypoints : Waypoints
     static : bool
         Whether it never moves.
     rear_axle_offset_m : float, m

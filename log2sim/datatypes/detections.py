@@ -366,7 +366,6 @@ class Obstacles:
 
     Attributes
     ----------
-    stamp_ns : int
     origin : (3,) float64
         m, map frame.
     xyz : (N, 3) float32
@@ -423,7 +422,6 @@ class Track:
 
     Attributes
     ----------
-    category : str
     tick : (n,) int64
         Strictly increasing indices of ticks.
     measurements : Measurements

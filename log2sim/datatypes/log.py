@@ -331,7 +331,6 @@ class Lidar:
 
     Attributes
     ----------
-    name : str
     mount : {"ego", "map"}
         Frame that it is fixed in: on the vehicle or at the roadside.
     mount_T_lidar : (4, 4) float64
@@ -414,7 +413,6 @@ class Log:
 
     Attributes
     ----------
-    name : str
     format : str
         Name of the reader.
     cameras, lidars : mapping of str to Camera, Lidar
@@ -422,8 +420,6 @@ class Log:
         By the name of the sensor.
     ego : PoseTrack or None
         None for a log of roadside sensors only.
-    ego_vehicle : EgoVehicle
-    map : MapFrame
     labels : Labels or None
         May be given as a function that reads them.
     image_labels : mapping of str to ImageLabels
@@ -594,7 +590,6 @@ class Frame:
 
     Attributes
     ----------
-    camera : Camera
     t_ns : int
         Absolute stamp.
     image : callable

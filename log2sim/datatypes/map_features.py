@@ -227,9 +227,6 @@ class MapFeatures:
 
     Attributes
     ----------
-    markings : tuple of Marking
-    borders : tuple of RoadBorder
-    lanes : tuple of MapLane
     notes : tuple of str
         What is not there, and why.
     """

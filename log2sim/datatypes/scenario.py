@@ -31,7 +31,6 @@ class Signal:
 
     Attributes
     ----------
-    id : str
     position_m : (3,) float64, m
         Middle of its housing, map frame.
     heading_rad : float or None
@@ -244,13 +243,11 @@ class Scenario:
 
     Attributes
     ----------
-    name : str
     t0_ns : int
         Absolute time of t_s = 0.
     duration_s : float, s
     agents : tuple of Agent
         The ego is the one with id `EGO`, if there is one.
-    map : MapFrame
     cameras : tuple of mapping
         The cameras of the log with the homographies that were fitted.
     stages : tuple of mapping
@@ -261,7 +258,6 @@ class Scenario:
         Only in truth: where objects were left without labels; None when the labels are complete.
     map_features : MapFeatures or None
         Markings, borders and lanes; None where they were not looked for.
-    signals : tuple of Signal
     """
 
     name: str

@@ -130,7 +130,6 @@ class Edited:
 
     Attributes
     ----------
-    scenario : Scenario
     warnings : tuple of str
         New collisions and infeasible motion.
     """
@@ -149,7 +148,6 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
 
     Parameters
     ----------
-    scenario : Scenario
     edits : sequence of Only, Remove, DropDoubtful, Replace, Add, Speed, Lateral, CutIn, Shift
         Each kind of motion at most once for an agent.
 

@@ -414,7 +414,6 @@ def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str
 
     Parameters
     ----------
-    true : sequence of Agent
     found : mapping
         The agent that each true one is matched with most often, by the true one's id.
 

@@ -83,11 +83,9 @@ class CameraFrame:
 
     Attributes
     ----------
-    t_ns : int
     camera : Camera
         Of the size of the image.
     map_T_cam : (4, 4) float64 or None
-    jpeg : bytes
     outlines : tuple of (Agent, (E, 2, 2) float64)
         Lines of each box, px.
     """
@@ -105,8 +103,6 @@ class ThinnedSweep:
 
     Attributes
     ----------
-    t_ns : int
-    lidar : str
     points_map : (N, 3) float64
     """
 

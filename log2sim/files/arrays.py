@@ -23,10 +23,8 @@ class StoredArray:
 
     Attributes
     ----------
-    file : ArrayFile
     offset : int
         Of its first byte.
-    shape : tuple of int
     dtype : dtype
     """
 

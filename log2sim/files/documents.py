@@ -88,7 +88,6 @@ def parse_unique(text: str, **hooks: Any) -> Any:
 
     Parameters
     ----------
-    text : str
     **hooks
         Parsers of numbers, as `json.loads` takes them.
 
@@ -399,7 +398,7 @@ def rounded(value: float, digits: int) -> float | None:
 @cache
 def load_schema(name: str) -> dict[str, Any]:
     """Load a schema by name, such as "scenario-1"."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     folder = package / "schemas"  # of an installation; a checkout has them at its top level
     file = (folder if folder.is_dir() else package.parent / "schemas") / f"{name}.json"
     document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))

@@ -33,7 +33,6 @@ def open_regular(path: Path | str, *, buffering: int = -1) -> BinaryIO:
 
     Parameters
     ----------
-    path : Path or str
     buffering : int
         As for `open`.
 
@@ -94,8 +93,6 @@ def read_file(
 
     Parameters
     ----------
-    path : Path or str
-    limit_bytes : int
     error : type
         Of the exception that is raised.
     where : str, optional
@@ -120,8 +117,6 @@ def require_readable(path: Path | str, limit_bytes: int, error: type[Exception],
 
     Parameters
     ----------
-    path : Path or str
-    limit_bytes : int
     error : type
         Of the exception that is raised for a file that is missing, empty, too large or no regular file.
     what : str

@@ -42,7 +42,6 @@ def claim(target: Path, *, overwrite: bool) -> None:
 
     Parameters
     ----------
-    target : Path
     overwrite : bool
         Whether another run does not matter.
 
@@ -311,7 +310,6 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
 
     Parameters
     ----------
-    target : Path
     overwrite : bool
         Whether a folder may be replaced; without it only an empty one is.
 

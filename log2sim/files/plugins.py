@@ -31,7 +31,6 @@ class Call:
         As it is declared, for messages.
     positional : int
         Number of positional arguments.
-    keywords : tuple of str
     """
 
     shown: str

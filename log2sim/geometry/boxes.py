@@ -121,7 +121,6 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     ----------
     center_m, size_m, yaw_rad : (L, 3), (L, 3), (L,)
         Boxes in the map frame; size is length, width, height.
-    camera : Camera
     cam_T_map : (4, 4)
 
     Notes

@@ -57,8 +57,6 @@ class Camera:
 
     Attributes
     ----------
-    name : str
-    width_px, height_px : int
     K : (3, 3) float64, px
         Camera matrix.
     mount : {"ego", "map"}
@@ -282,7 +280,6 @@ def project_moving(
 
     Parameters
     ----------
-    camera : Camera
     points : (N, 3), m
         In a frame in which they stand still.
     cam_T_points : callable

@@ -163,7 +163,6 @@ class CameraPath:
 
     Attributes
     ----------
-    camera : str
     t_ns : (P,) int64
         Increasing stamps.
     start_T_ego : (P, 4, 4) float64

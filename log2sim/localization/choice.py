@@ -151,7 +151,6 @@ def localize(log: Log, config: Config, *, progress: Progress | None = None) -> t
 
     Parameters
     ----------
-    log : Log
     config : Config
         `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
     progress : callable, optional

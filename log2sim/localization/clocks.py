@@ -352,15 +352,7 @@ TOO_FAR = {X: ("forward", "back"), Y: ("left", "right"), Z: ("up", "down")}
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a LiDAR is found to lack, and what was asked for.
-
-    Attributes
-    ----------
-    lidar : str
-    found : Estimate
-    seen : SweepPairs
-    asked : CalibrationConfig
-    """
+    """What a LiDAR is found to lack, and what was asked for."""
 
     lidar: str
     found: Estimate

@@ -402,7 +402,6 @@ class Moments:
 
     Attributes
     ----------
-    lidar : str
     sweeps : (S,) int64
         Rows of its stream.
     t_ns : (S,) int64

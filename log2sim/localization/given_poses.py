@@ -98,7 +98,6 @@ class Copies:
         The very one that was given where none does.
     first_ns, last_ns : int
         Stamps of the first and the last copy.
-    count : int
     worst_m : float
         How far the ego has moved on at most.
     """
@@ -367,7 +366,6 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
 
     Parameters
     ----------
-    log : Log
     stretches : sequence of Stretch
         In the order of time.
     during_ns : (int, int), optional

@@ -100,7 +100,6 @@ def find_exchanged(cameras: Mapping[str, Camera], pairs: Mapping[str, Sequence[F
 
     Parameters
     ----------
-    cameras : mapping of str to Camera
     pairs : mapping of str to sequence of FlowPair
         By camera, of those that may be exchanged.
 
@@ -175,7 +174,6 @@ class MountCheck:
 
     Attributes
     ----------
-    log : Log
     lidar : str
         "" without one to check against.
     views : mapping of str to list of EdgeView

@@ -170,7 +170,6 @@ def compensated(sweep: EgoSweep, motion: Array, motion_s: float) -> Array:
 
     Parameters
     ----------
-    sweep : EgoSweep
     motion : (4, 4) float64
         Pose of the ego after `motion_s` in its frame before.
     motion_s : float, s
@@ -320,7 +319,6 @@ def weakest_direction(information: Array, points: int) -> tuple[float, Array]:
     ----------
     information : (6, 6) float64
         Of rotation and translation, in this order.
-    points : int
 
     Notes
     -----
@@ -355,7 +353,6 @@ class Odometry:
 
     Attributes
     ----------
-    lidar : str
     t_ns : (P,) int64
         Increasing stamps.
     odom_T_ego : (P, 4, 4) float64
@@ -398,7 +395,6 @@ def run_odometry(
 
     Parameters
     ----------
-    log : Log
     lidar : str
         One on the ego.
     during_ns : (int, int), optional

@@ -122,7 +122,6 @@ class FittedPath:
         Standard deviation of each coordinate.
     step : (D,) float64
         How far the samples after the step are off those before it; 0 without a step.
-    step_sigma : float
     """
 
     value: Array
@@ -149,7 +148,6 @@ def fit_path(
     sigma : float, u
         Standard deviation of each sample.
     asked_s : (T,) float64, s
-    prior : PathPrior
     after : (n,) bool, optional
         Samples that are off all others by one unknown step.
 
@@ -213,7 +211,6 @@ def smooth_path(
     measured : (P,) bool
     noise : float, u
         Standard deviation of the samples, independent of each other.
-    prior : PathPrior
 
     Returns
     -------
@@ -522,7 +519,6 @@ class Limits:
     ----------
     max_change : float, u/s2
         Largest second derivative of a vehicle's path.
-    prior : PathPrior
     min_step : float, u
         Repairs that move samples by less are not made.
     min_lasting_step : float, u
@@ -544,7 +540,6 @@ class RepairedPath:
 
     Attributes
     ----------
-    limits : Limits
     values : (P, D) float64, u
     sigma : (P,) float64, u
         Standard deviation of what the repair adds, 0 where a sample is as it was.
@@ -574,7 +569,6 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
     ----------
     t_s : (P,) float64, s
     values : (P, D) float64, u
-    limits : Limits
     wrong : (P,) bool, optional
         Samples that are known to be wrong.
     """

@@ -45,9 +45,7 @@ class Keyframe:
 
     Attributes
     ----------
-    t_ns : int
     map_T_ego : (4, 4) float64
-    surfaces : Surfaces
     """
 
     t_ns: int

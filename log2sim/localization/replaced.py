@@ -22,7 +22,6 @@ class Replacement:
     ----------
     old : PoseTrack or None
         None where the log has no poses; then nothing but the ego is in its map.
-    new : PoseTrack
     """
 
     old: PoseTrack | None

@@ -56,7 +56,6 @@ class Unit:
 
     Attributes
     ----------
-    lidars, cameras : tuple of str
     site_m : (3,) float64, m
         Mean place of its LiDARs in the map.
     """
@@ -158,9 +157,6 @@ class Sight:
         Of the vehicle; None where it never comes near.
     road : RoadView
         What stands still by the unit's LiDARs.
-    surfaces : Surfaces or None
-    ground : CommonGround or None
-    objects : CommonObjects
     """
 
     view: VehicleView | None
@@ -339,8 +335,6 @@ class Findings:
 
     Attributes
     ----------
-    unit : Unit
-    found : Estimate
     visibility : pair of Visibility or None
         Without and with the correction.
     """
@@ -543,7 +537,6 @@ class RoadRegistration:
     ----------
     log : Log
         With the corrected mounts and stamps.
-    faults : tuple of Fault
     figures : list of dict
         For the report, one entry for each roadside unit.
     """

@@ -457,7 +457,6 @@ class MatchedStructure:
 
     Attributes
     ----------
-    evidence : Evidence
     points : int
         Matched points.
     on_surface : int
@@ -669,7 +668,6 @@ class ObjectTrack:
     xyz_m : (K, 3) float64, m
         In the frame of the site.
     velocity_mps : (K, 2) float64
-    group : int
     points : float
         Median number of points in its boxes.
     """
@@ -771,7 +769,6 @@ class Matched:
 
     Attributes
     ----------
-    evidence : Evidence
     pairs : int
         Of tracks.
     moving : int

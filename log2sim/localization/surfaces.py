@@ -118,7 +118,6 @@ class Surfaces:
     ----------
     xyz_m, normals : (N, 3) float64, m and unit vectors
         Middles of pieces of planes and their normals: as many that face up, forward and sideways, if there are.
-    tree : cKDTree
     middles : (V, 3) float64, m
         Of all voxels with points, those of `tree`.
     """
@@ -276,7 +275,6 @@ class SweepPairs:
         Where the LiDAR is in the ego's frame.
     t_ns : (K,) int64
         Stamps of the sweeps.
-    pairs : tuple of Pair
     """
 
     track: PoseTrack
@@ -292,8 +290,6 @@ def pair_sweeps(
 
     Parameters
     ----------
-    log : Log
-    lidar : str
     during_ns : (2,) tuple of int or None
         First and last stamp to look at; None for all.
     report : callable

@@ -140,9 +140,6 @@ def compare_poses(log: Log, lidar: str, tracks: Mapping[str, PoseTrack], t_ns: N
 
     Parameters
     ----------
-    log : Log
-    lidar : str
-    tracks : mapping of str to PoseTrack
     t_ns : (P,) int64
         Stamps of the sweeps to choose from, two at least.
     """
@@ -235,7 +232,6 @@ class Verdict:
 
     Attributes
     ----------
-    keep : bool
     reason : str
         For people.
     excess_m, scatter_m : dict
@@ -335,7 +331,6 @@ def bridge_by_lidar(log: Log, checked: CheckedPoses, progress: Progress) -> Chec
     ----------
     log : Log
         With the poses that were given, by which its sweeps may be placed.
-    checked : CheckedPoses
     progress : callable
         Called with (sweeps done, all sweeps).
     """

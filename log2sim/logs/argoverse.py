@@ -263,8 +263,6 @@ def read_labels(
 
     Parameters
     ----------
-    path : Path
-    ego : PoseTrack
     upper_lidar_xy : (2,) float64, m
         Position of the upper LiDAR, ego frame.
     swept_ns : (F,) int64

@@ -245,7 +245,6 @@ class TableLimits:
 
     Attributes
     ----------
-    rows : int
     file_bytes : int
         Of a feather file, which is read as a whole. Parquet files are read in parts.
     unpacked_bytes : int
@@ -272,7 +271,6 @@ def read_columns(
 
     Parameters
     ----------
-    path : Path
     wanted : mapping of str to str
         What each column must hold. "float": numbers, as (N,) float32 if they are float16 or float32, else float64, NaN where
         one is missing. "int": whole numbers, (N,) int64. "bool": (N,) bool. "text": (N,) object of str, also of whole numbers
@@ -283,7 +281,6 @@ def read_columns(
         Names out of `wanted` that may be absent; they are absent in the result then.
     error : type
         What is raised: `LogError` for an index or calibration, `RecordError` for one record.
-    limits : TableLimits
 
     Returns
     -------

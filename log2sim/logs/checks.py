@@ -194,7 +194,6 @@ class Span:
     ----------
     words : str
         What it is, such as "ego poses".
-    first_ns, last_ns : int
     """
 
     words: str

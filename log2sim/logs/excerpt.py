@@ -42,7 +42,6 @@ def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = No
 
     Parameters
     ----------
-    log : Log
     cameras : sequence of str
         All where it is empty. LiDARs are always kept.
     start_s, stop_s : float, optional

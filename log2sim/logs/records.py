@@ -174,7 +174,6 @@ def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[n
 
     Parameters
     ----------
-    data : bytes
     where : str
         Names file and stamp in errors.
     size_px : (int, int)

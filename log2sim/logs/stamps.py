@@ -230,7 +230,6 @@ def poses_from_geodetic(map_frame: MapFrame, position: Array, attitude_rad: Arra
 
     Parameters
     ----------
-    map_frame : MapFrame
     position : (N, 3) float64
         Latitude and longitude in deg, altitude in m.
     attitude_rad : (N, 3) float64, rad

@@ -138,7 +138,6 @@ class SeenBoxes:
     Attributes
     ----------
     boxes : M Boxes3D
-    errors : BoxErrors
     sensor_m : (3,) float64, optional
         Where they are all seen from, m, map frame.
     """

@@ -50,12 +50,10 @@ class LightBox:
 
     Attributes
     ----------
-    camera : str
     t_ns : int
         Stamp of the frame.
     box_px : (4,) float64
         u0, v0, u1, v1.
-    score : float
     crop : (h, w, 3) uint8
         The picture there, BGR.
     range_m : float
@@ -139,7 +137,6 @@ class PictureFindings:
 
     Attributes
     ----------
-    detections : Detections
     thumbnail : (h, w) float32
         By which it is compared with other pictures.
     lights : tuple of LightBox

@@ -288,10 +288,8 @@ class Observations:
         Foot points of measured objects and ground points of the LiDAR, by camera.
     detections : dict of str to int
         Number of detections by camera and by name of the detector in sweeps.
-    records : RecordReader, optional
     sweeps : Counter of str
         Number of sweeps by how they were compensated, see `compensation_of`.
-    frames_detected : int
     frames_skipped : mapping of str to int
         By camera.
     unseen : mapping of str to list of int
@@ -315,6 +313,11 @@ class Observations:
     unseen: dict[str, list[int]] = field(default_factory=dict)
     faults: tuple[Fault, ...] = ()
     lights: list[LightBox] = field(default_factory=list)
+
+    @property
+    def unreadable(self) -> dict[str, Any]:
+        """Return the records that could not be read, by stream, for the report."""
+        return {} if self.records is None else self.records.summary()
 
     def recorded(self, schedule: Schedule) -> dict[str, NDArray[np.bool_]]:
         """Return (T,) for each camera, and for "" any LiDAR, whether it recorded at each tick something that shows what is there."""

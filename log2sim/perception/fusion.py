@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, TUPLES, TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import ENDS, GROUP_OF, TUPLES, TYPICAL_SIZE_M, Measurements
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.files.arrays import array_lengths
 from log2sim.geometry import NS_PER_S, Array, box_iou
 from log2sim.perception.boxes import fit_extents, place_boxes, provisional_sizes, rotate, top_of
 from log2sim.perception.lidar.projection import View, project_boxes_in_view
+from log2sim.plan import FusionLevel, Plan, Stage
 from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Boxes that overlap less are different objects.
@@ -43,12 +44,10 @@ class PairWeights:
 
     Attributes
     ----------
-    bias : float
     image : float
         Of the log-odds of the score in the image.
     sweep : float
         Of the log-odds of the score in the sweep.
-    iou : float
     range_10m : float
         Of the distance in units of 10 m.
     """
@@ -193,6 +192,14 @@ MIN_DRIVER_SHARE = 0.8
 TRUNCATED_SCORE_FACTOR = 0.7
 # What a detector in LiDAR sweeps adds to a row.
 BOX_COLUMNS = ("box_center_m", "box_size_m", "box_yaw_rad", "heading_score")
+
+
+def fuse_by_end(placed: Sequence[Measurements], plan: Plan) -> list[list[Measurements]]:
+    """Fuse what is tracked together, by tick: of each end where its tracks are joined later, else of all sensors."""
+    across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
+    if plan.fusion is not FusionLevel.TRACKS:
+        return [fuse(placed, across=across)]
+    return [fuse([rows.take(rows.seen_by[:, k]) for rows in placed], across=across) for k in range(len(ENDS))]
 
 
 def fuse(measurements: Sequence[Measurements], *, across: bool = True) -> list[Measurements]:

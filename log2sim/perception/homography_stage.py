@@ -49,8 +49,6 @@ class CameraHomography:
 
     Attributes
     ----------
-    camera : Camera
-    fit : HomographyFit
     source : str
         What it was fitted to, "calibration and flat ground" where a fit was refused, "none" where there is none.
     refusal : str
@@ -73,14 +71,8 @@ class CameraHomography:
         return self.fit.at_tick(tick) if self.rig is None else self.rig.road_at_tick(self.camera.name, tick)
 
 
-def estimation_options(config: TopdownConfig) -> EstimationOptions:
-    """Make the options of the estimator from the settings."""
-    together = config.rig == "together"
-    return EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=together)
-
-
 def fit_homographies(
-    log: Log, observed: Observations, plan: Plan, options: EstimationOptions, *, rng: np.random.Generator
+    log: Log, observed: Observations, plan: Plan, config: TopdownConfig, *, rng: np.random.Generator
 ) -> dict[str, CameraHomography]:
     """Fit the cameras that need a homography, by the scope of the plan.
 
@@ -89,6 +81,7 @@ def fit_homographies(
     """
     if plan.homography is HomographyScope.NONE:
         return {}
+    options = EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=config.rig == "together")
     wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
     together, why_apart = _fit_together(log, observed, plan, options, rng) if wanted else ({}, {})
     apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}

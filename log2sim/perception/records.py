@@ -395,7 +395,6 @@ class CameraWatch:
 
         Parameters
         ----------
-        t_ns : int
         thumbnail : (h, w) float32
         found : bool
             Whether a detector found something in it: then it does show something.

@@ -32,7 +32,6 @@ class GivenDetectors:
 
     Attributes
     ----------
-    config : Config
     images : Detector, optional
         Searches pictures in place of the one that the settings name.
     sweeps : LidarDetector, optional
@@ -53,7 +52,6 @@ def sort_detectors(
     ----------
     given : callable, Detector, LidarDetector, str or a list of two of them, optional
         See `log2sim.reconstruct`.
-    config : Config
 
     Raises
     ------

@@ -171,7 +171,6 @@ class SeamPlace:
         In the ground frame.
     azimuth_rad : float
         Direction of its rows, away from the rig's middle.
-    width_m : float
     """
 
     first: str
@@ -259,8 +258,6 @@ class Seam:
 
     Attributes
     ----------
-    place : SeamPlace
-    tick : int
     offset_m : (2,) float64
         From the picture of the first camera to that of the second, ground frame, m.
     covariance : (2, 2) float64
@@ -286,8 +283,6 @@ class SeamView:
 
     Attributes
     ----------
-    place : SeamPlace
-    tick : int
     hidden : mapping of str to (R, C) bool
         Cells that do not show the ground, by camera.
     """
@@ -536,7 +531,6 @@ class SeamSurvey:
 
     Attributes
     ----------
-    seams : tuple of Seam
     places : int
         How many patches two cameras see.
     covered : int
@@ -559,9 +553,6 @@ class SeamPictures:
 
     Attributes
     ----------
-    log : Log
-    schedule : Schedule
-    observed : Observations
     images : mapping of (str, int) to (H, W) uint8
         By camera and tick.
     """

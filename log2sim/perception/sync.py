@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.config import Config
 from log2sim.datatypes import Log, Stream, Sweep, Tick
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.files.plugins import nearest
@@ -141,6 +142,19 @@ def synchronize(
         row = cameras.index(reference) if cameras else 0
         _, residuals[lidar] = nearest_records(middle, asked[row], tolerance_ns)
     return Schedule(reference, ticks, frames, sweeps, residuals)
+
+
+def schedule_of(log: Log, cameras: tuple[str, ...], config: Config) -> Schedule:
+    """Synchronize the chosen cameras and the LiDARs of a log by the settings of a run."""
+    sync = config.sync
+    return synchronize(
+        log,
+        cameras,
+        reference=sync.reference,
+        max_residual_s=sync.max_residual_s,
+        start_s=config.start_s,
+        stop_s=config.stop_s,
+    )
 
 
 def _reference(log: Log, cameras: tuple[str, ...], wanted: str) -> str:

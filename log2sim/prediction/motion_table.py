@@ -27,7 +27,6 @@ class MotionTable:
 
     Attributes
     ----------
-    agents : tuple of Agent
     t_s : (T,) float64, s
         Ticks, `tick_s` apart.
     tick_s : float, s

@@ -179,8 +179,6 @@ def follow(paths: Paths, places: Places, speed_mps: Array, lead_s: Array) -> tup
 
     Parameters
     ----------
-    paths : Paths
-    places : Places
     speed_mps : (Q,) float64, m/s
     lead_s : (H,) float64, s
 

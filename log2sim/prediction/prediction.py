@@ -251,7 +251,6 @@ def predict_scenario(
 
     Parameters
     ----------
-    scenario : Scenario
     horizon_s : float, s
         Longest lead.
     methods : sequence of str

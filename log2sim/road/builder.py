@@ -360,10 +360,8 @@ def map_ground(
 
     Parameters
     ----------
-    log : Log
     scenario : Scenario
         Its agents are left out of the map; its span of time is what is mapped.
-    settings : MapConfig, optional
     reader : RecordReader, optional
         Counts the records that cannot be read.
     progress : callable, optional

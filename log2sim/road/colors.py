@@ -180,7 +180,6 @@ class Look:
         Standard deviations of its lightness, chroma, and across the chroma.
     probability : (K,) float64
         Of each of `COLOR_NAMES`.
-    weight : float
     """
 
     lab: Array
@@ -266,7 +265,6 @@ class Boxes:
 
     Attributes
     ----------
-    agents : sequence of Agent
     center : (A, F, 3) float64, m, map frame
         NaN while an agent is not there.
     yaw : (A, F) float64

@@ -16,7 +16,7 @@ from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
 from log2sim.localization.pose_refinement import MAX_KEYFRAMES, place_as_given, refine_poses
-from log2sim.perception.first_pass import Observations
+from log2sim.perception.detection_cache import LightBox
 from log2sim.perception.frames import KeepingReader, PictureConsumer, RecordReader, look_again
 from log2sim.plan import Decision, Outcome, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
@@ -27,72 +27,62 @@ from log2sim.road.signals import find_signals
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """What a scenario was made from, and how.
-
-    Attributes
-    ----------
-    log : Log
-        With the sensors that were used.
-    config : Config
-    plan : Plan
-    observations : Observations
-    clock : StageClock
-    report_progress : callable
-        Called as `report_progress(stage, done, total)`.
-    """
-
-    log: Log
-    config: Config
-    plan: Plan
-    observations: Observations
-    clock: StageClock
-    report_progress: Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, eq=False)
 class Description:
     """A described scenario.
 
     Attributes
     ----------
-    scenario : Scenario
     outcomes : tuple of Outcome
         Of the stages of the description.
     figures : dict
         For the report: "map_features", "colors", "signals".
-    reader : RecordReader
-        What could not be read.
+    unreadable : dict
+        Records that could not be read, by stream, for the report.
     """
 
     scenario: Scenario
     outcomes: tuple[Outcome, ...]
     figures: dict[str, Any]
-    reader: RecordReader
+    unreadable: dict[str, Any]
 
 
-def describe(scenario: Scenario, recorded: Recorded) -> Description:
-    """Add what the plan keeps of lanes, colors and traffic lights to a scenario."""
-    log, plan = recorded.log, recorded.plan
+def describe(
+    scenario: Scenario,
+    log: Log,
+    config: Config,
+    plan: Plan,
+    lights: Sequence[LightBox],
+    clock: StageClock,
+    progress: Callable[[str, int, int], None],
+) -> Description:
+    """Add what the plan keeps of lanes, colors and traffic lights to a scenario.
+
+    Parameters
+    ----------
+    lights : sequence of LightBox
+        Traffic lights in frames, from the first pass.
+    progress : callable
+        Called as `progress(stage, done, total)`.
+    """
+    log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     reader = KeepingReader(log, MAX_KEYFRAMES)
-    with recorded.clock.stage("map poses", recorded.report_progress):
-        started = start_map(scenario, recorded, reader) if plan.keeps(Stage.LANES) else None
+    with clock.stage("map poses", progress):
+        started = start_map(scenario, log, config, reader) if plan.keeps(Stage.LANES) else None
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
     builder = None if started is None else started.builder
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
-    with recorded.clock.stage("pictures", recorded.report_progress):
-        look_again(log, reader, consumers, lambda done, total: recorded.report_progress("pictures", done, total))
-    with recorded.clock.stage("lanes", recorded.report_progress):
+    with clock.stage("pictures", progress):
+        look_again(log, reader, consumers, lambda done, total: progress("pictures", done, total))
+    with clock.stage("lanes", progress):
         features = None if started is None else with_lanes(read_map(started, log, reader), scenario)
-    with recorded.clock.stage("colors"):
+    with clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
-    with recorded.clock.stage("signals"):
-        lights = recorded.observations.lights
+    with clock.stage("signals"):
         signals, seen = find_signals(log, scenario, lights) if plan.keeps(Stage.SIGNALS) else ((), "")
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
     figures = {"map_features": count_features(features), "colors": count_colors(agents), "signals": len(signals)}
     uncolored = () if colors is None else colors.notes()
-    return Description(described, outcomes_of(plan, described, seen, uncolored), figures, reader)
+    return Description(described, outcomes_of(plan, described, seen, uncolored), figures, reader.summary())
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +104,11 @@ class StartedMap:
     notes: tuple[str, ...] = ()
 
 
-def start_map(scenario: Scenario, recorded: Recorded, reader: RecordReader) -> StartedMap:
+def start_map(scenario: Scenario, log: Log, config: Config, reader: RecordReader) -> StartedMap:
     """Refine the poses for a map of the ground, and choose what it is made of."""
-    log = refine_poses(recorded.log, scenario, reader)
+    log = refine_poses(log, scenario, reader)
     try:
-        return StartedMap(log, GroundMapBuilder(log, scenario, recorded.config.map, reader))
+        return StartedMap(log, GroundMapBuilder(log, scenario, config.map, reader))
     except LogError as problem:
         return StartedMap(log, None, (f"no map of the ground: {problem}",))
 

@@ -201,7 +201,6 @@ class LaneLine:
     ----------
     offset_m : float
         To the left of the camera.
-    markings : tuple of Marking
     points_m : (N, 3) float64, m
         Beyond the markings by the course of the others.
     """
@@ -345,7 +344,6 @@ class PictureMarkings:
     ----------
     markings : tuple of Marking
         In the frame of the ground below the camera: x forward, y left, z up.
-    borders : tuple of RoadBorder
     lane_lines : tuple of LaneLine
         The lines of which lane markings are parts, from left to right.
     camera : Camera

@@ -92,7 +92,6 @@ def reflectances(pixels: Array, light: Light, facing: Array, veil: Array) -> Arr
     ----------
     pixels : (N, 3)
         Linear RGB.
-    light : Light
     facing : (N,)
         Cosines of the angles at which they are seen.
     veil : (3,)

@@ -272,12 +272,10 @@ class PaintedLine:
         Middle, from end to end.
     kind : str
         "solid" or "dashed".
-    width_m : float
     pieces : Pieces
         What shows it.
     painted_m : float
         Length with paint.
-    dashes : int
     log_odds : float
         That it is a marking.
     """

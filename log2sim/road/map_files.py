@@ -46,9 +46,6 @@ class GeoKeys:
 
     Attributes
     ----------
-    directory : tuple of int
-    doubles : tuple of float
-    ascii : str
     problem : str or None
         Why the keys say nothing about the place on Earth; None where they do.
     """
@@ -148,7 +145,6 @@ def write_map(
 
     Parameters
     ----------
-    ground : GroundMap
     path : Path
         Ends in one of `SUFFIXES`.
     layer : {"color", "intensity", "height"}

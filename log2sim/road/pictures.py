@@ -80,7 +80,6 @@ def project_cells(
 
     Parameters
     ----------
-    view : GroundView
     image_H_cell : (3, 3) float64
         Column and row of a cell to undistorted pixels.
     rows, columns : (R,), (C,) int
@@ -243,9 +242,6 @@ class View:
 
     Attributes
     ----------
-    log : Log
-    camera : Camera
-    t_ns : int
     map_T_cam : (4, 4) float64
     """
 
@@ -276,12 +272,10 @@ def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster) -> Warp
 
     Parameters
     ----------
-    view : View
     surface : Surface
         With the north-west corner of the raster and cells a whole number of times as long.
     z0_m : float
         Height of reference of the surface, m.
-    raster : Raster
     """
     window = _window(view, surface, z0_m)
     if window is None:

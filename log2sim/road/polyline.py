@@ -239,7 +239,6 @@ class DrivenPath:
 
     Attributes
     ----------
-    agent : str
     line : Polyline
         Ground under the middle of the box, in the direction of the heading.
     width_m : float

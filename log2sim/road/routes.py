@@ -42,7 +42,6 @@ class Beside:
 
     Attributes
     ----------
-    route, other : int
     s_m, other_s_m : (K,) float64
         Stations on both; those of `other` fall where it leads the other way.
     aside_m : (K,) float64
@@ -299,7 +298,6 @@ class Route:
 
     Attributes
     ----------
-    line : Polyline
     width_m : (K,) float64
         At the stations `width_s_m` (K,), constant beyond.
     width_s_m : (K,) float64

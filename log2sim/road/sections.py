@@ -45,7 +45,6 @@ class Conflict:
 
     Attributes
     ----------
-    intervals : tuple of Interval
     crossing : bool
         Whether lanes cross there; else they branch, merge or follow each other.
     """
@@ -278,7 +277,6 @@ class Section:
 
     Attributes
     ----------
-    route : int
     first_m, last_m : float
         Stations on the route.
     start, end : int
@@ -298,7 +296,6 @@ class Strip:
 
     Attributes
     ----------
-    section : Section
     line : Polyline
         Its center line.
     width_m : (N,) float64
@@ -534,7 +531,6 @@ class Connection:
     ----------
     origin, target : int
         Sections.
-    line : Polyline
     width_m : (N,) float64
     area : int
         Where it is.

@@ -227,7 +227,6 @@ class Housing:
     ----------
     position : (3,) float64, m, map frame
     covariance : (3, 3) float64
-    boxes : list of LightBox
     eyes : list of (3,) float64
         Where each was seen from.
     """

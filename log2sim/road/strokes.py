@@ -191,7 +191,6 @@ class Stretch:
 
     Attributes
     ----------
-    begin_m, end_m : float
     kind : str
         "solid" or "dashed".
     dashes : int

@@ -63,7 +63,6 @@ class PreparedSweep:
 
     Attributes
     ----------
-    stamp_ns : int
     hiding : (H, 3) float64
         Points above the ground, m, map frame.
     columns : tuple of arrays
@@ -186,7 +185,6 @@ class Surface:
 
     Attributes
     ----------
-    raster : Raster
     z_m : (R, C) float32, m
         Above the height of reference, everywhere.
     known : (R, C) bool
@@ -221,8 +219,6 @@ def estimate_surface(points: GroundPoints, raster: Raster, path: Array, z0_m: fl
 
     Parameters
     ----------
-    points : GroundPoints
-    raster : Raster
     path : (K, 3) float64, m
         Places on the ground, map frame, which say how high it is where there are no points.
     z0_m : float
@@ -364,10 +360,8 @@ def map_intensity(
 
     Parameters
     ----------
-    points : GroundPoints
     surface : Surface
         Points off it are left out.
-    raster : Raster
     road : (r, c) bool
         Cells of the surface's raster that are road surely, because the ego drove there.
     """

@@ -55,7 +55,6 @@ class StepClock:
     begin_s : float, s
     dt_s : float, s
         Length of a step.
-    steps : int
     """
 
     begin_s: float

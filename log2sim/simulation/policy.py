@@ -60,15 +60,12 @@ class EgoState:
     ----------
     x_m, y_m, z_m, yaw_rad : float
         Box center and heading, map frame.
-    speed_mps : float
     accel_mps2, steer_rad : float
         Present state of the actuators: along the heading; at the road wheels.
-    length_m, width_m, height_m : float
     wheelbase_m : float
         From the rear to the front axle.
     rear_axle_offset_m : float
         From the rear axle, about which a vehicle turns, forward to the box center.
-    understeer_s2pm2 : float
     """
 
     x_m: float
@@ -170,13 +167,8 @@ class Observation:
 
     Attributes
     ----------
-    t_s : float
     dt_s : float
         The returned controls hold for this long.
-    ego : EgoState
-    others : Others
-    route : Route
-    path : PathAhead
     """
 
     t_s: float

@@ -226,8 +226,6 @@ class TrafficState:
 
     Attributes
     ----------
-    paths : PathTable
-    idm : IdmParameters
     size_m : (A, 3) float64
     reacts : (A,) bool
         Whether an agent is reactive.

@@ -49,7 +49,6 @@ class Reference:
     ----------
     trajectory : Trajectory
         The box centers in the scenario.
-    first_row : int
     columns : (K, C) float64
         `VEHICLE_COLUMNS`, `POINT_COLUMNS`, or x, y, yaw, speed.
     exact : callable

@@ -26,7 +26,6 @@ class Moment:
     t_s : float, s
     distance_m : float
         Between the boxes.
-    ego_speed_mps : float
     stopping_m : float
         Way of the ego until it stands, with the reaction.
     """
@@ -43,7 +42,6 @@ class CollisionWarning:
 
     Attributes
     ----------
-    agent, category : str
     known : Moment or None
         When it is first known; None where it never is.
     known_by : mapping of str to float
@@ -108,7 +106,6 @@ class Warnings:
         Other agents, and how many of them the ends get to know.
     driven_s : float, s
         For how long the ego moved.
-    events : tuple of CollisionWarning
     """
 
     ends: str
@@ -176,7 +173,6 @@ class AgentReplay:
 
     Attributes
     ----------
-    id, category : str
     size_m : (3,) tuple of float, m
         Length, width, height.
     driver : str
@@ -248,7 +244,6 @@ class Replay:
         Simulation step.
     store_dt_s : float, s
         Spacing of the stored states.
-    agents : tuple of AgentReplay
     metrics : mapping
         As in `schemas/replay-1.json`.
     left_out : mapping

@@ -311,7 +311,6 @@ def replay(
 
     Parameters
     ----------
-    scenario : Scenario
     mode : {"pid", "exact"}
         "pid": agents follow their trajectories by control through a vehicle model; "exact": they are placed on them.
     model : {"auto", "kinematic", "dynamic", "single-track"} or the name of a plug-in

@@ -175,7 +175,6 @@ class Watch:
 
         Parameters
         ----------
-        ego : EgoStates
         ticks : (T,) int
         seen : (A,) complex128, m, and (A,) float64, m/s, optional
             Where agents are, and how fast, if they may be elsewhere than in the table: then they are expected to do from there

@@ -48,8 +48,6 @@ class Actor:
 
     Attributes
     ----------
-    spec : AgentSpec
-    appearance : Appearance
     path : TimedPath or None
         None for a parked one.
     parked : (float, float, float) or None
@@ -159,8 +157,6 @@ class MovingScene:
 
     Attributes
     ----------
-    scene : Scene
-    ego : EgoMotion or None
     actors : tuple of Actor
         Without the ego.
     ego_body : Actor or None

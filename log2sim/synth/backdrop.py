@@ -127,8 +127,6 @@ class Wall:
         Unit direction from there along the foot.
     outward : (2,) float64
         Unit normal.
-    length_m : float
-    height_m : float
     color : (int, int, int)
         RGB.
     seed : tuple of int
@@ -229,7 +227,6 @@ class _Seen:
 
     Attributes
     ----------
-    wall : Wall
     gap_m : float
         Distance of the camera from its plane.
     polygon : (P, 2) int32

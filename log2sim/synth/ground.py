@@ -118,7 +118,6 @@ class GroundPlan:
 
     Attributes
     ----------
-    roads, zebras, stop_lines, arrows : sequence
     keeps_right : bool
         Whether vehicles drive on the right.
     """
@@ -150,7 +149,6 @@ class Stroke:
     Attributes
     ----------
     line : (P, 2) float64, m
-    width_m : float
     """
 
     line: Array
@@ -170,7 +168,6 @@ class RoadLine:
     kind : "solid" or "dashed"
     line : (P, 2) float64, m
         Its middle.
-    width_m : float
     color : "white" or "yellow"
     dashes : tuple of (Q, 2) float64, m
         What is painted of it.

@@ -41,7 +41,6 @@ class Light:
         Brightness of headlights, rear lights and street lights, relative to what surfaces emit by day.
     wetness : float
         From 0 for a dry road to 1 for a wet one.
-    rain_mm_h : float
     noise : float
         Of the camera, relative to daylight.
     exposure : float
@@ -225,8 +224,6 @@ class RenderCamera:
     Attributes
     ----------
     K : (3, 3) float64, px
-    width_px : int
-    height_px : int
     map_T_cam : (4, 4) float64
     """
 

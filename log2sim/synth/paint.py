@@ -31,7 +31,6 @@ class Appearance:
 
     Attributes
     ----------
-    category : str
     size_m : (float, float, float)
         Length, width, height.
     color : (int, int, int)
@@ -83,7 +82,6 @@ class Patch:
 
     Attributes
     ----------
-    appearance : Appearance
     out : Paint
         Of all points of the actor.
     rows : (Q,) int64
@@ -94,7 +92,6 @@ class Patch:
         Heights above the ground.
     n : (Q, 3) float64
         Normals.
-    part : Material
     """
 
     appearance: Appearance

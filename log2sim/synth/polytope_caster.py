@@ -34,10 +34,8 @@ class Solid:
 
     Attributes
     ----------
-    parts : tuple of Polytope
     position_m : (3,) float64, m
         Middle of its floor at time 0.
-    yaw_rad : float
     velocity_mps : (2,) float64, m/s
     glass_passes : float
         Share of rays that its windows let through.
@@ -339,10 +337,6 @@ def cast_polytopes(
 
     Parameters
     ----------
-    model : LidarModel
-    sensor : SensorState
-    solids : sequence of Solid
-    terrain : Terrain
     rng : Generator
         Draws reflectances, losses and noise.
     returns : ReturnModel, optional

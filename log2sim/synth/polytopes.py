@@ -44,7 +44,6 @@ class Polytope:
     offsets : (K,) float32, m
     low, high : (3,) float64, m
         Bounds.
-    material : Material
     """
 
     normals: NDArray[np.float32]

@@ -178,7 +178,6 @@ class Samples:
         Face and row of the image of each row.
     planes : (F, 3 vertices, 3) float64
         As in `Fragments`.
-    width_px : int
     """
 
     pixel: Index

@@ -31,7 +31,6 @@ class LabeledSweep:
 
     Attributes
     ----------
-    sweep : Sweep
     hit : (N,) int64
         Index of the actor, GROUND, BUILDING, EGO or AIR.
     """

@@ -49,13 +49,7 @@ Values = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Light on bodies.
-
-    Attributes
-    ----------
-    light : Light
-    lamps : tuple of Lamp
-    """
+    """Light on bodies."""
 
     light: Light
     lamps: tuple[Lamp, ...] = ()
@@ -75,7 +69,6 @@ class Body:
     map_T_body : (4, 4) float64
     size_m : (float, float, float)
         Of the box.
-    painter : Painter
     passes : (K,) float32 or None
         Share of samples through which one sees what is behind, by material; None for a solid body.
     """
@@ -500,9 +493,6 @@ class SceneInstant:
 
     Attributes
     ----------
-    backdrop : Scenery
-    bodies : sequence of Body
-    light : Light
     lamps : sequence of Lamp
         Headlights and street lights that are on.
     """

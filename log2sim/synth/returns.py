@@ -37,7 +37,6 @@ class LidarModel(BaseModel):
 
     Attributes
     ----------
-    name : str
     elevation_deg : tuple of float
         Of each line, deg.
     azimuth_deg : (float, float)
@@ -224,7 +223,6 @@ class ReturnModel:
         Share of returns that are lost whatever they hit.
     mixed : float
         Share of returns that lie between two surfaces.
-    weather : Weather
     """
 
     noise_m: float = 0.02
@@ -244,7 +242,6 @@ def reflected(
     reflectance : (N,) float32
     incidence : (N,) float32
         Cosine of the angle between ray and normal.
-    weather : Weather
     """
     lost = np.exp(np.float32(-2 * weather.extinction_per_m) * range_m)
     nearness = np.maximum(range_m / np.float32(REFERENCE_RANGE_M), np.float32(0.05))

@@ -33,13 +33,10 @@ class Road:
         Point of the line at s = 0.
     yaw_rad : float
         Direction of the line there.
-    curvature_per_m : float
     half_width_m : float
         Half of the carriageway, m.
     lanes : int
         In all.
-    keeps_right : bool
-    one_way : bool
     """
 
     origin_m: Array
@@ -82,7 +79,6 @@ class Surface:
         Of x, y, x^2, x y, y^2.
     waves : (K, 4) float64
         Amplitude in m, wave numbers along x and y in rad/m, phase.
-    roads : tuple of Road
     kerb_m : float
         Height of the ground beside the roads.
     """
@@ -128,10 +124,8 @@ class TrafficObject:
         One of the road users' categories, "" for clutter.
     position_m : (3,) float64, m
         Middle of its floor, level frame under the sensor.
-    yaw_rad : float
     size_m : (float, float, float)
         Length, width, height, m.
-    parts : tuple of Polytope
     speed_mps : float
         Along the heading.
     turn_radps : float
@@ -166,12 +160,6 @@ class TrafficScene:
     ----------
     mount : str
         vehicle or roadside.
-    roads : tuple of Road
-    surface : Surface
-    objects : tuple of TrafficObject
-    lidar : LidarModel
-    sensor : SensorState
-    returns : ReturnModel
     second : (LidarModel, SensorState) or None
         Another LiDAR that sees the scene too.
     """
@@ -230,7 +218,6 @@ class LabeledCloud:
         x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's points.
     points : (M,) int64
         Number of points on each.
-    scene : TrafficScene
     """
 
     xyz_m: NDArray[np.float32]
@@ -637,7 +624,6 @@ class Rig:
 
     Attributes
     ----------
-    camera : Camera
     map_T_cam : (4, 4) float64
     map_T_lidar : (4, 4) float64
     map_T_level : (4, 4) float64

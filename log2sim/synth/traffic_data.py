@@ -428,8 +428,6 @@ class TrafficSettings:
     ----------
     mount : str
         "vehicle" or "roadside".
-    scenes : int
-    seed : int
     sensor : str or None
         Name or TOML file of a LiDAR, "random", or None for the usual one of the mount.
     layout : str

@@ -64,7 +64,6 @@ class Look:
 
     Attributes
     ----------
-    category, kind : str
     size_m : (float, float, float)
     material : (K,) int64
     color : (K, 3) float32
@@ -197,8 +196,6 @@ class TrafficBackdrop:
 
     Attributes
     ----------
-    ground : Ground
-    terrain : Terrain
     buildings, shadows : tuple
         None; houses are bodies.
     """

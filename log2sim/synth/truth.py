@@ -229,8 +229,6 @@ class _Lanes:
 
     Attributes
     ----------
-    road : Road
-    number : int
     first_forward, last_forward : int
         Which lanes lead along the line.
     at_m : (L + 1,) float64
@@ -368,7 +366,6 @@ class FrameVisibility:
 
     Attributes
     ----------
-    t_ns : int
     unoccluded : (A,) float64
         Share of the silhouette that is visible.
     inside : (A,) float64

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.config import TrackConfig
 from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
 from log2sim.tracking.forward import CHI2_2DOF_99, measurement_noise, track_forward
@@ -28,7 +29,6 @@ def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.b
 
     Parameters
     ----------
-    tracks : sequence of Track
     recorded : mapping of str to (T,) bool
         Whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
     """
@@ -112,23 +112,18 @@ MAX_SHARED_TICKS = 1
 RELATED = ({"pedestrian", "two_wheeler"},)
 
 
-def track_ends(
-    ends: Sequence[Sequence[Measurements]],
-    t_ns: NDArray[np.int64],
-    *,
-    birth_score: float,
-    max_gap_s: float,
-    min_life_s: float,
-) -> list[Track]:
+def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
     """Track the measurements of each end on their own and merge the tracks.
 
     Parameters
     ----------
     ends : sequence of sequences of T Measurements
         Of each end, by tick; those of a single one are tracked and no more.
-    t_ns, birth_score, max_gap_s, min_life_s
+    t_ns : (T,) int64
+    config : TrackConfig
         As for `track`; what both ends have of an object counts as its life.
     """
+    birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
     if len(ends) == 1:
         return track(ends[0], t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=min_life_s)
     tracks: list[Track] = []

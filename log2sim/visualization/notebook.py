@@ -44,8 +44,6 @@ class Thumbnail:
     ----------
     media_type : str
         "image/png" or "image/jpeg".
-    data : bytes
-    caption : str
     """
 
     media_type: str
@@ -241,7 +239,6 @@ class Picture:
     Attributes
     ----------
     figure : matplotlib.figure.Figure
-    title : str
     """
 
     figure: Figure

@@ -69,7 +69,6 @@ class Shot:
 
     Attributes
     ----------
-    camera : Camera
     t_ns : int
         Stamp of the image.
     image : (H, W, 3) uint8 BGR or None
@@ -105,10 +104,8 @@ class Moment:
     ----------
     log : Log
         With standing poses where it has none.
-    t_ns : int
     at_s : float
         Since the first tick.
-    shots : tuple of Shot
     sweeps : tuple of SweepInMap
         Those nearest to the tick.
     boxes : LabelBoxes
@@ -138,7 +135,6 @@ def read_moment(
 
     Parameters
     ----------
-    log : Log
     cameras : sequence of str
         All of the log where it is empty.
     at_s : float, optional

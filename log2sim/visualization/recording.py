@@ -441,7 +441,6 @@ class PointsAbove:
 
     Attributes
     ----------
-    t_ns : int
     origin : (2,) tuple of int, m
         Map position that the points are relative to.
     xy_m : (N, 2) float64

@@ -232,7 +232,6 @@ def zero_velocity_sigma(
     Parameters
     ----------
     knots_s : (K,) float64, s
-    measurement : MeasurementModel
     weight : (n,) float64
         Weights of the observations.
     state : (K, 3, 2) float64
@@ -363,8 +362,6 @@ class _Problem:
 
     Attributes
     ----------
-    prior : MotionPrior
-    measurement : MeasurementModel
     state : (K, 3, 2) float64
         Reference of the forms.
     weight : (n,) float64
@@ -415,10 +412,8 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
 
     Parameters
     ----------
-    observed : NoisyPositions
     asked_s : (T,) float64, s
         Times of the result.
-    motion : MotionModel
 
     Notes
     -----

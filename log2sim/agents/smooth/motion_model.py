@@ -135,7 +135,6 @@ def course_is_known(
     velocity_mps : (T, 2) float64, m/s
     covariance : (T, 2, 2) float64, m2/s2
         Of the velocity.
-    holonomic : bool
     correlated : bool
         Whether the errors of the positions repeat. The covariances are too small then, so the speed alone decides.
     max_curvature_1pm : float, 1/m

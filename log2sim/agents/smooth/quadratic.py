@@ -55,7 +55,6 @@ class Minimum:
         At the minimum.
     log_determinant : float
         log(det A).
-    form : Quadratic
     """
 
     step: Array
@@ -336,7 +335,6 @@ class MeasurementModel:
 
     Attributes
     ----------
-    observed : NoisyPositions
     knot : (n,) int
         Index of the knot that each observation measures.
     design : (n, 3) float64
@@ -475,7 +473,6 @@ class DensityEstimator:
 
     Attributes
     ----------
-    prior : LogNormalPrior
     unknown_scale : bool
         Whether the variance of the noise is known up to a factor only.
     rounds : int
@@ -493,7 +490,6 @@ class DensityEstimator:
 
         Parameters
         ----------
-        motion : MotionPrior
         state : (K, 3, 2) float64
             Reference state of the forms.
         likelihood : Quadratic

@@ -64,13 +64,10 @@ class Panel:
 
     Attributes
     ----------
-    stage : str
     error, label, unit : str
         Key of the figure that is the error, its description and its unit.
-    points : tuple of Point
     on_front : tuple of bool
         Which points are Pareto-optimal.
-    recommendation : Recommendation
     """
 
     stage: str

@@ -35,11 +35,11 @@ from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.fusion import fuse
-from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
+from log2sim.perception.homography_stage import CameraHomography, fit_homographies
 from log2sim.perception.run_detectors import Detectors, create_image_detector
 from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
-from log2sim.perception.sync import Schedule
-from log2sim.pipeline import Run, first_pass, schedule_of, second_pass, start
+from log2sim.perception.sync import Schedule, schedule_of
+from log2sim.pipeline import Run, infer_scenario, observe_log, start
 from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, Stage, make_plan, select_sensors
 
 
@@ -49,8 +49,6 @@ class RecordedDetections:
 
     Attributes
     ----------
-    name : str
-    default_min_score : float
     found : dict of (str, int) to Detections
         By camera and stamp.
     spent_s : list of float, s
@@ -134,7 +132,6 @@ class SeamBench:
 
     Attributes
     ----------
-    aligning, measuring : SeamPictures
     survey : SeamSurvey
         Which pixels of two cameras show one point of the road 15 m away, registered once for all homographies.
     reading_s : float, s
@@ -202,11 +199,6 @@ class BenchContext:
     ----------
     log : Log
         Narrowed to the cameras and sensors of the plan.
-    plan : Plan
-    schedule : Schedule
-    truth : Scenario or None
-    scope : Scope
-    grid : Grid
     found : dict of str to RecordedDetections
         Detections by setting of the detector.
     shared_s : dict of str to float, s
@@ -238,7 +230,6 @@ class BenchRun:
 
     Attributes
     ----------
-    setting : Setting
     score : Score
         Of the scenario.
     measurement_score : Score
@@ -266,14 +257,14 @@ def make_context(
     config, clock = grid.present.config, StageClock()
     sensors = select_sensors(log, config)
     with clock.stage("sync"):
-        schedule = schedule_of(log, config, sensors)
+        schedule = schedule_of(sensors.restrict(log), sensors.cameras, config)
     log = sensors.restrict(log)
     detectors = {s.name: create_image_detector(log, s.config) for s in grid.detect}
     decode = any(s.config.detect.name != LABELS for s in grid.detect)
     found, decoding_s = detect_once(
         log, schedule, detectors, decode=decode, progress=lambda done, total: report("detect", done, total)
     )
-    plan = make_plan(log, config, sensors, schedule.t_ns)
+    plan = make_plan(log, config, sensors, schedule.t_ns).only_agents()
     # Detections are looked up, so that no image is decoded and no frame skipped.
     plan = replace(plan.variant(Decision(Stage.IMAGE_DECODING, False, "detections are shared")), detector_stride=1)
     return BenchContext(log, plan, schedule, truth, scope, grid, found, {**clock.seconds, "decode": decoding_s})
@@ -332,7 +323,7 @@ def _concluded(context: BenchContext, setting: Setting, observations: Observatio
     detectors = Detectors(context.found[context.grid.present.name], None)
     try:
         run = Run(context.log, setting.config, context.plan, context.schedule, detectors, clock, lambda *_: None)
-        result = second_pass(run, observations)
+        result = infer_scenario(run, observations)
     except NothingToReconstruct:
         return Score({"agents": 0})
     return score_scenario(result.scenario, context.truth, context.tick_s, context.scope)
@@ -425,8 +416,8 @@ def homography_points(context: BenchContext, observations: Observations, report:
 def fit(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, CameraHomography]:
     """Fit the homographies of all cameras by one method."""
     plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
-    options, rng = estimation_options(setting.config.topdown), np.random.default_rng(setting.config.seed)
-    return fit_homographies(context.log, holdout.observations, plan, options, rng=rng)
+    rng = np.random.default_rng(setting.config.seed)
+    return fit_homographies(context.log, holdout.observations, plan, setting.config.topdown, rng=rng)
 
 
 def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
@@ -466,8 +457,8 @@ def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | No
     check_scope(truth, scope)
     config = ends[0].config
     sensors = select_sensors(log, config)
-    schedule = schedule_of(log, config, sensors)
-    plan = make_plan(log, config, sensors, schedule.t_ns)
+    schedule = schedule_of(sensors.restrict(log), sensors.cameras, config)
+    plan = make_plan(log, config, sensors, schedule.t_ns).only_agents()
     grid = Grid(detect=tuple(ends[:1]), measure=(), homography=(), hypotheses=(), smooth=())
     return BenchContext(sensors.restrict(log), plan, schedule, truth, scope, grid, {}, {})
 
@@ -508,7 +499,7 @@ def whole_points(
         run = start(log, setting.config, cache=False)
         begin = time.perf_counter()
         try:
-            result = second_pass(run, first_pass(run))
+            result = infer_scenario(replace(run, plan=run.plan.only_agents()), observe_log(run))
             score = score_scenario(result.scenario, truth, period_of(run.schedule.t_ns), scope)
         except NothingToReconstruct:
             score = Score({"agents": 0})

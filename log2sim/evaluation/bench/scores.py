@@ -63,7 +63,6 @@ class Score:
 
     Attributes
     ----------
-    figures : dict
     by_object : mapping of str to ErrorSums
         Contributions of single objects, for figures that are errors.
     """

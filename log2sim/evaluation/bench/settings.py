@@ -87,7 +87,6 @@ class Setting:
 
     Attributes
     ----------
-    stage : str
     name : str
         Within the stage.
     config : Config
@@ -297,7 +296,6 @@ class Point:
 
     Attributes
     ----------
-    setting : str
     present : bool
         Whether it is the present setting.
     ms_per_tick : float, ms
@@ -338,8 +336,6 @@ class Recommendation:
     ----------
     supported : str or None
         The setting that the figures support; None when they do not decide.
-    present : str
-    reason : str
     """
 
     supported: str | None

@@ -32,7 +32,6 @@ class SearchedCloud:
 
     Attributes
     ----------
-    tick : int
     cloud : Cloud or None
         None where the sweep cannot be read or has no pose.
     boxes : Boxes3D
@@ -86,7 +85,6 @@ class LogDetections:
 
     Attributes
     ----------
-    found : DetectedBoxes
     left_out : int
         Sweeps that cannot be read or have no pose.
     unreadable : dict
@@ -108,7 +106,6 @@ def detect_log(
 
     Parameters
     ----------
-    log : Log
     config : Config, optional
         `detect.name` is a LiDAR detector, "lidar:vehicle" by default; its settings are in the section `lidar`. Where vehicle and
         road are joined as tracks, their boxes are joined as boxes.

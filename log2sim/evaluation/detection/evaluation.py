@@ -134,8 +134,6 @@ def average_precision(
 
     Parameters
     ----------
-    found, truth : SceneBoxes
-    criterion : Criterion
     recall_points : {40, 11}
         As in `PrecisionRecall.average`.
     """
@@ -244,9 +242,6 @@ class Objects:
 
     Attributes
     ----------
-    name : str
-    boxes : ClassBoxes
-    found, truth : SceneBoxes
     elsewhere : (M,) bool
         Found boxes that are not false where they match nothing, since they are out of range or of other objects.
     """
@@ -268,7 +263,6 @@ def class_figures(boxes: ClassBoxes, of_class: ObjectClass, min_score: float) ->
 
     Parameters
     ----------
-    boxes : ClassBoxes
     of_class : ObjectClass
         The first of its criteria is that of the tables by range and by points.
     min_score : float
@@ -566,10 +560,8 @@ def evaluate_boxes(
 
     Parameters
     ----------
-    detected : DetectedBoxes
     log : Log
         With labels; its sweeps are read to count points.
-    options : Options
     progress : callable, optional
         Called with (sweeps done, all sweeps).
 

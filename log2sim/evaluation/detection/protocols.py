@@ -103,7 +103,6 @@ def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches
     ----------
     found, truth : SceneBoxes
         Of one class: categories are not compared.
-    criterion : Criterion
     """
     return assign(found, truth, candidate_pairs(found, truth, criterion), criterion)
 
@@ -183,7 +182,6 @@ class ObjectClass:
 
     Attributes
     ----------
-    name : str
     categories : tuple of str
         Categories that make it up; they match freely among each other.
     criteria : tuple of Criterion
@@ -204,8 +202,6 @@ class Protocol:
 
     Attributes
     ----------
-    name : str
-    classes : tuple of ObjectClass
     of_camera : bool
         Whether only boxes count that the reference camera shows, by KITTI's difficulties.
     """
@@ -217,15 +213,7 @@ class Protocol:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Limits of a true box; found boxes below the height are ignored.
-
-    Attributes
-    ----------
-    name : str
-    min_height_px : float
-    max_occlusion : int
-    max_truncation : float
-    """
+    """Limits of a true box; found boxes below the height are ignored."""
 
     name: str
     min_height_px: float

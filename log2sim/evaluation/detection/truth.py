@@ -160,8 +160,6 @@ def image_views(
 
     Parameters
     ----------
-    log : Log
-    camera : str
     t_ns : (F,) int64
         Stamps of the scenes, absolute; the camera is taken where it was then.
     boxes : SceneBoxes
@@ -243,7 +241,6 @@ def truth_of_sweeps(
 
     Parameters
     ----------
-    log : Log
     t_ns : (F,) int64
         Stamps of the sweeps, absolute, increasing.
     progress : callable, optional

@@ -233,7 +233,6 @@ class StateTable:
 
     Attributes
     ----------
-    ids : tuple of str
     category, group : (A,) str
     size_m : (A, 3) float64, m
     xy_m : (A, T, 2) float64, m
@@ -411,7 +410,6 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
 
     Parameters
     ----------
-    ignore_regions : IgnoreRegions
     t_s : (T,)
         Ticks, seconds of the truth.
     agents : StateTable
@@ -515,7 +513,6 @@ class Comparison:
     ----------
     truth, other : StateTable
         Truth and reconstruction.
-    pairs : Pairs
     match : (A, T) int64
         Index of the reconstructed agent, -1 for none.
     counted : (A, T) bool
@@ -556,10 +553,8 @@ def compare(
 
     Parameters
     ----------
-    truth, other : StateTable
     tick_s : float, s
         Interval of the ticks.
-    selection : Selection
     visibility_stated : bool
         Whether the truth states what is visible; else it follows from `MIN_POINTS` points and from pictures.
     """
@@ -613,7 +608,6 @@ def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s:
 
     Parameters
     ----------
-    c : Comparison
     regions : IgnoreRegions or None
         None where the labels are complete.
     truth_ticks_s : (T,) float64, s

@@ -93,8 +93,6 @@ class JudgedAgents:
 
     Attributes
     ----------
-    states : StateTable
-    verdicts : Verdicts
     wrong : (B, T) bool
     confidence : (B,) float64
     reasons : tuple of tuple of str
@@ -125,7 +123,6 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
 
     Parameters
     ----------
-    c : Comparison
     agents : sequence of Agent
         The B reconstructed agents of the comparison.
     ticks_s : (T,) float64, s

@@ -296,7 +296,6 @@ def truth_from_log(
 
     Parameters
     ----------
-    log : Log
     cameras : sequence of str, optional
         Cameras that were used, all by default; only what they show counts as visible.
     points : bool

@@ -36,7 +36,6 @@ class VehicleDefaults:
     ----------
     category : str
         OpenSCENARIO's vehicle category.
-    wheel_diameter_m, max_steering_rad, max_speed_mps, max_acceleration_mps2 : float
     tracks : bool
         Whether an axle has two wheels.
     """
@@ -169,7 +168,6 @@ class AgentStory:
 
     Attributes
     ----------
-    name : str
     vertices : (V, 5) float64
         t, x, y, z, heading of the reference point.
     speed_mps : float

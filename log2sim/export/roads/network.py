@@ -152,13 +152,10 @@ class Road:
         Its id.
     lanes : tuple of MapLane
         From the left to the right: lane -1, -2, ...
-    line : ReferenceLine
     elevation, offset : (K, 5) float64
         Stations and coefficients a, b, c, d of cubics: the height, and how far the left edge of lane -1 is left of the line.
     widths : tuple of (K, 5) float64
         Of the lanes.
-    junction : int or None
-    before, after : Link or None
     """
 
     number: int

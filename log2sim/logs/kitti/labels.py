@@ -238,7 +238,6 @@ class DriveLabels:
 
     Attributes
     ----------
-    boxes_3d : Labels or None
     boxes_2d : mapping of str to ImageLabels
         By camera.
     ignored : mapping of str to ImageRegions
@@ -308,7 +307,6 @@ def labels_of_rows(
 
     Parameters
     ----------
-    rows : LabelRows
     ego_T_rect : (4, 4) float64
         Pose of the rectified camera 0.
     track : PoseTrack
@@ -350,7 +348,6 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
 
     Parameters
     ----------
-    text : str
     path : Path
         For messages.
     damaged : list of str, optional

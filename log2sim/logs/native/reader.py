@@ -61,7 +61,6 @@ class CsvTable:
 
     Attributes
     ----------
-    path : Path
     columns : mapping of str to (N,) array
     line : (N,) int64
         Line of the file of each row, for messages.
@@ -102,7 +101,6 @@ def read_csv_table(
 
     Parameters
     ----------
-    path : Path
     columns, optional : mapping of name to "int", "float", "bool" or "str"
         Columns that must and that may be there, in any order. An unknown one is an error.
     damaged : list of str, optional
@@ -304,7 +302,6 @@ class SweepFiles:
 
     Attributes
     ----------
-    files : list of Path
     t_ns : (F,) int64
         Absolute stamps.
     frame : {"lidar", "map"}

@@ -148,7 +148,6 @@ def write_log(
     ----------
     log : Log
         Its records are read one by one, so that a log may render them on demand.
-    path : Path or str
     overwrite : bool
         Replace a log folder of that name; a folder that is no log is never replaced.
     jpeg_quality : int

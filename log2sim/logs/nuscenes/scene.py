@@ -46,7 +46,6 @@ def sweep_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], poses: P
 
     Parameters
     ----------
-    name : str
     t_ns : (F,) int64
         Ends of the turns.
     files : list of Path
@@ -150,7 +149,6 @@ class Scene:
 
     Attributes
     ----------
-    tables : Tables
     record : Record
         Of scene.
     notes : list of str
@@ -316,7 +314,6 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
 
     Parameters
     ----------
-    scene : Scene
     lidar : Channel or None
         In whose sweeps objects were labeled.
     offset_m : (3,) float64

@@ -34,12 +34,7 @@ SCENES, DATA = "scene", "sample_data"
 
 @dataclass(frozen=True)
 class Tables:
-    """Tables of one version, such as the folder v1.0-mini.
-
-    Attributes
-    ----------
-    folder : Path
-    """
+    """Tables of one version, such as the folder v1.0-mini."""
 
     folder: Path
 

@@ -33,7 +33,6 @@ class Recording:
 
     Attributes
     ----------
-    name : str
     place : Path
         Its file or folder.
     files : tuple of Path

@@ -33,7 +33,6 @@ class Channel:
 
     Attributes
     ----------
-    topic : str
     msgtype : str
         Such as "sensor_msgs/msg/Image".
     encoding : str

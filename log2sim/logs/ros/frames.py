@@ -223,8 +223,6 @@ class EgoFrame:
     base_T_ego : (4, 4) float64
     ground_z_m : float or None
         Height of the road in the ego frame; None where it has to be measured.
-    vehicle : EgoVehicle
-    notes : tuple of str
     """
 
     base: str | None
@@ -241,7 +239,6 @@ def choose_base(
 
     Parameters
     ----------
-    tree : FrameTree
     sensor_frames : list of str
         Frames of the LiDARs, then of the cameras.
     pose_frames : iterable of str

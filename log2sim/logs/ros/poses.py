@@ -52,16 +52,12 @@ class PoseSources:
 
     Attributes
     ----------
-    bag : Bag
     topics : mapping of str to list of str
         Topics by kind.
     messages : mapping of str to sequence of bytes or None
         Their messages.
-    tree : FrameTree
     base : str
         The vehicle's frame.
-    settings : PoseSettings
-    map : MapSettings
     span_ns : (int, int)
         First and last stamp of the sensors.
     damaged : dict of str to int

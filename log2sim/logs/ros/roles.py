@@ -52,7 +52,6 @@ class Roles:
         Topics by kind: "camera info", "odometry", "pose", "gnss", "imu", "tf".
     reasons : dict of str to (str, str)
         Role and reason by topic.
-    notes : list of str
     """
 
     cameras: dict[str, CameraTopic] = field(default_factory=dict)

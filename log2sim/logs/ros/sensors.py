@@ -47,7 +47,6 @@ def camera_from_info(
 
     Parameters
     ----------
-    name : str
     info : sensor_msgs/CameraInfo
     pose : (mount, (4, 4) float64)
         Where the frame of the images is: mount_T_cam.
@@ -232,7 +231,6 @@ def sweep_from(message: Any, t_ns: int, period_ns: float, settings: LidarTopic, 
         Its stamp.
     period_ns : float
         Time between two sweeps, by which the unit of the times is recognized.
-    settings : LidarTopic
     where : str
         Names the message in errors.
 

@@ -60,7 +60,6 @@ class Field(NamedTuple):
 
     Attributes
     ----------
-    number : int
     kind : int
         VARINT, FIXED64, BYTES or FIXED32.
     value : int
@@ -195,14 +194,10 @@ class FrameIndex:
 
     Attributes
     ----------
-    context : Span
-    stamp_us : int or None
     pose : (4, 4) float64 or None
     images : dict of camera number to (ImageTimes, Span of the JPEG)
     lasers : dict of LiDAR number to Span of its message
         Only those with a range image.
-    labels, camera_labels, projected_labels : list of Span
-    no_label_zones : int
     """
 
     context: Span = (0, 0)
@@ -343,7 +338,6 @@ def read_box(data: bytes, dimensions: int) -> tuple[str, int, list[float]] | Non
 
     Parameters
     ----------
-    data : bytes
     dimensions : int
         3, or 2 for a box in an image.
     """

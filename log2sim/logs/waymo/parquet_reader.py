@@ -213,14 +213,12 @@ class SensorRows:
 
     Parameters
     ----------
-    path : Path
     index : mapping of str to str
         Columns to read at once, with the stamp and the sensor.
     names : mapping of int to str
         Sensors by number.
     frame_of : mapping of int to int
         Index of the frame of a stamp in us.
-    records : RecordColumns
 
     Attributes
     ----------

@@ -92,8 +92,6 @@ def points_of(
 
     Parameters
     ----------
-    images : RangeImages
-    laser : LaserCalibration
     world_T_vehicle : (4, 4) float64
         Pose that defines the vehicle's frame.
 
@@ -210,7 +208,6 @@ def labels_of(
     ----------
     table : BoxTable
         `frame` counts the frames in order.
-    times : FrameTimes
     map_T_vehicle : (F, 4, 4) float64
         Poses that define the vehicle's frames.
     top : LaserCalibration or None
@@ -288,7 +285,6 @@ class LabelsOnRequest(Mapping[str, ImageLabels]):
 
     Attributes
     ----------
-    cameras : tuple of str
     read : callable
         Reads the labels of a camera.
     """

@@ -40,7 +40,6 @@ class CameraCalibration:
         f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3.
     vehicle_T_camera : (4, 4) float64
         The camera's frame has x forward, y left, z up.
-    width_px, height_px : int
     direction : int
         RollingShutterReadOutDirection.
     """
@@ -213,7 +212,6 @@ class Segment:
 
     Attributes
     ----------
-    name : str
     path : Path
         Its file or folder, for errors.
     cameras : mapping of number to CameraCalibration
@@ -236,7 +234,6 @@ class Segment:
         Names a frame by index in errors.
     details : mapping
         For `log2sim inspect`.
-    notes : list of str
     """
 
     name: str

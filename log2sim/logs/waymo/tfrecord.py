@@ -156,7 +156,6 @@ class RecordFile:
 
         Parameters
         ----------
-        k : int
         what : str
             Names the record in errors.
 

@@ -101,8 +101,6 @@ class FunctionDetector:
     function : callable
     min_score : float
         Boxes with lower scores are left out.
-    name : str
-    default_min_score : float
     """
 
     function: ImageFunction
@@ -376,14 +374,7 @@ class FrameBoxes:
 
 @dataclass(frozen=True, eq=False)
 class LabelDetector:
-    """Detector that returns the labels of a log; it never decodes an image.
-
-    Attributes
-    ----------
-    log : Log
-    min_score, default_min_score : float
-    name : str
-    """
+    """Detector that returns the labels of a log; it never decodes an image."""
 
     log: Log
     min_score: float = 0.0

@@ -24,7 +24,6 @@ class InputSpec:
 
     Attributes
     ----------
-    name : str
     height_px, width_px : int or None
         None where the model takes any size.
     channels_last : bool

@@ -52,8 +52,6 @@ class OnnxModel:
 
     Attributes
     ----------
-    path : Path
-    spec : InputSpec
     metadata : mapping of str to str
         Custom metadata of the file, such as class names.
     session : onnxruntime.InferenceSession
@@ -272,7 +270,6 @@ def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detection
 
     Parameters
     ----------
-    detections : Detections
     sure_score : float
         A two-wheeler of a lower score that lies inside the person's box is a bag or clothes, and nothing is joined.
 
@@ -348,10 +345,6 @@ class OnnxDetector:
 
     Attributes
     ----------
-    name : str
-    model : OnnxModel
-    layout : Layout
-    classes : Classes
     min_score : float
         Lowest score of a box.
     min_weak_score : float

@@ -47,8 +47,6 @@ class Node:
 
     Attributes
     ----------
-    name : str
-    op : str
     inputs : tuple of str
         Names of nodes, without output numbers.
     attributes : dict of str to bytes

@@ -40,10 +40,8 @@ class LabelBoxDetector:
 
     Attributes
     ----------
-    log : Log
     max_range_m : float
         Largest distance from the sensor along an axis, m; infinite without a limit.
-    name : str
     """
 
     log: Log
@@ -156,8 +154,6 @@ class NetworkDetector:
 
     Attributes
     ----------
-    name : str
-    network : Network
     decode : "centers" or "votes"
         See `LidarConfig`.
     range_m : float

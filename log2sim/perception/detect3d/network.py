@@ -34,7 +34,6 @@ def open_session(path: Path, options: Any) -> Any:
 
     Parameters
     ----------
-    path : Path
     options : onnxruntime.SessionOptions
 
     Returns
@@ -64,7 +63,6 @@ def grid_window(
     Parameters
     ----------
     xy : (N, 2) float32, m
-    cell_m : float
     range_m : float
         Largest magnitude of x and y relative to `center`, m.
     center : (2,) float64, m
@@ -102,7 +100,6 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     ----------
     xyz : (N, 3) float32, m
         Points whose z is the height above the ground; points outside the grid, of other heights or not finite are left out.
-    cell_m : float
     low : (2,) float64, m
         Lower corner of the grid.
     shape : (int, int)
@@ -163,7 +160,6 @@ def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDA
 
     Parameters
     ----------
-    cloud : Cloud
     range_m : float
         Largest distance from a sensor along x and along y, m.
 
@@ -224,7 +220,6 @@ def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[
         Centers of the boxes, relative to the cloud's origin.
     inside : PointsOfBoxes
         Each box has at least one point.
-    cloud : Cloud
     index : (n,) int
         Of the points that `inside` numbers in the cloud.
 
@@ -272,8 +267,6 @@ class NetworkInfo(BaseModel):
 
     Attributes
     ----------
-    version : int
-    name : str
     cell_m : float
         Side of a cell of the grid, m.
     stride : int
@@ -396,8 +389,6 @@ class Network:
 
     Attributes
     ----------
-    path : Path
-    info : NetworkInfo
     session : onnxruntime.InferenceSession
     """
 

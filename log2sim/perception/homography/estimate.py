@@ -91,8 +91,6 @@ def estimate_homography(
     ----------
     correspondences : Correspondences
         Rows that are not finite are ignored.
-    options : EstimationOptions, optional
-    rng : numpy.random.Generator
 
     Raises
     ------
@@ -218,7 +216,6 @@ def fit_camera(
         Of obstacles and of LiDAR ground points.
     options : EstimationOptions
         Its standard deviations are replaced by those of these correspondences; `pitch_roll` is decided by the data.
-    rng : numpy.random.Generator
 
     Returns
     -------
@@ -343,7 +340,6 @@ def place_obstacle(
     Parameters
     ----------
     ground_H_image : (3, 3) float64
-    camera : Camera
     box_px : (4,) float64
     category : str
         Its typical size is used.

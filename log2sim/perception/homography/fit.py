@@ -38,7 +38,6 @@ class FitHealth:
 
     Attributes
     ----------
-    ok : bool
     reason : str
         Why it is refused, "" otherwise.
     condition : float

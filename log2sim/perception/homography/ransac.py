@@ -172,8 +172,6 @@ def ransac(
 
     Parameters
     ----------
-    data : NormalizedCorrespondences
-    rng : numpy.random.Generator
     pitch_sigma : float
         Standard deviation of an image shift along v that differs from tick to tick, normalized units. With it the
         result is not refined, which is left to the fit of pitch and roll.

@@ -29,7 +29,6 @@ class RigCamera:
 
     Attributes
     ----------
-    camera : Camera
     cam_T_rig : (4, 4) float64
         The rig frame is the ground frame of the correspondences with its origin on the ground below the cameras' mean.
     """
@@ -44,7 +43,6 @@ class Rig:
 
     Attributes
     ----------
-    cameras : mapping of str to RigCamera
     origin_m : (3,) float64
         Origin of the rig frame in the ground frame of the correspondences.
     """
@@ -113,7 +111,6 @@ def cam_of_ground(member: RigCamera, plane: Array, turn: Array) -> Array:
 
     Parameters
     ----------
-    member : RigCamera
     plane : (..., 3) float64
     turn : (3, 3) float64
         Rotation of the camera against its calibration.

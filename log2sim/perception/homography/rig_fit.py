@@ -63,7 +63,6 @@ class FeetFit:
 
     Attributes
     ----------
-    state : RigState
     errors : FootErrors
         Of all rows, by the assumed noise.
     noise : float
@@ -182,10 +181,8 @@ class RigFit:
     ----------
     reason : str
         Why nothing was fitted, "" otherwise.
-    rig : Rig
     fits : mapping of str to HomographyFit
         From the feet of boxes to the ground, by camera; refused ones state why.
-    state : RigState or None
     ticks : (T,) int64
         Ticks with a plane of their own, ascending.
     planes : (T, 3) float64
@@ -227,10 +224,8 @@ def fit_rig(
 
     Parameters
     ----------
-    rig : Rig
     feet, ground : mapping of str to Correspondences
         Of obstacles and of LiDAR ground points, by camera.
-    rng : numpy.random.Generator
     samples : int
         Planes that RANSAC draws for the whole rig.
     """

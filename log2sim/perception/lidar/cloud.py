@@ -254,7 +254,6 @@ class _Clusters:
 
     Attributes
     ----------
-    index : AzimuthIndex
     count, start : (R,) int
         Number of points of each cluster, and the place of its first.
     group : (K,) int
@@ -410,7 +409,6 @@ class Cloud:
 
     Attributes
     ----------
-    stamp_ns : int
     origin : (3,) float64
         m, map frame. Coordinates are relative to it, so that single precision resolves 1e-5 m.
     xyz : (N, 3) float32

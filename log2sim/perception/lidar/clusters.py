@@ -69,7 +69,6 @@ def candidate_clusters(
         Their distances from the sensor.
     box_px : (4,) float64
         The detection box: u0, v0, u1, v1.
-    category : str
 
     Returns
     -------
@@ -309,10 +308,8 @@ def _body_points(
 
     Parameters
     ----------
-    visible : ProjectedPoints
     rows : Measurements
         Of the frame.
-    k : int
     is_free : callable
         Marks those of some of the points that are no other object's.
     focal_px : float

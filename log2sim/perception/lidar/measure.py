@@ -57,7 +57,6 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
     rows : R ints
     members : R arrays (n,) of int
         The points of each row in the cloud.
-    cloud : Cloud
     """
     split = [cloud.split(index) for index in members]
     kept = [i for i, views in enumerate(split) if len(views[0][1]) >= min(MIN_CLUSTER_POINTS, len(members[i]))]

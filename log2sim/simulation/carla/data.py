@@ -33,7 +33,6 @@ class Asset:
 
     Attributes
     ----------
-    blueprint : str
     size_m : (3,) tuple of float, m
         Length, width, height.
     error_m : (3,) tuple of float, m

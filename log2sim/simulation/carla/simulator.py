@@ -37,10 +37,6 @@ class CarlaServer:
 
     Attributes
     ----------
-    host : str
-    port : int
-    timeout_s : float
-    town : str or None
     opendrive : Path or None
         An OpenDRIVE file.
     """

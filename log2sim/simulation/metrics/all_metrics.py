@@ -252,7 +252,6 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
 
     Parameters
     ----------
-    ego : AgentReplay
     index : int
         Its column in `boxes`.
     boxes : BoxTracks
@@ -443,7 +442,6 @@ def replay_metrics(
 
     Parameters
     ----------
-    agents : sequence of AgentReplay
     stored : sequence of (S,) int
         The steps of each agent's rows; of a static agent all stored steps at which it is present.
     trajectories, errors : by id

@@ -169,7 +169,6 @@ class FrameTiming:
 
     Attributes
     ----------
-    frames : int
     step_s : float, s
         Of the scenario from frame to frame.
     start_s : float, s

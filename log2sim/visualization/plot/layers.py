@@ -109,7 +109,6 @@ class WarnedPlace(NamedTuple):
     ----------
     ends_m : (2, 2) float64, m
         Centers of the ego and of the agent.
-    text : str
     """
 
     ends_m: Array
@@ -277,12 +276,10 @@ class Overlays:
         In the time and map of the scenario.
     background : BirdsEyeView or None
         A picture of the ground, drawn below everything.
-    predicted : PredictedPaths or None
     title : str or None
         None for the name of the scenario.
     span : Span or None
         Range of time that is shown; None for the whole scenario.
-    options : PlotOptions
     """
 
     replay: Any = None

@@ -71,11 +71,8 @@ class MapLabel:
 
     Attributes
     ----------
-    text, color : str
     place_m : (2,) float64, m
         Middle of the text.
-    size_pt : float
-    bold : bool
     """
 
     text: str
@@ -91,7 +88,6 @@ class Placed:
 
     Attributes
     ----------
-    labels : list of MapLabel
     told : set of str
         Ids of the agents of which the map says all that the legend would.
     """
@@ -373,8 +369,6 @@ class FigureLayout:
 
     Attributes
     ----------
-    figure : Figure
-    canvas : FigureCanvasAgg
     ax : Axes
         Of the map.
     view : Viewport

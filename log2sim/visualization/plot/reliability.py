@@ -26,7 +26,6 @@ class Reliability:
 
     Attributes
     ----------
-    name : str
     noun : str
         What is counted, in the plural: "boxes", "ticks".
     error : float

@@ -58,7 +58,6 @@ class PictureBase:
 
     Attributes
     ----------
-    layout : FigureLayout
     step_s : float, s
         Between time marks.
     charts : TimelineCharts or None
@@ -193,7 +192,6 @@ def plot(
 
     Parameters
     ----------
-    scenario : Scenario
     ax : matplotlib.axes.Axes, optional
         Drawn into; limits of axes that show something already are kept. Without, a new figure of pyplot.
     replay : Replay, optional

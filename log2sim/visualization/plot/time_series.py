@@ -37,7 +37,6 @@ class Curve:
 
     Attributes
     ----------
-    label : str
     t_s, values : (T,) float64
     style : {"thin", "ribbon", "muted"}
         A ribbon is the reference of the thin line over it; muted curves are secondary.
@@ -55,7 +54,6 @@ class Chart:
 
     Attributes
     ----------
-    name, unit : str
     min_span : float
         Smallest range of the value axis, in `unit`.
     lines : tuple of Curve
@@ -74,9 +72,6 @@ class AgentTimeline:
 
     Attributes
     ----------
-    role : AgentRole
-    driver : str
-    charts : tuple of Chart
     collisions_s : tuple of float, s
         Start of its collisions that belong to the replay.
     """
@@ -138,7 +133,6 @@ class TimelineCharts:
 
     Attributes
     ----------
-    timeline : AgentTimeline
     axes : tuple of Axes
         From the top, one for each chart.
     moving : list

@@ -23,8 +23,6 @@ class AgentRole:
 
     Attributes
     ----------
-    agent : Agent
-    color : str
     label : str
         Shared by map and legend.
     leading : bool
