@@ -598,4 +598,4 @@ def test_seconds_stand_in_the_report_and_not_in_the_scenario(tiny: Log) -> None:
     a, b = run(tiny), run(tiny)
     assert a.scenario.to_dict() == b.scenario.to_dict()
     assert all("saved_s" in p for p in a.report["plan"])
-    assert not any("saved_s" in p for p in a.scenario.plan)
+    assert not any("saved_s" in p for p in a.scenario.stages)

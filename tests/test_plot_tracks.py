@@ -14,7 +14,7 @@ from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import viewport
 from log2sim.visualization.plot.animation import AnimatedArtists
 from log2sim.visualization.plot.layers import Overlays
-from log2sim.visualization.plot.layout import FigureLayout
+from log2sim.visualization.plot.layout import FigureLayout, place_labels
 from log2sim.visualization.plot.style import PALETTE, printable
 from log2sim.visualization.plot.tracks import plot_tracks, still
 from log2sim.visualization.plot.viewport import Viewport, assign_roles, choose_viewport, nice_step, time_step_s
@@ -303,3 +303,28 @@ def test_steps_are_round_numbers() -> None:
 def test_letters_that_the_font_lacks_become_question_marks() -> None:
     assert printable("Straße 日 \n x") == "Straße ? x"
     assert len(printable("x" * 500)) == 80
+
+
+def test_a_part_of_a_scenario_keeps_the_colors_of_the_whole_and_labels_are_ids() -> None:
+    whole = many(8)
+    colors = {role.agent.id: role.color for role in assign_roles(whole).movers}
+    part = dataclasses.replace(whole, agents=whole.agents[:1] + whole.agents[4:])
+    assert {role.agent.id: role.color for role in assign_roles(part, whole).movers} == {
+        a.id: colors[a.id] for a in part.agents
+    }
+    assert {role.agent.id: role.color for role in assign_roles(part).movers} != {
+        a.id: colors[a.id] for a in part.agents
+    }
+    roles = assign_roles(whole)
+    placed = place_labels(roles, choose_viewport(roles).fitted(400, 400), 1.0)
+    assert placed.labels
+    assert all(
+        any(label.text.startswith(a.id) for a in whole.agents) or label.text.endswith(" s") for label in placed.labels
+    )
+
+
+def test_static_agents_have_labels_on_demand() -> None:
+    roles = assign_roles(crossing())
+    view = choose_viewport(roles).fitted(400, 400)
+    assert not any(label.text == "p" for label in place_labels(roles, view, 1.0).labels)
+    assert any(label.text == "p" for label in place_labels(roles, view, 1.0, static=True).labels)

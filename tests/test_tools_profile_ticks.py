@@ -31,13 +31,13 @@ def test_time_is_given_to_the_innermost_function_of_log2sim() -> None:
 
     with pytest.raises(LogError), translate_parser_errors("here", LogError):
         raise Noticing
-    assert {profile_ticks.function_of(frame) for frame in frames} == {"logs.guarding.translate_parser_errors"}
+    assert {profile_ticks.function_of(frame) for frame in frames} == {"logs.records.translate_parser_errors"}
 
 
 @pytest.mark.parametrize(
     ("function", "part"),
     [
-        ("logs.guarding.guarded", "logs"),
+        ("logs.records.guarded", "logs"),
         ("perception.lidar.cloud.deskew", "perception.lidar"),
         ("perception.frames.get", "perception.frames"),
         ("pipeline.start", "pipeline"),

@@ -115,7 +115,9 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
     """
     rows = [_placed(boxes) for boxes in found]
     yaw, score = [b.yaw_rad.copy() for b in found], [b.heading_score.copy() for b in found]
-    for one in track(rows, t_ns, **config.model_dump()):
+    for one in track(
+        rows, t_ns, birth_score=config.birth_score, max_gap_s=config.max_gap_s, min_life_s=config.min_life_s
+    ):
         m, group, velocity = one.measurements, GROUP_OF[one.category], velocities(one)
         speed, course = np.hypot(*velocity.T), np.arctan2(velocity[:, 1], velocity[:, 0])
         t_s = (m.t_ns - m.t_ns[0]) / NS_PER_S

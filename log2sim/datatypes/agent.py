@@ -383,10 +383,10 @@ class Agent:
     rear_axle_offset_m: float = 0.0
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0
-    quarantined: bool = False
     quality: Mapping[str, Any] = field(default_factory=dict)
     doubts: tuple[Doubt, ...] = ()
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
+    quarantined: bool = False
 
     def __repr__(self) -> str:
         """Return category, size, times and confidence in one line."""

@@ -123,7 +123,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "nuscenes": "log2sim.logs.nuscenes.reader:READER",
         "log2sim": "log2sim.logs.native.reader:READER",
         "kitti": "log2sim.logs.kitti.drives:READER",
-        "kitti-tracking": "log2sim.logs.kitti.drives:READER",
+        "kitti-tracking": "log2sim.logs.kitti.drives:TRACKING_READER",
         "kitti-object": "log2sim.logs.kitti.object:READER",
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",

@@ -98,7 +98,7 @@ class Placed:
 
 def short_label(role: AgentRole) -> str:
     """Return what marks a mover on the map where there is little room."""
-    return ("ego" if role.is_ego else role.label) + "?" * role.agent.is_doubtful
+    return printable(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
 
 
 def speed_text(agent: Agent) -> str:
@@ -112,8 +112,8 @@ def full_label(role: AgentRole) -> str:
     return f"{printable(role.agent.id, MAX_ID_LETTERS)}{'?' * role.agent.is_doubtful} · {speed_text(role.agent)}"
 
 
-def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float) -> Placed:
-    """Find places for the labels of movers and doubtful agents, and for times along the ego's track.
+def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float, *, static: bool = False) -> Placed:
+    """Find places for the labels of movers and doubtful agents, with `static` of all static ones, and for times along the ego's track.
 
     Notes
     -----
@@ -130,6 +130,10 @@ def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float) -> Plac
     for agent in roles.stationary:
         if agent.is_doubtful:
             _place_doubtful(agent, room, placed)
+        elif static:
+            anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
+            place = room.place(name := printable(agent.id, MAX_ID_LETTERS), DETAIL_PT, [anchor])
+            placed.labels += [] if place is None else [MapLabel(name, MUTED, place, DETAIL_PT, bold=False)]
     if roles.movers and roles.movers[0].is_ego:
         _place_times(roles.movers[0].agent, times_step_s, room, placed)
     return placed
@@ -329,7 +333,7 @@ class MovingLabels:
     def _text_of(self, role: AgentRole, speed_mps: float) -> str:
         if not self._named:
             return short_label(role)
-        name = printable(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
+        name = short_label(role)
         moves = abs(speed_mps) >= STANDSTILL_MPS
         return f"{name} · {abs(speed_mps) * 3.6:.0f} km/h" if moves else name
 
@@ -529,21 +533,16 @@ def _axes_style(ax: Axes, view: Viewport, projected: bool) -> None:
         spine.set(color=FRAME, linewidth=0.8)
 
 
-def _reading_order(role: AgentRole) -> tuple[bool, int, str]:
-    """Sort the ego first, then labels by their number: 2 before 10."""
-    digits = "".join(c for c in role.label if c in "0123456789")
-    return (not role.is_ego, int(digits) if digits else 0, role.label)
+def _reading_order(role: AgentRole) -> tuple[bool, str, int, str]:
+    """Sort the ego first, then ids by their number: car-2 before car-10."""
+    name, digits = role.agent.id.rstrip("0123456789"), role.agent.id[len(role.agent.id.rstrip("0123456789")) :]
+    return (not role.is_ego, name, int(digits) if digits else 0, role.agent.id)
 
 
 def _name(role: AgentRole) -> str:
-    moving = speed_text(role.agent)
-    if role.is_ego:
-        return f"ego · {moving}"
-    if role.agent.id.startswith(role.agent.category):
-        return f"{printable(role.label, 9)} · {printable(role.agent.id, 20)} · {moving}"
-    text = f"{printable(role.label, 9)} · {role.agent.category} · {moving}"
-    room = 34 - len(text) - 3  # 34 letters fit into the column
-    return text if role.label == role.agent.id else f"{text} · {printable(role.agent.id, max(room, 4))}"
+    name, moving = "ego" if role.is_ego else printable(role.agent.id, 20), speed_text(role.agent)
+    known = role.is_ego or role.agent.id.startswith(role.agent.category)
+    return f"{name} · {moving}" if known else f"{name} · {role.agent.category} · {moving}"
 
 
 def _line(color: str, **style: Any) -> Line2D:

@@ -50,6 +50,8 @@ class PlotOptions:
         Two opposite corners of the part of the map, map frame. A picture of other proportions shows more of the map.
     agents : tuple of str or None
         Ids of the agents that are shown; None for all.
+    label_static : bool
+        Whether static agents have labels too; those that are doubtful always have.
     """
 
     size_px: tuple[int, int] | None = None
@@ -59,6 +61,7 @@ class PlotOptions:
     stop_s: float | None = None
     extent_m: tuple[float, float, float, float] | None = None
     agents: tuple[str, ...] | None = None
+    label_static: bool = False
 
     def require_fits(self, suffix: str, name: str) -> None:
         """Raise `ConfigError` when a file with this suffix and name has no such options, or a value is out of its limits."""

@@ -89,6 +89,7 @@ def plot_tracks(
     suffix = film.path.suffix.lower()
     options.require_fits(suffix, film.path.name)
     refuse_existing(film.path, overwrite=overwrite)
+    whole = scenario
     scenario, replay = select_shown(scenario, replay, options)
     span = choose_span(scenario, options)
     overlays = Overlays(
@@ -101,7 +102,7 @@ def plot_tracks(
         options=options,
     )
     scenario = cut_scenario(scenario, span)
-    roles = assign_roles(scenario)
+    roles = assign_roles(scenario, whole)
     if suffix in MOVING:
         from log2sim.visualization.plot.animation import write_animation
 

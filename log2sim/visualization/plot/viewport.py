@@ -23,15 +23,12 @@ class AgentRole:
 
     Attributes
     ----------
-    label : str
-        Shared by map and legend.
     leading : bool
         Whether it has its own color, a label and a line in the legend.
     """
 
     agent: Agent
     color: str
-    label: str
     leading: bool
 
     @property
@@ -53,22 +50,29 @@ class AgentRoles:
     stationary: tuple[Agent, ...]
 
 
-def assign_roles(scenario: Scenario, max_leading: int = len(PALETTE)) -> AgentRoles:
-    """Split agents into movers and stationary ones; movers by closest approach to the ego, without one by distance driven."""
-    ego = scenario.ego
-    moving = [a for a in scenario.others if is_moving(a)]
+def assign_roles(scenario: Scenario, whole: Scenario | None = None, max_leading: int = len(PALETTE)) -> AgentRoles:
+    """Split agents into movers and static ones; movers by closest approach to the ego, without one by distance driven.
+
+    Where `scenario` is a part of a `whole` one, its agents keep their colors of the whole: those of every picture, film and page.
+    """
+    movers = _ranked(scenario)
+    rank = {agent.id: k for k, agent in enumerate(movers if whole is None else _ranked(whole))}
+    roles = [] if scenario.ego is None else [AgentRole(scenario.ego, INK, True)]
+    for k, agent in enumerate(movers):
+        leading = k < max_leading
+        color = PALETTE[rank.get(agent.id, k) % len(PALETTE)] if leading else CROWD_COLOR
+        roles.append(AgentRole(agent, color, leading))
+    return AgentRoles(tuple(roles), tuple(a for a in scenario.others if not is_moving(a)))
+
+
+def _ranked(scenario: Scenario) -> list[Agent]:
+    """Return the agents that move but the ego, the most important first."""
+    ego, moving = scenario.ego, [a for a in scenario.others if is_moving(a)]
     if ego is not None:
         key = {a.id: _closest_m(a, ego) for a in moving}
     else:
         key = {a.id: -float(np.ptp(centers_xy(a), axis=0).sum()) for a in moving}
-    moving.sort(key=lambda a: (key[a.id], a.id))
-    short = all(len(a.id) <= 4 for a in moving)
-    roles = [] if ego is None else [AgentRole(ego, INK, "ego", True)]
-    for k, agent in enumerate(moving):
-        leading = k < max_leading
-        label = agent.id if short else str(k + 1)
-        roles.append(AgentRole(agent, PALETTE[k % len(PALETTE)] if leading else CROWD_COLOR, label, leading))
-    return AgentRoles(tuple(roles), tuple(a for a in scenario.others if not is_moving(a)))
+    return sorted(moving, key=lambda a: (key[a.id], a.id))
 
 
 def is_moving(agent: Agent) -> bool:
