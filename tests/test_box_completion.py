@@ -9,18 +9,20 @@ from hypothesis import strategies as st
 from worlds import measured_row, scan, standing
 
 from log2sim.datatypes import CATEGORIES, TYPICAL_SIZE_M
-from log2sim.perception.box_completion import (
+from log2sim.perception.boxes import (
     CORNER_ROUNDING_SHARE,
     FACING_END,
+    SENSOR_MOTION_M,
     SIDE_END,
     complete_box,
     corner_correction,
+    extents,
     oriented_covariance,
     place_boxes,
     provisional_sizes,
     real_ends,
+    rotate,
 )
-from log2sim.perception.box_fitting import extents, rotate
 
 QUARTER = np.pi / 2
 # Of the corners of a car of 1.8 m.
@@ -137,9 +139,21 @@ def test_the_best_real_end_stays_whatever_the_size(seen, factor):
 def test_a_side_that_faces_the_sensor_is_real_and_the_opposite_one_does_not_face_it(seen):
     low, high, _, sensor, ends = seen
     real = real_ends(low, high, sensor, np.array(ends))
-    np.testing.assert_array_equal(real[:, 0] == FACING_END, sensor < low)
-    np.testing.assert_array_equal(real[:, 1] == FACING_END, sensor > high)
+    beyond = np.stack([low - sensor, sensor - high], axis=1)
+    assert (real[beyond > SENSOR_MOTION_M] == FACING_END).all()
+    assert (real[beyond <= 0] != FACING_END).all()
     assert not (real == FACING_END).all(axis=1).any()
+
+
+@pytest.mark.parametrize("ahead_m", [-0.4, 0.0, 0.4])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_flank_that_leaves_the_field_of_view_level_with_the_sensor_does_not_end_there(ahead_m, side):
+    # Of a bus at 2 m only what is ahead of the sensor is seen.
+    low, high = np.array([ahead_m, 2.0]), np.array([7.0, 2.2])
+    if side < 0:
+        low, high = np.array([low[0], -high[1]]), np.array([high[0], -low[1]])
+    real = real_ends(low, high, np.zeros(2), np.array(RIGHT if side > 0 else LEFT), min_sine=0.15)
+    assert real.tolist() == [[0, SIDE_END], [FACING_END, 0] if side > 0 else [0, FACING_END]]
 
 
 @given(observations(), METERS, METERS)

@@ -15,9 +15,9 @@ from worlds import tiny_toml
 import log2sim
 from log2sim import Scenario
 from log2sim.cli import entry
-from log2sim.documents import check
 from log2sim.errors import LogError, install_command
-from log2sim.registry import BUILT_IN
+from log2sim.files.documents import check
+from log2sim.files.plugins import BUILT_IN
 
 COMMANDS = (
     "reconstruct",
@@ -202,7 +202,9 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     assert "recall" in whole.out
     by_log = run("evaluate", tiny_scenario, "--truth", tiny_folder, "--out", tmp_path / "b.json", "--quiet")
     assert by_log.out == ""
-    assert read(tmp_path / "a.json") == read(tmp_path / "b.json")
+    by_file, points = read(tmp_path / "a.json"), read(tmp_path / "b.json")["coverage"]
+    assert (by_file["coverage"]["hit"], by_file["correctness"]) == (None, read(tmp_path / "b.json")["correctness"])
+    assert points["counted"] <= points["hit"] <= points["labeled"]  # the log has the sweeps, too
     narrowed = run(
         "evaluate", tiny_scenario, "--truth", tiny_folder, "--range", "40", "--categories", "pedestrian",
         "--out", tmp_path / "c.json",
@@ -211,8 +213,10 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     document = read(tmp_path / "c.json")
     assert document["max_range_m"] == 40.0
     assert document["categories"] == ["pedestrian"]
-    assert list(read(tmp_path / "a.json")["by_category"]) == ["car"]  # the pedestrian is in sight for less than 1 s
-    assert document["by_category"] == {}
+    walker = document["by_category"]["pedestrian"]  # in sight for less than 1 s
+    assert (walker["recall"], walker["coverage"]["counted"]) == (None, 0)
+    assert 0 < walker["coverage"]["why_not"]["short"] <= walker["coverage"]["labeled"]
+    assert list(document["by_category"]) == ["pedestrian"]
     # A scenario is its own truth without error.
     assert run("evaluate", tiny_scenario, "--truth", tiny_scenario, "--out", tmp_path / "d.json").code == 0
     assert read(tmp_path / "d.json")["position_rmse_m"] == 0.0
@@ -227,6 +231,32 @@ def test_evaluate_takes_labels_where_a_log_has_no_truth_file(
     metrics = read(tmp_path / "m.json")
     assert metrics["recall"] == 1.0
     assert metrics["position_rmse_m"] < 0.4
+
+
+def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
+    log_folder: Path, tiny_scenario: Path, tmp_path: Path
+) -> None:
+    rows = (log_folder / "labels" / "boxes_3d.csv").read_text().splitlines()
+    (tmp_path / "cars.csv").write_text("\n".join([rows[0], *(row for row in rows[1:] if ",car," in row)]))
+    ran = run(
+        "evaluate",
+        tiny_scenario,
+        "--truth",
+        log_folder,
+        "--labels",
+        tmp_path / "cars.csv",
+        "-v",
+        "-o",
+        tmp_path / "m.json",
+    )
+    assert ran.code == 0, ran.err
+    assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
+    metrics = read(tmp_path / "m.json")
+    assert (metrics["recall"], list(metrics["by_category"])) == (1.0, ["car", "pedestrian"])  # one that is now false
+    assert metrics["by_category"]["pedestrian"]["coverage"]["labeled"] == 0
+    assert metrics["coverage"]["hit"] >= metrics["coverage"]["counted"] > 0
+    truth = log_folder / "truth.json"
+    assert run("evaluate", tiny_scenario, "--truth", truth, "--labels", tmp_path / "cars.csv").code == 2
 
 
 def test_inspect_prints_json(tiny_folder: Path) -> None:

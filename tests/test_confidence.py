@@ -12,14 +12,28 @@ from hypothesis import strategies as st
 from test_size import T0_NS, measured, moved
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of
-from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, confidence_of, rate_agents
-from log2sim.agents.confidence.systematic import position_terms, speed_terms, with_systematic_errors, yaw_terms
-from log2sim.agents.confidence.weights import POSITION_VARIANCE, SPEED_VARIANCE, WEIGHTS, YAW_VARIANCE
+from log2sim.agents.confidence import (
+    MAX_CONFIDENCE,
+    MIN_CONFIDENCE,
+    POSITION_VARIANCE,
+    SIGNS,
+    SPEED_VARIANCE,
+    WITH_LIDAR,
+    WITHOUT_LIDAR,
+    YAW_VARIANCE,
+    Evidence,
+    confidence_of,
+    evidence_of,
+    position_terms,
+    rate_agents,
+    speed_terms,
+    with_systematic_errors,
+    yaw_terms,
+)
 from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
-from log2sim.datatypes import Doubt, Track
+from log2sim.datatypes import MIN_TRUSTED_CONFIDENCE, TYPICAL_SIZE_M, Doubt, Track
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
 DARK = [None] * len(TIMELINE.t_ns)
@@ -43,21 +57,51 @@ def candidate_of(track: Track, *, static: bool = True) -> AgentCandidate:
 
 
 def rated(candidate: AgentCandidate) -> AgentCandidate:
-    return rate_agents([candidate], TIMELINE)[0]
+    return rate_agents([candidate], TIMELINE, lidar=True)[0]
 
 
 def test_every_weight_has_the_sign_of_its_reason():
-    assert set(WEIGHTS) == set(NAMES) == set(SIGNS)
-    assert [name for name, sign in SIGNS.items() if sign * WEIGHTS[name] < 0] == []
+    assert set(WITH_LIDAR) | set(WITHOUT_LIDAR) == {"bias", *NAMES} == {"bias", *SIGNS}
+    for weights in (WITH_LIDAR, WITHOUT_LIDAR):
+        assert [name for name, weight in weights.items() if SIGNS.get(name, 0) * weight < 0] == []
     assert min(*POSITION_VARIANCE.values(), *YAW_VARIANCE.values(), *SPEED_VARIANCE.values()) >= 0
 
 
 @settings(deadline=None)
-@given(st.lists(st.floats(-3, 3), min_size=len(NAMES), max_size=len(NAMES)), st.sampled_from(NAMES), st.floats(0, 3))
-def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more):
+@given(
+    st.lists(st.floats(-3, 3), min_size=len(NAMES), max_size=len(NAMES)),
+    st.sampled_from(NAMES),
+    st.floats(0, 3),
+    st.booleans(),
+)
+def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more, lidar):
     weak = Evidence(**dict(zip(NAMES, values)))
-    strong = replace(weak, **{name: getattr(weak, name) + (SIGNS[name] or np.sign(WEIGHTS[name])) * more})
-    assert MIN_CONFIDENCE <= confidence_of(weak) <= confidence_of(strong) <= MAX_CONFIDENCE
+    weight = (WITH_LIDAR if lidar else WITHOUT_LIDAR).get(name, 0.0)
+    strong = replace(weak, **{name: getattr(weak, name) + (SIGNS[name] or np.sign(weight)) * more})
+    low, high = confidence_of(weak, lidar=lidar), confidence_of(strong, lidar=lidar)
+    assert MIN_CONFIDENCE <= low <= high <= MAX_CONFIDENCE
+
+
+def by_camera(height_px_m: float) -> AgentCandidate:
+    """A parked car that a camera alone shows, whose boxes span a height where they are placed."""
+    candidate = parked(20)
+    m = candidate.track.measurements
+    n, none = len(m), np.full((len(m), 2), np.nan)
+    bare = replace(
+        m, points=np.zeros(n, dtype=np.int64), low_m=none, high_m=none, source=np.full(n, "topdown", dtype="<U16"),
+        camera=np.full(n, "front"), yaw_rad=np.full(n, np.nan), score=np.full(n, 0.95),
+        height_px_m=np.full(n, height_px_m),
+    )  # fmt: skip
+    return replace(candidate, track=replace(candidate.track, measurements=bare))
+
+
+def test_without_lidar_the_height_in_the_image_separates_right_from_wrong_places():
+    height = TYPICAL_SIZE_M["car"][2]
+    fits, half, twice = (
+        rate_agents([by_camera(share * height)], TIMELINE, lidar=False)[0].agent.confidence for share in (1.0, 0.6, 1.7)
+    )
+    assert fits > MIN_TRUSTED_CONFIDENCE > max(half, twice)
+    assert rate_agents([by_camera(height)], TIMELINE, lidar=True)[0].agent.confidence < fits
 
 
 @pytest.mark.parametrize("make", [parked, driving])

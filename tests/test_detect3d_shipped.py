@@ -14,11 +14,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 from lidar_training.clouds import draw_example
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion, match
+from log2sim.evaluation.detection.protocols import Criterion, match
 from log2sim.geometry import wrap_angle
-from log2sim.perception.detect3d.network_detector import WEIGHTS, open_shipped
+from log2sim.perception.detect3d.detectors import WEIGHTS, describe_weakness, open_shipped
 
 VEHICLES = ("car", "truck", "bus")
 
@@ -88,3 +88,14 @@ def test_model_cards_state_how_the_networks_were_made() -> None:
         assert sum(r["steps"] for r in card["rounds"]) > 1000
         assert 0 < card["simulated"]["all"]["f1"] < 1
         assert (WEIGHTS / f"{name}.onnx").stat().st_size < 2_000_000
+
+
+def test_a_network_that_misses_most_groups_is_named_with_its_figures():
+    card = json.loads((WEIGHTS / "roadside.json").read_text())["simulated"]
+    told = describe_weakness("lidar:roadside")
+    for group in ("vehicle", "two_wheeler", "pedestrian"):
+        assert f"{card[group]['recall']:.0%}" in told
+        assert f"{card[group]['headings_flipped']:.0%}" in told
+    assert [describe_weakness(name) for name in ("lidar:vehicle", "lidar:labels", "lidar:../roadside.onnx", "")] == [
+        ""
+    ] * 4

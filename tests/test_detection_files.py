@@ -17,13 +17,12 @@ from worlds import tiny_log
 
 from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, ImageRegions, Labels, Log
-from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError
-from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
-from log2sim.evaluation.detection.label_tracks import LabelTracks
-from log2sim.evaluation.detection.truth import labeled_sweeps, truth_of_sweeps
+from log2sim.evaluation.detection.truth import LabelTracks, labeled_sweeps, truth_of_sweeps
+from log2sim.files.documents import check
 from log2sim.geometry import points_in_box
 from log2sim.perception.lidar.cloud import sweep_to_map
 
@@ -327,9 +326,15 @@ def test_detect_and_evaluate_as_commands(tiny_folder: Path, tmp_path: Path) -> N
     assert ran.code == 0, ran.err
     assert "in 4 sweeps by lidar:labels" in ran.out
     assert run("validate", boxes).code == 0
-    ran = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture)
+    ran = run(
+        "evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture, "-v"
+    )
     assert ran.code == 0, ran.err
     assert "IoU 3D > 0.5" in ran.out
+    assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
+    brief = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair").out
+    assert ran.out.startswith(brief.rstrip("\n"))
+    assert "100 % of" in brief
     assert "expected calibration error of the scores 0.000" in ran.out
     assert run("validate", metrics).code == 0
     assert picture.read_bytes()[:4] == b"\x89PNG"

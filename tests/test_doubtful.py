@@ -16,9 +16,10 @@ from log2sim.datatypes import Agent, Doubt, Scenario, list_doubtful, why_doubtfu
 from log2sim.edit.apply import edit
 from log2sim.edit.edits import DropDoubtful, Lateral, Only, Shift, Speed
 from log2sim.errors import ConfigError, ScenarioError
+from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.export.exporters import Options, export, formats, with_doubtful
 from log2sim.export.openscenario.read import load
-from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.metrics.all_metrics import summarize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
@@ -167,7 +168,7 @@ def test_an_export_keeps_or_drops_them_and_says_how_many(to: str, tmp_path: Path
 
 
 def test_another_choice_is_refused() -> None:
-    with pytest.raises(ConfigError, match="--doubtful: 'maybe', expected keep or drop"):
+    with pytest.raises(ConfigError, match="--doubtful: 'maybe', expected keep, drop, all"):
         with_doubtful(doubted(), "maybe")
 
 
@@ -228,3 +229,22 @@ def test_viewers_say_why_agents_are_doubtful(tmp_path: Path) -> None:
     told = {entity.id: {pair.key: pair.value for pair in entity.metadata}.get("doubtful") for entity in update.entities}
     assert told["phantom"] == "passes through parked at 1.2 s, 2.8 m wide"
     assert told["sure"] is None
+
+
+def test_quarantined_agents_stay_in_the_file_and_out_of_replays_and_exports(tmp_path: Path) -> None:
+    scenario = world(straight("ego"), straight("sure", start=(0.0, 10.0)), replace(unsure(0.1), quarantined=True))
+    assert ids(Scenario.from_dict(scenario.to_dict())) == ["ego", "sure", "unsure"]
+    assert [a.quarantined for a in Scenario.from_dict(scenario.to_dict()).agents] == [False, False, True]
+    assert ids(scenario.active) == ["ego", "sure"]
+    result = replay(scenario, mode="exact")
+    assert [a.id for a in result.agents] == ["ego", "sure"]
+    assert set(result.left_out) == {"unsure"}
+    assert len(replay(scenario, mode="exact", quarantined=True).agents) == 3
+    for name, choices in (("a", {}), ("b", {"quarantined": True})):
+        export(scenario, "csv", tmp_path / name, **choices)
+        rows = next((tmp_path / name).glob("*.csv")).read_text()
+        assert ("unsure" in rows) is bool(choices)
+    assert ids(with_doubtful(scenario, "keep")) == ["ego", "sure"]
+    assert ids(with_doubtful(scenario, "all")) == ids(scenario)
+    assert evaluate(scenario, scenario.active)["precision"] == 1.0
+    assert evaluate(scenario, scenario.active)["quarantined"] == ["unsure"]

@@ -12,7 +12,7 @@ import pytest
 
 from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.edit.apply import edit
-from log2sim.edit.edits import Edit, Lateral, Only, Remove, Shift, Speed
+from log2sim.edit.edits import Add, CutIn, Edit, Lateral, Only, Remove, Replace, Shift, Speed, Window
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.runner import replay
@@ -326,3 +326,71 @@ def test_edits_of_the_sample_can_be_driven(meters: float) -> None:
     metrics = replay(after).metrics
     assert metrics["cross_track_max_m"] < 0.35
     assert metrics["speed_rms_mps"] < 0.3
+
+
+@pytest.mark.parametrize("meters", [-3.5, 3.5])
+def test_a_lane_change_starts_and_ends_parallel_and_moves_as_it_points(meters: float) -> None:
+    source = straight("car", 12.0, end_s=6.0)
+    edited = edit(scenario(source), [Lateral("car", meters, Window(1.0, 3.0))])
+    (after,) = edited.scenario.agents
+    assert edited.warnings == ()
+    t = np.array([0.0, 1.0, 4.0, 6.0])
+    np.testing.assert_allclose(after.at(t).y_m, [0.0, 0.0, meters, meters], atol=1e-6)
+    np.testing.assert_allclose(after.at(t).yaw_rad, 0.0, atol=1e-6)
+    fine = np.linspace(0.0, 6.0, 601)
+    s = after.at(fine)
+    vx, vy = np.gradient(s.x_m, fine), np.gradient(s.y_m, fine)
+    np.testing.assert_allclose(s.speed_mps, np.hypot(vx, vy), atol=0.02)
+    np.testing.assert_allclose(np.arctan2(vy, vx), s.yaw_rad, atol=0.005)
+    # Least jerk: the largest acceleration across is 10 / sqrt(3) times the offset over the square of the time.
+    across = np.gradient(np.gradient(s.y_m, fine), fine)[5:-5]
+    assert np.abs(across).max() == pytest.approx(10 / np.sqrt(3) * abs(meters) / 3.0**2, rel=0.05)
+    assert len(edit(scenario(straight("car", 30.0)), [Lateral("car", 10.0, Window(1.0, 1.0))]).warnings) >= 1
+
+
+def test_a_window_of_slower_driving_keeps_the_path_and_comes_back_to_its_speed() -> None:
+    source = straight("car", 10.0, end_s=4.0)
+    after = edit(scenario(source), [Speed("car", 0.5, Window(1.0, 2.0))]).scenario.agents[0]
+    s = after.at(np.array([0.5, 2.0, 3.5]))
+    np.testing.assert_allclose(s.speed_mps, [10.0, 5.0, 10.0], atol=0.05)
+    # Half a second of each ramp at 7.5 m/s on average, a second at 5 m/s: 12.5 m in 2 s instead of 20 m.
+    assert s.x_m[2] == pytest.approx(35.0 - 7.5, abs=0.05)
+    assert after.waypoints.x_m[-1] == pytest.approx(40.0)
+    fine = np.linspace(0.0, 4.5, 451)
+    np.testing.assert_allclose(np.gradient(after.at(fine).x_m, fine)[1:-1], after.at(fine).speed_mps[1:-1], atol=0.3)
+
+
+def test_a_cut_in_ends_on_the_path_of_the_ego_with_the_gap_that_was_asked_for() -> None:
+    ego, car = straight("ego", 10.0, end_s=6.0), straight("car", 12.0, y_m=3.5, x0_m=-20.0, end_s=8.0)
+    edited = edit(replace(scenario(ego, car), duration_s=8.0), [CutIn("car", Window(2.0, 2.0), 6.0)])
+    after = {a.id: a for a in edited.scenario.agents}
+    at = np.array([4.0, 5.0])
+    np.testing.assert_allclose(after["car"].at(at).y_m, 0.0, atol=0.01)
+    gap = after["car"].at(at).x_m[0] - after["ego"].at(at).x_m[0] - 4.0
+    assert gap == pytest.approx(6.0, abs=1.3)  # steps of a tenth of a second
+    with pytest.raises(ConfigError, match="never 500 m ahead"):
+        edit(scenario(ego, car), [CutIn("car", Window(2.0, 2.0), 500.0)])
+
+
+def test_agents_are_added_and_replaced_on_the_ground() -> None:
+    ego = circling(20.0, 8.0)
+    source = scenario(replace(ego, id="ego"), parked())
+    edits = [
+        Add("car", 5.0, 6.0, 0.5),
+        Add("truck", 0.0, 0.0, 0.0, 3.0),
+        Add("car", ahead_of="ego", meters=5.0),
+        Replace("parked", "truck"),
+    ]
+    after = {a.id: a for a in edit(source, edits).scenario.agents}
+    assert list(after) == ["ego", "parked", "car-1", "truck-1", "car-2"]
+    assert after["car-1"].is_permanent
+    assert after["parked"].category == "truck"
+    for a in after.values():
+        np.testing.assert_allclose(a.waypoints.z_m - a.size_m[2] / 2, 0.0, atol=1e-9)
+    assert after["truck-1"].at(2.0).x_m[0] == pytest.approx(6.0)
+    t = np.array([0.5, 2.0])
+    lead, follow = after["car-2"].at(t), after["ego"].at(t)
+    ahead = wrap_angle(np.arctan2(lead.y_m, lead.x_m) - np.arctan2(follow.y_m, follow.x_m)) * 20.0
+    np.testing.assert_allclose(ahead, 5.0, atol=0.05)
+    np.testing.assert_allclose(np.hypot(lead.x_m, lead.y_m), 20.0, atol=0.05)
+    assert not after["car-2"].waypoints.observed.any()

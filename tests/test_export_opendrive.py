@@ -15,7 +15,7 @@ from export_readers import Sampled, distance, play, roads
 from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import Options, export
-from log2sim.export.roads.checks import require_roads
+from log2sim.export.roads.opendrive import require_roads
 from log2sim.export.roads.reference_line import ReferenceLine, fit, straight
 from log2sim.geometry import Array
 

@@ -9,9 +9,11 @@ import pytest
 from worlds import rows_at
 
 from log2sim.agents.candidate import Timeline, candidate_of
-from log2sim.agents.heading.decide import decide_headings
+from log2sim.agents.heading import decide_headings
+from log2sim.agents.moving import turn_to_courses
 from log2sim.agents.size import TrackGeometry
-from log2sim.datatypes import Doubt, Track, Waypoints
+from log2sim.config import Config
+from log2sim.datatypes import TYPICAL_SIZE_M, Boxes3D, Doubt, Track, Waypoints
 
 T_NS = np.arange(20) * 100_000_000
 TIMELINE = Timeline(T_NS, 0)
@@ -162,3 +164,41 @@ def test_headings_do_not_depend_on_the_map_or_on_the_order():
     for a, b in zip(here, there):
         assert np.cos(b.waypoints.yaw_rad[0] - a.waypoints.yaw_rad[0] - turn) == pytest.approx(1.0)
         assert b.quality["heading_confidence"] == pytest.approx(a.quality["heading_confidence"], abs=2e-3)
+
+
+def boxes_of_sweeps(category, velocity, yaw, *, turned, rate_hz=10.0, count=20):
+    """Boxes of one object sweep by sweep, of which a random share is turned round, each as sure of its front as any other."""
+    rng, t_s = np.random.default_rng(3), np.arange(count) / rate_hz
+    yaw = yaw + np.pi * (rng.random(count) < turned)
+    return np.rint(t_s * 1e9).astype(np.int64), [
+        Boxes3D(
+            np.array([round(t * 1e9)]), np.array([[5.0 + velocity[0] * t, 2.0 + velocity[1] * t, 0.8]]),
+            np.array([TYPICAL_SIZE_M[category]]), np.array([y]), np.array([0.8]), np.array([category]), np.array([0.7]),
+            np.array([40]),
+        )
+        for t, y in zip(t_s, yaw)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 10.0, 20.0])
+@pytest.mark.parametrize(("category", "speed"), [("car", 8.0), ("truck", 6.0), ("cyclist", 4.0), ("pedestrian", 1.4)])
+def test_boxes_of_sweeps_point_where_their_object_goes(category, speed, rate_hz):
+    course = 2.2
+    velocity = speed * np.array([np.cos(course), np.sin(course)])
+    t_ns, found = boxes_of_sweeps(category, velocity, course, turned=0.8, rate_hz=rate_hz)
+    turned = turn_to_courses(found, t_ns, Config().track)
+    assert all(np.cos(b.yaw_rad[0] - course) > 0.99 for b in turned)
+    assert np.mean([b.heading_score[0] for b in turned]) > 0.85
+    assert all(np.array_equal(a.center_m, b.center_m) for a, b in zip(found, turned))
+
+
+def test_boxes_of_what_stands_maneuvers_or_is_seen_once_keep_their_headings():
+    for velocity, surely in (((0.0, 0.0), 0.8), ((-0.4, 0.0), 0.99)):
+        t_ns, found = boxes_of_sweeps("car", velocity, 0.0, turned=0.0)
+        found = [replace(b, heading_score=np.array([surely])) for b in found]
+        for a, b in zip(found, turn_to_courses(found, t_ns, Config().track)):
+            assert np.array_equal(a.yaw_rad, b.yaw_rad)
+    t_ns, [one, *_] = boxes_of_sweeps("car", (9.0, 0.0), np.pi, turned=0.0)
+    [same] = turn_to_courses([one], t_ns[:1], Config().track)
+    assert np.array_equal(same.yaw_rad, one.yaw_rad)
+    assert np.array_equal(same.heading_score, one.heading_score)

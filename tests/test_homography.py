@@ -24,11 +24,17 @@ from log2sim.geometry import (
     rotation_from_rpy,
     transform,
 )
-from log2sim.perception.homography.camera_fit import FOOT_SIGMA_PX, fit_camera
 from log2sim.perception.homography.correspondences import Correspondences, foot_points
-from log2sim.perception.homography.estimate import METHODS, EstimationOptions, estimate_homography
+from log2sim.perception.homography.estimate import (
+    FOOT_SIGMA_PX,
+    METHODS,
+    EstimationOptions,
+    estimate_homography,
+    fit_camera,
+    place_obstacle,
+    spanned_height_m,
+)
 from log2sim.perception.homography.fit import HomographyFit
-from log2sim.perception.homography.placement import place_obstacle
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])
@@ -409,6 +415,20 @@ def test_an_obstacle_stands_behind_its_foot_by_half_its_depth(camera: Camera, fo
     length, width, _ = TYPICAL_SIZE_M["car"]
     expected = foot + ray / np.hypot(*ray) * (length + width) / 4
     np.testing.assert_allclose(placed[0], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.0, 1.3])
+def test_a_post_spans_its_height_times_the_error_of_its_distance(scale: float) -> None:
+    camera, h = make_camera()
+    base_T_cam = camera.mount_T_cam.copy()
+    foot = np.array([18.0, -4.0])
+    bottom, top = (project(camera, apply(inverse(base_T_cam), [[*foot, z]]))[0][0] for z in (0.0, 1.7))
+    box = np.array([bottom[0] - 9, top[1], bottom[0] + 9, bottom[1]])
+    assert spanned_height_m(h, camera, box, base_T_cam) == pytest.approx(1.7, rel=0.01)
+    # Another distance by the same ray: the homography of other ground.
+    camera_xy = base_T_cam[:2, 3]
+    farther = np.array([[scale, 0, (1 - scale) * camera_xy[0]], [0, scale, (1 - scale) * camera_xy[1]], [0, 0, 1.0]])
+    assert spanned_height_m(farther @ h, camera, box, base_T_cam) == pytest.approx(1.7 * scale, rel=0.01)
 
 
 def test_the_covariance_of_a_located_obstacle_lies_along_the_ray_and_grows() -> None:

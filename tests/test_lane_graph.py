@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.graph.coverage import find_covered
-from log2sim.lanes.graph.driven_paths import collect_paths
-from log2sim.lanes.graph.lane_graph import infer_lanes
-from log2sim.lanes.graph.polyline import Polyline
+from log2sim.road.lane_graph import find_covered, infer_lanes
+from log2sim.road.polyline import Polyline, collect_paths
 
 
 def turn_left(radius_m: float = 9.0) -> Array:
@@ -194,7 +192,7 @@ def test_paths_of_several_vehicles_in_one_lane_make_one_middle() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pandaset/002", "kitti_tracking"])
 def test_lanes_of_recorded_traffic_hold_every_path(name: str, real_data: Path) -> None:
-    from log2sim.cli.truth import truth_at
+    from log2sim.evaluation.metrics.truth import truth_at
 
     world = truth_at(real_data / name, None, None)
     lanes = lanes_of(world)

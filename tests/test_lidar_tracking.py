@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.lidar_tracking import BoxState, match_box, match_standing, track_with_lidar
-from log2sim.datatypes import Obstacles
+from log2sim.agents.candidate import MIN_SWEEP_CONFIDENCE, followed_confidence
+from log2sim.agents.static import BoxState, LidarMatch, left_free, match_box, match_standing, track_with_lidar
+from log2sim.datatypes import Boxes3D, Measurements, Obstacles, Rays, Track
 from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.box_fitting import rotate
+from log2sim.perception.boxes import place_boxes, rotate
 
 T0_NS = 1_700_000_000_000_000_000
 SIZE = np.array([4.4, 1.85, 1.6])
@@ -217,3 +218,90 @@ def test_boxes_that_stand_are_matched_together_as_each_alone():
     assert [[m.tick for m in matches] for matches in found] == [[3, 4, 5], [0, 1, 3, 5], []]
     for one, other in zip(found, alone):
         assert [(m.tick, m.t_ns, *m.xy_m) for m in one] == [(m.tick, m.t_ns, *m.xy_m) for m in other]
+
+
+# Vehicles beside the sensor, of which a flank is seen
+
+BUS = (12.0, 2.55, 3.1)
+ALL_AROUND, AHEAD = (-180.0, 180.0), (-90.0, 90.0)
+
+
+def around(solids, azimuth_deg=ALL_AROUND, stamp_ns=T0_NS):
+    """The points above ground of one sweep from (0, 0), with its rays."""
+    xyz, _ = scan(solids, azimuth_deg=azimuth_deg, steps=(720, 32), noise_m=0.01)
+    sensor = np.array([[0.0, 0.0, 1.9]], dtype=np.float32)
+    rays = Rays(
+        xyz.astype(np.float32),
+        np.zeros(len(xyz), np.float32),
+        np.zeros(len(xyz), np.uint8),
+        sensor,
+        np.zeros((1, 3), np.float32),
+    )
+    above = xyz[xyz[:, 2] > 0.2].astype(np.float32)
+    return Obstacles(stamp_ns, np.zeros(3), above, np.zeros(len(above), np.float32), sensor[0], rays)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(
+    ("x", "azimuth_deg"), [(0.0, ALL_AROUND), (4.0, ALL_AROUND), (-3.0, ALL_AROUND), (1.0, AHEAD), (-4.5, AHEAD)]
+)
+def test_a_bus_beside_the_sensor_is_found_by_its_flank_and_one_end(x, azimuth_deg, side):
+    y = 3.0 * side
+    match = seen(around([standing(x, y, 0, BUS)], azimuth_deg), (x + 0.3, y + 0.1), size=np.array(BUS))
+    assert np.hypot(*(match.xy_m - [x, y])) < 0.3
+
+
+WALL = Solid((0.0, 3.0, 1.5), (80.0, 2.55, 3.0))
+NO_BUS = {
+    "a wall": ([WALL], ALL_AROUND),
+    "a part between two borders of the view": ([standing(0, 3, 0, BUS)], (45.0, 135.0)),
+    "a car in its place": ([standing(0, 2.7, 0)], ALL_AROUND),
+    "a post in its place": ([Solid((0.0, 2.0, 1.0), (0.3, 0.3, 2.0))], ALL_AROUND),
+    "posts where it would end": ([Solid((x, 1.8, 1.0), (0.2, 0.2, 2.0)) for x in (-6, 6)], ALL_AROUND),
+}
+
+
+@pytest.mark.parametrize("name", NO_BUS)
+def test_what_is_no_bus_beside_the_sensor_is_not_taken_for_it(name):
+    solids, azimuth_deg = NO_BUS[name]
+    assert seen(around(solids, azimuth_deg), (0.0, 3.0), size=np.array(BUS)) is None
+
+
+@pytest.mark.parametrize(("azimuth_deg", "forward"), [(ALL_AROUND, True), (ALL_AROUND, False), (AHEAD, True)])
+def test_a_bus_is_followed_past_the_sensor_for_as_long_as_points_show_it(azimuth_deg, forward):
+    x = 16.0 - 1.4 * np.arange(20)
+    t_ns = T0_NS + np.arange(20) * STEP_NS
+    clouds = [around([standing(p, 3.0, 180, BUS)], azimuth_deg, int(t)) for p, t in zip(x, t_ns)]
+    shown = [k for k in range(20) if (np.abs(clouds[k].xyz[:, 0] - x[k]) < 6.1).sum() >= 50]
+    first, rest = (shown[0], shown[1:]) if forward else (shown[-1], shown[-2::-1])
+    start = BoxState(int(t_ns[first]), np.array([x[first], 3.0]), np.array([-14.0, 0.0]), np.pi, np.array(BUS), 0.0)
+    found = track_with_lidar(clouds, [*rest, *range(shown[-1] + 1, 20)] if forward else rest, t_ns, start)
+    assert [m.tick for m in found] == rest
+    assert max(np.hypot(*(m.xy_m - [x[m.tick], 3.0])) for m in found) < 0.6
+
+
+def straight_track(*, score, count=10):
+    """A car that a network found at 10 ticks, 0.8 m from each other."""
+    size, t_ns = np.tile(SIZE, (count, 1)), T0_NS + np.arange(count) * STEP_NS
+    center = np.stack([2.0 + 0.8 * np.arange(count), np.full(count, 3.0), np.full(count, 0.8)], axis=1)
+    some, points = np.full(count, score), np.zeros(count, np.int64)
+    boxes = Boxes3D(t_ns, center, size, np.zeros(count), some, np.full(count, "car"), some, points)
+    rows = replace(Measurements.of_boxes(boxes, np.zeros(3)), yaw_rad=boxes.yaw_rad)
+    return Track("car", np.arange(count), place_boxes(rows))
+
+
+def test_what_moves_on_and_fits_its_points_is_an_object_though_its_scores_are_low():
+    track = straight_track(score=0.3)
+    places = np.stack([10.0 + np.arange(10) * 1.4, np.full(10, 3.0)], axis=1)
+    assert followed_confidence(track, places) >= MIN_SWEEP_CONFIDENCE
+    assert followed_confidence(track, places[:3]) == 0.0
+    assert followed_confidence(straight_track(score=0.05), places) < MIN_SWEEP_CONFIDENCE
+
+
+def test_what_moves_leaves_its_place_free_and_clutter_does_not():
+    x = 16.0 - 1.4 * np.arange(20)
+    matches = [LidarMatch(k, T0_NS + k * STEP_NS, np.array([p, 3.0]), np.eye(2), np.pi, 50) for k, p in enumerate(x)]
+    bus = [around([standing(p, 3.0, 180, BUS)]) for p in x]
+    assert left_free(bus, matches, np.array(BUS), 0.0)[[0, -1]].all()
+    row = [around([WALL])] * len(x)
+    assert not left_free(row, matches, np.array(BUS), 0.0).any()

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from ground_worlds import EGO_R_CAM, World, empty_scenario, height_at, is_paint, parked_car, world_log
 
-from log2sim.config_sections import MapConfig
+from log2sim.config import MapConfig
 from log2sim.datatypes import Agent, Log, Scenario, Stream, Sweep, Waypoints
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform
-from log2sim.mapping.builder import map_ground
-from log2sim.mapping.ground_map import GroundMap
-from log2sim.mapping.records import MAX_SWEEPS, STANDING_RECORDS, choose_records, sweep_step_m
-from log2sim.mapping.road_users import RoadUsers, draw_outlines
+from log2sim.road.builder import MAX_SWEEPS, STANDING_RECORDS, choose_records, map_ground, sweep_step_m
+from log2sim.road.ground_map import GroundMap
+from log2sim.road.road_users import RoadUsers, draw_outlines
 
 SETTINGS = MapConfig(cell_m=0.05)
 
@@ -145,7 +144,7 @@ def test_a_log_without_poses_is_refused_with_the_reason() -> None:
 
 @pytest.mark.slow
 def test_a_long_log_gets_coarser_cells_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("log2sim.mapping.raster.MAX_CELLS", 100_000)
+    monkeypatch.setattr("log2sim.road.ground_map.MAX_CELLS", 100_000)
     log = world_log(World(gains=()))
     ground = map_ground(log, empty_scenario(log), SETTINGS)
     assert ground.alpha.size <= 100_000

@@ -8,23 +8,24 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.box_votes import (
+from log2sim.agents.candidate import HIDDEN_S, agent_confidence, image_confidence, is_confirmed, sweep_confidence
+from log2sim.agents.moving import heading_log_odds
+from log2sim.agents.size import (
     TICK_CORRELATION,
     independent,
     independent_along,
     mean_box_axis,
+    moving_geometry,
+    static_geometry,
     typical_box_size,
     weighted_median,
 )
-from log2sim.agents.confirmation import agent_confidence, image_confidence, is_confirmed, sweep_confidence
-from log2sim.agents.heading.box_headings import heading_log_odds
-from log2sim.agents.size import moving_geometry, static_geometry
 from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
 from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, wrap_angle
-from log2sim.perception.box_completion import BOX_SIGMA_M, box_sigma, weighted_center
+from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
-from log2sim.tracking.recorded import mark_unrecorded
+from log2sim.perception.lidar.measure import measure_boxes, outside_ego
+from log2sim.tracking.tracker import mark_unrecorded
 
 ORIGIN = np.array([500.0, -200.0, 3.0])
 SENSOR = (0.0, 0.0, 1.9)
@@ -212,14 +213,41 @@ def test_what_the_image_confirms_needs_no_sweep() -> None:
     assert not is_confirmed(track_of(20, 0.45), typical=True)
 
 
-def test_a_track_seen_at_every_third_tick_is_no_object() -> None:
-    whole = track_of(60, 0.7)
+@pytest.mark.parametrize(("score", "confirmed"), [(0.5, False), (0.7, True)])
+def test_people_whom_images_alone_show_have_to_be_surer_than_vehicles(score: float, confirmed: bool) -> None:
+    car = track_of(20, score, camera="front")
+    boxless = replace(car.measurements, box_yaw_rad=np.full(20, np.nan))
+    person = Track("pedestrian", car.tick, replace(boxless, category=np.full(20, "pedestrian")))
+    assert is_confirmed(Track("car", car.tick, boxless), typical=True)
+    assert is_confirmed(person, typical=True) is confirmed
+
+
+@pytest.mark.parametrize("camera", ["", "front"])
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.5])
+def test_a_track_seen_at_every_third_tick_is_no_object(camera: str, period_s: float) -> None:
+    whole = track_of(60, 0.7, camera=camera)
+    stamps = (np.arange(60) * period_s * NS_PER_S).astype(np.int64)
+    whole = replace(whole, measurements=replace(whole.measurements, t_ns=stamps))
     rows = np.arange(0, 60, 3)
-    sparse = Track("car", whole.tick[rows], replace(whole.measurements.take(rows)))
-    # The stamps of every third tick alone look complete; the gaps show against two neighbors.
+    sparse = Track("car", whole.tick[rows], whole.measurements.take(rows))
     pairs = np.sort(np.r_[rows, rows[::3] + 1])
     gappy = Track("car", whole.tick[pairs], whole.measurements.take(pairs))
-    assert sweep_confidence(gappy) < sweep_confidence(sparse) <= sweep_confidence(whole)
+    confidence = image_confidence if camera else sweep_confidence
+    # Gaps of more than a second may be occlusions.
+    limit = 0.5 if period_s < HIDDEN_S / 3 else 0.7
+    for missed in (sparse, gappy):
+        assert confidence(missed) < limit * confidence(whole)
+
+
+def test_weak_detections_of_a_person_are_no_occlusion() -> None:
+    # Three looks of two sure detections each, 2 s apart; in between a building hides the person, or it is detected weakly.
+    sure = np.isin(np.arange(62) % 20, (0, 1))
+    whole = track_of(62, np.where(sure, 0.7, 0.2), camera="front")
+    boxless = replace(whole.measurements, box_yaw_rad=np.full(62, np.nan), category=np.full(62, "pedestrian"))
+    weak = Track("pedestrian", whole.tick, boxless)
+    hidden = Track("pedestrian", whole.tick[sure], boxless.take(sure))
+    assert image_confidence(weak) == pytest.approx(0.7 * sure.mean(), rel=0.02)
+    assert image_confidence(hidden) > 2 * image_confidence(weak)
 
 
 def test_ticks_at_which_nothing_was_recorded_do_not_count_against_a_track() -> None:

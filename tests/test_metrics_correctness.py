@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
 from log2sim.datatypes import CATEGORIES, Agent, Doubt, Scenario
-from log2sim.documents import check
 from log2sim.errors import ScenarioError
-from log2sim.evaluation.metrics.align import reconstructed_states, truth_states
-from log2sim.evaluation.metrics.comparison import Selection, compare
+from log2sim.evaluation.metrics.comparison import Selection, compare, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.table import format_table
+from log2sim.evaluation.metrics.table import format_table, format_verdict
 from log2sim.evaluation.metrics.verdicts import MEASURES, REPORTED, judge
+from log2sim.files.documents import check
 
 TICKS = len(T_S)
 WALK = {"category": "pedestrian", "size_m": (0.6, 0.6, 1.7)}
@@ -339,6 +338,7 @@ def test_a_result_keeps_its_schema_and_the_worst_agents_are_named():
     result = evaluate(broken(), world())
     check(result, "metrics-1", ScenarioError)
     json.dumps(result, allow_nan=False)
+    assert "car-18 backwards, wrong size (31 of 31 ticks)" in format_verdict(result)
     text = format_table(result)
     assert "car-18: backwards in 31, wrong size in 31 of 31 ticks, confidence 0.88, not doubted" in text
     assert "ghost: invented in 31 of 31 ticks, confidence 1.00, doubted (jump)" in text
@@ -372,7 +372,7 @@ def test_the_command_writes_them_and_draws_the_reliability(tmp_path):
         "--plot", tmp_path / "r.png",
     )  # fmt: skip
     assert ran.code == 0, ran.err
-    assert "car-18: backwards in 31" in ran.out
+    assert "car-18 backwards" in ran.out
     document = json.loads((tmp_path / "m.json").read_text())
     check(document, "metrics-1", ScenarioError)
     assert document["correctness"]["invented"]["agents"] == 1

@@ -10,10 +10,10 @@ import pytest
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
 from log2sim.datatypes import MapFrame
-from log2sim.documents import check
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.table import format_table
+from log2sim.evaluation.metrics.table import columns_text, format_table, format_verdict
+from log2sim.files.documents import check
 
 FIGURES = ("recall", "precision", "position_rmse_m", "yaw_median_deg", "speed_rmse_mps", "mota", "hota", "counts")
 
@@ -35,19 +35,34 @@ def test_a_result_keeps_its_schema_and_prints():
         result = evaluate(ours, truth)
         check(result, "metrics-1", ScenarioError)
         json.dumps(result, allow_nan=False)
-        assert "recall" in format_table(result).splitlines()[0]
-    lines = format_table(evaluate(world(), world())).split("\n\n")[0].splitlines()
-    assert [line.split()[0] for line in lines[1:]] == [
-        "all",
-        "0-20",
-        "20-40",
-        "40-60",
-        "car",
-        "cyclist",
-        "pedestrian",
-        "ego",
-    ]
+        assert "recall" in format_verdict(result)
+        assert ("recall %" in format_table(result)) == (result["recall"] is not None)
+    blocks = format_table(evaluate(world(), world())).split("\n\n")
+    rows = ["all", "0-20", "20-40", "car", "cyclist", "pedestrian"]
+    assert [line.split()[0] for line in blocks[0].splitlines()[1:]] == rows
+    lines = blocks[1].splitlines()
+    assert [line.split()[0] for line in lines[1:]] == [*rows, "ego"]
     assert len(set(map(len, lines[:-1]))) == 1
+
+
+def test_the_verdict_is_short_and_nothing_is_wider_than_100_characters():
+    long = "a0123456789012345678901234567890"
+    ours = [moved(a, 0.3 * k) for k, a in enumerate(world().others)]
+    wrong = [agent(f"{long}{k}", 20.0 * k, 50.0, yaw=k, speed=9.0, size_m=(9.0, 3.0, 1.5)) for k in range(9)]
+    result = evaluate(scenario(world().ego, *ours, *wrong), scenario(*world().agents, agent(long, 90.0, 20.0)))
+    lines = format_verdict(result).splitlines()
+    assert len(lines) < 15
+    assert max(map(len, [*lines, *format_table(result).splitlines()])) <= 100
+
+
+def test_columns_without_content_go_and_what_does_not_fit_goes_below():
+    cells = [["", "none", *(f"title {k}" for k in range(16))], ["row", "-", *(str(k) for k in range(16))]]
+    lines = columns_text([*cells, ["other", "", *("-" for _ in range(16))]])
+    assert max(map(len, lines)) <= 100
+    titles = [line for line in lines if "title" in line]
+    assert len(titles) == 2
+    assert " ".join(titles).split() == " ".join(f"title {k}" for k in range(16)).split()
+    assert sum(line.startswith("row") for line in lines) == sum(line.startswith("other") for line in lines) == 2
 
 
 def test_a_known_shift_is_the_position_error_and_the_ego_stands_apart():
@@ -302,11 +317,102 @@ def test_a_range_needs_an_ego_and_a_positive_number():
     assert evaluate(scenario(agent("x", 0.0)), scenario(agent("a", 0.0)))["by_range"] is None
 
 
-def test_two_projections_are_refused():
-    a = replace(world(), map=MapFrame(projection="+proj=utm +zone=32"))
-    b = replace(world(), map=MapFrame(projection="+proj=utm +zone=33"))
-    with pytest.raises(ScenarioError, match="zone=33"):
-        evaluate(a, b)
+def with_points(a, visible, points):
+    return moved(a, visible=np.broadcast_to(visible, T_S.shape), lidar_points=np.broadcast_to(points, T_S.shape) + 0.0)
+
+
+def test_what_is_labeled_counts_or_has_one_reason_not_to():
+    """31 ticks of each: counts, has too few points, is in no picture, is far away, is of another category, is seen too briefly."""
+    truth = scenario(
+        world().ego,
+        with_points(agent("counts", 10.0, 3.0), True, 100),
+        with_points(agent("few", 10.0, -6.0), False, np.where(T_S < 1.0, 19, 3)),
+        with_points(agent("outside", 20.0, -9.0), False, 20),
+        with_points(agent("far", 300.0), True, 100),
+        with_points(agent("walker", 5.0, 9.0, category="pedestrian"), True, 100),
+        with_points(agent("brief", 25.0, 9.0), T_S < 0.45, 30),
+        provenance={"visibility": "computed"},
+    )
+    ours = scenario(world().ego, agent("x", 10.0, 3.0), agent("y", 10.0, -6.0), agent("z", 300.0))
+    result = evaluate(ours, truth, max_range_m=60.0, categories=["vehicle"])
+    check(result, "metrics-1", ScenarioError)
+    covered = result["coverage"]
+    assert (covered["labeled"], covered["counted"]) == (6 * 31, 31)
+    assert covered["why_not"] == {
+        "other_category": 31, "out_of_range": 31, "few_points": 31, "not_in_picture": 31 + 26, "hidden": 0, "short": 5,
+    }  # fmt: skip
+    # The LiDAR hits those two that are found, one of them for 10 ticks, and two that are not.
+    assert (covered["hit"], covered["hit_matched"]) == (31 + 10 + 31 + 31, 31 + 10)
+    assert covered["hit_recall"] == pytest.approx(41 / 103, abs=1e-6)
+    assert result["recall"] == 1.0
+    assert result["by_category"]["car"]["coverage"] == {
+        **covered,
+        "labeled": 5 * 31,
+        "why_not": {**covered["why_not"], "other_category": 0},
+    }
+    stated = evaluate(ours, replace(truth, provenance={}), max_range_m=60.0, categories=["vehicle"])["coverage"]
+    assert stated["why_not"]["hidden"] == 31 + 31 + 26
+    assert (stated["why_not"]["few_points"], stated["hit"]) == (0, covered["hit"])
+    plain = evaluate(world(), world())["coverage"]
+    assert (plain["labeled"], plain["counted"], plain["hit"], plain["hit_recall"]) == (155, 155, None, None)
+
+
+def test_a_truth_in_another_projection_is_reprojected():
+    """The scenario in UTM zone 32, its truth on the sphere of KITTI's drives and in zone 33, the headings turned to each grid."""
+    from pyproj import Transformer
+
+    zone32 = "+proj=utm +zone=32 +datum=WGS84"
+    origin = np.array([620_000.0, 5_400_000.0])
+    ours = replace(world(), map=MapFrame(projection=zone32, offset_m=(*origin, 0.0), altitude_m=100.0))
+    for other, scale in (("+proj=utm +zone=33 +datum=WGS84", 2e-3), ("+proj=merc +R=6378137 +k_0=0.656", 4e-3)):
+        to = Transformer.from_crs(zone32, other, always_xy=True)
+        base = np.floor(np.array(to.transform(*origin)) / 1000) * 1000
+        far = []
+        for a in ours.agents:
+            w = a.waypoints
+            x, y = np.array(to.transform(w.x_m + origin[0], w.y_m + origin[1])) - base[:, None]
+            ahead = (
+                np.array(to.transform(w.x_m + origin[0] + np.cos(w.yaw_rad), w.y_m + origin[1] + np.sin(w.yaw_rad)))
+                - base[:, None]
+            )
+            far.append(replace(a, waypoints=replace(w, x_m=x, y_m=y, yaw_rad=np.arctan2(ahead[1] - y, ahead[0] - x))))
+        truth = replace(
+            ours, agents=tuple(far), map=MapFrame(projection=other, offset_m=(*base, 0.0), altitude_m=100.0)
+        )
+        for with_ego in (True, False):
+            known = truth if with_ego else replace(truth, agents=truth.others)
+            result = evaluate(ours, known)
+            assert result["placement"]["method"] == "projection"
+            assert result["recall"] == result["precision"] == 1.0
+            # With the ego the world around it stays rigid, so that both scales differ over the distance, up to 30 m.
+            assert result["position_rmse_m"] < (30 * scale if with_ego else 1e-5)
+            assert result["yaw_median_deg"] < 0.02
+        assert result["placement"]["ego_apart_m"] is None
+        assert evaluate(ours, truth)["ego"]["position_rmse_m"] < 1e-5
+
+
+def test_without_a_georeference_the_truth_goes_where_the_egos_fit():
+    """Rotated by 40 degrees and 1 km away; a standing ego has a heading, too."""
+    turn = np.radians(40)
+    for ego in (world().ego, agent("ego", 3.0, 1.0, yaw=0.3, static=True)):
+        ours = scenario(ego, *world().others)
+        far = []
+        for a in ours.agents:
+            w = a.waypoints
+            x, y = np.cos(turn) * w.x_m - np.sin(turn) * w.y_m, np.sin(turn) * w.x_m + np.cos(turn) * w.y_m
+            far.append(
+                replace(a, waypoints=replace(w, x_m=x + 1000, y_m=y - 500, z_m=w.z_m + 7, yaw_rad=w.yaw_rad + turn))
+            )
+        result = evaluate(ours, replace(ours, agents=tuple(far), map=MapFrame(projection="+proj=utm +zone=33")))
+        assert result["placement"]["method"] == "ego_path"
+        assert result["placement"]["ego_apart_m"] < 1e-6
+        assert result["position_rmse_m"] < 1e-6
+        assert result["yaw_median_deg"] < 1e-6
+    # Maps of one projection stay: a wrong pose is an error.
+    assert evaluate(shifted(world(), 5.0), world())["placement"] == {"method": "ego_path", "ego_apart_m": 0.0}
+    utm = MapFrame(projection="+proj=utm +zone=33")
+    same = evaluate(replace(shifted(world(), 5.0), map=utm), replace(world(), map=utm))
+    assert same["placement"] == {"method": "same_map", "ego_apart_m": 5.0}
 
 
 def test_a_truth_of_another_time_is_refused():

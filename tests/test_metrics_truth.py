@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from log2sim.datatypes import Labels, Lidar, Log, Stream, Sweep
+from log2sim.datatypes import Labels, Lidar, Log, Scenario, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.truth import is_static, nearest_record, speed_along, truth_from_log
-from log2sim.evaluation.metrics.visibility import PointGrid, convex_hull, image_shares
+from log2sim.evaluation.metrics.truth import (
+    PointGrid,
+    convex_hull,
+    image_shares,
+    is_static,
+    nearest_record,
+    speed_along,
+    truth_from_log,
+    with_points,
+)
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, points_in_box, rotation_from_rpy, transform
 
 NS = 1_000_000_000
@@ -109,6 +118,34 @@ def test_visibility_that_the_log_states_is_taken_and_no_sweep_read():
     truth = truth_from_log(log)
     assert truth.others[0].waypoints.visible.tolist() == stated.tolist()
     assert truth.provenance["unreadable_sweeps"] == 0
+
+
+def test_points_are_counted_beside_what_the_log_states_and_in_a_truth_of_its_own():
+    """By label and by sweep, in cars that stand."""
+    log = make_log([[60, 0, 0.75], [60, 8, 0.75]], [40, 3], visible=np.tile([False, True], FRAMES))
+    assert truth_from_log(log).others[0].waypoints.lidar_points is None
+    truth = truth_from_log(log, points=True)
+    assert [a.waypoints.lidar_points.tolist() for a in truth.others] == [[40.0] * FRAMES, [3.0] * FRAMES]
+    assert [a.waypoints.visible.tolist() for a in truth.others] == [[False] * FRAMES, [True] * FRAMES]
+    ends = [replace(a, waypoints=replace(a.waypoints, lidar_points=None).take([0, -1])) for a in truth.others]
+    again = with_points(replace(truth, agents=(truth.ego, *ends)), replace(log, labels=None))
+    assert [a.waypoints.lidar_points.tolist() for a in again.others] == [[40.0, 40.0], [3.0, 3.0]]
+    found = evaluate(truth, log)
+    assert (found["coverage"]["hit"], found["coverage"]["hit_recall"], found["counts"]["truth_ticks"]) == (15, 1.0, 15)
+    assert Scenario.from_dict(truth.to_dict()).others[0].waypoints.lidar_points.tolist() == [40.0] * FRAMES
+
+
+def test_either_side_may_be_a_file_and_the_truth_a_log(tmp_path):
+    log = make_log([[60, 0, 0.75]], [40])
+    truth = truth_from_log(log)
+    truth.save(tmp_path / "s.json")
+    expected = evaluate(truth, log)
+    assert expected["recall"] == 1.0
+    assert evaluate(tmp_path / "s.json", log) == expected
+    assert evaluate(str(tmp_path / "s.json"), tmp_path / "s.json")["recall"] == 1.0
+    assert evaluate(SimpleNamespace(scenario=truth), truth)["recall"] == 1.0
+    with pytest.raises(TypeError, match="first"):
+        evaluate(log, truth)
 
 
 def test_an_unreadable_sweep_is_counted_and_the_rest_goes_on():

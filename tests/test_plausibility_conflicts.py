@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 from test_overlap import agent, candidate
 
-from log2sim.agents.naming import name_agents
-from log2sim.agents.plausibility import box_table
-from log2sim.agents.plausibility.box_table import BoxTable
-from log2sim.agents.plausibility.conflicts import conflict_doubts, find_all_conflicts, find_conflicts, resolve_conflicts
+from log2sim.agents import evidence as box_table
+from log2sim.agents.candidate import Timeline, name_agents
+from log2sim.agents.conflicts import (
+    conflict_doubts,
+    extend_static,
+    find_all_conflicts,
+    find_conflicts,
+    resolve_conflicts,
+)
+from log2sim.agents.evidence import BoxTable
+from log2sim.datatypes import Obstacles, Rays
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -172,3 +179,45 @@ def test_conflicts_are_the_same_whether_ticks_are_looked_at_together_or_in_turn(
         np.testing.assert_allclose(one.share, other.share)
         np.testing.assert_allclose(one.depth_m, other.depth_m)
     np.testing.assert_array_equal(present, BoxTable.of(agents, T).present)
+
+
+def static(x_m, t, *, confidence=0.9):
+    return replace(agent(x_m, t=t), id=f"car at {x_m}", static=True, confidence=confidence)
+
+
+def life(extended):
+    return [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in extended]
+
+
+def test_static_agents_exist_all_the_time_but_where_something_else_is() -> None:
+    timeline = Timeline((np.linspace(0.0, 4.0, 41) * 1e9).astype(np.int64), 0)
+    clouds = [None] * 41
+    (alone,) = extend_static([static(0.0, (1.0, 2.0))], None, clouds, timeline)
+    assert life([alone]) == [(0.0, 4.0)]
+    w = alone.waypoints
+    assert w.observed.tolist() == [1.0 <= t <= 2.0 for t in w.t_s.tolist()]
+    # The ego is in its place until it is 4.4 m away, at 10 m/s; the other car takes it before.
+    ego = agent(0.0, speed=10.0)
+    (late,) = extend_static([static(0.0, (3.0, 4.0))], ego, clouds, timeline)
+    assert life([late])[0][0] == pytest.approx(0.44, abs=0.1)
+    pair = extend_static([static(0.0, (0.0, 1.0)), static(1.0, (3.0, 4.0), confidence=0.8)], None, clouds, timeline)
+    assert life(pair) == [(0.0, pytest.approx(2.9)), (3.0, 4.0)]
+    assert extend_static([ego], None, clouds, timeline) == [ego]
+
+
+def test_a_place_through_which_rays_pass_is_free() -> None:
+    timeline = Timeline((np.linspace(0.0, 4.0, 41) * 1e9).astype(np.int64), 0)
+    sensor = np.array([-10.0, 0.0, 0.6])
+    y, z = (a.ravel() for a in np.meshgrid(np.linspace(-0.8, 0.8, 9), np.linspace(0.5, 0.6, 5)))
+
+    def rays_to(x_m):
+        end = np.column_stack([np.full(len(y), x_m), y, z]).astype(np.float32)
+        still = np.zeros(len(end), np.float32)
+        free = Rays(end, still, still.astype(np.uint8), sensor[None].astype(np.float32), np.zeros((1, 3), np.float32))
+        return Obstacles(0, np.zeros(3), end[:0], still[:0], sensor.astype(np.float32), free)
+
+    # They pass until 1 s, end at the car from then on, and pass again from 3.5 s.
+    t = np.linspace(0.0, 4.0, 41)
+    clouds = [rays_to(20.0 if s < 0.95 or s > 3.45 else -2.2) for s in t]
+    (car,) = extend_static([static(0.0, (2.0, 3.0))], None, clouds, timeline)
+    assert life([car]) == [(pytest.approx(1.0), pytest.approx(3.4))]

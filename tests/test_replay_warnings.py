@@ -15,14 +15,10 @@ from replay_scenes import LENGTH_M, line, parked, walker
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.prediction.motion_table import table_of
+from log2sim.simulation.expected_motion import EgoPath, EgoStates, WarningSettings
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.simulation.warnings.ego_path import EgoPath, EgoStates
-from log2sim.simulation.warnings.policy import BrakeWhenWarned
-from log2sim.simulation.warnings.sentences import describe_warnings
-from log2sim.simulation.warnings.settings import WarningSettings
-from log2sim.simulation.warnings.warn import warn
-from log2sim.simulation.warnings.watch import Watch
+from log2sim.simulation.warnings import BrakeWhenWarned, Watch, describe_warnings, warn
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 TOWN_MPS = 30 / 3.6

@@ -12,8 +12,8 @@ import pytest
 from command_line import names, run
 from worlds import tiny_log, tiny_table
 
-from log2sim import registry
 from log2sim.datatypes import Scenario
+from log2sim.files import plugins
 from log2sim.logs.native.writer import write_log
 
 TOP, FRONT = tiny_table()["lidar"][0], tiny_table()["camera"][0]
@@ -102,7 +102,7 @@ def test_the_scenario_is_drawn_replayed_changed_and_exported(
         ran = run(*command, "--quiet") if command[0] != "plot" else run(*command)
         assert ran.code == 0, (command, ran.err)
     ego = ("--ego", first) if name.startswith("roadside") else ()
-    for format in registry.names("export"):
+    for format in plugins.names("export"):
         if format == "rerun":
             continue  # needs its package
         ran = run("export", scenario, "--to", format, "--out", tmp_path / format, *ego, "--quiet")

@@ -51,6 +51,22 @@ def test_whoever_is_seen_from_both_ends_is_within_a_foot_and_three_degrees(kind:
         assert found.yaw_deg < 3.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "pose"), [("bus", "oncoming"), ("road_train", "overtaking"), ("road_train", "overtaken")]
+)
+def test_who_passes_the_ego_is_there_though_the_only_camera_looks_ahead(kind: str, pose: str) -> None:
+    from bench_large_vehicles import measured
+
+    (found,) = next(measured([kind], [pose], "labels", 0, cameras=1))
+    assert found.recall > 0.95
+    assert found.extra == 0
+    assert found.position_m is not None
+    assert found.position_m < 0.3
+    assert found.yaw_deg is not None
+    assert found.yaw_deg < 3.0
+
+
 def test_the_sweep_is_where_the_boxes_are() -> None:
     from bench_large_vehicles import KINDS, log_of, scene_of
 

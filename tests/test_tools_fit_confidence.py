@@ -56,13 +56,13 @@ def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
     np.testing.assert_array_equal(one.box_px, two.box_px)
     assert len(one)
     assert one.score.min() >= confidence_logs.MIN_SCORE
-    [case, *_] = pickle.loads(pickle.dumps(confidence_logs.cases_of(1, 8)))
-    agents = fit_confidence.agents_of(case)
-    assert len(agents) > 3
+    cases = pickle.loads(pickle.dumps(confidence_logs.cases_of(1, 8)))
+    agents = [agent for case in cases for agent in fit_confidence.agents_of(case)]
+    assert [sum(a.lidar == lidar for a in agents) > 3 for lidar in (True, False)] == [True, True]
     assert all(0 <= a.right <= 1 and a.ticks > 0 for a in agents)
     x = fit_confidence.matrix_of(agents)
     assert np.isfinite(x).all()
-    bias, weights, by_kind = fit_confidence.fit_all(agents)
-    p = fit_confidence.probabilities(x, bias, weights)
+    tables, by_kind = fit_confidence.fit_all(agents)
+    p = fit_confidence.probabilities(agents, tables)
     assert ((p > 0) & (p < 1)).all()
     assert set(by_kind) == {"position", "yaw", "speed"}

@@ -25,10 +25,12 @@ from lidar_training.network import BOX, CATEGORY, HEAT, OUT_CHANNELS, SEGMENT, V
 from lidar_training.samples import CATEGORIES, Sample, Shard, augmented, draw_sample, grid_of, write_shard  # noqa: E402
 from lidar_training.targets import targets_of  # noqa: E402
 
-from log2sim.config_sections import LidarConfig  # noqa: E402
-from log2sim.perception.detect3d.centers import decode_centers  # noqa: E402
+from log2sim.config import LidarConfig  # noqa: E402
+from log2sim.errors import LogError  # noqa: E402
+from log2sim.perception.detect3d.boxes import decode_centers  # noqa: E402
+from log2sim.perception.detect3d.detectors import open_network  # noqa: E402
 from log2sim.perception.detect3d.network import NetworkInfo  # noqa: E402
-from log2sim.perception.detect3d.network_detector import open_network  # noqa: E402
+from log2sim.synth.traffic_data import TrafficSettings, write_traffic  # noqa: E402
 
 CELLS, CELL_M = 128, 0.25
 LOW = np.array([-16.0, -16.0])
@@ -192,3 +194,38 @@ def test_a_toy_learns_to_find_vehicles(tmp_path) -> None:
     card = json.loads((tmp_path / "roadside.json").read_text())
     assert card["simulated"]["vehicle"]["average_precision"] > 0.15
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000
+
+
+def test_labeled_logs_are_trained_on_and_their_last_sweeps_held_out(tmp_path, monkeypatch) -> None:
+    settings = TrafficSettings("roadside", 2, seed=3, layout="log2sim", duration_s=1.0, pictures=False)
+    write_traffic(settings, tmp_path / "logs")
+    paths, held_out = train_lidar.read_own([tmp_path / "logs"], tmp_path / "data", every=1)
+    shards = [Shard(path) for path in paths]
+    assert [len(shard) for shard in shards] == [8, 8]
+    assert len(held_out) == 4
+    # The labels are those of the generated scenes: points are in them, on the ground's level.
+    one = shards[0][0]
+    k = int(np.argmax(one.points))
+    x, y, z, length, width, height, yaw = one.boxes[k]
+    c, s = np.cos(yaw), np.sin(yaw)
+    local = (one.xyz_m[:, :2] - [x, y]) @ np.array([[c, -s], [s, c]])
+    inside = (np.abs(local) < np.array([length, width]) / 2 + 0.1).all(axis=1) & (
+        np.abs(one.xyz_m[:, 2] - z) < height / 2 + 0.1
+    )
+    assert inside.sum() >= 0.9 * one.points[k]
+    held = held_out[0]
+    assert np.abs(held.cloud.sensor[:2]).max() == 0
+    assert held.truth.range_m[np.argmax(held.truth.points)] < 30
+    alone = train_lidar.Pool(tmp_path, "roadside", [train_lidar.Round(1, 0, 5)], paths)
+    alone.prepare(0)
+    sizes = {len(sample.xyz_m) for shard in shards for sample in (shard[k] for k in range(len(shard)))}
+    assert {len(alone.draw(np.random.default_rng(k)).xyz_m) for k in range(20)} <= sizes
+    monkeypatch.setattr(train_lidar, "CELLS", {"roadside": 64})
+    round_ = train_lidar.Round(1, 0, 2)
+    train_lidar.fit("roadside", tmp_path / "data", tmp_path, [round_], paths)
+    assert (tmp_path / "round-1.pt").is_file()
+
+
+def test_training_on_own_logs_alone_without_labels_is_refused(tmp_path) -> None:
+    with pytest.raises(LogError):
+        train_lidar.read_own([tmp_path], tmp_path / "data", every=1)

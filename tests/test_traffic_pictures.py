@@ -9,28 +9,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command_line import run
 from scipy.spatial import ConvexHull
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import apply, box_corners, inverse
 from log2sim.logs.opening import open_log
-from log2sim.synth.bodies import Body, samples_of
-from log2sim.synth.ground import Ground
-from log2sim.synth.light import NOON
-from log2sim.synth.markings import GroundPlan
-from log2sim.synth.polytope_mesh import meshes_of
-from log2sim.synth.polytopes import Material
+from log2sim.synth.backdrop import draw_terrain, sampled_ground
+from log2sim.synth.ground import Ground, GroundPlan
+from log2sim.synth.light import FAR_M, NOON, RenderCamera
+from log2sim.synth.polytopes import Material, meshes_of
 from log2sim.synth.raster import nearest_of
-from log2sim.synth.render import SceneInstant, segment
-from log2sim.synth.render_camera import RenderCamera
+from log2sim.synth.render import Body, SceneInstant, samples_of, segment
 from log2sim.synth.returns import ReturnModel, Weather
-from log2sim.synth.scenery import FAR_M
-from log2sim.synth.terrain_view import draw_terrain, sampled_ground
-from log2sim.synth.traffic import TrafficObject, TrafficScene
-from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, frame_of, write_traffic
-from log2sim.synth.traffic_motion import run_of
+from log2sim.synth.traffic import TrafficObject, TrafficScene, rig_of
+from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, frame_of, run_of, write_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
-from log2sim.synth.traffic_rig import rig_of
 
 CLEAR = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0, weather=Weather())
 SEE_THROUGH = (Material.GLASS, Material.LEAVES, Material.MESH)
@@ -321,3 +315,29 @@ def test_a_row_of_a_picture_may_see_near_and_far_ground() -> None:
     colors = sampled_ground(ground, 0, x, np.zeros_like(x), np.ones(x.shape, bool))
     assert colors.shape == (3, 400, 3)
     assert np.ptp(colors.reshape(-1, 3).astype(int), axis=0).max() < 60  # a meadow all over
+
+
+def test_without_pictures_sweeps_and_labels_are_those_with_pictures(tmp_path: Path) -> None:
+    settings = TrafficSettings("roadside", 1, seed=2, layout="log2sim", duration_s=0.5)
+    write_traffic(settings, tmp_path / "with")
+    write_traffic(replace(settings, pictures=False), tmp_path / "without")
+    both = [open_log(tmp_path / name / "scene_000000") for name in ("with", "without")]
+    assert [len(log.cameras) for log in both] == [1, 0]
+    for a, b in zip(*(log.streams["lidar"].t_ns for log in both), strict=True):
+        assert a == b
+    np.testing.assert_array_equal(*(log.streams["lidar"].read(1).xyz_m for log in both))
+    np.testing.assert_array_equal(*(log.labels.center_m for log in both))
+    assert sorted(p.name for p in (tmp_path / "without").rglob("*.jpg")) == []
+    with pytest.raises(ConfigError, match="log2sim"):
+        write_traffic(replace(settings, pictures=False, layout="kitti"), tmp_path / "kitti")
+
+
+def test_a_scene_is_written_without_its_cameras(tmp_path: Path) -> None:
+    scene = Path(__file__).parents[1] / "samples" / "scenes" / "roadside.toml"
+    short = tmp_path / "short.toml"
+    short.write_text(scene.read_text().replace("duration_s = 8.0", "duration_s = 0.5"))
+    assert run("synth", short, "--no-pictures", "-o", tmp_path / "log", "--quiet").code == 0
+    log = open_log(tmp_path / "log")
+    assert (list(log.cameras), list(log.lidars)) == ([], ["roadside_lidar"])
+    assert log.labels is not None
+    assert run("synth", "--traffic", "vehicle", "--no-pictures", "--layout", "kitti", "-o", tmp_path / "k").code == 2

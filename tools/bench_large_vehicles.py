@@ -1,9 +1,10 @@
-"""Large and close vehicles: one row of ten kinds of 4 to 19 m, in five poses, with and without a second vehicle.
+"""Large and close vehicles: one row of ten kinds of 4 to 19 m, in eight poses, with and without a second vehicle.
 
     python tools/bench_large_vehicles.py --out large.json
     python tools/bench_large_vehicles.py --kinds box_truck,bus --poses end_on --detector lidar:vehicle
+    python tools/bench_large_vehicles.py --kinds bus,road_train --poses oncoming,overtaking,overtaken --cameras 1
 
-reconstructs a small synthetic log for each of them from the exact boxes of six cameras and the sweeps of one LiDAR, and prints
+reconstructs a small synthetic log for each of them from the exact boxes of six cameras, or fewer, and the sweeps of one LiDAR, and prints
 how far each vehicle is from the truth: recall (ticks at which its box has an agent), position, yaw up to half turns, length,
 width, speed (medians over the ticks), backwards (share of its ticks). Ticks count whether or not a camera shows half of it.
 """
@@ -45,6 +46,7 @@ KINDS: Mapping[str, tuple[str, tuple[float, float, float]]] = {
 SECOND_SIZE_M = (4.5, 1.8, 1.5)
 GAP_M = 1.5
 DURATION_S = 2.6
+CAMERA_YAWS_DEG = (0, 60, 120, 180, 240, 300)
 EGO_FRONT_M = 3.7
 STANDING = {"waypoints": [[0.0, 0.0, 0.0], [60.0, 0.0, 8.0]], "wait_s": [[0, 60.0]]}
 # An agent stands for a vehicle while its center is in the vehicle's box, widened by the gate of `evaluate`.
@@ -99,14 +101,18 @@ def place_of(pose: str, size_m: tuple[float, float, float]) -> Place:
         "curb": Place((8.0 + length / 2, -2.4 - width / 2), 0.0, driving(8.0)),
         # Starts from rest beside a waiting ego.
         "start": Place((3.0 - length / 4, 2.2 + width / 2), 0.0, STANDING, start_s=0.5),
+        # Passes the ego in the other direction, from behind, and is passed.
+        "oncoming": Place((EGO_FRONT_M + 10.0 + length / 2, 3.4), 180.0, driving(7.0), 7.0),
+        "overtaking": Place((-4.0 - length / 2, 3.4), 0.0, driving(8.0), 18.0),
+        "overtaken": Place((EGO_FRONT_M + 4.0 + length / 2, -3.4), 0.0, driving(16.0), 6.0),
     }[pose]
 
 
-POSES = ("end_on", "beside", "oblique", "curb", "start")
+POSES = ("end_on", "beside", "oblique", "curb", "start", "oncoming", "overtaking", "overtaken")
 
 
-def scene_of(kind: str, pose: str, second: bool, *, exact: bool = False) -> Scene:
-    """Make the scene of a kind in a pose; an exact one has a LiDAR and poses without noise."""
+def scene_of(kind: str, pose: str, second: bool, *, exact: bool = False, cameras: int = len(CAMERA_YAWS_DEG)) -> Scene:
+    """Make the scene of a kind in a pose; an exact one has a LiDAR and poses without noise. The first camera looks ahead."""
     category, size = KINDS[kind]
     place = place_of(pose, size)
     agents = [agent_at("target", category, size, place, place.xy_m)]
@@ -115,17 +121,24 @@ def scene_of(kind: str, pose: str, second: bool, *, exact: bool = False) -> Scen
         yaw = np.deg2rad(place.yaw_deg)
         xy = place.xy_m[0] + ahead * float(np.cos(yaw)), place.xy_m[1] + ahead * float(np.sin(yaw))
         agents.append(agent_at("second", "car", SECOND_SIZE_M, place, xy))
-    return scene_from_table(table_of(f"{kind}-{pose}{'-second' if second else ''}", place.ego, agents, exact=exact))
+    return scene_from_table(
+        table_of(f"{kind}-{pose}{'-second' if second else ''}", place.ego, agents, exact=exact, cameras=cameras)
+    )
 
 
 def table_of(
-    name: str, ego: dict[str, Any], agents: Sequence[dict[str, Any]], *, exact: bool = False
+    name: str,
+    ego: dict[str, Any],
+    agents: Sequence[dict[str, Any]],
+    *,
+    exact: bool = False,
+    cameras: int = len(CAMERA_YAWS_DEG),
 ) -> dict[str, Any]:
-    """Make the table of a scene with six cameras and one LiDAR around the ego."""
-    cameras = [
+    """Make the table of a scene with some of six cameras and one LiDAR around the ego."""
+    around = [
         {"name": f"camera_{yaw}", "position_m": [1.4, 0.0, 1.6], "yaw_deg": float(yaw), "fov_deg": 70.0,
          "size_px": [480, 300], "offset_s": 0.05}
-        for yaw in (0, 60, 120, 180, 240, 300)
+        for yaw in CAMERA_YAWS_DEG[:cameras]
     ]  # fmt: skip
     lidar: dict[str, Any] = {
         "name": "top",
@@ -137,7 +150,7 @@ def table_of(
         lidar |= {"noise_m": 0.0, "dropout": 0.0, "resolution_m": 0.0}
     sigma = 0.0 if exact else 0.02
     return {
-        "name": name, "duration_s": DURATION_S, "ego": ego | {"poses": "poses"}, "agent": list(agents), "camera": cameras,
+        "name": name, "duration_s": DURATION_S, "ego": ego | {"poses": "poses"}, "agent": list(agents), "camera": around,
         "lidar": [lidar], "gnss": {"position_sigma_m": sigma, "angle_sigma_deg": sigma},
         "road": [{"line": [[-60.0, 0.0], [150.0, 0.0]], "width_m": 14.0}],
     }  # fmt: skip
@@ -283,7 +296,13 @@ def cast(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.random.Gen
 
 
 def measured(
-    kinds: Sequence[str], poses: Sequence[str], detector: str, seed: int, *, exact: bool = False
+    kinds: Sequence[str],
+    poses: Sequence[str],
+    detector: str,
+    seed: int,
+    *,
+    exact: bool = False,
+    cameras: int = len(CAMERA_YAWS_DEG),
 ) -> Iterator[list[Figures]]:
     """Reconstruct every scene and compare its vehicles with the truth."""
     # Agents alone are compared: the ground and colors only take time.
@@ -292,7 +311,7 @@ def measured(
     for pose in poses:
         for kind in kinds:
             for second in (False, True):
-                log, truth = log_of(scene_of(kind, pose, second, exact=exact), seed=seed)
+                log, truth = log_of(scene_of(kind, pose, second, exact=exact, cameras=cameras), seed=seed)
                 found = reconstruct(log, config).scenario
                 names = [a.id for a in truth.others]
                 yield [figures(kind, pose + ("+" if second else ""), name, truth, found) for name in names]
@@ -346,10 +365,12 @@ def main() -> None:
     parser.add_argument("--detector", default="labels")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--exact", action="store_true", help="LiDAR and poses without noise")
+    parser.add_argument("--cameras", type=int, default=len(CAMERA_YAWS_DEG), help="the first looks ahead")
     parser.add_argument("--out", type=Path, help="file for the figures as JSON")
     args = parser.parse_args()
     rows: list[Figures] = []
-    for found in measured(args.kinds.split(","), args.poses.split(","), args.detector, args.seed, exact=args.exact):
+    options = {"exact": args.exact, "cameras": args.cameras}
+    for found in measured(args.kinds.split(","), args.poses.split(","), args.detector, args.seed, **options):
         rows += found
         for f in found:
             print(" | ".join(row(f)), flush=True)

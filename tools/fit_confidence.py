@@ -1,7 +1,7 @@
 """Fit the weights by which agents are rated, and those of their systematic errors, on synthetic logs.
 
     python tools/confidence_logs.py --logs 60 --seed 2 --out FOLDER
-    python tools/fit_confidence.py FOLDER > log2sim/agents/confidence/weights.py
+    python tools/fit_confidence.py FOLDER > log2sim/agents/confidence.py
 
 Goes on from the first passes that the former made, judges the agents as `evaluate` does, and prints the module. Tables of
 logs that were held out go to stderr: each fifth of the logs is rated by weights that fit the others.
@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 import pickle
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,27 @@ from numpy.typing import NDArray
 
 from log2sim import pipeline
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of, seen_share, yaw_at_measurements
-from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE
-from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
-from log2sim.datatypes import CATEGORIES, Agent, Scenario
-from log2sim.evaluation.metrics.calibration import reliability
+from log2sim.agents.confidence import (
+    MAX_CONFIDENCE,
+    MIN_CONFIDENCE,
+    SIGNS,
+    Evidence,
+    evidence_of,
+    position_terms,
+    seen_share,
+    speed_terms,
+    yaw_at_measurements,
+    yaw_terms,
+)
+from log2sim.datatypes import CATEGORIES, Agent
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.comparison import Selection
-from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE
+from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
 from log2sim.evaluation.metrics.verdicts import judge
 from log2sim.geometry import Array
-from log2sim.log_odds import probability_of
+
+Table = dict[str, float]
 
 FOLDS = 5
 # Standard deviation of the weights of evidence that is scaled to a standard deviation of 1, before anything is seen.
@@ -50,6 +60,7 @@ class Rated:
 
     log: str
     case: str
+    lidar: bool
     id: str
     evidence: Evidence
     ticks: int
@@ -67,7 +78,7 @@ def agents_of(case: Case) -> list[Rated]:
     kept: list[AgentCandidate] = []
     original = pipeline.rate_agents
 
-    def keep(candidates: Sequence[AgentCandidate], timeline: Timeline) -> list[AgentCandidate]:
+    def keep(candidates: Sequence[AgentCandidate], timeline: Timeline, *, lidar: bool) -> list[AgentCandidate]:
         kept.extend(candidates)
         return list(candidates)
 
@@ -76,15 +87,9 @@ def agents_of(case: Case) -> list[Rated]:
         scenario = case.second().scenario
     finally:
         pipeline.rate_agents = original
-    return rated_agents(case.name, scenario, case.truth, kept, case.run.schedule.t_ns)
-
-
-def rated_agents(
-    name: str, scenario: Scenario, truth: Scenario, kept: Sequence[AgentCandidate], t_ns: NDArray[np.int64]
-) -> list[Rated]:
-    """Judge the agents of a scenario of which the candidates are known."""
+    t_ns, lidar = case.run.schedule.t_ns, bool(case.run.log.lidars)
     timeline = Timeline(t_ns, int(t_ns[0]))
-    compared, _, ego = compare_scenarios(scenario, truth, Selection(None, frozenset(CATEGORIES)))
+    compared, _, ego = compare_scenarios(scenario, case.truth, Selection(None, frozenset(CATEGORIES)))
     v, out = judge(compared, ego), []
     for k, agent in enumerate(scenario.others):
         ticks = v.judged[k]
@@ -108,8 +113,9 @@ def rated_agents(
         range_m = float(np.median(compared.other.range_m[k, ticks]))
         out.append(
             Rated(
-                name.split(" ")[0],
-                name,
+                case.name.split(" ")[0],
+                case.name,
+                lidar,
                 agent.id,
                 evidence,
                 int(ticks.sum()),
@@ -125,8 +131,8 @@ def rated_agents(
     return out
 
 
-def matrix_of(agents: Sequence[Rated]) -> Array:
-    return np.array([[getattr(a.evidence, name) for name in SIGNS] for a in agents])
+def matrix_of(agents: Sequence[Rated], names: Sequence[str] = tuple(SIGNS)) -> Array:
+    return np.array([[getattr(a.evidence, name) for name in names] for a in agents])
 
 
 def targets_of(agents: Sequence[Rated]) -> Array:
@@ -155,8 +161,11 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
     return float(w[0] - (w[1:] / scale) @ mean), w[1:] / scale
 
 
-def probabilities(x: Array, bias: float, weights: Array) -> Array:
-    return np.clip(probability_of(bias + x @ weights), MIN_CONFIDENCE, MAX_CONFIDENCE)
+def probabilities(agents: Sequence[Rated], tables: Mapping[bool, Table]) -> Array:
+    """Rate agents (A,) by the tables of weights with and without a LiDAR."""
+    rows = [(list(tables[a.lidar].items()), {"bias": 1.0, **asdict(a.evidence)}) for a in agents]
+    odds = np.array([sum(weight * values[name] for name, weight in table) for table, values in rows])
+    return np.clip(probability_of(odds), MIN_CONFIDENCE, MAX_CONFIDENCE)
 
 
 def fit_variances(terms: Array, squared: Array, least: Array) -> Array:
@@ -200,8 +209,8 @@ def held_out(agents: Sequence[Rated]) -> tuple[Array, dict[str, tuple[Array, Arr
     for fold in range(FOLDS):
         rest = [a for a, log in zip(agents, logs) if log % FOLDS != fold]
         rows = np.flatnonzero(logs % FOLDS == fold)
-        bias, weights, by_kind = fit_all(rest)
-        p[rows] = probabilities(matrix_of([agents[k] for k in rows]), bias, weights)
+        tables, by_kind = fit_all(rest)
+        p[rows] = probabilities([agents[k] for k in rows], tables)
         for kind, found in by_kind.items():
             for k in rows:
                 if has_sigma(kind, agents[k]):
@@ -211,13 +220,19 @@ def held_out(agents: Sequence[Rated]) -> tuple[Array, dict[str, tuple[Array, Arr
     return p, {kind: (np.array(rows, dtype=int), np.array(v)) for kind, (rows, v) in variances.items()}
 
 
-def fit_all(agents: Sequence[Rated]) -> tuple[float, Array, dict[str, dict[str, float]]]:
-    """Fit the bias, the weights (F,) of evidence, and by kind of error those of the terms of its variance."""
-    x = matrix_of(agents)
-    # An agent of many ticks counts more, since they do in the calibration of ticks, but less than they are.
-    ticks = np.sqrt([a.ticks for a in agents])
-    bias, weights = fit_weights(x, targets_of(agents), ticks / ticks.mean(), list(SIGNS.values()))
-    p = probabilities(x, bias, weights)
+def fit_all(agents: Sequence[Rated]) -> tuple[dict[bool, Table], dict[str, Table]]:
+    """Fit the weights of evidence with and without a LiDAR, and by kind of error those of the terms of its variance."""
+    tables = {}
+    for lidar in {a.lidar for a in agents}:
+        own = [a for a in agents if a.lidar == lidar]
+        x = matrix_of(own)
+        names = [name for name, used in zip(SIGNS, np.ptp(x, axis=0) > 0) if used]
+        # An agent of many ticks counts more, since they do in the calibration of ticks, but less than they are.
+        ticks = np.sqrt([a.ticks for a in own])
+        signs = [SIGNS[name] for name in names]
+        bias, weights = fit_weights(matrix_of(own, names), targets_of(own), ticks / ticks.mean(), signs)
+        tables[lidar] = {**dict(zip(names, weights.tolist())), "bias": bias}
+    p = probabilities(agents, tables)
     by_kind = {}
     for kind in ("position", "yaw", "speed"):
         rows = [(a, float(c)) for a, c in zip(agents, p) if has_sigma(kind, a)]
@@ -228,7 +243,7 @@ def fit_all(agents: Sequence[Rated]) -> tuple[float, Array, dict[str, dict[str, 
         least = np.array([MIN_GIVEN_WEIGHT if name == "given" else MIN_WEIGHT for name in names])
         found = fit_variances(terms, np.array([a.errors[kind] for a, _ in rows]) + 1e-8, least)
         by_kind[kind] = dict(zip(names, found.tolist()))
-    return bias, weights, by_kind
+    return tables, by_kind
 
 
 def say(text: str) -> None:
@@ -272,19 +287,20 @@ def say_sigma(kind: str, rows: NDArray[Any], variance: Array, agents: Sequence[R
             )
 
 
-def module_text(command: str, count: int, logs: int, fitted: tuple[float, Array, dict[str, dict[str, float]]]) -> str:
-    bias, weights, by_kind = fitted
+def module_text(command: str, agents: Sequence[Rated]) -> str:
+    counts = [sum(a.lidar == lidar for a in agents) for lidar in (True, False)]
+    found, by_kind = fit_all(agents)
     lines = [
         '"""Weights of the evidence (`evidence.Evidence`) and of systematic errors (`systematic`).',
         "",
-        f"Printed by `{command}`: {count} agents of {logs} synthetic logs.",
+        f"Printed by `{command}`: {counts[0]} agents with a LiDAR and",
+        f"{counts[1]} without, of {len({a.log for a in agents})} synthetic logs.",
         '"""',
         "",
         "from __future__ import annotations",
         "",
-        f"BIAS = {bias:.3f}",
     ]
-    tables = {"WEIGHTS": dict(zip(SIGNS, weights.tolist()))}
+    tables = {"WITH_LIDAR": found.get(True, {}), "WITHOUT_LIDAR": found.get(False, {})}
     tables |= {f"{kind.upper()}_VARIANCE": by_kind.get(kind, {}) for kind in ("position", "yaw", "speed")}
     for name, table in tables.items():
         lines += [f"{name} = {{", *(f'    "{key}": {float(f"{value:.4g}")},' for key, value in table.items()), "}"]
@@ -298,13 +314,13 @@ def main() -> None:
     agents: list[Rated] = []
     for path in sorted(options.folder.glob("*.pkl")):
         for case in pickle.loads(path.read_bytes()):
-            found = agents_of(case)
+            found = [replace(agent, log=path.stem) for agent in agents_of(case)]
             agents += found
             say(f"{case.name}: {len(found)} agents")
     report(agents)
     seeds = ", ".join(sorted({path.stem.split("-")[0] for path in options.folder.glob("*.pkl")}))
     command = f"tools/fit_confidence.py` on the logs of `tools/confidence_logs.py --seed {seeds}"
-    print(module_text(command, len(agents), len({a.log for a in agents}), fit_all(agents)))
+    print(module_text(command, agents))
 
 
 def report(agents: Sequence[Rated]) -> None:
@@ -315,7 +331,8 @@ def report(agents: Sequence[Rated]) -> None:
     kinds = {
         "sweeps": lambda a: a.evidence.sweep != 0,
         "images and points": lambda a: a.evidence.sweep == 0 and a.evidence.blind < 0.5,
-        "images": lambda a: a.evidence.blind >= 0.5,
+        "images": lambda a: a.evidence.blind >= 0.5 and a.lidar,
+        "no LiDAR": lambda a: not a.lidar,
     }
     for title, chosen in kinds.items():
         rows = [k for k, a in enumerate(agents) if chosen(a)]

@@ -1,13 +1,16 @@
-"""Train the LiDAR detector on simulated clouds: generate, fit, export, check, in one command that resumes.
+"""Train the LiDAR detector on simulated clouds and on labeled logs: generate, fit, export, check, in one command that resumes.
 
 pip install 'log2sim[train]'
 python tools/train_lidar.py vehicle --out DIR             # everything, with the settings of the shipped weights
 python tools/train_lidar.py vehicle --out DIR --scenes 200 --steps 300     # a toy
+python tools/train_lidar.py vehicle --out DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
+python tools/train_lidar.py vehicle --out DIR --data LOGS --scenes 0 --steps 2000          # from these alone
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import sys
@@ -23,20 +26,26 @@ from torch import Tensor, nn
 sys.path.insert(0, str(Path(__file__).parent))
 
 from lidar_training import fitting
-from lidar_training.clouds import draw_example
+from lidar_training.clouds import Example, draw_example
 from lidar_training.export import calibrate, describe, description, export_onnx, quantize
 from lidar_training.fitting import FitPlan
 from lidar_training.losses import loss_of
 from lidar_training.network import BevNetwork
+from lidar_training.real_logs import example_of, read_sweeps, sample_of
 from lidar_training.report import report
 from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_of, window_of, write_shard
 from lidar_training.targets import targets_of
 
-from log2sim.config_sections import LidarConfig
+from log2sim.batch.discovery import find_logs
+from log2sim.config import LidarConfig
+from log2sim.errors import ConfigError, LogError
+from log2sim.logs.opening import open_log
+from log2sim.perception.detect3d.detectors import open_network
 from log2sim.perception.detect3d.network import load_network
-from log2sim.perception.detect3d.network_detector import open_network
 
 PER_SHARD = 100
+# Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.
+HELD_OUT_SHARE = 0.2
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 WARM_UP_STEPS = 100
@@ -90,13 +99,36 @@ def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
         print(f"{path.name}: {(time.process_time() - begun) / PER_SHARD * 1e3:.0f} ms of CPU a scene", flush=True)
 
 
+def read_own(folders: Sequence[Path], out: Path, every: int) -> tuple[list[Path], list[Example]]:
+    """Write the labeled sweeps of the logs below some folders into shards, which are kept, and return the held-out ones as examples."""
+    out.mkdir(parents=True, exist_ok=True)
+    paths, held_out = [], []
+    for found in [found for folder in folders for found in find_logs(folder)]:
+        log = open_log(found.path, format=found.format, sequence=found.sequence or None)
+        try:
+            sweeps = read_sweeps(log, every)
+        except LogError as error:
+            print(f"left out: {error}", flush=True)
+            continue
+        first_held = max(math.ceil(len(sweeps) * (1 - HELD_OUT_SHARE)), 1)
+        held_out += [example_of(sweep) for sweep in sweeps[first_held:]]
+        paths.append(out / f"own-{hashlib.sha256(f'{log.digest} {every}'.encode()).hexdigest()[:16]}.npz")
+        if not paths[-1].exists():
+            write_shard(paths[-1], [sample_of(sweep) for sweep in sweeps[:first_held]])
+            print(f"{found.id}: {first_held} sweeps to train on, {len(sweeps) - first_held} held out", flush=True)
+    if not paths:
+        raise LogError(f"{', '.join(map(str, folders))}: no log with labeled sweeps")
+    return paths, held_out
+
+
 class Pool:
     """Samples of the shards that a step may use; waits for those that are still being generated.
 
     How many these are depends on the step alone, so that fitting beside generating gives the same weights as after it.
     """
 
-    def __init__(self, folder: Path, mount: str, rounds: Sequence[Round]) -> None:
+    def __init__(self, folder: Path, mount: str, rounds: Sequence[Round], own: Sequence[Path] = ()) -> None:
+        self._own = [Shard(path) for path in own]
         self._paths = [
             folder / shard_name(mount, r.seed, k) for r in rounds for k in range(math.ceil(r.scenes / PER_SHARD))
         ]
@@ -113,8 +145,10 @@ class Pool:
             self._shards.append(Shard(path))
 
     def draw(self, rng: np.random.Generator) -> Sample:
-        """Draw a sample."""
-        shard = self._shards[rng.integers(len(self._shards))]
+        """Draw a sample: from each kind of shards as often where there are both."""
+        of_logs = bool(self._own) and (not self._shards or rng.random() < 0.5)
+        shards = self._own if of_logs else self._shards
+        shard = shards[rng.integers(len(shards))]
         return shard[int(rng.integers(len(shard)))]
 
 
@@ -141,7 +175,7 @@ def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
     return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, cells, cell_m)
 
 
-def fit(mount: str, data: Path, out: Path, rounds: Sequence[Round]) -> None:
+def fit(mount: str, data: Path, out: Path, rounds: Sequence[Round], own: Sequence[Path] = ()) -> None:
     """Train the last of some rounds, or go on from its checkpoint in `out`; the earlier ones are complete."""
     this, number = rounds[-1], len(rounds)
     torch.manual_seed(this.seed)
@@ -149,7 +183,7 @@ def fit(mount: str, data: Path, out: Path, rounds: Sequence[Round]) -> None:
     if number > 1:
         before = torch.load(checkpoint_path(out, number - 1), weights_only=True)
         network.load_state_dict(before["mean"])
-    pool = Pool(data, mount, rounds)
+    pool = Pool(data, mount, rounds, own)
 
     def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         pool.prepare(step)
@@ -160,11 +194,18 @@ def fit(mount: str, data: Path, out: Path, rounds: Sequence[Round]) -> None:
     fitting.fit(network, step_loss, plan)
 
 
-def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int) -> None:
-    """Export, calibrate, quantize and report; the files that ship are in `out` afterwards."""
-    seed = rounds[0].seed
-    calibration = [draw_example(mount, (seed, 1_000_000, k)) for k in range(examples)]
-    test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
+def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = ()) -> None:
+    """Export, calibrate, quantize and report; the files that ship are in `out` afterwards.
+
+    Without simulated scenes the scores are calibrated and tested on the held-out sweeps; with both, on both.
+    """
+    seed, simulated = rounds[0].seed, any(r.scenes for r in rounds)
+    calibration, test = list(held_out[::2]), list(held_out[1::2])
+    if simulated:
+        calibration += [draw_example(mount, (seed, 1_000_000, k)) for k in range(examples)]
+        test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
+    if not calibration or not test:
+        raise ConfigError("--data: too few labeled sweeps to hold any out; give more of them, or --scenes")
     info, exact = description(mount, CELL_M[mount], RANGE_M[mount]), out / f"{mount}-float32.onnx"
     export_onnx(checkpoint_path(out, len(rounds)), exact, info)
     info["calibration"] = calibrate(exact, calibration)
@@ -190,8 +231,10 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int) -> Non
     card |= {
         "file": "int8" if chosen is small else "float32",
         "loss_of_f1_by_int8": round(loss, 4),
-        "simulated": reports[chosen.name],
+        "simulated" if simulated else "own": reports[chosen.name],
     }
+    if simulated and held_out[1::2]:
+        card["own"] = report(open_network(chosen, LidarConfig(), name=mount), held_out[1::2], range_m=RANGE_M[mount])
     info = json.loads(load_network(chosen).info.model_dump_json()) | {"card": {k: card[k] for k in ("rounds", "file")}}
     (out / f"{mount}.onnx").write_bytes(chosen.read_bytes())
     describe(out / f"{mount}.onnx", info)
@@ -203,25 +246,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mount", choices=("vehicle", "roadside"))
     parser.add_argument("--out", type=Path, required=True, help="folder of shards, checkpoints and results")
-    parser.add_argument("--scenes", type=int, help="a single round with as many scenes")
+    parser.add_argument("--scenes", type=int, help="a single round with as many scenes; 0 with --data alone")
     parser.add_argument("--steps", type=int, help="a single round with as many steps")
     parser.add_argument("--seed", type=int, default=1, help="with --scenes or --steps")
+    parser.add_argument(
+        "--data", type=Path, nargs="+", default=[], help="labeled logs, or folders of them, of any format"
+    )
+    parser.add_argument("--every", type=int, default=1, help="of the sweeps of --data take every n-th")
     parser.add_argument("--only", choices=("generate", "fit", "finish"))
     parser.add_argument("--examples", type=int, default=150, help="scenes to calibrate with, and as many to test with")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rounds = ROUNDS[options.mount]
-    if options.steps or options.scenes:
+    if options.steps or options.scenes is not None:
         first = rounds[0]
-        rounds = (Round(options.seed, options.scenes or first.scenes, options.steps or first.steps),)
+        scenes = first.scenes if options.scenes is None else options.scenes
+        rounds = (Round(options.seed, scenes, options.steps or first.steps),)
     data = options.out / "data"
+    if options.scenes == 0 and not options.data:
+        parser.error("--scenes 0 needs --data")
+    own, held_out = read_own(options.data, data, options.every) if options.data else ([], [])
     for number in range(1, len(rounds) + 1):
         if options.only in (None, "generate"):
             generate(options.mount, data, rounds[number - 1].scenes, rounds[number - 1].seed)
         if options.only in (None, "fit"):
-            fit(options.mount, data, options.out, rounds[:number])
+            fit(options.mount, data, options.out, rounds[:number], own)
     if options.only in (None, "finish"):
-        finish(options.mount, options.out, rounds, options.examples)
+        finish(options.mount, options.out, rounds, options.examples, held_out)
 
 
 if __name__ == "__main__":

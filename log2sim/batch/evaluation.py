@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
@@ -12,10 +12,19 @@ from typing import Any
 from log2sim.batch.discovery import FoundLog, find_logs
 from log2sim.batch.folder import LOGS, SCENARIO_FILE, BatchFolder
 from log2sim.datatypes import Scenario
-from log2sim.documents import rounded
 from log2sim.errors import Log2SimError, LogError
-from log2sim.evaluation.metrics.clear_mot import mota
+from log2sim.evaluation.metrics.comparison import mota
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.table import (
+    MAX_NAMED,
+    columns_text,
+    counted_text,
+    error_text,
+    percent,
+    recall_text,
+    verdict_text,
+)
+from log2sim.files.documents import rounded
 
 Figures = dict[str, Any]
 LoadTruth = Callable[[FoundLog, Scenario], Scenario]
@@ -37,7 +46,6 @@ class Scope:
     Attributes
     ----------
     max_range_m : float, m, optional
-    categories : sequence of str, optional
     """
 
     max_range_m: float | None = None
@@ -56,12 +64,10 @@ def evaluate_batch(
 
     Parameters
     ----------
-    folder : BatchFolder
     truth : Path
         Folder in which the logs have the same places as in the batch's own.
     load_truth : callable
         Returns the truth of a log for a scenario.
-    scope : Scope
     progress : callable
         Called as `progress(done, total)`.
 
@@ -109,6 +115,7 @@ def _figures(found: Figures) -> Figures:
     return {
         **{name: found[name] for name in OF_A_LOG},
         "counts": found["counts"],
+        "coverage": found["coverage"],
         "judged_ticks": judged["ticks"],
         "wrong_ticks": judged["wrong"]["ticks"],
     }
@@ -132,6 +139,7 @@ def pool(entries: Sequence[Figures]) -> Figures:
     matched, false = counts.get("matched_ticks", 0), counts.get("false_ticks", 0)
     truth, switches = counts.get("truth_ticks", 0), sum(e["id_switches"] for e in entries)
     judged, wrong = (sum(e[name] for e in entries) for name in ("judged_ticks", "wrong_ticks"))
+    covered = [e["coverage"] for e in entries if "coverage" in e]
     return {
         "logs": len(entries),
         "recall": _share(matched, truth),
@@ -140,8 +148,23 @@ def pool(entries: Sequence[Figures]) -> Figures:
         "id_switches": switches,
         "mota": mota(truth, truth - matched, false, switches) if truth else None,
         "wrong_share": _share(wrong, judged),
+        **({"coverage": _pooled_coverage(covered)} if covered else {}),
         "counts": counts,
         "median_of_logs": {name: _median(entries, name) for name in MEDIANS},
+    }
+
+
+def _pooled_coverage(covered: Sequence[Figures]) -> Figures:
+    """Add up what was labeled and counted in each log; what LiDARs hit is that of the logs with points."""
+    hits = [c for c in covered if c["hit"] is not None]
+    hit, matched = (sum(c[key] for c in hits) if hits else None for key in ("hit", "hit_matched"))
+    return {
+        "labeled": sum(c["labeled"] for c in covered),
+        "counted": sum(c["counted"] for c in covered),
+        "why_not": {name: sum(c["why_not"][name] for c in covered) for name in covered[0]["why_not"]},
+        "hit": hit,
+        "hit_matched": matched,
+        "hit_recall": _share(matched, hit) if hit and matched is not None else None,
     }
 
 
@@ -161,6 +184,37 @@ def _median(entries: Sequence[Figures], name: str) -> float | None:
     return rounded(median(known), DIGITS) if known else None
 
 
+def format_batch_verdict(document: Figures) -> str:
+    """Say what counted, was found and is wrong in all logs together, and name the logs with the lowest recall."""
+    total, compared = document["total"], [e for e in document["logs"] if "error" not in e]
+    lines = [("logs", f"{total['logs']} compared")] if total["logs"] else []
+    if "coverage" in total:
+        lines += [("counted", counted_text(total["coverage"])), ("recall", recall_text(total))]
+    counts = total["counts"]
+    if counts:
+        ticks = counts["matched_ticks"] + counts["false_ticks"]
+        lines.append(("precision", f"{percent(total['precision'])} of {ticks} reconstructed agent-ticks"))
+    if total["position_rmse_m"] is not None:
+        lines.append(
+            (
+                "errors",
+                error_text(
+                    {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in POOLED_BY_SQUARE}}
+                ),
+            )
+        )
+    if total["wrong_share"] is not None:
+        lines.append(("wrong", f"{percent(total['wrong_share'])} of the reconstructed agents' ticks"))
+    low = sorted((e["recall"], e["log"]) for e in compared if e["recall"] is not None and e["recall"] < 1)
+    if low and len(compared) > 1:
+        lines.append(("lowest", "; ".join(f"{log} recall {percent(recall)}" for recall, log in low[:MAX_NAMED])))
+    notes = [f"{document['without_truth']} logs are not below the folder with the truth"] * bool(
+        document["without_truth"]
+    )
+    notes += [f"{entry['log']}: {entry['error']}" for entry in document["logs"] if "error" in entry]
+    return verdict_text([*lines, *(("note:", note) for note in notes)])
+
+
 def format_batch_table(document: Figures, *, max_rows: int) -> str:
     """Format the figures: a line for each log up to a number of them, the worst recall first, and one for all."""
     rows = sorted(
@@ -171,42 +225,16 @@ def format_batch_table(document: Figures, *, max_rows: int) -> str:
     whole = {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in OF_A_LOG if k in total}}
     lines = [("all", {**whole, "counts": total["counts"]}), *((entry["log"], entry) for entry in rows[:max_rows])]
     cells = [["", "agents", *_TITLES], *(_cells(name, figures) for name, figures in lines)]
-    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
-    text = ["  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))]) for row in cells]
-    return "\n".join([*(line.rstrip() for line in text), *_notes(document, len(rows) - max_rows)])
+    notes = [f"and {len(rows) - max_rows} more logs with higher recall"] if len(rows) > max_rows else []
+    return "\n".join([*columns_text(cells), *notes, "medians and HOTA of all are medians over the logs"])
 
 
-_TITLES = (
-    "recall",
-    "precis.",
-    "pos rmse m",
-    "pos med m",
-    "yaw med deg",
-    "speed rmse m/s",
-    "size med m",
-    "id sw",
-    "MOTA",
-    "HOTA",
-)
-_DECIMALS = (3, 3, 2, 2, 1, 2, 2, 0, 3, 3)
+_TITLES = ("recall %", "precis. %", "rms m", "med m", "yaw deg", "m/s", "size m", "id sw", "MOTA", "HOTA")
+_DECIMALS = (1, 1, 2, 2, 1, 2, 2, 0, 3, 3)
 
 
 def _cells(name: str, figures: Figures) -> list[str]:
     values = [figures[key] for key in OF_A_LOG]
+    values[:2] = [None if share is None else 100 * share for share in values[:2]]
     numbers = ["-" if value is None else f"{value:.{digits}f}" for value, digits in zip(values, _DECIMALS)]
     return [name, str(figures["counts"].get("truth_agents", 0)), *numbers]
-
-
-def _notes(document: Figures, hidden: int) -> Iterator[str]:
-    """Yield what the table does not show."""
-    total = document["total"]
-    if hidden > 0:
-        yield f"and {hidden} more logs with higher recall"
-    if total["wrong_share"] is not None:
-        yield f"wrong: {100 * total['wrong_share']:.1f} % of the reconstructed agents' ticks"
-    yield "medians and HOTA of all are medians over the logs"
-    if document["without_truth"]:
-        yield f"note: {document['without_truth']} logs are not below the folder with the truth"
-    for entry in document["logs"]:
-        if "error" in entry:
-            yield f"note: {entry['log']}: {entry['error']}"

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from log2sim.datatypes import Log, Scenario
-    from log2sim.mapping.ground_map import GroundMap
+    from log2sim.road.ground_map import GroundMap
 
 CELL_M = 0.06
 """Edge of a cell, m: pictures on paper and screens show no more of a hundred meters."""
@@ -31,7 +31,7 @@ def load_background(
     from log2sim.errors import LogError
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
-    from log2sim.mapping.files import read_png_map
+    from log2sim.road.map_files import read_png_map
 
     if path.suffix.lower() == ".png":
         return read_png_map(path, scenario.map)
@@ -43,7 +43,7 @@ def load_background(
 
 def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], None]) -> GroundMap:
     """Return the map of the ground of an opened log, as fine as screens and paper show it."""
-    from log2sim.config_sections import MapConfig
-    from log2sim.mapping.builder import map_ground
+    from log2sim.config import MapConfig
+    from log2sim.road.builder import map_ground
 
     return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress)

@@ -12,7 +12,7 @@ from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, co
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
-    from log2sim.edit.edits import Edit
+    from log2sim.edit.edits import Edit, Window
 
 Changes = list[str] | None
 
@@ -27,6 +27,30 @@ def edit(
     lateral: Annotated[
         Changes, typer.Option(metavar="AGENT=METERS", help="Move an agent to its left; negative: to its right.")
     ] = None,
+    begin: Annotated[
+        float | None,
+        typer.Option("--from", metavar="S", help="Change speed and lateral position from this time on, within --over."),
+    ] = None,
+    over: Annotated[
+        float | None, typer.Option(metavar="S", help="Seconds that the change takes, with --from; 3 if not given.")
+    ] = None,
+    cut_in: Annotated[
+        Changes,
+        typer.Option(metavar="AGENT[=GAP]", help="At --from, bring an agent onto the ego's path, GAP meters ahead."),
+    ] = None,
+    add: Annotated[
+        Changes, typer.Option(metavar="CATEGORY", help="Add an agent, at the place that --at gives.")
+    ] = None,
+    at: Annotated[
+        Changes,
+        typer.Option(
+            metavar="X,Y[,DEG[,MPS]]|AGENT+M",
+            help="Place of --add in the map, its heading and speed; or meters ahead of an agent, at its pace.",
+        ),
+    ] = None,
+    replace: Annotated[
+        Changes, typer.Option(metavar="AGENT=CATEGORY", help="Replace an agent by one of another category and size.")
+    ] = None,
     remove: Annotated[Changes, typer.Option(metavar="A,B", help="Remove agents.")] = None,
     only: Annotated[Changes, typer.Option(metavar="A,B", help="Keep only these agents; the ego is 'ego'.")] = None,
     drop_doubtful: DropDoubtful = False,
@@ -34,20 +58,22 @@ def edit(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Edit the agents of a scenario: their presence, timing, speed and lateral position.
+    """Edit the agents of a scenario: their presence, category, timing, speed and lateral position.
 
-    Options with values but --out may be given several times. They are applied in this order: only, remove, drop-doubtful,
-    speed, lateral, shift.
+    Options with values but --out, --from and --over may be given several times. They are applied in this order: only, remove,
+    drop-doubtful, replace, add, speed, lateral, cut-in, shift.
 
     Examples
     --------
-    log2sim edit s.json --shift car-3=-0.5 --lateral ego=0.3 -o edited.json
+    log2sim edit s.json --lateral car-3=3.5 --from 2 --over 2.5 -o lane_change.json
+    log2sim edit s.json --cut-in car-3=8 --from 2 -o cut_in.json
+    log2sim edit s.json --add car --at ego+20 --replace car-2=truck -o more.json
     log2sim edit s.json --remove bus-1 --speed car-2=1.2 -o edited.json
     """
     from log2sim.datatypes import Scenario, list_doubtful, say_agents
-    from log2sim.documents import check_targets
     from log2sim.edit.apply import edit as run
     from log2sim.edit.edits import DropDoubtful as Drop
+    from log2sim.files.documents import check_targets
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
@@ -55,7 +81,10 @@ def edit(
     edits = [
         *_choices(loaded, only, remove),
         *([Drop()] if drop_doubtful else []),
-        *_motions({"speed": speed, "lateral": lateral, "shift": shift}),
+        *_new_agents(loaded, replace, add, at),
+        *_motions({"speed": speed, "lateral": lateral}, _window(begin, over)),
+        *_cut_ins(loaded, cut_in, _window(begin, over)),
+        *_motions({"shift": shift}, None),
     ]
     result = run(loaded, edits)
     edited = result.scenario
@@ -91,12 +120,69 @@ def ids_of(scenario: Scenario, entries: Iterable[str]) -> Iterator[str]:
         yield from [entry] if entry in known else (name.strip() for name in entry.split(","))
 
 
-def _motions(changes: dict[str, Changes]) -> Iterator[Edit]:
+def _window(begin_s: float | None, over_s: float | None) -> Window | None:
+    """Return the window of --from and --over."""
+    from log2sim.edit.edits import Window
+    from log2sim.errors import ConfigError
+
+    if begin_s is None:
+        if over_s is not None:
+            raise ConfigError("--over: says how long a change takes; add --from, when it begins")
+        return None
+    return Window(begin_s, 3.0 if over_s is None else over_s)
+
+
+def _new_agents(scenario: Scenario, replaced: Changes, added: Changes, places: Changes) -> Iterator[Edit]:
+    """Yield the edits that replace and add agents."""
+    from math import radians
+
+    from log2sim.edit.edits import Add, Replace
+    from log2sim.errors import ConfigError
+
+    for entry in replaced or ():
+        agent, _, category = entry.rpartition("=")
+        if not agent:
+            raise ConfigError(f"--replace {entry}: expected an agent, '=' and a category, such as car-1=truck")
+        yield Replace(agent, category)
+    if len(added or ()) != len(places or ()):
+        raise ConfigError("--add and --at: give one place for each agent that is added, in the same order")
+    ids = [a.id for a in scenario.agents]
+    for category, place in zip(added or (), places or ()):
+        leader = next((i for i in ids if place.startswith((f"{i}+", f"{i}-"))), None)
+        try:
+            if leader is not None:
+                yield Add(category, ahead_of=leader, meters=float(place.removeprefix(leader)))
+                continue
+            x, y, deg, mps = ([float(v) for v in place.split(",")] + [0.0, 0.0])[:4]
+        except ValueError:
+            raise ConfigError(
+                f"--at {place}: expected x,y[,degrees[,m/s]] or an agent and meters, such as ego+20"
+            ) from None
+        yield Add(category, x, y, radians(deg), mps)
+
+
+def _cut_ins(scenario: Scenario, entries: Changes, window: Window | None) -> Iterator[Edit]:
+    """Yield the edits that bring agents onto the path of the ego."""
+    from log2sim.edit.edits import CutIn
+    from log2sim.errors import ConfigError
+
+    if entries and window is None:
+        raise ConfigError("--cut-in: add --from, when it begins")
+    for entry in entries or ():
+        agent, _, gap = (entry, "", "") if any(a.id == entry for a in scenario.agents) else entry.rpartition("=")
+        try:
+            gap_m = float(gap) if gap else None
+        except ValueError:
+            raise ConfigError(f"--cut-in {entry}: expected an agent, and meters if any, such as car-1=8") from None
+        if window is not None:
+            yield CutIn(agent or entry, window, gap_m)
+
+
+def _motions(changes: dict[str, Changes], window: Window | None) -> Iterator[Edit]:
     """Yield the edits of timing, speed and lateral position."""
     from log2sim.edit.edits import Lateral, Shift, Speed
     from log2sim.errors import ConfigError
 
-    kinds = {"speed": Speed, "lateral": Lateral, "shift": Shift}
     for option, entries in changes.items():
         for entry in entries or ():
             agent, _, value = entry.rpartition("=")  # an id may hold an equals sign, a number does not
@@ -106,4 +192,7 @@ def _motions(changes: dict[str, Changes]) -> Iterator[Edit]:
                 number = None
             if not agent or number is None:
                 raise ConfigError(f"--{option} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
-            yield kinds[option](agent, number)
+            if option == "shift":
+                yield Shift(agent, number)
+            else:
+                yield (Speed if option == "speed" else Lateral)(agent, number, window)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, complete, say
-from log2sim.cli.truth import load_truth
+from log2sim.cli.options import Overwrite, Poses, Quiet, SequenceName, Verbose, complete, say, say_written
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -34,7 +33,14 @@ def evaluate(
             help="Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
         ),
     ],
-    sequence: Sequence = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="True boxes for the log of --truth: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
+        ),
+    ] = None,
+    sequence: SequenceName = None,
     poses: Poses = None,
     range: Annotated[
         float | None, typer.Option(metavar="M", help="Compare agents or boxes up to this distance from the ego, in m.")
@@ -64,37 +70,49 @@ def evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Metrics file to write.")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Compare a scenario, or detected boxes, with the ground truth.
 
     Examples
     --------
     log2sim evaluate s.json --truth samples/crossing --range 40
+    log2sim evaluate s.json --truth drive.bag --labels label_02.txt
     log2sim evaluate boxes.json --truth kitti_tracking/ --sequence 0000 --protocol kitti
     """
-    from log2sim.documents import check_targets, read_json, write_json
+    from log2sim.cli.progress import progress
     from log2sim.errors import ConfigError, ScenarioError
-    from log2sim.evaluation.detection.boxes_file import is_boxes_document
-    from log2sim.outputs import together
+    from log2sim.evaluation.detection.boxes import is_boxes_document
+    from log2sim.evaluation.metrics.evaluator import evaluate as run
+    from log2sim.evaluation.metrics.table import format_table, format_verdict
+    from log2sim.evaluation.metrics.truth import load_truth
+    from log2sim.files.documents import check_targets, read_json, write_json
+    from log2sim.files.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
     wanted = [c.strip() for c in categories.split(",")] if categories else None
     only_boxes = {"--protocol": protocol, "--score": score}
     if path.is_dir():
-        only_files = {**only_boxes, "--sequence": sequence, "--poses": poses, "--plot": plot}
+        only_files = {**only_boxes, "--sequence": sequence, "--poses": poses, "--plot": plot, "--labels": labels}
         for name in (name for name, value in only_files.items() if value is not None):
             raise ConfigError(f"{name}: is for single files; {path} is a folder, so leave it out")
-        result, table = _batch_figures(path, truth, range, wanted, quiet=quiet)
+        result, table = _batch_figures(path, truth, range, wanted, quiet=quiet, verbose=verbose)
         if out is not None:
             write_json(out, result)
         say(table, quiet=quiet)
+        say_written(out, quiet=quiet)
         return
     document = read_json(path, ScenarioError)
     if is_boxes_document(document):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
         options |= {} if score is None else {"min_score": score}
         result, table = _boxes_figures(
-            path, document, _log_of(truth, sequence, _stated(document.get("poses"), poses)), options, quiet=quiet
+            path,
+            document,
+            _log_of(truth, sequence, labels, _stated(document.get("poses"), poses)),
+            options,
+            quiet=quiet,
+            verbose=verbose,
         )
     else:
         for name in (name for name, value in only_boxes.items() if value is not None):
@@ -103,20 +121,29 @@ def evaluate(
         if poses is not None:
             stated = _stated(scenario.provenance.get("poses"), poses)
             scenario = replace(scenario, provenance={**scenario.provenance, **stated})
-        if (note := _other_map(scenario, truth)) is not None:
+        with progress(quiet=quiet) as report_progress:
+            known = load_truth(
+                truth, scenario, sequence=sequence, labels=labels, points=True,
+                progress=lambda done, total: report_progress("count points", done, total),
+            )  # fmt: skip
+        for note in known.provenance.get("notes", ()) if labels is not None else ():
             say(f"note: {note}", quiet=quiet)
-        result, table = _scenario_figures(scenario, load_truth(truth, scenario, sequence), range, wanted)
+        result = run(scenario, known, max_range_m=range, categories=wanted)
+        if result["placement"]["method"] == "same_map" and (note := _other_map(scenario, truth)) is not None:
+            say(f"note: {note}", quiet=quiet)
+        table = format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
     with together():
         if out is not None:
             write_json(out, result)
         if plot is not None:
             _plot_reliability(result, plot)
     say(table, quiet=quiet)
+    say_written(out, plot, quiet=quiet)
 
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
     """Return the provenance of poses: as stated by what is evaluated, or as requested."""
-    from log2sim.config_sections import PosesConfig
+    from log2sim.config import PosesConfig
     from log2sim.errors import ConfigError
 
     if requested is None or requested == "auto":
@@ -171,24 +198,15 @@ def _scenario(path: Path, document: Any) -> Scenario:
         raise ScenarioError(f"{path}: {error}") from None
 
 
-def _scenario_figures(
-    scenario: Scenario, truth: Scenario, max_range_m: float | None, categories: list[str] | None
-) -> tuple[dict[str, Any], str]:
-    from log2sim.evaluation.metrics.evaluator import evaluate as run
-    from log2sim.evaluation.metrics.table import format_table
-
-    result = run(scenario, truth, max_range_m=max_range_m, categories=categories)
-    return result, format_table(result)
-
-
 def _batch_figures(
-    path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool
+    path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
     """Compare all scenarios of a batch with the labels of their logs."""
-    from log2sim.batch.evaluation import Scope, evaluate_batch, format_batch_table
+    from log2sim.batch.evaluation import Scope, evaluate_batch, format_batch_table, format_batch_verdict
     from log2sim.batch.folder import BatchFolder, is_batch
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
+    from log2sim.evaluation.metrics.truth import load_truth
 
     if not is_batch(path):
         raise LogError(
@@ -198,14 +216,15 @@ def _batch_figures(
         result = evaluate_batch(
             BatchFolder.load(path),
             truth,
-            lambda log, scenario: load_truth(log.path, scenario, log.sequence),
+            lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
             Scope(max_range_m, categories),
             progress=lambda done, total: report_progress("logs", done, total),
         )
-    return result, format_batch_table(result, max_rows=MAX_LOGS)
+    table = f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
+    return result, format_batch_verdict(result) + table
 
 
-def _log_of(path: Path, sequence: str | None, provenance: dict[str, Any]) -> Callable[[], Log]:
+def _log_of(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Callable[[], Log]:
     """Return a function that opens the log with the true boxes, once everything else is known to be right."""
 
     def opened() -> Log:
@@ -215,19 +234,18 @@ def _log_of(path: Path, sequence: str | None, provenance: dict[str, Any]) -> Cal
 
         if path.is_file() and not is_log_file(path):
             raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
-        return localize_like(open_log(path, sequence=sequence), provenance)
+        return localize_like(open_log(path, sequence=sequence, labels=labels), provenance)
 
     return opened
 
 
 def _boxes_figures(
-    path: Path, document: Any, truth: Callable[[], Log], options: dict[str, Any], *, quiet: bool
+    path: Path, document: Any, truth: Callable[[], Log], options: dict[str, Any], *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
-    from log2sim.evaluation.detection.boxes_file import DetectedBoxes
-    from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
-    from log2sim.evaluation.detection.table import format_table
+    from log2sim.evaluation.detection.boxes import DetectedBoxes
+    from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes, format_table, format_verdict
 
     chosen = Options(**options)
     chosen.chosen()
@@ -239,4 +257,4 @@ def _boxes_figures(
         result = evaluate_boxes(
             detected, truth(), chosen, progress=lambda done, total: report_progress("count points", done, total)
         )
-    return result, format_table(result)
+    return result, format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")

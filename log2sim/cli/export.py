@@ -41,7 +41,14 @@ def export(
         ),
     ] = None,
     doubtful: Annotated[
-        str, choose("--doubtful", "keep", "drop", help="What to do with agents that the scenario itself doubts.")
+        str,
+        choose(
+            "--doubtful",
+            "keep",
+            "drop",
+            "all",
+            help="Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
+        ),
     ] = "keep",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -56,10 +63,10 @@ def export(
     log2sim export s.json --to rerun --log samples/crossing -o rerun/
     """
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_folder
     from log2sim.export.checks import doubtful_note, export_notes
     from log2sim.export.exporters import EXTERNAL, Options, with_doubtful, with_ego
     from log2sim.export.exporters import export as run
+    from log2sim.files.documents import check_folder
     from log2sim.logs.opening import open_log
 
     check_folder(out, overwrite=overwrite)
@@ -69,7 +76,8 @@ def export(
         loaded = with_ego(loaded, ego)
     chosen = with_doubtful(loaded, doubtful)
     opened = open_log(log) if log is not None else None
-    files = run(chosen, to, out, Options(revision, map, mode, opened, driver), overwrite=overwrite)
+    options = Options(revision, map, mode, opened, driver)
+    files = run(chosen, to, out, options, quarantined=doubtful == "all", overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
     notes = export_notes(chosen)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, Truth, say, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, SequenceName, Truth, say, say_written, write_to
 
 
 def plot(
@@ -40,6 +40,7 @@ def plot(
     agents: Annotated[
         str | None, typer.Option(metavar="ID,ID", help="Show these agents alone.", show_default="all")
     ] = None,
+    label_static: Annotated[bool, typer.Option("--label-static", help="Write the ids of static agents too.")] = False,
     size: Annotated[
         str | None,
         typer.Option(
@@ -58,7 +59,7 @@ def plot(
             show_default="1, or what fits into a minute, half a minute for a .gif",
         ),
     ] = None,
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -72,19 +73,26 @@ def plot(
     log2sim plot scenario.json -o film.mp4 --size 1280x720 --start 2 --stop 8
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay, load_truth
+    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_targets
-    from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
+    from log2sim.files.documents import check_targets
+    from log2sim.visualization.plot.selection import PlotOptions, parse_extent, parse_ids, parse_size
     from log2sim.visualization.plot.tracks import plot_tracks, resolve_picture
 
-    options = PlotOptions(parse_size(size), fps, speed, start, stop, parse_extent(extent), parse_ids(agents))
+    options = PlotOptions(
+        parse_size(size), fps, speed, start, stop, parse_extent(extent), parse_ids(agents), label_static
+    )
     picture = resolve_picture(out)
     options.require_fits(picture.path.suffix.lower(), picture.path.name)
     check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
-    known = load_truth(truth, loaded, sequence) if truth is not None else None
+    known = None
+    if truth is not None:
+        from log2sim.evaluation.metrics.evaluator import place_truth
+        from log2sim.evaluation.metrics.truth import load_truth
+
+        known = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     if picture.note is not None:
         say(f"note: {picture.note}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:

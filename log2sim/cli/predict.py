@@ -31,16 +31,16 @@ def predict(
     log2sim predict s.json --horizon 2 -o prediction.json
     """
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_targets, write_json
     from log2sim.errors import ConfigError
-    from log2sim.prediction.document import format_figures, prediction_document
+    from log2sim.files.documents import check_targets, write_json
+    from log2sim.prediction.displacement import format_figures, prediction_document
     from log2sim.prediction.prediction import METHODS, predict_scenario
 
     check_targets(out, overwrite=overwrite)
     if positions and out is None:
         raise ConfigError("--positions: there is no file to write them to; name one with --out")
     methods = tuple(METHODS) if method is None else tuple(dict.fromkeys(m.strip() for m in method.split(",")))
-    loaded = Scenario.load(scenario)
+    loaded = Scenario.load(scenario).active
     document = prediction_document(loaded, predict_scenario(loaded, horizon, methods=methods), with_positions=positions)
     if out is not None:
         write_json(out, document)

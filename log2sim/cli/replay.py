@@ -92,7 +92,11 @@ def replay(
         ),
     ] = "path",
     confidence: Annotated[
-        float | None, typer.Option(metavar="MIN", help="Leave out agents with a lower confidence; the ego stays.")
+        float | None,
+        typer.Option(
+            metavar="MIN",
+            help="Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.",
+        ),
     ] = None,
     drop_doubtful: DropDoubtful = False,
     simulator: Annotated[
@@ -133,17 +137,16 @@ def replay(
     from log2sim.cli.edit import ids_of
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
+    from log2sim.export.checks import doubtful_note, export_notes
+    from log2sim.files.documents import check_targets
     from log2sim.simulation.backends import external_simulator
-    from log2sim.simulation.metrics.limits import check_limits, parse_limits, require_strict
-    from log2sim.simulation.metrics.summary import MAX_LISTED, summarize
-    from log2sim.simulation.policy_loading import load_policy
+    from log2sim.simulation.expected_motion import WarningSettings
+    from log2sim.simulation.metrics.all_metrics import MAX_LISTED, check_limits, parse_limits, require_strict, summarize
+    from log2sim.simulation.policy import load_policy
     from log2sim.simulation.runner import replay as run
-    from log2sim.simulation.warnings.policy import BrakeWhenWarned
-    from log2sim.simulation.warnings.settings import WarningSettings
-    from log2sim.simulation.warnings.warn import warn as find_warnings
-    from log2sim.simulation.warnings.warn import warnable
+    from log2sim.simulation.warnings import BrakeWhenWarned, warnable
+    from log2sim.simulation.warnings import warn as find_warnings
 
     check_targets(out, overwrite=overwrite)
     if out is not None and out.resolve() == scenario.resolve():
@@ -166,13 +169,16 @@ def replay(
     with progress(quiet=quiet) as report_progress:
         result = run(
             kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, foresight=foresight, host=moved_by,
-            progress=lambda done, total: report_progress("replay", done, total),
+            quarantined=confidence is not None, progress=lambda done, total: report_progress("replay", done, total),
         )  # fmt: skip
     warned = None if warning is None else find_warnings(kept, result, ends=warning.ends, settings=warning)
     result = changed(result, left_out=left_out, warnings=warned)
     if out is not None:
         result.save(out)
     say(summarize(result, limit=None if verbose else MAX_LISTED), quiet=quiet)
+    note = doubtful_note(kept, kept)
+    for line in [*([note] if note else []), *export_notes(kept)]:
+        say(f"note: {line}", quiet=quiet)
     say_written(out, quiet=quiet)
     if strict:
         require_strict(result, limits)
@@ -184,7 +190,7 @@ def _trusted(scenario: Scenario, confidence: float | None, *, drop_doubtful: boo
     """Return the scenario without the agents that are not wanted, and these with why."""
     from log2sim.datatypes import say_confidence, why_doubtful
 
-    kept = scenario if confidence is None else scenario.trusted(confidence)
+    kept = scenario.active if confidence is None else scenario.trusted(confidence)
     there = {a.id for a in kept.agents}
     left_out = {a.id: say_confidence(a) for a in scenario.agents if a.id not in there}
     if drop_doubtful:

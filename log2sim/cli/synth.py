@@ -59,13 +59,20 @@ def synth(
         ),
     ] = None,
     layout: Annotated[
-        Layout, typer.Option(help="Layout of random scenes: KITTI's object layout or a log folder each.")
-    ] = Layout.kitti,
+        Layout | None,
+        typer.Option(
+            help="Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
+            "pictures]"
+        ),
+    ] = None,
     duration: Annotated[
         float, typer.Option(min=0.5, max=60.0, help="Length of each log of random traffic in s.")
     ] = 5.0,
     light: Annotated[LightName | None, typer.Option(help="Light; random scenes draw it otherwise.")] = None,
     weather: Annotated[WeatherName | None, typer.Option(help="Weather; random scenes draw it otherwise.")] = None,
+    no_pictures: Annotated[
+        bool, typer.Option("--no-pictures", help="Write no cameras: LiDAR sweeps, poses and labels alone.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -76,10 +83,11 @@ def synth(
     --------
     log2sim synth samples/crossing.toml -o log/
     log2sim synth --traffic vehicle --scenes 100 -o scenes/
+    log2sim synth --traffic roadside --no-pictures --duration 2 -o clouds/
     """
     from log2sim.cli.progress import progress
     from log2sim.synth.scene import load_scene
-    from log2sim.synth.write import write_synthetic
+    from log2sim.synth.synthesis import write_synthetic
 
     if (scene is None) == (traffic is None):
         raise ConfigError("give either a scene file or --traffic vehicle or --traffic roadside")
@@ -87,9 +95,12 @@ def synth(
         if scene is not None:
             loaded = load_scene(scene)
             changes = {k: v.value for k, v in (("light", light), ("weather", weather)) if v is not None}
+            if no_pictures and not loaded.lidar:
+                raise ConfigError(f"{scene}: has no LiDAR, so that nothing is left without pictures")
+            cameras = () if no_pictures else loaded.camera
             environment = loaded.environment.model_copy(update=changes)
             write_synthetic(
-                loaded.model_copy(update={"environment": environment}),
+                loaded.model_copy(update={"environment": environment, "camera": cameras}),
                 out,
                 seed=seed,
                 overwrite=overwrite,
@@ -98,9 +109,11 @@ def synth(
         elif traffic is not None:
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic
 
+            chosen = layout or (Layout.log2sim if no_pictures else Layout.kitti)
             settings = TrafficSettings(
-                traffic.value, scenes, seed, sensor, layout.value, duration,
+                traffic.value, scenes, seed, sensor, chosen.value, duration,
                 None if light is None else light.value, None if weather is None else weather.value,
+                pictures=not no_pictures,
             )  # fmt: skip
             write_traffic(
                 settings, out, overwrite=overwrite, progress=lambda done, total: report_progress("scenes", done, total)

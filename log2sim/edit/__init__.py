@@ -1,6 +1,20 @@
-"""Edits of scenarios: an agent later, faster, shifted sideways, or removed."""
+"""Edits of scenarios: agents later, faster, in another lane, cutting in, of another category, added or removed."""
 
 from log2sim.edit.apply import Edited, edit
-from log2sim.edit.edits import DropDoubtful, Edit, Lateral, Only, Remove, Shift, Speed
+from log2sim.edit.edits import Add, CutIn, DropDoubtful, Edit, Lateral, Only, Remove, Replace, Shift, Speed, Window
 
-__all__ = ["DropDoubtful", "Edit", "Edited", "Lateral", "Only", "Remove", "Shift", "Speed", "edit"]
+__all__ = [
+    "Add",
+    "CutIn",
+    "DropDoubtful",
+    "Edit",
+    "Edited",
+    "Lateral",
+    "Only",
+    "Remove",
+    "Replace",
+    "Shift",
+    "Speed",
+    "Window",
+    "edit",
+]

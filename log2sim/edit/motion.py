@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Doubt, Waypoints
-from log2sim.geometry import Array
+from log2sim.geometry import Array, wrap_angle
 
 MIN_PATH_MPS = 0.5  # slower waypoints do not define the curvature of a path
+STEP_S = 0.1
+"""Waypoints of a maneuver are so far apart: a lane change of 2 s is then right to a millimeter between them."""
 OLD_TIME = "before it was moved in time"
 _NAMES_A_TIME = re.compile(r"\d s\b")
 
@@ -39,18 +41,12 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
 
 def doubts_shifted(agent: Agent, seconds: float) -> tuple[Doubt, ...]:
     """Return the doubts of an agent that comes `seconds` later; none that held only before the scenario's start t = 0."""
-    moved = _retimed(agent.doubts, lambda t_s: t_s + seconds)
+    moved = retimed_doubts(agent.doubts, lambda t_s: t_s + seconds)
     cut = (replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0)) for d in moved)
     return tuple(d for d in cut if d.end_s is None or d.end_s >= 0.0)
 
 
-def doubts_sped_up(agent: Agent, factor: float) -> tuple[Doubt, ...]:
-    """Return the doubts of an agent that passes its waypoints `factor` times as fast from the first one on."""
-    begin_s = float(agent.waypoints.t_s[0])
-    return _retimed(agent.doubts, lambda t_s: begin_s + (t_s - begin_s) / factor)
-
-
-def _retimed(doubts: Sequence[Doubt], change: Callable[[float], float]) -> tuple[Doubt, ...]:
+def retimed_doubts(doubts: Sequence[Doubt], change: Callable[[float], float]) -> tuple[Doubt, ...]:
     """Move the spans of doubts; a reason that names a time, which stays that of the source, says so."""
     moved = (doubt.retimed(change) for doubt in doubts)
     return tuple(
@@ -98,3 +94,91 @@ def chords(w: Waypoints) -> tuple[Array, Array]:
     yaw = np.unwrap(w.yaw_rad)
     turn, mean = np.diff(yaw), (yaw[1:] + yaw[:-1]) / 2
     return np.diff(w.x_m) * np.cos(mean) + np.diff(w.y_m) * np.sin(mean), turn
+
+
+def resampled(agent: Agent, t_s: Array) -> Waypoints:
+    """Return waypoints at times (T,) within the life of an agent; a waypoint is observed where both of its neighbors are."""
+    w, at = agent.waypoints, agent.at(t_s)
+    columns = {k: getattr(at, k) for k in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")}
+    columns |= {k: np.interp(t_s, w.t_s, v) for k, v in w.columns().items() if k.startswith("sigma")}
+    observed = np.interp(t_s, w.t_s, w.observed.astype(np.float64)) > 1 - 1e-9
+    return Waypoints(t_s=np.asarray(t_s, dtype=np.float64), observed=observed, **columns)
+
+
+def with_steps(w: Waypoints, begin_s: float, end_s: float) -> Array:
+    """Return the times of waypoints with more of them, at most `STEP_S` apart, between two times."""
+    begin_s, end_s = np.clip([begin_s, end_s], w.t_s[0], w.t_s[-1])
+    steps = np.linspace(begin_s, end_s, max(int(np.ceil((end_s - begin_s) / STEP_S)), 1) + 1)
+    times = np.unique(np.concatenate([w.t_s, steps]))
+    kept: Array = times[np.concatenate([[True], np.diff(times) > 1e-9])]
+    return kept
+
+
+def smooth_step(share: Array) -> tuple[Array, Array]:
+    """Return the polynomial of least jerk from 0 to 1 at shares (T,) of its duration, and its derivative.
+
+    Notes
+    -----
+    Flash and Hogan, "The coordination of arm movements", Journal of Neuroscience 5, 1985: velocity and acceleration are 0 at
+    both ends. Its largest derivative is 15/8, its largest second derivative 10 / sqrt(3).
+    """
+    u = np.clip(share, 0.0, 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2), 30 * u**2 * (1 - u) ** 2
+
+
+def lane_changed(agent: Agent, meters: float, begin_s: float, over_s: float) -> Waypoints:
+    """Return waypoints that move `meters` to the left within `over_s` seconds and stay there.
+
+    The heading follows the direction of motion, the speed its length, so that a vehicle can drive it.
+    """
+    w = resampled(agent, with_steps(agent.waypoints, begin_s, begin_s + over_s))
+    offset, slope = smooth_step((w.t_s - begin_s) / over_s)
+    offset, drift = meters * offset, meters * slope / over_s
+    yaw = np.unwrap(w.yaw_rad)
+    rate = np.gradient(yaw, w.t_s, edge_order=2 if len(w) > 2 else 1) if len(w) > 1 else np.zeros(len(w))
+    along = w.speed_mps - offset * rate
+    # Backward motion drifts to the left with the front to the right.
+    turn = np.arctan2(drift * np.where(along < 0, -1.0, 1.0), np.abs(along))
+    return replace(
+        w,
+        x_m=w.x_m - offset * np.sin(yaw),
+        y_m=w.y_m + offset * np.cos(yaw),
+        yaw_rad=wrap_angle(yaw + np.where(drift == 0, 0.0, turn)),
+        speed_mps=np.where(along < 0, -1.0, 1.0) * np.hypot(along, drift),
+    )
+
+
+def sped_up_between(
+    agent: Agent, factor: float, begin_s: float, over_s: float
+) -> tuple[Waypoints, Callable[[Array], Array]]:
+    """Return waypoints passed `factor` times as fast for a while, and the new times of old ones.
+
+    The factor comes and goes within a quarter of the time each, by the polynomial of least jerk.
+    """
+    ramp_s, life = over_s / 4, agent.waypoints.t_s
+    last_s = begin_s + max(over_s, (life[-1] - begin_s) / min(factor, 1.0)) + over_s
+    new = np.union1d(np.arange(life[0], last_s, STEP_S / 10), [begin_s, begin_s + over_s])
+    up, _ = smooth_step((new - begin_s) / ramp_s)
+    down, _ = smooth_step((new - begin_s - over_s + ramp_s) / ramp_s)
+    pace = 1 + (factor - 1) * (up - down)
+    old = life[0] + np.concatenate([[0.0], np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(new))])
+
+    def moved(t_s: Array) -> Array:
+        return np.asarray(np.interp(t_s, old, new))
+
+    during = old[(new >= begin_s) & (new <= begin_s + over_s)]
+    w = resampled(agent, with_steps(agent.waypoints, float(during[0]), float(during[-1])))
+    t_s = moved(w.t_s)
+    return replace(w, t_s=t_s, speed_mps=w.speed_mps * np.interp(t_s, new, pace)), moved
+
+
+def along_path(agent: Agent, meters: float) -> Waypoints:
+    """Return waypoints `meters` ahead on the path of an agent at its pace, straight on beyond its ends; behind where negative."""
+    w = resampled(agent, with_steps(agent.waypoints, *agent.waypoints.t_s[[0, -1]]))
+    station = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(w.x_m), np.diff(w.y_m)))])
+    moves = np.concatenate([[True], np.diff(station) > 1e-6])
+    path, target = station[moves], station + meters
+    beyond = target - np.clip(target, path[0], path[-1])
+    yaw = np.interp(target, path, np.unwrap(w.yaw_rad[moves]))
+    x, y, z = (np.interp(target, path, column[moves]) for column in (w.x_m, w.y_m, w.z_m))
+    return replace(w, x_m=x + beyond * np.cos(yaw), y_m=y + beyond * np.sin(yaw), z_m=z, yaw_rad=wrap_angle(yaw))

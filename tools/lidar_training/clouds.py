@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
-from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
-from log2sim.synth.traffic import Mount, TrafficScene, labeled_cloud
-from log2sim.synth.traffic_random import draw_scene
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, estimate_ground
+from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +20,6 @@ class Example:
 
     cloud: Cloud
     truth: SceneBoxes
-    scene: TrafficScene
 
 
 def level(xyz_m: NDArray[np.float32], sensor_m: Array) -> Cloud:
@@ -43,4 +40,4 @@ def draw_example(mount: Mount, seed: tuple[int, ...]) -> Example:
     seen = labeled.points > 0
     ignored = (labeled.points < MIN_POINTS) | np.isin(labeled.category, ("bicycle", "other"))
     truth = SceneBoxes.of(labeled.boxes, labeled.category, points=labeled.points, ignored=ignored).take(seen)
-    return Example(cloud, truth, scene)
+    return Example(cloud, truth)

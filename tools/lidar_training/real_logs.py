@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_training.clouds import Example
 from lidar_training.samples import CATEGORIES, KEPT_RANGE_M, Sample
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array, Camera, apply, inverse, nearest_index, project
 from log2sim.perception.detect3d.detectors import create_lidar_detector
-from log2sim.perception.detect3d.grid import MAX_HEIGHT_M, MIN_HEIGHT_M
-from log2sim.perception.lidar.cloud import Cloud, cloud_origin
-from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin
 
 MAX_RANGE_M = 60.0
 # The ground under a box is the mean of that under so many points nearest to it.
@@ -144,6 +145,19 @@ def sample_of(sweep: LogSweep) -> Sample:
     assert truth.points is not None
     category = np.array([CATEGORIES.index(c) if c in CATEGORIES else CATEGORIES.index("other") for c in truth.category])
     return Sample(xyz[near], boxes.astype(np.float32), category.astype(np.int64), truth.points)
+
+
+def example_of(sweep: LogSweep) -> Example:
+    """Turn a sweep into an example to test detectors on, with the sensor's foot as origin; only what was labeled is kept of the cloud."""
+    cloud, truth = sweep.cloud, sweep.truth
+    foot = np.append(cloud.sensor[:2], np.float32(0.0))
+    kept = sweep.labeled(cloud.xyz)
+    columns = {name: getattr(cloud, name)[kept] for name in ("t_s", "ground", "height")}
+    moved = Cloud(0, np.zeros(3), cloud.xyz[kept] - foot, sensor=cloud.sensor - foot, **columns)
+    boxes = truth.box - np.append(foot, np.zeros(truth.box.shape[1] - 3))
+    assert truth.points is not None
+    ignored = (truth.points < MIN_POINTS) | np.isin(truth.category, ("bicycle", "other"))
+    return Example(moved, SceneBoxes.of(boxes, truth.category, points=truth.points, ignored=ignored))
 
 
 def ground_under(cloud: Cloud, center: Array) -> Array:

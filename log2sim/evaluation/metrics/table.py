@@ -1,48 +1,325 @@
-"""Metrics as a table for the terminal."""
+"""Metrics as text for the terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from log2sim.evaluation.lanes.figures import map_lines
-from log2sim.evaluation.metrics.correctness_table import correctness_lines
+from log2sim.evaluation.metrics.comparison import MIN_HIT_POINTS, REASONS
+from log2sim.evaluation.metrics.evaluator import describe_placement
+from log2sim.evaluation.metrics.verdicts import MEASURES
+from log2sim.evaluation.road import map_lines, road_verdict
 
-COLUMNS = (
-    ("recall", "recall", 3),
-    ("precision", "precis.", 3),
-    ("position_rmse_m", "pos rmse m", 2),
-    ("position_median_m", "pos med m", 2),
-    ("yaw_median_deg", "yaw med deg", 1),
-    ("speed_rmse_mps", "speed rmse m/s", 2),
-    ("size_median_m", "size med m", 2),
-    ("id_switches", "id sw", 0),
-    ("mota", "MOTA", 3),
-    ("hota", "HOTA", 3),
+CORRECTNESS_COLUMNS = (
+    ("invented", "invented"),
+    ("duplicate", "duplicate"),
+    ("in_ego", "in ego"),
+    ("wrong_speed", "speed"),
+    ("wrong_motion", "motion"),
+    ("backwards", "backwards"),
+    ("wrong_size", "size"),
+    ("wrong", "wrong"),
+    ("wrong_class", "class"),
 )
+_FAULTS = dict(CORRECTNESS_COLUMNS) | {
+    k: f"wrong {n}" for k, n in CORRECTNESS_COLUMNS if k in ("wrong_speed", "wrong_motion", "wrong_size")
+}
+NEES = {"sigma": "NEES", "sigma_yaw": "yaw", "sigma_speed": "speed"}
+MAX_WORST = 6
+"""Agents that are named; the document has all."""
+
+
+def wrong_parts(found: Mapping[str, Any]) -> list[str]:
+    """Say which share of the agents' ticks is wrong, by what, and how much of it the scenario doubts."""
+    share = found["wrong"]["share"]
+    parts = [f"{found[key]['share']:.1%} {_FAULTS[key]}".replace("%", " %") for key in MEASURES if found[key]["ticks"]]
+    text = (
+        f"{share:.1%} of {found['ticks']} agent-ticks, {_noun(found['wrong']['agents'], 'agent')} of {found['agents']}"
+    )
+    doubted = found["doubted"]
+    lines = [text.replace("%", " %") + (f": {', '.join(parts)}" if parts else "")]
+    if parts:
+        lines.append(f"{_share(doubted['wrong_ticks'])} of it doubted, {_share(doubted['right_ticks'])} of the right")
+    elif doubted["right_ticks"]:
+        lines.append(f"{_share(doubted['right_ticks'])} of the right doubted")
+    return lines
+
+
+def correctness_lines(
+    found: Mapping[str, Any], columns_text: Callable[[Sequence[Sequence[str]]], list[str]]
+) -> list[str]:
+    """Format the part `correctness` of a result of `evaluate` as tables; no line where nothing was judged."""
+    if not found["ticks"]:
+        return []
+    return [
+        "",
+        "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
+        "NEES: squared errors of position, yaw and speed over sigma, 1 is right",
+        *columns_text(_cells(found)),
+        *textwrap.wrap(_confused_line(found["confusion"]), 100, subsequent_indent="  "),
+        "",
+        *_calibration_lines(found),
+        "",
+        *worst_agents(found["judged_agents"], MAX_WORST),
+    ]
+
+
+def _cells(found: Mapping[str, Any]) -> list[list[str]]:
+    lines = [("all", found)]
+    lines += list(found["by_kind"].items()) if len(found["by_kind"]) > 1 else []
+    lines += [(f"{name} m", figures) for name, figures in (found["by_range"] or {}).items()]
+    cells = [
+        ["", "agents", "ticks", *(title for _, title in CORRECTNESS_COLUMNS), *("doubted", "right"), *NEES.values()]
+    ]
+    for name, figures in lines:
+        if figures["ticks"]:
+            parts = [figures[key] for key, _ in CORRECTNESS_COLUMNS]
+            shares = [f"{100 * p['share']:.1f} ({p['agents']})" if p["ticks"] else "-" for p in parts]
+            doubted = [_number(_times_100(figures["doubted"][key]), 0) for key in ("wrong_ticks", "right_ticks")]
+            nees = [_number(figures[key]["nees"], 1) for key in NEES]
+            cells.append([name, str(figures["agents"]), str(figures["ticks"]), *shares, *doubted, *nees])
+    return cells
+
+
+def _confused_line(confusion: Mapping[str, Any]) -> str:
+    """Say which categories are taken for which, most agents first; "" without any."""
+    agents, ticks = confusion["agents"], confusion["ticks"]
+    pairs = [(true, ours) for ours, row in ticks.items() for true in row if true not in (ours, "nothing")]
+    counts = {(true, ours): (agents.get(ours, {}).get(true, 0), ticks[ours][true]) for true, ours in pairs}
+    parts = [
+        f"{true} as {ours} ({_noun(counts[true, ours][0], 'agent')}, {_noun(counts[true, ours][1], 'tick')})"
+        for true, ours in sorted(pairs, key=lambda pair: (*(-n for n in counts[pair]), pair))
+    ]
+    return f"class: {', '.join(parts)}" if parts else ""
+
+
+def _calibration_lines(found: Mapping[str, Any]) -> list[str]:
+    """Say for each tenth of confidence how many ticks and agents are right."""
+    ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
+    errors = [
+        f"{table['expected_calibration_error']:.3f} of {noun}" for noun, table in (("ticks", ticks), ("agents", agents))
+    ]
+    lines = [f"confidence: expected calibration error {', '.join(errors)}"]
+    for a, b in zip(ticks["bins"], agents["bins"], strict=True):
+        if a["count"]:
+            lines.append(
+                f"  {a['low']:.1f}-{a['high']:.1f}: {_number(a['right'], 3)} of {a['count']} ticks right, "
+                f"{_number(b['right'], 3)} of {_noun(b['count'], 'agent')}"
+            )
+    return lines
+
+
+def worst_agents(agents: Sequence[Mapping[str, Any]], count: int, *, brief: bool = False) -> list[str]:
+    """Name the agents with the most wrong ticks, those first that the scenario does not doubt."""
+    wrong = [row for row in agents if row["wrong_ticks"]]
+    worst = sorted(wrong, key=lambda row: (row["doubted"], -row["wrong_ticks"], row["id"]))[:count]
+    more = len(wrong) - len(worst)
+    return [
+        *(_brief(row) if brief else _sentence(row) for row in worst),
+        *([f"and {more} more with wrong ticks"] if more else []),
+    ]
+
+
+def _brief(row: Mapping[str, Any]) -> str:
+    faults = [_FAULTS[key] for key in MEASURES if row[f"{key}_ticks"]]
+    return (
+        f"{row['id']} {', '.join(faults)} ({row['wrong_ticks']} of {row['ticks']} ticks{', doubted' * row['doubted']})"
+    )
+
+
+def _sentence(row: Mapping[str, Any]) -> str:
+    faults = [f"{_FAULTS[key]} in {row[f'{key}_ticks']}" for key in MEASURES if row[f"{key}_ticks"]]
+    doubt = f"doubted ({', '.join(row['doubts'])})" if row["doubted"] else "not doubted"
+    return f"{row['id']}: {', '.join(faults)} of {_noun(row['ticks'], 'tick')}, confidence {row['confidence']:.2f}, {doubt}"
+
+
+def _noun(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def _times_100(value: float | None) -> float | None:
+    return None if value is None else 100 * value
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+MAX_COLUMNS = 100
+MAX_NAMED = 3
+"""Agents that a line of the verdict names; the tables have more, the document all."""
+
+MAX_NAME = 16
+"""Characters of the id of a labeled object; some logs use 36."""
+
+_COLUMNS = (
+    ("recall", "recall %", 1), ("precision", "precis. %", 1), ("position_rmse_m", "rms m", 2), ("position_median_m", "med m", 2),
+    ("yaw_median_deg", "yaw deg", 1), ("speed_rmse_mps", "m/s", 2), ("size_median_m", "size m", 2), ("id_switches", "id sw", 0),
+    ("mota", "MOTA", 3), ("hota", "HOTA", 3),
+)  # fmt: skip
+
+
+def format_verdict(result: Mapping[str, Any]) -> str:
+    """Say what counted, what was found and how well, and what is wrong, in lines of at most 100 characters."""
+    placement = describe_placement(result["placement"]) if "placement" in result else None
+    lines = [] if placement is None else [("map", placement)]
+    if result.get("quarantined"):
+        lines.append(("left out", f"quarantined: {', '.join(result['quarantined'])}"))
+    if "coverage" in result:
+        lines.append(("counted", counted_text(result["coverage"], f" of {result['counts']['truth_agents']} agents")))
+    lines += [("recall", recall_text(result)), *_missed(result["agents"])]
+    counts, found = result["counts"], result["correctness"]
+    total = counts["matched_ticks"] + counts["false_ticks"]
+    ignored = f", {counts['ignored_ticks']} where the labels cannot tell" if counts["ignored_ticks"] else ""
+    lines.append(("precision", f"{percent(result['precision'])} of {total} reconstructed agent-ticks{ignored}"))
+    if result["position_rmse_m"] is not None:
+        lines.append(("errors", error_text(result)))
+    if found["ticks"]:
+        lines.append(("wrong", "; ".join(wrong_parts(found))))
+    if worst := worst_agents(found["judged_agents"], MAX_NAMED, brief=True):
+        lines.append(("worst", "; ".join(worst)))
+    return verdict_text([*lines, *road_verdict(result)])
+
+
+def counted_text(coverage: Mapping[str, Any], agents: str = "") -> str:
+    """Say how much of what is labeled counts, and why the rest does not."""
+    why = [f"{count} {REASONS[name]}" for name, count in coverage["why_not"].items() if count]
+    reasons = f"; not: {', '.join(why)}" if why else ""
+    share = percent(coverage["counted"] / coverage["labeled"]) if coverage["labeled"] else "-"
+    return f"{coverage['counted']} of {coverage['labeled']} labeled agent-ticks ({share}){agents}{reasons}"
+
+
+def recall_text(result: Mapping[str, Any]) -> str:
+    """Give both recalls: of what counts, and of what the LiDARs hit."""
+    text = f"{percent(result['recall'])} of what counts"
+    coverage = result.get("coverage")
+    if coverage is None or coverage["hit"] is None:
+        return text
+    return (
+        f"{text}; {percent(coverage['hit_recall'])} of all {coverage['hit']} with {MIN_HIT_POINTS} LiDAR points or more"
+    )
+
+
+def error_text(result: Mapping[str, Any]) -> str:
+    """Give the errors of position, yaw, speed and size."""
+    parts = [f"position {result['position_median_m']:.2f} m (median; RMS {result['position_rmse_m']:.2f})"]
+    for key, name, digits, unit in (
+        ("yaw_median_deg", "yaw", 1, "deg"), ("speed_rmse_mps", "speed", 2, "m/s"), ("size_median_m", "size", 2, "m"),
+    ):  # fmt: skip
+        parts += [f"{name} {result[key]:.{digits}f} {unit}"] if result[key] is not None else []
+    ego = result.get("ego")
+    own = "" if ego is None or ego["position_rmse_m"] is None else f"; ego {ego['position_rmse_m']:.2f} m"
+    return f"{', '.join(parts)}{own}"
+
+
+def _missed(agents: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Name the true agents that are missed longest: of the ticks with enough LiDAR points, else of those that count."""
+    rows = []
+    for row in agents:
+        of, matched = (row["ticks"], row["matched"]) if row.get("hit") is None else (row["hit"], row["hit_matched"])
+        if of > matched:
+            name = row["id"] if len(row["id"]) <= MAX_NAME else f"{row['id'][: MAX_NAME - 2]}.."
+            rows.append((matched - of, f"{row['category']} '{name}' in {of - matched} of {of} ticks"))
+    named = [text for _, text in sorted(rows)[:MAX_NAMED]]
+    more = len(rows) - len(named)
+    return [("missed", "; ".join([*named, *([f"and {more} more"] if more else [])]))] if rows else []
+
+
+def verdict_text(lines: Iterable[tuple[str, str]]) -> str:
+    """Put names in front of texts, and break these at 100 characters."""
+    found = list(lines)
+    room = max((len(name) for name, _ in found), default=0) + 2
+    out: list[str] = []
+    for name, text in found:
+        out += textwrap.wrap(
+            text.replace(" %", "\N{NO-BREAK SPACE}%"),
+            MAX_COLUMNS,
+            initial_indent=name.ljust(room),
+            subsequent_indent=" " * room,
+            break_on_hyphens=False,
+        )
+    return "\n".join(out).replace("\N{NO-BREAK SPACE}", " ")
 
 
 def format_table(result: Mapping[str, Any]) -> str:
-    """Format a result of `evaluate`: a line for all, for each range and category, and for the ego; '-' for None.
-
-    A second table says what is wrong with the agents, and the worst are named; lines below it tell of map features, colors of
-    vehicles and traffic lights.
-    """
+    """Format all tables of a result of `evaluate`: what counts, errors, what is wrong, and the road; '-' for None."""
     lines = [("all", result)]
     lines += [(f"{name} m", figures) for name, figures in (result["by_range"] or {}).items()]
     lines += list(result["by_category"].items())
-    cells = [["", "agents", *(title for _, title, _ in COLUMNS)]]
+    blocks = []
+    if "coverage" in result:
+        titles = [name.replace("_", " ") for name in REASONS]
+        cells = [["", "labeled", "counted", *titles, f"{MIN_HIT_POINTS} points", "recall %"]]
+        for name, figures in lines:
+            part = figures["coverage"]
+            if part["labeled"]:
+                hit = [_cell(part["hit"], 0), _cell(part["hit_recall"], 1, 100)]
+                why_not = [str(count or "-") for count in part["why_not"].values()]
+                cells.append([name, str(part["labeled"]), str(part["counted"]), *why_not, *hit])
+        blocks += columns_text(cells)
+    cells = [["", "agents", *(title for _, title, _ in _COLUMNS)]]
     for name, figures in lines:
-        agents = str(figures["counts"]["truth_agents"])
-        cells.append([name, agents, *(_cell(figures[key], digits) for key, _, digits in COLUMNS)])
-    ego = result["ego"]
-    if ego is not None:
-        cells.append(["ego", "", *(_cell(ego[key], digits) if key in ego else "" for key, _, digits in COLUMNS)])
-    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
-    rows = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))] for row in cells]
-    below = [*correctness_lines(result["correctness"]), *map_lines(result)]
-    return "\n".join(["  ".join(row).rstrip() for row in rows] + below)
+        if figures is result or any(figures["counts"].values()):
+            cells.append([name, str(figures["counts"]["truth_agents"]), *_values(figures)])
+    if result["ego"] is not None:
+        cells.append(["ego", "", *_values(result["ego"])])
+    blocks += ["", *columns_text(cells)] if blocks else columns_text(cells)
+    return "\n".join([*blocks, *correctness_lines(result["correctness"], columns_text), *map_lines(result)])
 
 
-def _cell(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def _values(figures: Mapping[str, Any]) -> list[str]:
+    scale = {"recall": 100, "precision": 100}
+    found = {**figures, "id_switches": figures.get("id_switches") or None}
+    return [_cell(found[key], n, scale.get(key, 1)) if key in found else "" for key, _, n in _COLUMNS]
+
+
+def columns_text(cells: Sequence[Sequence[str]], heads: int = 1, columns: int = MAX_COLUMNS) -> list[str]:
+    """Format rows, the first of titles, within a number of characters.
+
+    Columns of dashes alone are left out. What does not fit goes into a further table below, which repeats the
+    first `heads` columns; these are aligned to the left.
+    """
+    if len(cells) < 2:
+        return []
+    used = [k for k in range(len(cells[0])) if k < heads or any(row[k] not in ("", "-") for row in cells[1:])]
+    widths = {k: max(len(row[k]) for row in cells) for k in used}
+    # A name may be of any length; it takes half of a line at most.
+    for k in range(heads):
+        widths[k] = min(widths[k], columns // (2 * heads))
+    first = used[:heads]
+    rest, blocks = used[heads:], list[list[int]]()
+    while rest or not blocks:
+        block, width = list(first), sum(widths[k] + 2 for k in first) - 2
+        while rest and (width + 2 + widths[rest[0]] <= columns or len(block) == heads):
+            width += 2 + widths[rest[0]]
+            block.append(rest.pop(0))
+        blocks.append(block)
+    lines: list[str] = []
+    for block in blocks:
+        lines += [""] if lines else []
+        for row in cells:
+            texts = [
+                _short(row[k], widths[k]).ljust(widths[k]) if k < heads else row[k].rjust(widths[k]) for k in block
+            ]
+            lines.append("  ".join(texts).rstrip())
+    return lines
+
+
+def _short(text: str, width: int) -> str:
+    return text if len(text) <= width else f"..{text[2 - width :]}"
+
+
+def percent(share: float | None) -> str:
+    """Format a share; only what is all or nothing has no decimals."""
+    if share is None:
+        return "-"
+    return f"{100 * share:.0f} %" if share in (0, 1) else f"{min(max(100 * share, 0.1), 99.9):.1f} %"
+
+
+def _cell(value: float | None, digits: int, scale: float = 1) -> str:
+    return "-" if value is None else f"{scale * value:.{digits}f}"

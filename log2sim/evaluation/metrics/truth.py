@@ -1,20 +1,205 @@
-"""The truth scenario of a log from its labels and ego poses."""
+"""The truth scenario of a log: labels, visibility, and where labels are incomplete."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Labels, Log, Scenario, Sweep, Waypoints
-from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.evaluation.metrics.label_views import ignore_regions_of
-from log2sim.evaluation.metrics.visibility import PointGrid, image_shares
-from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, wrap_angle, yaw_of
+from log2sim.datatypes import Agent, IgnoreRegions, Labels, LabelView, Log, Scenario, Sweep, Waypoints
+from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
+from log2sim.files.plugins import nearest
+from log2sim.geometry import (
+    MIN_DEPTH_M,
+    NS_PER_S,
+    Array,
+    Camera,
+    apply,
+    box_corners,
+    inverse,
+    nearest_index,
+    outline,
+    points_in_box,
+    project,
+    quaternion_from_rotation,
+    wrap_angle,
+    yaw_of,
+)
+from log2sim.localization.choice import localize_like
+from log2sim.logs.opening import is_log_file, open_log
 from log2sim.perception.lidar.cloud import sweep_to_map
-from log2sim.registry import nearest
+
+CELL_M = 2.0
+SAMPLES_PER_SIDE = 32
+
+
+class PointGrid:
+    """Points (N, 3) sorted into cells of 2 x 2 m, to count those in a box without testing all."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        self._corner = points[:, :2].min(axis=0) if len(points) else np.zeros(2)
+        cell = ((points[:, :2] - self._corner) / CELL_M).astype(np.int64)
+        self._rows = int(cell[:, 1].max()) + 1 if len(points) else 1
+        key = cell[:, 0] * self._rows + cell[:, 1]
+        order = np.argsort(key, kind="stable")
+        self._key, self._points = key[order], points[order].astype(np.float64)
+
+    def count(self, center_m: Array, size_m: Array, yaw_rad: float) -> int:
+        """Count the points inside one upright box."""
+        reach = np.hypot(size_m[0], size_m[1]) / 2
+        low = np.floor((center_m[:2] - reach - self._corner) / CELL_M).astype(np.int64)
+        high = np.floor((center_m[:2] + reach - self._corner) / CELL_M).astype(np.int64)
+        # A key outside 0 .. rows - 1 would spill into the neighboring column of cells.
+        bottom, top = max(int(low[1]), 0), min(int(high[1]), self._rows - 1)
+        if top < bottom:
+            return 0
+        columns = np.arange(low[0], high[0] + 1) * self._rows
+        begin = np.searchsorted(self._key, columns + bottom)
+        end = np.searchsorted(self._key, columns + top, side="right")
+        inside = (points_in_box(self._points[b:e], center_m, size_m, yaw_rad) for b, e in zip(begin, end) if e > b)
+        return int(sum(np.count_nonzero(mask) for mask in inside))
+
+
+def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> Array:
+    """Compute the share (M,) of the outline of each box of the map frame that lies inside the image.
+
+    Notes
+    -----
+    The outline is the convex hull of the part of the box in front of the camera on the plane at depth 1, where edges are
+    straight for any lens. The share is that of a grid of samples, accurate to 1 or 2 %: exact clipping would need the
+    image border on that plane, which does not exist for every strong distortion.
+    """
+    corners = box_corners(center_m, size_m, yaw_rad)
+    in_cam = apply(cam_T_map, corners.reshape(-1, 3))
+    _, in_image = project(camera, in_cam)
+    corner_inside = in_image.reshape(-1, 8)
+    in_cam = in_cam.reshape(-1, 8, 3)
+    shares = np.where(corner_inside.all(1), 1.0, 0.0)
+    for k in np.flatnonzero(~corner_inside.all(1) & (in_cam[..., 2] > MIN_DEPTH_M).any(1)):
+        samples = _samples(convex_hull(outline(in_cam[k])))
+        if len(samples):
+            _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))
+            shares[k] = inside.mean()
+    return shares
+
+
+def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> list[Array]:
+    """Sample pixels (S, 2) evenly over the part of each box's outline inside the image; none for a box outside.
+
+    Notes
+    -----
+    As in `image_shares`, but with a grid over the view only: next to the camera an outline on the plane at depth 1 can be
+    so wide that a grid over all of it has no sample inside the image.
+    """
+    corners = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3)).reshape(-1, 8, 3)
+    low, high = _view(camera)
+    found = []
+    for box in corners:
+        rays = _samples(convex_hull(outline(box)), low, high)
+        uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
+        found.append(uv[inside])
+    return found
+
+
+def _view(camera: Camera) -> tuple[Array, Array]:
+    """Bound the view on the plane at depth 1 by corners (2,), (2,); exact without distortion."""
+    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
+    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
+    # Distortion widens a view on this plane to at most three times that of a pinhole.
+    return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
+
+
+def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
+    """Make a regular grid of points (S, 2) inside a convex polygon (K, 2), counter-clockwise, and between two corners (2,)."""
+    if len(polygon) < 3:
+        return np.zeros((0, 2))
+    low, high = np.maximum(polygon.min(axis=0), lowest), np.minimum(polygon.max(axis=0), highest)
+    if np.any(low >= high):
+        return np.zeros((0, 2))
+    steps = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
+    x, y = np.meshgrid(*(low + steps[:, None] * (high - low)).T)
+    points = np.stack([x.ravel(), y.ravel()], -1)
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    to = points[:, None] - polygon[None]
+    return points[np.all(edge[:, 0] * to[..., 1] - edge[:, 1] * to[..., 0] >= 0, axis=1)]
+
+
+def convex_hull(points: Array) -> Array:
+    """Compute the convex hull (K, 2), counter-clockwise, of points (N, 2).
+
+    Notes
+    -----
+    Andrew's monotone chain (1979). Points on one line give a polygon without area.
+    """
+    ordered = np.unique(points, axis=0).tolist()
+    if len(ordered) < 3:
+        return np.array(ordered)
+    chains = []
+    for run in (ordered, ordered[::-1]):
+        chain: list[list[float]] = []
+        for p in run:
+            while len(chain) >= 2 and _turn(chain[-2], chain[-1], p) <= 0:
+                chain.pop()
+            chain.append(p)
+        chains += chain[:-1]
+    return np.array(chains)
+
+
+def _turn(a: list[float], b: list[float], c: list[float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+MAX_STAMP_LAG_NS = 50_000_000
+"""A region belongs to the frame nearest to its stamp within this time."""
+
+
+def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
+    """Collect the ignore regions of a log; None when its labels are complete.
+
+    Parameters
+    ----------
+    log : Log
+        Its labels may be limited to the views of some cameras and to some categories, and it may have ignored regions.
+    t0_ns : int
+        Start of the truth.
+
+    Raises
+    ------
+    LogError
+        When labels refer to a camera that the log does not have.
+    """
+    only = None if log.labels is None else log.labels.cameras
+    never = () if log.labels is None else log.labels.never_labeled
+    if only is None and not log.ignored_regions and not never:
+        return None
+    names = list(log.ignored_regions) if only is None else list(only)
+    for name in names:
+        if name not in log.cameras:
+            raise LogError(
+                f"{log.name}: its labels are of camera '{name}'{nearest(name, list(log.cameras))}, which it does not "
+                f"have; there are: {', '.join(log.cameras)}"
+            )
+    views = tuple(_label_view(log, name, t0_ns) for name in names)
+    return IgnoreRegions(views, outside_views=only is not None, categories=never)
+
+
+def _label_view(log: Log, name: str, t0_ns: int) -> LabelView:
+    t_ns = np.unique(log.streams[name].t_ns) if name in log.streams else np.zeros(0, dtype=np.int64)
+    poses, known = log.map_T_sensor(name, t_ns)
+    t_ns, poses = t_ns[known], poses[known]
+    frame, box = np.zeros(0, dtype=np.int64), np.zeros((0, 4))
+    regions = log.ignored_regions.get(name)
+    if regions is not None and len(t_ns):
+        frame = nearest_index(t_ns, regions.t_ns)
+        near = np.abs(t_ns[frame] - regions.t_ns) <= MAX_STAMP_LAG_NS
+        frame, box = frame[near], regions.box_px[near]
+    rotation = quaternion_from_rotation(poses[:, :3, :3])
+    return LabelView(log.cameras[name], (t_ns - t0_ns) / NS_PER_S, poses[:, :3, 3], rotation, frame, box)
+
 
 MIN_POINTS = 20
 MIN_IMAGE_SHARE = 0.5
@@ -27,14 +212,94 @@ MAX_STATIC_DRIFT_MPS = 0.2
 Progress = Callable[[int, int], None]
 
 
-def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: Progress | None = None) -> Scenario:
+def load_truth(
+    source: Scenario | Log | Path | str,
+    scenario: Scenario,
+    *,
+    sequence: str | None = None,
+    labels: Path | None = None,
+    points: bool = False,
+    progress: Progress | None = None,
+) -> Scenario:
+    """Load the ground truth of a scenario for the cameras that it used; see `truth_at`."""
+    used = [str(c["name"]) for c in scenario.cameras if c.get("used")]
+    return truth_at(
+        source, used if scenario.cameras else None, sequence, provenance=scenario.provenance, labels=labels,
+        points=points, progress=progress,
+    )  # fmt: skip
+
+
+def truth_at(
+    source: Scenario | Log | Path | str,
+    used: Iterable[str] | None,
+    sequence: str | None,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+    labels: Path | None = None,
+    points: bool = False,
+    progress: Progress | None = None,
+) -> Scenario:
+    """Load ground truth from a scenario or a log: its `truth.json`, else its labels in view of the sensors used.
+
+    Parameters
+    ----------
+    source : Scenario, Log, Path or str
+    used : iterable of str or None
+        Cameras that were used, all of the log for None. Without any camera, what the LiDARs show counts as visible.
+    sequence : str or None
+        Of a folder with several.
+    provenance : mapping, optional
+        States the poses by which labels are placed, so that they are in the map of what is compared.
+    labels : Path, optional
+        File with the true boxes of the log; see `log2sim.logs.label_files`.
+    points : bool
+        Whether LiDAR points are counted in all boxes, also where the truth states what is visible.
+    progress : callable, optional
+        As for `truth_from_log`.
+
+    Raises
+    ------
+    LogError
+        When there are no labels, or they cannot be read.
+    """
+    if isinstance(source, Scenario):
+        return source
+    path = None if isinstance(source, Log) else Path(source)
+    if path is not None and not (path.is_dir() or is_log_file(path)):
+        if labels is not None:
+            raise ConfigError(f"--labels {labels}: the labels are of a log; {path} is none")
+        return Scenario.load(path)
+    if path is not None and labels is None and (path / "truth.json").is_file():
+        stated = Scenario.load(path / "truth.json")
+        if not points:
+            return stated
+        try:  # by the poses of the log, in whose map its truth is
+            return with_points(stated, open_log(path, sequence=sequence), progress)
+        except (LogError, ConfigError, MissingExtra):  # what can be compared does not need the sweeps
+            return stated
+    opened = source if isinstance(source, Log) else open_log(source, sequence=sequence, labels=labels)
+    log = localize_like(opened, provenance or {})
+    names = None if used is None else list(used)
+    known = None if names is None else [name for name in names if name in log.cameras]
+    cameras = None if names and not known else known
+    truth = truth_from_log(log, cameras=cameras, points=points, progress=progress)
+    if labels is None:
+        return truth
+    notes = [note for note in log.notes if note.startswith(f"{labels.name}: ")]
+    return replace(truth, provenance={**truth.provenance, "labels": labels.name, "notes": notes})
+
+
+def truth_from_log(
+    log: Log, *, cameras: Sequence[str] | None = None, points: bool = False, progress: Progress | None = None
+) -> Scenario:
     """Make a truth scenario of a log's labeled 3D boxes and its ego poses.
 
     Parameters
     ----------
-    log : Log
     cameras : sequence of str, optional
         Cameras that were used, all by default; only what they show counts as visible.
+    points : bool
+        Whether LiDAR points are counted also where the log states visibility, which needs none.
     progress : callable, optional
         Called with (sweeps done, all sweeps); every sweep is read once.
 
@@ -59,19 +324,18 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
             raise ConfigError(
                 f"unknown camera '{name}'{nearest(name, list(log.cameras))}; known: {', '.join(log.cameras)}"
             )
-    unreadable = 0
+    counts, unreadable = None, 0
+    if log.lidars and (points or labels.visible is None):
+        counts, unreadable = points_in_labels(log, labels, progress)
     if labels.visible is not None:
         visible = np.asarray(labels.visible, dtype=bool)
     else:
-        visible = np.ones(len(labels.t_ns), dtype=bool)
-        if log.lidars:
-            counts, unreadable = points_in_labels(log, labels, progress)
-            visible &= counts >= MIN_POINTS
+        visible = np.ones(len(labels.t_ns), dtype=bool) if counts is None else counts >= MIN_POINTS
         if used:
             visible &= in_some_image(log, labels, used, visible)
     ego_t_ns, map_T_ego = _ego_poses(log)
     t0_ns = int(min([labels.t_ns.min(), *ego_t_ns[:1]]))
-    agents = [_label_agent(labels, visible, rows, t0_ns) for rows in _rows_by_track(labels)]
+    agents = [_label_agent(labels, visible, counts, rows, t0_ns) for rows in _rows_by_track(labels)]
     if len(ego_t_ns):
         agents.insert(0, _ego_agent(log, ego_t_ns, map_T_ego, t0_ns))
     return Scenario(
@@ -153,7 +417,48 @@ def _rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
     return np.split(order, np.flatnonzero(np.diff(track[order])) + 1)
 
 
-def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.int64], t0_ns: int) -> Agent:
+def with_points(truth: Scenario, log: Log, progress: Progress | None = None) -> Scenario:
+    """Return a truth with the LiDAR points of a log in its boxes, which are put where they were at the time of the sweep.
+
+    A waypoint gets the points of the sweeps nearest to it within `MAX_LAG_S`; where the log has no LiDAR, nothing changes.
+    """
+    streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
+    done, total = 0, sum(len(stream.t_ns) for _, stream in streams)
+    totals = [np.zeros(len(agent.waypoints)) for agent in truth.others]
+    for name, stream in streams:
+        states = [agent.at((stream.t_ns - truth.t0_ns) / NS_PER_S) for agent in truth.others]
+        counts = np.zeros((len(states), len(stream.t_ns)))
+        for i in range(len(stream.t_ns)):
+            rows = [k for k, state in enumerate(states) if state.valid[i]]
+            try:
+                mapped = sweep_to_map(log, name, stream.read(i), compensate=True) if rows else None
+            except RecordError:
+                mapped = None
+            grid = PointGrid(np.zeros((0, 3)) if mapped is None else mapped[0])
+            for k in rows:
+                s = states[k]
+                center = np.array([s.x_m[i], s.y_m[i], s.z_m[i]])
+                counts[k, i] = grid.count(center, np.array(truth.others[k].size_m), float(s.yaw_rad[i]))
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        for k, agent in enumerate(truth.others):
+            t_ns = truth.t0_ns + np.round(agent.waypoints.t_s * NS_PER_S).astype(np.int64)
+            index, near = nearest_record(stream.t_ns, t_ns)
+            totals[k] += np.where(near, counts[k, index], 0) if len(stream.t_ns) else 0
+    if not streams:
+        return truth
+    agents = [replace(a, waypoints=replace(a.waypoints, lidar_points=n)) for a, n in zip(truth.others, totals)]
+    return replace(truth, agents=(*([truth.ego] if truth.ego is not None else []), *agents))
+
+
+def _label_agent(
+    labels: Labels,
+    visible: NDArray[np.bool_],
+    points: NDArray[np.int64] | None,
+    rows: NDArray[np.int64],
+    t0_ns: int,
+) -> Agent:
     center, yaw = labels.center_m[rows], np.asarray(labels.yaw_rad[rows], dtype=np.float64)
     t_s = (labels.t_ns[rows] - t0_ns) / NS_PER_S
     static = is_static(t_s, center[:, :2])
@@ -165,7 +470,10 @@ def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.in
         id=track_id if track_id != "ego" else "label-ego",
         category=str(labels.category[rows[0]]),
         size_m=(length, width, height),
-        waypoints=_waypoints(t_s, center, yaw, speed, visible[rows]),
+        waypoints=replace(
+            _waypoints(t_s, center, yaw, speed, visible[rows]),
+            lidar_points=None if points is None else points[rows].astype(np.float64),
+        ),
         static=static,
     )
 
@@ -263,5 +571,6 @@ def _provenance(log: Log, cameras: Sequence[str], labels: Labels, unreadable: in
         "digest": log.digest,
         "cameras": list(cameras),
         "visible": rule,
+        "visibility": "stated" if stated else "computed",
         "unreadable_sweeps": unreadable,
     }

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from log2sim.datatypes import MapLane
-from log2sim.lanes.graph.beside import Beside, find_beside
-from log2sim.lanes.graph.polyline import Polyline
+from log2sim.road.polyline import Polyline
+from log2sim.road.routes import Beside, find_beside
 
 ALIGNED_M = 0.3
 """Lanes side by side whose ends are farther apart along the road than this are roads of their own."""

@@ -70,7 +70,7 @@ const fit = () => {
 
 // The list is shown beside the map until hidden; on a narrow screen it is hidden until shown.
 const showList = () => {
-  const narrow = matchMedia("(max-width: 720px)").matches && state.chosen !== null;
+  const narrow = matchMedia("(max-width: 720px), (max-height: 480px)").matches && state.chosen !== null;
   if (narrow) choose(null);
   document.body.classList.toggle("flipped", narrow || undefined);
 };
