@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def cut_together(lanes: Sequence[MapLane], refused: Collection[frozenset[str]] =
         after = tuple(names[name][0] for name in lane.successors)
         links = [before, *((name,) for name in names[lane.id]), after]
         for k, name in enumerate(names[lane.id]):
-            known = {}
+            known: dict[str, Any] = {}
             for side in ("left_lane", "right_lane", "opposite"):
                 other = getattr(lane, side)
                 whole = other is not None and names[lane.id] == [lane.id] and names[other] == [other]
@@ -128,7 +129,7 @@ def _neighbors(
     beside: Sequence[Beside],
     plain: Sequence[MapLane],
     names: Mapping[str, Sequence[str]],
-) -> dict[str, str]:
+) -> dict[str, Any]:
     """Return the parts of other lanes beside the middle of part k of a lane; who drives the other way is to the left."""
     middle = (stations[row][k] + stations[row][k + 1]) / 2
     found = {}

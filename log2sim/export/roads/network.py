@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -321,11 +321,11 @@ def build_network(lanes: Sequence[MapLane]) -> Network:
         crossing = {lane.id for lane in parts if is_connection(lane, by_id)}
         sides = _with_opposites(_groups([lane for lane in parts if lane.id not in crossing], by_id))
         plain = {k + 1: pair for k, pair in enumerate(sides)}
-        place = {}
+        place: dict[str, _Place] = {}
         for number, (group, opposite) in plain.items():
             place |= {lane.id: _Place(number, -1 - row) for row, lane in enumerate(group)}
             place |= {lane.id: _Place(number, 1 + row) for row, lane in enumerate(opposite)}
-        torn = _torn(plain, place, crossing) - refused
+        torn = _torn(plain, place, by_id) - refused
         if not torn:
             break
         refused |= torn
@@ -408,9 +408,11 @@ def _faces(lane: MapLane, other: MapLane) -> bool:
 
 
 def _torn(
-    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]], place: Mapping[str, _Place], crossing: Set[str]
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
 ) -> set[frozenset[str]]:
-    """Return pairs of lanes that share a road, by their names before cuts, and at one end of it go on in different roads.
+    """Return pairs of neighbors in a road, by their names before cuts, that go on in different roads or junctions at one end of it.
 
     A road has one neighbor at each end, so that such lanes would lose their links.
     """
@@ -418,13 +420,14 @@ def _torn(
     for group, opposite in plain.values():
         across = [*opposite[::-1], *group]
         for at in (0, -1):
-            reached: dict[str, set[int | None]] = {lane.id: set() for lane in across}
+            reached: dict[str, set[tuple[int, str | None]]] = {lane.id: set() for lane in across}
             for lane, name in _linked(across, place, at):
-                reached[lane.id].add(None if name in crossing else place[name].road)
-            linked = [lane for lane in across if reached[lane.id]]
+                inside = is_connection(by_id[name], by_id)
+                reached[lane.id].add((0, by_id[name].junction) if inside else (place[name].road, None))
+            linked = [k for k, lane in enumerate(across) if reached[lane.id]]
             for one, two in pairwise(linked):
-                if reached[one.id] != reached[two.id]:
-                    found |= {frozenset(n.id.partition("/")[0] for n in pair) for pair in pairwise(across)}
+                if reached[across[one].id] != reached[across[two].id]:
+                    found.add(frozenset(across[k].id.partition("/")[0] for k in (one, one + 1)))
     return found
 
 
