@@ -248,11 +248,11 @@ def link_of(road: ElementTree.Element, tag: str) -> dict[str, str]:
     return {} if link is None else dict(link.attrib)
 
 
-@pytest.mark.parametrize("made", ["leaving", "crossing", "beside", "sample"])
+@pytest.mark.parametrize("made", ["leaving", "crossing", "beside", "oncoming", "sample"])
 def test_linked_lanes_meet_without_gap_or_kink(made: str, tmp_path: Path) -> None:
-    """Positions and headings at both sides of every link, walked by the reader of the tests, and links lead back."""
+    """Positions, widths and headings at both sides of every link, walked by the reader of the tests, and links lead back."""
     turn = agent(np.concatenate([line(30.0, 31), bend()[1:] + np.array([30.0, 0.0])]), "leaving", yaw_rad=np.concatenate([np.zeros(31), np.linspace(0, np.pi / 2, 60)[1:]]))  # fmt: skip
-    others = {"leaving": turn, "crossing": agent(line(40.0, 41, 1.2, (30.0, -20.0)), "crossing"), "beside": agent(line(40.0, 41, start=(5.0, 3.9)), "beside")}  # fmt: skip
+    others = {"leaving": turn, "crossing": agent(line(40.0, 41, 1.2, (30.0, -20.0)), "crossing"), "beside": agent(line(40.0, 41, start=(5.0, 3.9)), "beside"), "oncoming": agent(line(40.0, 41, np.pi, (50.0, 4.4)), "oncoming")}  # fmt: skip
     world = Scenario.load(SAMPLE) if made == "sample" else scenario(agent(line(60.0, 61)), others[made])
     found = {r.road.attrib["id"]: r for r in network(tmp_path, world)}
     met = 0
@@ -265,10 +265,9 @@ def test_linked_lanes_meet_without_gap_or_kink(made: str, tmp_path: Path) -> Non
         for lane in road.road.iterfind("lanes/laneSection/*/lane"):
             if lane.find("link/successor") is None:
                 continue
-            one, two = (
-                road.centers[int(lane.attrib["id"])],
-                other.centers[int(lane.find("link/successor").attrib["id"])],
-            )
+            own, linked = int(lane.attrib["id"]), int(lane.find("link/successor").attrib["id"])
+            one, two = road.centers[own], other.centers[linked]
+            assert road.widths[own][-1] == pytest.approx(other.widths[linked][point], abs=1e-3)
             np.testing.assert_allclose(one[-1], two[point], atol=0.005)
             ahead = [np.arctan2(*(p[1] - p[0])[1::-1]) for p in (one[-2:], two[:2] if point == 0 else two[:-3:-1])]
             assert abs(np.angle(np.exp(1j * (ahead[1] - ahead[0])))) < 0.02

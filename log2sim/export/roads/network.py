@@ -117,6 +117,10 @@ STEP_M = 2.0
 """Stations at which widths are taken."""
 
 
+TAPER_M = 10.0
+"""Over so much of its length a lane changes to the width that it has in the next road."""
+
+
 @dataclass(frozen=True, eq=False)
 class End:
     """The start or the end of a lane as a road has it: x, y, z, heading (4,) of the road's cross section, and the lane's width."""
@@ -184,8 +188,12 @@ def road_of_lanes(
     opposite: Sequence[MapLane],
     headings: tuple[float | None, float | None],
     free: tuple[bool, bool],
+    met: Mapping[tuple[str, int], End],
 ) -> tuple[Road, dict[tuple[str, int], End]]:
-    """Return a road of lanes side by side, some of which may lead the opposite way, and the ends of its lanes in their own direction."""
+    """Return a road of lanes side by side, some of which may lead the opposite way, and the ends of its lanes in their own direction.
+
+    Near ends that meet those of lanes of other roads its lanes go over to their edges.
+    """
     across = [*map(_turned, opposite[::-1]), *group]
     base = _surest(group)
     shared = [cross_heading(across, at) if h is None else h for at, h in zip((0, -1), headings)]
@@ -193,6 +201,16 @@ def road_of_lanes(
     line, stations = fit(base.points_m[:, :2], poses[0], poses[1])
     s = _width_stations(line)
     edges = _edges(across, base, line.at(s))
+    for at in (0, -1):
+        near = np.clip(1.0 - np.abs(s - s[at]) / min(TAPER_M, line.length_m), 0.0, 1.0)
+        near = near**2 * (3.0 - 2.0 * near)
+        x, y, heading = line.at(s)[at]
+        for row, lane in enumerate(across):
+            other = met.get((lane.id, -1 - at if row < len(opposite) else at))
+            if other is not None:
+                aside = (other.pose[1] - y) * np.cos(heading) - (other.pose[0] - x) * np.sin(heading)
+                for k, edge in ((row, aside + other.width_m / 2), (row + 1, aside - other.width_m / 2)):
+                    edges[k] += (edge - edges[k, at]) * near
     ends = {}
     for at in (0, -1):
         x, y, z = base.points_m[at]
@@ -334,8 +352,10 @@ def build_network(lanes: Sequence[MapLane]) -> Network:
     names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
     headings = _shared_headings(plain, place, by_id)
-    roads, ends = [], {}
-    for number, (group, opposite) in plain.items():
+    roads: list[Road] = []
+    ends: dict[tuple[str, int], End] = {}
+    # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
+    for number, (group, opposite) in sorted(plain.items(), key=lambda item: -len(item[1][0]) - len(item[1][1])):
         before, after = (_link([*group, *opposite], place, by_id, number_of, at) for at in (0, -1))
         road, own = road_of_lanes(
             number,
@@ -343,9 +363,11 @@ def build_network(lanes: Sequence[MapLane]) -> Network:
             opposite,
             (headings.get((number, 0)), headings.get((number, -1))),
             (before is None, after is None),
+            _met([*group, *opposite], place, (before, after), ends),
         )
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
+    roads.sort(key=lambda road: road.number)
     connections = []
     for name in inside:
         lane = by_id[name]
@@ -473,6 +495,23 @@ def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> l
     return [
         (lane, name) for lane in group for name in (lane.successors if place[lane.id].end == at else lane.predecessors)
     ]
+
+
+def _met(
+    group: Sequence[MapLane],
+    place: Mapping[str, _Place],
+    links: tuple[Link | None, Link | None],
+    ends: Mapping[tuple[str, int], End],
+) -> dict[tuple[str, int], End]:
+    """Return the ends, as far as they are there, of the lanes that those of a road are linked with, by lane and its start or end."""
+    found = {}
+    for at in (0, -1):
+        link = links[at]
+        for lane, name in _linked(group, place, at) if link is not None and link.kind == "road" else ():
+            own = -1 if place[lane.id].end == at else 0
+            if (name, -1 - own) in ends:
+                found[lane.id, own] = ends[name, -1 - own]
+    return found
 
 
 def _met_at(lane: MapLane, name: str, place: Mapping[str, _Place], at: int) -> int:
