@@ -19,7 +19,10 @@ from log2sim.files.documents import check_folder, refuse_existing
 from log2sim.files.outputs import expect_new, place_all, temporary_beside, unfinished_folder, written_meanwhile
 from log2sim.geometry import Array, whole_kilometers, wrap_angle
 
-__all__ = ["Exporter", "Options", "export", "formats"]
+__all__ = ["EXTERNAL", "Exporter", "Options", "export", "formats"]
+
+EXTERNAL = "external"
+"""As the ego of an export: another program drives it, from its place and speed in the scenario."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +98,31 @@ def on_map(frame: MapFrame, projection: str | None, offset_m: tuple[float, float
     return ExportPlacement(offset_m, frame.offset_m, frame.projection, projection)
 
 
+def geo_reference(projection: str) -> str:
+    """Return a PROJ string with the same coordinates in the words that esmini reads, too; others stay as they are.
+
+    Notes
+    -----
+    esmini requires lat_0 and lon_0, and knows neither R, south, no_defs nor type. UTM is the transverse Mercator projection
+    about the middle of its zone, a sphere of radius R has both axes R, and PROJ takes 0 for an origin that is not given.
+    """
+    words = dict(w.partition("=")[::2] for w in projection.split() if w.split("=")[0] not in ("+no_defs", "+type"))
+    if words.get("+proj") == "utm" and words.get("+zone", "").isdecimal():
+        middle_deg, false_northing = 6 * int(words.pop("+zone")) - 183, 10_000_000 if "+south" in words else 0
+        words.pop("+south", None)
+        words |= {"+proj": "tmerc", "+lat_0": "0", "+lon_0": str(middle_deg), "+k": "0.9996", "+x_0": "500000"}
+        words["+y_0"] = str(false_northing)
+    if "+R" in words:
+        words["+a"] = words["+b"] = words.pop("+R")
+    if "+proj" in words:
+        words = {"+lat_0": "0", "+lon_0": "0"} | words
+    return " ".join(f"{name}={value}" if value else name for name, value in words.items())
+
+
 def _proj_parameters(projection: str) -> list[str]:
     """Return the parameters of a PROJ string in order, without those for heights and file names."""
-    return sorted(
-        w for w in projection.split() if not w.startswith(("+geoidgrids", "+nadgrids", "+vunits", "+no_defs", "+type"))
-    )
+    words = geo_reference(projection).split()
+    return sorted(w for w in words if not w.startswith(("+geoidgrids", "+nadgrids", "+vunits")))
 
 
 def _transformer(source: str, target: str) -> Any:
@@ -251,12 +274,15 @@ class Options:
         "exact" or "pid", for scripts that move agents.
     log : Log or None
         The opened log, for formats that also hold its images and points.
+    ego : str or None
+        `EXTERNAL`, for an ego without a trajectory.
     """
 
     revision: str | None = None
     map: Path | None = None
     mode: str | None = None
     log: Log | None = None
+    ego: str | None = None
 
 
 class Exporter(Protocol):

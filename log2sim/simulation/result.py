@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Scenario, Waypoints
+from log2sim.datatypes import EGO, Scenario, Waypoints
 from log2sim.errors import ScenarioError
 from log2sim.files import plugins
 from log2sim.files.documents import check, read_json, short_repr, write_json
@@ -38,7 +38,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class CollisionWarning:
-    """What is known of an agent on a collision course with the ego.
+    """What is known of an agent on a collision course with the ego, or with another vehicle that is warned in its place.
 
     Attributes
     ----------
@@ -62,6 +62,8 @@ class CollisionWarning:
         While it is warned of.
     collision_s : float or None, s
         When the ego touches it in the replay.
+    driver : str
+        Who is warned: the ego, or a vehicle of a scenario without one.
     """
 
     agent: str
@@ -76,6 +78,7 @@ class CollisionWarning:
     braking_suffices: bool = False
     spans_s: tuple[tuple[float, float], ...] = ()
     collision_s: float | None = None
+    driver: str = EGO
 
     @property
     def begin_s(self) -> float:
@@ -103,9 +106,9 @@ class Warnings:
     horizon_s, min_probability, early_probability, margin_s, reaction_s, brake_mps2 : float
         As in `WarningSettings`.
     agents, known_agents : int
-        Other agents, and how many of them the ends get to know.
+        Agents without the ego, and how many of them the ends get to know.
     driven_s : float, s
-        For how long the ego moved.
+        For how long the ego moved, or all together who are warned in its place.
     """
 
     ends: str

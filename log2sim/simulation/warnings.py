@@ -1,10 +1,12 @@
-"""Warnings of collisions with the ego, from what the sensors at chosen ends have observed."""
+"""Warnings of collisions with the ego, or without one of each vehicle, from what the sensors at chosen ends have observed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
+from copy import copy
 from dataclasses import fields, replace
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +31,7 @@ from log2sim.simulation.follower import ControllerMemory, follow_vehicles
 from log2sim.simulation.policy import Controls, EgoState, Observation
 from log2sim.simulation.reference import Reference, vehicle_reference_of
 from log2sim.simulation.result import CollisionWarning, Moment, Replay, Warnings, to_scenario
-from log2sim.simulation.vehicles.parameters import parameters_for
+from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for
 from log2sim.simulation.vehicles.vehicle import VehicleState
 
 MAX_LISTED = 5
@@ -42,8 +44,9 @@ def describe_warnings(warnings: Warnings) -> str:
     whose = (
         _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not distinguish by end"
     )
+    others = "agents" if any(w.driver != EGO for w in warnings.events) else "other agents"
     lines = [
-        f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}: they know {warnings.known_agents} of {warnings.agents} other agents"
+        f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}: they know {warnings.known_agents} of {warnings.agents} {others}"
     ]
     lines += [f"  {describe_warning(w, warnings)}" for w in warnings.events[:MAX_LISTED]]
     if len(warnings.events) > MAX_LISTED:
@@ -71,11 +74,15 @@ def describe_briefly(warning: CollisionWarning) -> str:
     """Say who is warned of, when, and how soon and how far off the collision is."""
     at = warning.warned
     if at is None or warning.ttc_s is None:
-        return f"{warning.agent}: no warning before the collision at {warning.begin_s:.2f} s"
+        return f"{_pair(warning)}: no warning before the collision at {warning.begin_s:.2f} s"
     return (
-        f"{warning.agent}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
+        f"{_pair(warning)}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
         f"{warning.probability:.2f}, {at.distance_m:.1f} m apart"
     )
+
+
+def _pair(warning: CollisionWarning) -> str:
+    return warning.agent if warning.driver == EGO else f"{warning.driver} and {warning.agent}"
 
 
 def _braking(warning: CollisionWarning, warnings: Warnings) -> str:
@@ -84,8 +91,9 @@ def _braking(warning: CollisionWarning, warnings: Warnings) -> str:
         return ""
     verdict = "braking suffices" if warning.braking_suffices else "braking comes too late"
     needed = "" if warning.needed_mps2 is None else f", {warning.needed_mps2:.1f} m/s2 would be needed"
+    driver = "The ego" if warning.driver == EGO else warning.driver
     return (
-        f"The ego drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the collision, and stands after "
+        f"{driver} drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the collision, and stands after "
         f"{at.stopping_m:.1f} m ({warnings.reaction_s:g} s to react, then {warnings.brake_mps2:g} m/s2): {verdict}{needed}."
     )
 
@@ -139,36 +147,42 @@ class Courses(NamedTuple):
 
 
 class Watch:
-    """All other agents of a scenario, and what chosen ends know of them at common ticks.
+    """All agents of a scenario that somebody may be warned of, and what chosen ends know of them at common ticks.
+
+    The ego is warned; `of_driver` gives the same watch for another vehicle.
 
     Parameters
     ----------
     scenario : Scenario
-        With an ego, and what was observed when.
+        With what was observed when.
     agents : sequence of Agent
-        The other agents, where they are: as in the scenario, or in a replay of it.
+        All but the ego, where they are: as in the scenario, or in a replay of it.
     settings : WarningSettings
     t_s : (T,) float64, s
         Ticks, `TICK_S` apart.
-
-    Raises
-    ------
-    ConfigError
-        For a scenario without an ego.
     """
 
+    ego_path: EgoPath
+
     def __init__(self, scenario: Scenario, agents: Sequence[Agent], settings: WarningSettings, t_s: Array) -> None:
-        if scenario.ego is None:
-            raise ConfigError(f"warnings: scenario '{scenario.name}' has no agent '{EGO}' that could be warned")
         self.settings, self.interval_s = settings, observation_interval_s(scenario)
         source = {a.id: a for a in scenario.agents}
         spans = [observed_spans(source[a.id], settings.used_ends) for a in agents]
         self.table = tabulate(agents, t_s, TICK_S)
         self.known = known_agents(agents, spans, t_s, self.interval_s, self.table.present)
-        self.ego_path = EgoPath(scenario.ego)
+        self.own: int | None = None
+        if scenario.ego is not None:
+            self.ego_path = EgoPath(scenario.ego)
         self._expected = ExpectedAgents(self.table, self.known, self.interval_s, settings.horizon_s)
         self._height_m = np.array([a.size_m[2] for a in agents])
         self._radius_m = np.array([np.hypot(*a.size_m[:2]) / 2 for a in agents])
+
+    def of_driver(self, driver: Agent) -> Watch:
+        """Return a watch that warns a vehicle of the scenario in place of the ego, while the ends know it."""
+        view = copy(self)
+        view.ego_path = EgoPath(driver)
+        view.own = next((k for k, a in enumerate(self.table.agents) if a.id == driver.id), None)
+        return view
 
     def courses(self, ego: EgoStates, ticks: Index, seen: tuple[Complex, Array] | None = None) -> Courses:
         """Find who may collide with the ego, whose states are those at ticks (T,).
@@ -182,6 +196,8 @@ class Watch:
         """
         row, agent = np.nonzero(self.known.source[:, ticks].T >= 0)
         kept = np.abs(ego.speed_mps[row]) >= MIN_EGO_MPS
+        if self.own is not None:
+            kept &= (agent != self.own) & (self.known.source[self.own, ticks[row]] >= 0)
         row, agent = row[kept], agent[kept]
         kept = self._may_meet(ego.take(row), agent, ticks[row])
         row, agent = row[kept], agent[kept]
@@ -239,7 +255,7 @@ _DIGITS = 3
 def warn(
     scenario: Scenario, replay: Replay | None = None, *, ends: str = "both", settings: WarningSettings | None = None
 ) -> Warnings:
-    """Find the agents on a collision course with the ego: since when they are known, and when they are warned of.
+    """Find the agents on a collision course with the ego, or without one with any vehicle: since when they are known, and when they are warned of.
 
     Parameters
     ----------
@@ -255,38 +271,63 @@ def warn(
     Raises
     ------
     ConfigError
-        For a scenario without an ego, or unknown ends.
+        For a scenario without an ego and without vehicles that move, or unknown ends.
 
     Notes
     -----
     At every tick of 0.1 s agents are expected where `log2sim.prediction` sees them by what the ends have observed up to then, and
     the ego on its path at its speed, or braking as it does. An agent with which the ego collides by that, with at least
     `min_probability` within `horizon_s`, is warned of from when the ego has to react within `margin_s`. Nothing later is used but the ego's path: its route. States of a
-    reconstruction were smoothed over the whole log, so that they depend a little on what came next.
+    reconstruction were smoothed over the whole log, so that they depend a little on what came next. In scenarios without an ego
+    every vehicle that moves is warned as the ego would be, on a route of its own, while the ends know it.
     """
     settings = replace(settings or WarningSettings(), ends=ends)
+    drivers = warnable(scenario)
     moved = to_scenario(replay, scenario) if replay is not None else scenario
-    if scenario.ego is None or moved.ego is None:
-        raise ConfigError(f"warnings: scenario '{scenario.name}' has no agent '{EGO}' that could be warned")
+    now = {a.id: a for a in moved.agents}
     table = table_of(moved)
-    ticks = np.flatnonzero(table.present[[a.id for a in moved.agents].index(EGO)])
-    watch = Watch(scenario, moved.others, settings, table.t_s)
-    drive = _Drive(watch, ego_states(moved.ego, watch, table.t_s[ticks]), table.t_s[ticks])
-    events = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), _collisions(replay), drive)
-    if len(ends_of(scenario)) > 1:
-        sources = {a.id: a for a in scenario.agents}
-        events = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in events]
-    driven_s = float((np.abs(drive.ego.speed_mps[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
+    everybody = Watch(scenario, moved.others, settings, table.t_s)
+    collisions = _collisions(replay, {driver.id for driver in drivers})
+    sources = {a.id: a for a in scenario.agents}
+    events, driven_s = [], 0.0
+    for driver in drivers:
+        watch = everybody.of_driver(driver)
+        ticks = np.flatnonzero(table.present[list(now).index(driver.id)])
+        drive = _Drive(watch, ego_states(now[driver.id], watch, table.t_s[ticks]), table.t_s[ticks], driver.id)
+        own = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), collisions.get(driver.id, {}), drive)
+        if len(ends_of(scenario)) > 1:
+            own = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in own]
+        events += own
+        driven_s += float((np.abs(drive.ego.speed_mps[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
     used = {f.name: getattr(settings, f.name) for f in fields(settings)}
-    in_order = tuple(sorted(events, key=lambda e: (e.begin_s, e.agent)))
+    in_order = tuple(sorted(_once(events), key=lambda e: (e.begin_s, e.driver, e.agent)))
     return Warnings(
         tells_ends=bool(ends_of(scenario)),
-        agents=len(watch.table.agents),
-        known_agents=int(np.isfinite(watch.known.since_s).sum()),
+        agents=len(everybody.table.agents),
+        known_agents=int(np.isfinite(everybody.known.since_s).sum()),
         driven_s=round(driven_s, 1),
         events=in_order,
         **used,
     )
+
+
+def warnable(scenario: Scenario) -> list[Agent]:
+    """Return who is warned: the ego, or in a scenario without one the vehicles that move.
+
+    Raises
+    ------
+    ConfigError
+        When there is nobody.
+    """
+    if scenario.ego is not None:
+        return [scenario.ego]
+    wheeled = [a for a in scenario.agents if a.category in WHEELED and not a.static]
+    drivers = [a for a in wheeled if np.abs(a.waypoints.speed_mps).max(initial=0.0) >= MIN_EGO_MPS]
+    if not drivers:
+        raise ConfigError(
+            f"warnings: scenario '{scenario.name}' has no agent '{EGO}' and no vehicle that moves, so nobody could be warned"
+        )
+    return drivers
 
 
 def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:
@@ -305,6 +346,7 @@ class _Drive(NamedTuple):
     watch: Watch
     ego: EgoStates
     t_s: Array
+    driver: str
 
     def moment(self, agent: int, t_s: float) -> Moment:
         """Compute how far the ego and an agent are from each other at a time."""
@@ -320,10 +362,10 @@ class _Drive(NamedTuple):
         return Moment(*(round(v, _DIGITS) for v in (t_s, gap_m, abs(own_speed), stopping_m)))
 
     def known(self, agent: int) -> Moment | None:
-        """Compute the same for when an agent is first known; None where it never is, or while there was no ego."""
-        since_s = float(self.watch.known.since_s[agent])
-        there = self.t_s[0] - TICK_S <= since_s <= self.t_s[-1] + TICK_S
-        return self.moment(agent, since_s) if there else None
+        """Compute the same for when an agent is first known, and who is warned, too, and there; None where that never is."""
+        own = [] if self.watch.own is None else [self.watch.own]
+        since_s = max(float(self.t_s[0]), *self.watch.known.since_s[[agent, *own]].tolist())
+        return self.moment(agent, since_s) if since_s <= self.t_s[-1] + TICK_S else None
 
 
 def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
@@ -337,6 +379,7 @@ def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
         event = CollisionWarning(
             agent=who.id,
             category=who.category,
+            driver=drive.driver,
             known=drive.known(agent),
             warned=moment,
             probability=round(float(found.probability[first]), _DIGITS),
@@ -364,13 +407,15 @@ def _spans(t_s: Array) -> tuple[tuple[float, float], ...]:
     return tuple((round(float(t_s[a]), _DIGITS), round(float(t_s[b]), _DIGITS)) for a, b in zip(first, last))
 
 
-def _collisions(replay: Replay | None) -> Mapping[str, float]:
-    """Return when the ego first touches others in a replay, by id; boxes that overlap from the start have not collided."""
-    touched: dict[str, float] = {}
+def _collisions(replay: Replay | None, drivers: Set[str]) -> dict[str, dict[str, float]]:
+    """Return when drivers first touch others in a replay, by both ids; boxes that overlap from the start have not collided."""
+    touched: dict[str, dict[str, float]] = {}
     for event in () if replay is None else replay.metrics.get("collisions", ()):
-        if EGO in event["agents"] and not event.get("from_start", False):
-            (other,) = (i for i in event["agents"] if i != EGO)
-            touched[other] = min(touched.get(other, np.inf), round(float(event["t_s"]), _DIGITS))
+        if not event.get("from_start", False):
+            for driver, other in permutations(event["agents"], 2):
+                if driver in drivers:
+                    own = touched.setdefault(driver, {})
+                    own[other] = min(own.get(other, np.inf), round(float(event["t_s"]), _DIGITS))
     return touched
 
 
@@ -383,8 +428,18 @@ def _with_collisions(
     for agent in hit.keys() - {e.agent for e in out}:
         k = row[agent]
         category = drive.watch.table.agents[k].category
-        out.append(CollisionWarning(agent, category, drive.known(k), collision_s=hit[agent]))
+        out.append(CollisionWarning(agent, category, drive.known(k), driver=drive.driver, collision_s=hit[agent]))
     return out
+
+
+def _once(events: Iterable[CollisionWarning]) -> list[CollisionWarning]:
+    """Leave out collisions without a warning of pairs that are there already: two vehicles may both be drivers."""
+    out: dict[Set[str], list[CollisionWarning]] = {}
+    for event in sorted(events, key=lambda e: e.warned is None):
+        pair = out.setdefault(frozenset((event.driver, event.agent)), [])
+        if event.warned is not None or not pair:
+            pair.append(event)
+    return [event for pair in out.values() for event in pair]
 
 
 def _known_by(agent: Agent, t_s: Array, interval_s: float) -> dict[str, float]:

@@ -284,9 +284,12 @@ def _color(properties: Mapping[str, str], where: str) -> Mapping[str, Any] | Non
     text = properties.get("color")
     if text is None:
         return None
+    name = unescaped(properties.get(PREFIX + "color_name", ""))
+    if re.fullmatch(r"#[0-9A-Fa-f]{6}", text):
+        return {"rgb": list(bytes.fromhex(text[1:])), "name": name}
     if not re.fullmatch(r"\s*[0-9]{1,3}\s*,\s*[0-9]{1,3}\s*,\s*[0-9]{1,3}\s*", text):
-        raise ScenarioError(f"{where}: property color is {text[:40]!r}, expected three whole numbers such as 200,30,30")
-    return {"rgb": [int(v) for v in text.split(",")], "name": unescaped(properties.get(PREFIX + "color_name", ""))}
+        raise ScenarioError(f"{where}: property color is {text[:40]!r}, expected #C81E1E or 200,30,30")
+    return {"rgb": [int(v) for v in text.split(",")], "name": name}
 
 
 def _waypoints(

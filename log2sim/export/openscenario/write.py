@@ -16,10 +16,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import EGO, Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.checks import require_start_as_in_scenario
-from log2sim.export.exporters import ExportPlacement, Options
+from log2sim.export.exporters import EXTERNAL, ExportPlacement, Options
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
 from log2sim.geometry import Array
@@ -62,8 +62,8 @@ PEDESTRIAN_MASS_KG = 75.0
 WHEELBASE_SHARE, TRACK_SHARE = 0.6, 0.85
 
 
-def add_entity(parent: Element, agent: Agent, name: str, minor: int) -> None:
-    """Add the `ScenarioObject` of an agent for revision 1.`minor`."""
+def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external: bool = False) -> None:
+    """Add the `ScenarioObject` of an agent for revision 1.`minor`; an `external` one is driven from outside."""
     scenario_object = element("ScenarioObject", parent, name=name)
     if agent.category == "pedestrian":
         about = {"model": "walker"} if minor == 0 else {}  # required by 1.0, deprecated since
@@ -76,7 +76,12 @@ def add_entity(parent: Element, agent: Agent, name: str, minor: int) -> None:
         body = element("Vehicle", scenario_object, name=agent.category, vehicleCategory=kind.category)
         _add_box(body, agent)
         _add_limits(body, agent, kind)
-    _add_properties(body, agent)
+    _add_properties(body, agent, minor)
+    if external and minor > 0:
+        controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
+        properties = element("Properties", controller)
+        element("Property", properties, name="esminiController", value="ExternalController")
+        element("Property", properties, name="useGhost", value="false")
 
 
 def _add_box(parent: Element, agent: Agent) -> None:
@@ -104,12 +109,13 @@ def _add_limits(parent: Element, agent: Agent, kind: VehicleDefaults) -> None:
     element("RearAxle", axles, maxSteering="0", positionX="0", **shared)
 
 
-def _add_properties(parent: Element, agent: Agent) -> None:
-    """Add the properties that players use (`type` and `color` as in ScenarioRunner), then those for an import."""
+def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
+    """Add the properties that players use (`type` of ScenarioRunner, `color` in its form or esmini's), then those for an import."""
     w = agent.waypoints
     values = {"type": "ego_vehicle" if agent.id == "ego" else "simulation"}
     if agent.color is not None:
-        values["color"] = ",".join(str(int(v)) for v in agent.color["rgb"])
+        rgb = [int(v) for v in agent.color["rgb"]]
+        values["color"] = ",".join(map(str, rgb)) if minor == 0 else "#" + "".join(f"{v:02X}" for v in rgb)
         values[PREFIX + "color_name"] = escaped(str(agent.color["name"]))
     values |= {
         PREFIX + "id": escaped(agent.id),
@@ -176,6 +182,8 @@ class AgentStory:
         Whether it is absent before and after the vertices.
     hidden_m : float
         How far below it waits in revisions without spawning.
+    external : bool
+        Whether it is driven from outside: it gets a place and a speed at the start, and nothing else.
     """
 
     name: str
@@ -184,6 +192,7 @@ class AgentStory:
     enters: bool
     leaves: bool
     hidden_m: float = HIDDEN_DEPTH_M
+    external: bool = False
 
     @property
     def first_s(self) -> float:
@@ -240,9 +249,12 @@ def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float
     for story in stories:
         if not story.enters or not revision.spawns:
             _add_start(actions, story)
+        if story.external:
+            _add_external_control(actions[-1], revision)
     act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
     for story in stories:
-        _add_group(act, story, revision)
+        if not story.external:
+            _add_group(act, story, revision)
     _add_trigger(act, "StartTrigger", "at the start", 0.0, revision)
     _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, revision)
 
@@ -252,6 +264,20 @@ def _add_start(actions: Element, story: AgentStory) -> None:
     below_m = story.hidden_m if story.enters else 0.0
     _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
     _add_speed(private, "PrivateAction", 0.0 if story.enters else story.speed_mps)
+
+
+def _add_external_control(private: Element, revision: Revision) -> None:
+    """Hand the control over: to who reports states to esmini from 1.1 on, to who drives the vehicle in CARLA in 1.0."""
+    control = element("ControllerAction", element("PrivateAction", private))
+    if revision.minor > 0:
+        element("ActivateControllerAction", control, longitudinal="true", lateral="true")
+        return
+    controller = element("Controller", element("AssignControllerAction", control), name="external control")
+    element("Property", element("Properties", controller), name="module", value="external_control")
+    overridden = element("OverrideControllerValueAction", control)
+    for pedal in ("Throttle", "Brake", "Clutch", "ParkingBrake", "SteeringWheel"):
+        element(pedal, overridden, value="0", active="false")
+    element("Gear", overridden, number="0", active="false")
 
 
 def _add_group(act: Element, story: AgentStory, revision: Revision) -> None:
@@ -334,7 +360,7 @@ NEWEST = "1.2"
 class OpenScenario:
     """`scenario.xosc` and its road."""
 
-    options: tuple[str, ...] = ("revision", "map")
+    options: tuple[str, ...] = ("revision", "map", "ego")
     loses = (
         "states of traffic lights, confidences of lanes and markings, cameras, quality, stages and provenance; players take a"
         " cyclist for a bicycle and what is 'other' for a van (an import does not), and ScenarioRunner takes over no sizes"
@@ -346,18 +372,37 @@ class OpenScenario:
         if revision is None:
             known = ", ".join(REVISIONS)
             raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
+        external = options.ego is not None
+        if external:
+            _require_drivable_ego(scenario, str(options.ego))
         road, placement = add_road_file(scenario, folder, options.map)
-        write(document(scenario, road, placement, revision), folder / "scenario.xosc")
+        write(document(scenario, road, placement, revision, external=external), folder / "scenario.xosc")
 
 
 EXPORTER = OpenScenario()
 
 
-def document(scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision) -> Element:
-    """Return the document of a scenario whose road is in the file `road` beside it."""
+def _require_drivable_ego(scenario: Scenario, driver: str) -> None:
+    """Raise unless there is an ego on wheels from the start, which another program can drive."""
+    if driver != EXTERNAL:
+        raise ConfigError(f"--ego {driver}: expected '{EXTERNAL}', an ego that another program drives")
+    ego = scenario.ego
+    if ego is None or ego.category == "pedestrian":
+        raise ConfigError(f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
+    if ego.waypoints.t_s[0] > SAME_TIME_S:
+        first_s = float(ego.waypoints.t_s[0])
+        raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
+
+
+def document(
+    scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision, *, external: bool = False
+) -> Element:
+    """Return the document of a scenario whose road is in the file `road` beside it; an `external` ego is driven from outside."""
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
     stories = agent_stories(scenario.agents, names, duration_s, placement)
+    driven = [external and agent.id == EGO for agent in scenario.agents]
+    stories = [replace(story, external=flag) for story, flag in zip(stories, driven)]
     require_start_as_in_scenario(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
     root = element("OpenSCENARIO")
     element(
@@ -368,8 +413,8 @@ def document(scenario: Scenario, road: str, placement: ExportPlacement, revision
     element("CatalogLocations", root)
     element("LogicFile", element("RoadNetwork", root), filepath=road)
     entities = element("Entities", root)
-    for agent, name in zip(scenario.agents, names):
-        add_entity(entities, agent, name, revision.minor)
+    for agent, name, flag in zip(scenario.agents, names, driven):
+        add_entity(entities, agent, name, revision.minor, external=flag)
     add_storyboard(root, stories, duration_s, revision)
     return root
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
+from log2sim.export.roads.cutting import ALIGNED_M, cut_together, is_connection
 from log2sim.export.roads.reference_line import ReferenceLine, fit
 from log2sim.geometry import Array
 from log2sim.road.polyline import Polyline
@@ -135,27 +137,32 @@ class Link:
         Its id.
     lanes : mapping of int to int
         Lane ids of this road and those of the other, empty for a junction.
+    point : int
+        Start (0) or end (-1) of the other road.
     """
 
     kind: str
     number: int
     lanes: Mapping[int, int] = field(default_factory=dict)
+    point: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A road whose lanes all lead along its reference line, which is the middle of one of them.
+    """A road whose reference line is the middle of one of the lanes that lead along it.
 
     Attributes
     ----------
     number : int
         Its id.
     lanes : tuple of MapLane
-        From the left to the right: lane -1, -2, ...
+        Along the line, from the left to the right: lane -1, -2, ...
     elevation, offset : (K, 5) float64
         Stations and coefficients a, b, c, d of cubics: the height, and how far the left edge of lane -1 is left of the line.
-    widths : tuple of (K, 5) float64
-        Of the lanes.
+    widths, opposite_widths : tuple of (K, 5) float64
+        Of the lanes, along the line.
+    opposite : tuple of MapLane
+        Against the line, from the right to the left: lane 1, 2, ...
     """
 
     number: int
@@ -164,36 +171,53 @@ class Road:
     elevation: Array
     offset: Array
     widths: tuple[Array, ...]
+    opposite: tuple[MapLane, ...] = ()
+    opposite_widths: tuple[Array, ...] = ()
     junction: int | None = None
     before: Link | None = None
     after: Link | None = None
 
 
 def road_of_lanes(
-    number: int, group: Sequence[MapLane], headings: tuple[float | None, float | None], free: tuple[bool, bool]
+    number: int,
+    group: Sequence[MapLane],
+    opposite: Sequence[MapLane],
+    headings: tuple[float | None, float | None],
+    free: tuple[bool, bool],
 ) -> tuple[Road, dict[tuple[str, int], End]]:
-    """Return a road of lanes side by side, and the ends of its lanes."""
-    base = _base(group)
-    turned = [cross_heading(group, at) if h is None else h for at, h in zip((0, -1), headings)]
-    poses = [None if f else np.array([*p[:2], h]) for f, p, h in zip(free, base.points_m[[0, -1]], turned)]
+    """Return a road of lanes side by side, some of which may lead the opposite way, and the ends of its lanes in their own direction."""
+    across = [*map(_turned, opposite[::-1]), *group]
+    base = _surest(group)
+    shared = [cross_heading(across, at) if h is None else h for at, h in zip((0, -1), headings)]
+    poses = [None if f else np.array([*p[:2], h]) for f, p, h in zip(free, base.points_m[[0, -1]], shared)]
     line, stations = fit(base.points_m[:, :2], poses[0], poses[1])
     s = _width_stations(line)
-    edges = _edges(group, base, line.at(s))
+    edges = _edges(across, base, line.at(s))
     ends = {}
     for at in (0, -1):
         x, y, z = base.points_m[at]
-        heading = turned[at] if not free[at] else float(line.at(np.array([0.0, line.length_m]))[at, 2])
-        for row, lane in enumerate(group):
+        heading = shared[at] if not free[at] else float(line.at(np.array([0.0, line.length_m]))[at, 2])
+        for row, lane in enumerate(across):
             middle, width = edges[row : row + 2, at].mean(), edges[row, at] - edges[row + 1, at]
-            pose = np.array([x - middle * np.sin(heading), y + middle * np.cos(heading), z, heading])
-            ends[lane.id, at] = End(pose, float(width))
+            own, turn = (-1 - at, np.pi) if row < len(opposite) else (at, 0.0)
+            pose = np.array([x - middle * np.sin(heading), y + middle * np.cos(heading), z, heading + turn])
+            ends[lane.id, own] = End(pose, float(width))
     before, after = (EXTENSION_M if f else 0.0 for f in free)
     line = line.extended(before, after)
     stations = stations + before
     at_m = s + before
-    widths = tuple(cubics_through(at_m, edges[row] - edges[row + 1]) for row in range(len(group)))
+    widths = tuple(cubics_through(at_m, edges[row] - edges[row + 1]) for row in range(len(across)))
     elevation = elevation_profile(stations, base.points_m[:, 2], line.length_m)
-    return Road(number, tuple(group), line, elevation, cubics_through(at_m, edges[0]), widths), ends
+    middle = len(opposite)
+    return Road(
+        number, tuple(group), line, elevation, cubics_through(at_m, edges[middle]), widths[middle:], tuple(opposite),
+        widths[:middle][::-1],
+    ), ends  # fmt: skip
+
+
+def _turned(lane: MapLane) -> MapLane:
+    """Return a lane from its end to its start."""
+    return replace(lane, points_m=lane.points_m[::-1], width_m=lane.width_m[::-1])
 
 
 def connecting_road(number: int, lane: MapLane, start: End, end: End) -> Road:
@@ -214,8 +238,8 @@ def cross_heading(group: Sequence[MapLane], at: int) -> float:
     return float(Polyline(group[0].points_m).heading_rad[at])
 
 
-def _base(group: Sequence[MapLane]) -> MapLane:
-    """Return the lane whose middle is the reference line: the surest."""
+def _surest(group: Sequence[MapLane]) -> MapLane:
+    """Return the lane whose middle is the reference line of a road."""
     return max(group, key=lambda lane: (lane.confidence, -len(lane.id), lane.id))
 
 
@@ -251,10 +275,6 @@ def _across(reference: Array, line: Polyline, s: Array) -> Array:
     return np.asarray(s)
 
 
-ALIGNED_M = 0.3
-"""Lanes side by side whose ends are farther apart along the road than this are roads of their own."""
-
-
 @dataclass(frozen=True)
 class Connection:
     """A connecting road of a junction."""
@@ -274,42 +294,72 @@ class Network:
     connections: tuple[Connection, ...]
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a lane is: in which road, as which lane of it, and whether it leads along it."""
+
+    road: int
+    lane: int
+
+    @property
+    def start(self) -> int:
+        """Return the end of the road, 0 or -1, at which the lane starts."""
+        return 0 if self.lane < 0 else -1
+
+    @property
+    def end(self) -> int:
+        """Return the end of the road, 0 or -1, at which the lane ends."""
+        return -1 - self.start
+
+
 def build_network(lanes: Sequence[MapLane]) -> Network:
     """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
-    by_id = {lane.id: lane for lane in lanes}
-    crossing = {lane.id for lane in lanes if _is_connection(lane, by_id)}
-    groups = _groups([lane for lane in lanes if lane.id not in crossing], by_id)
-    place = {lane.id: (k + 1, -1 - row) for k, group in enumerate(groups) for row, lane in enumerate(group)}
-    place |= {name: (len(groups) + k + 1, -1) for k, name in enumerate(sorted(crossing, key=list(by_id).index))}
-    names = list(dict.fromkeys(str(by_id[name].junction) for name in by_id if name in crossing))
+    refused: set[frozenset[str]] = set()
+    while True:
+        parts = cut_together(lanes, refused)
+        by_id = {lane.id: lane for lane in parts}
+        crossing = {lane.id for lane in parts if is_connection(lane, by_id)}
+        sides = _with_opposites(_groups([lane for lane in parts if lane.id not in crossing], by_id))
+        plain = {k + 1: pair for k, pair in enumerate(sides)}
+        place: dict[str, _Place] = {}
+        for number, (group, opposite) in plain.items():
+            place |= {lane.id: _Place(number, -1 - row) for row, lane in enumerate(group)}
+            place |= {lane.id: _Place(number, 1 + row) for row, lane in enumerate(opposite)}
+        torn = _torn(plain, place, by_id) - refused
+        if not torn:
+            break
+        refused |= torn
+    inside = sorted(crossing, key=list(by_id).index)
+    place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
+    names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
-    plain = {k + 1: group for k, group in enumerate(groups)}
     headings = _shared_headings(plain, place, by_id)
     roads, ends = [], {}
-    for number, group in plain.items():
-        before, after = (_link(group, place, by_id, number_of, way) for way in ("predecessors", "successors"))
+    for number, (group, opposite) in plain.items():
+        before, after = (_link([*group, *opposite], place, by_id, number_of, at) for at in (0, -1))
         road, own = road_of_lanes(
-            number, group, (headings.get((number, 0)), headings.get((number, -1))), (before is None, after is None)
+            number,
+            group,
+            opposite,
+            (headings.get((number, 0)), headings.get((number, -1))),
+            (before is None, after is None),
         )
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
     connections = []
-    for name in sorted(crossing, key=list(by_id).index):
+    for name in inside:
         lane = by_id[name]
         origin, target = lane.predecessors[0], lane.successors[0]
-        road = connecting_road(place[name][0], lane, ends[origin, -1], ends[target, 0])
-        links = [Link("road", place[other][0], {-1: place[other][1]}) for other in (origin, target)]
+        one, two = place[origin], place[target]
+        road = connecting_road(place[name].road, lane, ends[origin, -1], ends[target, 0])
+        before, after = (
+            Link("road", one.road, {-1: one.lane}, one.end),
+            Link("road", two.road, {-1: two.lane}, two.start),
+        )
         junction = number_of[str(lane.junction)]
-        roads.append(replace(road, junction=junction, before=links[0], after=links[1]))
-        connections.append(Connection(junction, place[origin][0], road.number, place[origin][1]))
+        roads.append(replace(road, junction=junction, before=before, after=after))
+        connections.append(Connection(junction, one.road, road.number, one.lane))
     return Network(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
-
-
-def _is_connection(lane: MapLane, by_id: Mapping[str, MapLane]) -> bool:
-    """Whether a lane of a junction leads from one lane outside to another."""
-    if lane.junction is None or len(lane.predecessors) != 1 or len(lane.successors) != 1:
-        return False
-    return all(by_id[name].junction is None for name in (*lane.predecessors, *lane.successors))
 
 
 def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list[MapLane]]:
@@ -334,58 +384,121 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
     return found
 
 
+def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane], list[MapLane]]]:
+    """Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road."""
+    by_left = {group[0].id: group for group in groups}
+    found: list[tuple[list[MapLane], list[MapLane]]] = []
+    taken: set[str] = set()
+    for group in groups:
+        if group[0].id in taken:
+            continue
+        other = by_left.get(str(group[0].opposite), [])
+        if other and not (other[0].opposite == group[0].id and _faces(group[0], _turned(other[0]))):
+            other = []
+        taken |= {side[0].id for side in (group, other) if side}
+        found.append((group, other) if _surest([*group, *other]) in group else (other, group))
+    return found
+
+
+def _faces(lane: MapLane, other: MapLane) -> bool:
+    """Whether another lane begins and ends with a lane, to the left of it."""
+    heading = float(Polyline(lane.points_m).heading_rad[0])
+    gap = other.points_m[0] - lane.points_m[0]
+    return bool(gap[1] * np.cos(heading) > gap[0] * np.sin(heading)) and _aligned(lane, other)
+
+
+def _torn(
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
+) -> set[frozenset[str]]:
+    """Return pairs of neighbors in a road, by their names before cuts, that go on in different roads or junctions at one end of it.
+
+    A road has one neighbor at each end, so that such lanes would lose their links.
+    """
+    found: set[frozenset[str]] = set()
+    for group, opposite in plain.values():
+        across = [*opposite[::-1], *group]
+        for at in (0, -1):
+            reached: dict[str, set[tuple[int, str | None]]] = {lane.id: set() for lane in across}
+            for lane, name in _linked(across, place, at):
+                inside = is_connection(by_id[name], by_id)
+                reached[lane.id].add((0, by_id[name].junction) if inside else (place[name].road, None))
+            linked = [k for k, lane in enumerate(across) if reached[lane.id]]
+            for one, two in pairwise(linked):
+                if reached[across[one].id] != reached[across[two].id]:
+                    found.add(frozenset(across[k].id.partition("/")[0] for k in (one, one + 1)))
+    return found
+
+
 def _aligned(one: MapLane, two: MapLane) -> bool:
-    """Whether two lanes begin and end at the same line across the road."""
+    """Whether two lanes begin and end at the same line across the road, seen from either."""
     for at in (0, -1):
-        heading = Polyline(one.points_m).heading_rad[at]
         gap = two.points_m[at] - one.points_m[at]
-        if abs(gap[0] * np.cos(heading) + gap[1] * np.sin(heading)) > ALIGNED_M:
+        headings = [float(Polyline(lane.points_m).heading_rad[at]) for lane in (one, two)]
+        if min(abs(gap[0] * np.cos(h) + gap[1] * np.sin(h)) for h in headings) > ALIGNED_M:
             return False
     return True
 
 
 def _link(
     group: Sequence[MapLane],
-    place: Mapping[str, tuple[int, int]],
+    place: Mapping[str, _Place],
     by_id: Mapping[str, MapLane],
     number_of: Mapping[str, int],
-    way: str,
+    at: int,
 ) -> Link | None:
-    """Return what follows a road: a junction, the one road to which its lanes go on and from which no other comes, or None."""
-    back = "successors" if way == "predecessors" else "predecessors"
-    names = [(lane, name) for lane in group for name in getattr(lane, way)]
+    """Return what adjoins a road at its start (0) or end (-1).
+
+    That is a junction, the one road with which its lanes are linked there one to one, and no others there, or None.
+    """
+    names = _linked(group, place, at)
     for _, name in names:
-        junction = by_id[name].junction
-        if _is_connection(by_id[name], by_id):
-            return Link("junction", number_of[str(junction)])
-    roads = {place[name][0] for _, name in names}
-    if (
-        len(roads) != 1
-        or len({lane.id for lane, _ in names}) < len(names)
-        or len({name for _, name in names}) < len(names)
-    ):
+        if is_connection(by_id[name], by_id):
+            return Link("junction", number_of[str(by_id[name].junction)])
+    own = place[group[0].id].road
+    there = {(place[name].road, _met_at(lane, name, place, at)) for lane, name in names}
+    if len(there) != 1 or any(len(set(side)) < len(names) for side in zip(*((a.id, b) for a, b in names))):
         return None
-    (number,) = roads
-    others = [lane for name, lane in by_id.items() if place[name][0] == number]
-    sources = {place[name][0] for lane in others for name in getattr(lane, back)}
-    if sources != {place[group[0].id][0]} or any(len(getattr(lane, back)) > 1 for lane in others):
+    ((number, point),) = there
+    others = [lane for name, lane in by_id.items() if place[name].road == number]
+    back = {(name, lane.id) for lane, name in _linked(others, place, point)}
+    if back != {(lane.id, name) for lane, name in names} or number == own:
         return None
-    return Link("road", number, {place[lane.id][1]: place[name][1] for lane, name in names})
+    return Link("road", number, {place[lane.id].lane: place[name].lane for lane, name in names}, point)
+
+
+def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> list[tuple[MapLane, str]]:
+    """Return the lanes of a road with those that adjoin them at its start (0) or end (-1)."""
+    return [
+        (lane, name) for lane in group for name in (lane.successors if place[lane.id].end == at else lane.predecessors)
+    ]
+
+
+def _met_at(lane: MapLane, name: str, place: Mapping[str, _Place], at: int) -> int:
+    """Return at which end, 0 or -1, of its road a lane adjoins another one whose road meets it at `at`."""
+    return place[name].start if place[lane.id].end == at else place[name].end
 
 
 def _shared_headings(
-    plain: Mapping[int, Sequence[MapLane]], place: Mapping[str, tuple[int, int]], by_id: Mapping[str, MapLane]
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
 ) -> dict[tuple[int, int], float]:
     """Return the headings of cross sections where two roads meet, by road and end (0 or -1)."""
     found: dict[tuple[int, int], float] = {}
-    for number, group in plain.items():
-        for lane in group:
+    across = {number: [*map(_turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
+    for number, sides in plain.items():
+        for lane in (*sides[0], *sides[1]):
             for name in lane.successors:
-                if by_id[name].junction is not None or (number, -1) in found:
+                one, two = place[lane.id], place[name]
+                if two.road not in plain or (number, one.end) in found or (two.road, two.start) in found:
                     continue
-                other = place[name][0]
-                one, two = cross_heading(group, -1), cross_heading(plain[other], 0)
-                turn = float(np.angle(np.exp(1j * (two - one))))
-                share = 0.5 if (len(group) > 1) == (len(plain[other]) > 1) else 0.0 if len(group) > 1 else 1.0
-                found[number, -1] = found[other, 0] = one + share * turn
+                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
+                first = cross_heading(across[number], one.end) + turns[0]
+                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
+                wide = [len(across[k]) > 1 for k in (number, two.road)]
+                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
+                found[number, one.end] = first + share * turn - turns[0]
+                found[two.road, two.start] = first + share * turn - turns[1]
     return found

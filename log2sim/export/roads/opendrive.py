@@ -12,7 +12,7 @@ import numpy as np
 
 from log2sim.datatypes import Agent, MapFeatures, MapFrame, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.export.exporters import ExportPlacement, near_origin, on_map
+from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
 from log2sim.export.roads.network import MarkFinder, Network, Road, RoadMark, build_network
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 from log2sim.geometry import Array, wrap_angle
@@ -118,10 +118,10 @@ MAX_ASIDE_M = 15.0
 
 @dataclass(frozen=True)
 class RoadObjects:
-    """Crosswalks with their stations and offsets, and traffic lights, by the number of the road that names them."""
+    """Crosswalks with their stations and offsets, and traffic lights with their lanes, by the number of the road that names them."""
 
     crosswalks: Mapping[int, Sequence[tuple[Marking, float, float]]]
-    signals: Mapping[int, Sequence[Signal]]
+    signals: Mapping[int, Sequence[tuple[Signal, MapLane]]]
 
     @classmethod
     def of(cls, scenario: Scenario, roads: Sequence[Road]) -> RoadObjects:
@@ -134,12 +134,12 @@ class RoadObjects:
                 (s, t), number_ = min(places, key=lambda place: abs(place[0][1]))
                 if abs(t) <= MAX_ASIDE_M:
                     crosswalks.setdefault(number_, []).append((marking, s, t))
-        signals: dict[int, list[Signal]] = {}
-        lanes = [lane for road in roads for lane in road.lanes]
+        signals: dict[int, list[tuple[Signal, MapLane]]] = {}
+        lanes = [lane for road in roads for lane in (*road.lanes, *road.opposite)]
         for signal in scenario.signals:
             for lane in signal_lanes(signal, lanes)[:1]:
-                own = next(road.number for road in roads if lane in road.lanes)
-                signals.setdefault(own, []).append(signal)
+                owner = next(road.number for road in roads if any(lane is o for o in (*road.lanes, *road.opposite)))
+                signals.setdefault(owner, []).append((signal, lane))
         return cls(crosswalks, signals)
 
 
@@ -184,18 +184,20 @@ def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float,
 
 
 def add_signals(parent: Element, road: Road, objects: RoadObjects, placement: ExportPlacement) -> None:
-    """Add the traffic lights at the end of a road."""
+    """Add the traffic lights where the lanes end that they are for: at the end of the road, or for lanes against it at its start."""
     own = objects.signals.get(road.number, ())
     nodes = element("signals", parent) if own else parent
-    x, y, heading = road.line.at(np.array([road.line.length_m]))[0]
-    for signal in own:
-        dx, dy, height = signal.position_m - [x, y, road.lanes[0].points_m[-1, 2]]
+    for signal, lane in own:
+        along = any(lane is other for other in road.lanes)
+        s = road.line.length_m if along else 0.0
+        x, y, heading = road.line.at(np.array([s]))[0]
+        dx, dy, height = signal.position_m - [x, y, lane.points_m[-1, 2]]
         aside = float(dy * np.cos(heading) - dx * np.sin(heading))
         node = element(
-            "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(road.line.length_m, DIGITS),
-            t=number(aside, DIGITS), dynamic="yes", orientation="+", zOffset=number(float(height), DIGITS), country="OpenDRIVE",
-            type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2), width=number(LIGHT_WIDTH_M, 2),
-            hOffset="0", pitch="0", roll="0",
+            "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(s, DIGITS),
+            t=number(aside, DIGITS), dynamic="yes", orientation="+" if along else "-", zOffset=number(float(height), DIGITS),
+            country="OpenDRIVE", type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2),
+            width=number(LIGHT_WIDTH_M, 2), hOffset="0", pitch="0", roll="0",
         )  # fmt: skip
         at = signal.position_m - placement.origin_m
         place = {key: number(float(v), DIGITS) for key, v in zip("xyz", at)}
@@ -351,7 +353,7 @@ def document(scenario: Scenario, placement: ExportPlacement) -> Element:
 def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> None:
     """Add the geographic reference: projected coordinates are those of the file plus its offset."""
     if frame.projection is not None:
-        element("geoReference", header).text = frame.projection
+        element("geoReference", header).text = geo_reference(frame.projection)
     x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
     if (x, y, z) != (0.0, 0.0, 0.0):
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
@@ -360,13 +362,13 @@ def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> 
 def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> Element:
     x0, y0, z0 = placement.origin_m
     parent = element(
-        "road", root, name=escaped(" ".join(lane.id for lane in road.lanes)), length=number(road.line.length_m, LENGTH_DIGITS),
+        "road", root, name=escaped(" ".join(lane.id for lane in (*road.opposite[::-1], *road.lanes))), length=number(road.line.length_m, LENGTH_DIGITS),
         id=str(road.number), junction=str(road.junction or -1), rule="RHT",
     )  # fmt: skip
     links = element("link", parent)
-    for tag, link, point in (("predecessor", road.before, "end"), ("successor", road.after, "start")):
+    for tag, link in (("predecessor", road.before), ("successor", road.after)):
         if link is not None:
-            there = {"contactPoint": point} if link.kind == "road" else {}
+            there = {"contactPoint": "end" if link.point else "start"} if link.kind == "road" else {}
             element(tag, links, elementType=link.kind, elementId=str(link.number), **there)
     plan = element("planView", parent)
     for piece in road.line.pieces:
@@ -387,23 +389,31 @@ def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: Mark
 
 
 def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
-    """Add lanes -1, -2, ... to the right of the left edge of the first."""
+    """Add lanes -1, -2, ... to the right of the left edge of the first, and 1, 2, ... to the left of it."""
     parts = element("lanes", parent)
     for s, *rest in road.offset:
         _add_cubic(parts, "laneOffset", "s", s, rest)
     section = element("laneSection", parts, s="0")
+    if road.opposite:
+        left = element("left", section)
+        for row in reversed(range(len(road.opposite))):
+            _add_lane(left, road, 1 + row, road.opposite[row], road.opposite_widths[row], marks)
     middle = element("lane", element("center", section), id="0", type="none", level="false")
     _add_mark(middle, marks.left_of(road.lanes[0]))
     right = element("right", section)
     for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
-        node = element("lane", right, id=str(-1 - row), type="driving", level="false")
-        links = element("link", node)
-        for tag, link in (("predecessor", road.before), ("successor", road.after)):
-            if link is not None and -1 - row in link.lanes:
-                element(tag, links, id=str(link.lanes[-1 - row]))
-        for s, *rest in widths:
-            _add_cubic(node, "width", "sOffset", s, rest)
-        _add_mark(node, marks.right_of(lane))
+        _add_lane(right, road, -1 - row, lane, widths, marks)
+
+
+def _add_lane(parent: Element, road: Road, id: int, lane: MapLane, widths: Array, marks: MarkFinder) -> None:
+    node = element("lane", parent, id=str(id), type="driving", level="false")
+    links = element("link", node)
+    for tag, link in (("predecessor", road.before), ("successor", road.after)):
+        if link is not None and id in link.lanes:
+            element(tag, links, id=str(link.lanes[id]))
+    for s, *rest in widths:
+        _add_cubic(node, "width", "sOffset", s, rest)
+    _add_mark(node, marks.right_of(lane))
 
 
 def _add_mark(lane: Element, mark: RoadMark) -> None:

@@ -267,6 +267,7 @@ def _warnings(replay: Any) -> dict[str, Any]:
     events = [
         {
             "agent": w.agent,
+            "driver": w.driver,
             "t_s": w.begin_s,
             "spans": [list(span) for span in w.spans_s],
             "brief": describe_briefly(w),

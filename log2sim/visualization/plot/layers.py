@@ -109,7 +109,7 @@ class WarnedPlace(NamedTuple):
     Attributes
     ----------
     ends_m : (2, 2) float64, m
-        Centers of the ego and of the agent.
+        Centers of the warned vehicle and of the agent.
     """
 
     ends_m: Array
@@ -117,20 +117,20 @@ class WarnedPlace(NamedTuple):
 
 
 def warned_places(replay: Any) -> list[WarnedPlace]:
-    """Find where the ego and the others are in a replay when they are first warned of."""
+    """Find where the warned vehicle and the others are in a replay when they are first warned of."""
     if replay is None or replay.warnings is None:
         return []
     places = []
     for w in replay.warnings.events:
         if w.warned is not None:
-            pair = [replay.agent(id) for id in ("ego", w.agent)]
+            pair = [replay.agent(id) for id in (w.driver, w.agent)]
             ends = [[float(np.interp(w.warned.t_s, a.t_s, c)) for c in (a.x_m, a.y_m)] for a in pair]
             places.append(WarnedPlace(np.array(ends), f"{w.warned.t_s:.1f} s: {w.warned.distance_m:.1f} m"))
     return places
 
 
 def draw_warnings(ax: Axes, places: list[WarnedPlace]) -> None:
-    """Draw a line from the ego to the agent for each warning, with the time and the distance."""
+    """Draw a line from the warned vehicle to the agent for each warning, with the time and the distance."""
     for place in places:
         ax.plot(*place.ends_m.T, zorder=LABEL - 0.2, **LINE)
         ax.annotate(

@@ -217,8 +217,7 @@ def select_shown(scenario: Scenario, replay: Any, options: PlotOptions) -> tuple
     collisions = [e for e in replay.metrics.get("collisions", ()) if set(e["agents"]) <= set(options.agents)]
     warnings = replay.warnings
     if warnings is not None:
-        shown = "ego" in options.agents
-        events = tuple(e for e in warnings.events if shown and e.agent in options.agents)
+        events = tuple(e for e in warnings.events if {e.driver, e.agent} <= set(options.agents))
         warnings = replace(warnings, events=events)
     agents = tuple(a for a in replay.agents if a.id in options.agents)
     metrics: Mapping[str, Any] = {**replay.metrics, "collisions": collisions}
@@ -244,7 +243,9 @@ def cut_replay(replay: Any, span: TimeRange, scenario: Scenario) -> Any:
     warnings = replay.warnings
     if warnings is not None:
         kept = tuple(
-            w for w in warnings.events if w.warned is not None and span.holds(w.warned.t_s) and w.agent in there
+            w
+            for w in warnings.events
+            if w.warned is not None and span.holds(w.warned.t_s) and {w.driver, w.agent} <= there
         )
         warnings = replace(warnings, events=kept)
     return replace(replay, agents=agents, metrics={**replay.metrics, "collisions": events}, warnings=warnings)
