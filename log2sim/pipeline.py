@@ -17,6 +17,7 @@ from log2sim.agents.estimate import (
     ego_path,
     estimate_agents,
     provenance_of,
+    roadside_sensors,
     simplify,
     with_observers,
     with_pose_errors,
@@ -207,6 +208,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         agents=(*([] if ego is None else [ego]), *agents),
         map=log.map,
         cameras=tuple(camera_entries(log, plan.cameras, homographies)),
+        sensors=roadside_sensors(log, config.measure.max_range_m),
         provenance={
             **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
             **({"faults": faults} if faults else {}),

@@ -122,6 +122,9 @@ def test_a_log_of_lidars_alone_has_no_color() -> None:
     log = world_log(World(gains=()))
     ground = map_ground(log, empty_scenario(log), SETTINGS)
     assert not ground.alpha.any()
+    picture, known = ground.as_picture(), np.isfinite(ground.intensity)
+    assert ((picture.alpha > 0) == known).all()
+    np.testing.assert_allclose(picture.image_bgr[known][:, 0] / 255, np.clip(ground.intensity[known], 0, 1), atol=0.003)
     assert np.isfinite(ground.height_m).any()
     assert any("no color" in note for note in ground.notes)
 

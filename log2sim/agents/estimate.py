@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -245,6 +246,24 @@ def provenance_of(log: Log, config: Config, detector: str, poses: Mapping[str, A
         "seed": config.seed,
         "history": ["reconstruct"],
     }
+
+
+def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
+    """Return the sensors that are fixed in the map, as a scenario states them; LiDARs are taken to look all around."""
+    cameras = [
+        (name, c.mount_T_cam, 2 * math.atan(c.width_px / (2 * c.K[0, 0])))
+        for name, c in log.cameras.items()
+        if c.mount == "map"
+    ]
+    lidars = [(name, lidar.mount_T_lidar, 2 * math.pi) for name, lidar in log.lidars.items() if lidar.mount == "map"]
+    entries = []
+    for kind, sensors in (("camera", cameras), ("lidar", lidars)):
+        for name, map_T_sensor, fov_rad in sensors:
+            ahead = map_T_sensor[:2, 2 if kind == "camera" else 0]
+            place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
+            look = {"yaw_rad": math.atan2(ahead[1], ahead[0]), "fov_rad": fov_rad, "range_m": range_m}
+            entries.append({"name": name, "kind": kind, **place, **look})
+    return tuple(entries)
 
 
 def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:

@@ -26,7 +26,7 @@ def load_background(
     Raises
     ------
     LogError
-        When the file is no such map, or the log has no camera.
+        When the file is no such map, or the log has neither camera nor LiDAR.
     """
     from log2sim.errors import LogError
     from log2sim.localization.choice import localize_like
@@ -36,14 +36,14 @@ def load_background(
     if path.suffix.lower() == ".png":
         return read_png_map(path, scenario.map)
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
-    if not log.cameras:
-        raise LogError(f"{log.name}: the log has no camera, so there is no picture of the ground")
+    if not log.cameras and not log.lidars:
+        raise LogError(f"{log.name}: the log has neither a camera nor a LiDAR, so there is no picture of the ground")
     return map_of(log, scenario, progress)
 
 
 def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], None]) -> GroundMap:
-    """Return the map of the ground of an opened log, as fine as screens and paper show it."""
+    """Return the map of the ground of an opened log, as fine as screens and paper show it; in LiDAR intensities without a camera."""
     from log2sim.config import MapConfig
     from log2sim.road.builder import map_ground
 
-    return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress)
+    return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress).as_picture()

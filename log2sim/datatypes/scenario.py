@@ -271,6 +271,7 @@ class Scenario:
     ignore_regions: IgnoreRegions | None = None
     map_features: MapFeatures | None = None
     signals: tuple[Signal, ...] = ()
+    sensors: tuple[Mapping[str, Any], ...] = ()
 
     def __repr__(self) -> str:
         """Return name, agents and duration in one line."""
@@ -396,7 +397,10 @@ class Scenario:
         shift = np.array([dx, dy, dz])
         features = None if self.map_features is None else self.map_features.moved(lambda points_m: points_m + shift)
         signals = tuple(replace(s, position_m=s.position_m + shift, t_s=s.t_s + later_s) for s in self.signals)
-        placed = replace(self, map_features=features, signals=signals)
+        sensors = tuple(
+            {**s, **{k: s[k] + d for k, d in zip(("x_m", "y_m", "z_m"), (dx, dy, dz))}} for s in self.sensors
+        )
+        placed = replace(self, map_features=features, signals=signals, sensors=sensors)
         return replace(placed, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
@@ -478,6 +482,8 @@ class Scenario:
             document["map_features"] = self.map_features.to_dict()
         if self.signals:
             document["signals"] = [signal.to_dict() for signal in self.signals]
+        if self.sensors:
+            document["sensors"] = [dict(sensor) for sensor in self.sensors]
         return document
 
     @classmethod
@@ -511,6 +517,7 @@ class Scenario:
             ignore_regions=IgnoreRegions.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
             signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
+            sensors=tuple(document.get("sensors", ())),
         )
         for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
             seen: set[str] = set()

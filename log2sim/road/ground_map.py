@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -147,6 +147,14 @@ class GroundMap:
     def known(self) -> NDArray[np.bool_]:
         """Mask (R, C) of the cells of which anything is known."""
         return self.coverage | np.isfinite(self.height_m) | np.isfinite(self.intensity)
+
+    def as_picture(self) -> GroundMap:
+        """Return the map with a picture of the intensities in place of colors where no camera saw any of it; else itself."""
+        known = np.isfinite(self.intensity)
+        if self.has_color or not known.any():
+            return self
+        gray = np.rint(255 * np.clip(np.nan_to_num(self.intensity), 0.0, 1.0)).astype(np.uint8)
+        return replace(self, color_bgr=np.dstack([gray] * 3), alpha=np.where(known, 255, 0).astype(np.uint8))
 
     def around(self, cells: NDArray[np.bool_]) -> GroundMap:
         """Return the part of the map around all cells of a mask (R, C); one cell where there are none."""

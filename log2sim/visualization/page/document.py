@@ -77,6 +77,10 @@ def feature_columns(scenario: Scenario) -> dict[str, Any]:
             }
             for signal in scenario.signals
         ],
+        "sensors": [
+            {k: round(float(sensor[k]), 3) for k in ("x_m", "y_m", "yaw_rad", "fov_rad", "range_m")}
+            for sensor in scenario.sensors
+        ],
         "notes": list(features.notes),
     }
 

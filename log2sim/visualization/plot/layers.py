@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Wedge
 
 from log2sim.datatypes import (
     ENDS,
@@ -43,6 +43,7 @@ from log2sim.visualization.plot.style import (
     MUTED,
     PAPER,
     PARKED_FACE,
+    SENSOR_COLOR,
     SIGNAL_COLOR,
     WARNING,
     halo,
@@ -410,6 +411,7 @@ ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)
 
 def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: bool) -> None:
     """Draw the map features of a scenario; the faces of lanes not over a picture of the ground, which they would hide."""
+    draw_sensors(ax, scenario.sensors)
     features = scenario.map_features
     if features is None:
         return
@@ -423,6 +425,30 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
         LineCollection(borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1), autolim=False
     )
     _draw_markings(ax, features.markings, view)
+
+
+def draw_sensors(ax: Axes, sensors: Sequence[Mapping[str, Any]]) -> None:
+    """Draw sensors that are fixed in the map with their fields of view."""
+    for sensor in sensors:
+        half = min(np.rad2deg(sensor["fov_rad"]) / 2, 180.0)
+        yaw, place = np.rad2deg(sensor["yaw_rad"]), (sensor["x_m"], sensor["y_m"])
+        wedge = Wedge(
+            place, sensor["range_m"], yaw - half, yaw + half, fc=SENSOR_COLOR, ec=SENSOR_COLOR, alpha=0.05, lw=0.8
+        )
+        wedge.set_zorder(LANES - 0.2)
+        ax.add_artist(wedge)
+        ax.plot(
+            *place,
+            marker="^",
+            ms=7,
+            mfc=SENSOR_COLOR,
+            mec=PAPER,
+            mew=0.8,
+            ls="none",
+            zorder=LINES + 3,
+            scalex=False,
+            scaley=False,
+        )
 
 
 def _draw_markings(ax: Axes, markings: Sequence[Marking], view: Viewport) -> None:
@@ -486,6 +512,9 @@ def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
             rows.append((Line2D([0, 1], [0, 1], color=MARKING_COLOR["yellow"], lw=1.3), "yellow marking"))
         if features.borders:
             rows.append((Line2D([0, 1], [0, 1], color=BORDER_COLOR, lw=BORDER_PT), "border of a road"))
+    if scenario.sensors:
+        marker: dict[str, Any] = {"marker": "^", "ms": 6.0, "mfc": SENSOR_COLOR, "mec": PAPER, "ls": "none"}
+        rows.append((Line2D([], [], **marker), "sensor at the road, its field of view"))
     if scenario.signals:
         style: dict[str, Any] = {"marker": "o", "ms": 5.0, "mfc": SIGNAL_COLOR["red"], "mec": PAPER, "ls": "none"}
         rows.append((Line2D([], [], **style), "traffic light"))
