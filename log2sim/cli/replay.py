@@ -163,7 +163,7 @@ def replay(
     chosen = agents if react is None else list(ids_of(loaded, [react]))
     kept, left_out = _trusted(loaded, confidence, drop_doubtful=drop_doubtful)
     if warning is not None:
-        warnable(kept)
+        warnable(kept if confidence is not None else kept.active)
     policy = load_policy(ego) if ego is not None else BrakeWhenWarned(warning) if brake else None
     moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as report_progress:

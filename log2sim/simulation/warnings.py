@@ -282,9 +282,9 @@ def warn(
     every vehicle that moves is warned as the ego would be, on a route of its own, while the ends know it.
     """
     settings = replace(settings or WarningSettings(), ends=ends)
-    drivers = warnable(scenario)
     moved = to_scenario(replay, scenario) if replay is not None else scenario
     now = {a.id: a for a in moved.agents}
+    drivers = warnable(replace(scenario, agents=tuple(a for a in scenario.agents if a.id in now)))
     table = table_of(moved)
     everybody = Watch(scenario, moved.others, settings, table.t_s)
     collisions = _collisions(replay, {driver.id for driver in drivers})
