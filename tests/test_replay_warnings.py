@@ -286,8 +286,8 @@ def test_without_an_ego_each_vehicle_is_warned_as_an_ego_would_be() -> None:
     assert set(found) == {("car", "p"), ("one", "two"), ("two", "one")}
     assert found["car", "p"] == replace(expected, driver="car")
     assert found["one", "two"].ttc_s == pytest.approx(found["two", "one"].ttc_s, abs=2e-3)
-    doubtful = replace(line("doubtful", far, speed=10.0, duration_s=12.0, y_m=90.0), confidence=0.01)
-    scene = replace(scene, agents=(*scene.agents, doubtful))  # quarantined: not in the replay
+    doubtful = replace(line("doubtful", far, speed=10.0, duration_s=12.0, y_m=90.0), quarantined=True)
+    scene = replace(scene, agents=(*scene.agents, doubtful))  # who is not in the replay
     hit = {(e.driver, e.agent): e.collision_s for e in warn(scene, replay(scene, dt_s=0.05)).events}
     assert hit["one", "two"] == hit["two", "one"] == pytest.approx((180.0 - LENGTH_M) / 20.0, abs=0.1)
 
