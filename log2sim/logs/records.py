@@ -407,7 +407,8 @@ def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]
 def _offset_ns(values: NDArray[Any], t_ns: int, *, absolute: bool) -> NDArray[np.int64]:
     if values.dtype.kind in "iu":
         return checked_offset_ns(values, t_ns if absolute else 0)
-    seconds = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # damaged bytes may be signaling NaNs
+        seconds = values.astype(np.float64)
     seconds = np.where(np.isfinite(seconds), seconds, 0.0)
     if np.abs(seconds).max(initial=0.0) > MAX_TIME_S:
         raise ValueError(f"a point has the time {np.abs(seconds).max():g} s, expected at most {MAX_TIME_S:g}")
