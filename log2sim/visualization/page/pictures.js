@@ -71,9 +71,11 @@ class Pictures {
     byId("tiles").append(...this.tiles.map((tile) => tile.element));
     byId("pictures").classList.toggle("single", this.tiles.length === 1);
     byId("tiles").style.setProperty("--aspect", this.tiles[0].width / this.tiles[0].height);
-    this.buttons = [null, ...this.tiles].map((tile) => {
-      const button = element("button", { type: "button" }, tile?.name ?? (this.tiles.length > 1 ? "All" : "Small"));
-      button.addEventListener("click", () => this.enlarge(tile));
+    // A single camera needs no button for all: its own makes the picture large, and small again.
+    this.choices = this.tiles.length > 1 ? [null, ...this.tiles] : this.tiles;
+    this.buttons = this.choices.map((tile) => {
+      const button = element("button", { type: "button" }, tile?.name ?? "All");
+      button.addEventListener("click", () => (tile ? enlarge(tile) : this.enlarge(null)));
       return button;
     });
     byId("cameras").append(...this.buttons);
@@ -86,7 +88,7 @@ class Pictures {
     this.large = tile;
     byId("pictures").classList.toggle("one", tile !== null);
     for (const other of this.tiles) other.element.hidden = tile !== null && other !== tile;
-    [null, ...this.tiles].forEach((other, k) => this.buttons[k].setAttribute("aria-pressed", other === tile));
+    this.choices.forEach((other, k) => this.buttons[k].setAttribute("aria-pressed", other === tile));
     requestDraw();
   }
 
