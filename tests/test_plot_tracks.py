@@ -14,8 +14,9 @@ from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import shapes
 from log2sim.visualization.plot.animated_artists import AnimatedArtists
 from log2sim.visualization.plot.layout import FigureLayout
+from log2sim.visualization.plot.options import PlotOptions
 from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.roles import agent_colors, assign_roles
 from log2sim.visualization.plot.style import PALETTE, printable
 from log2sim.visualization.plot.tracks import plot_tracks, still
 from log2sim.visualization.plot.viewport import Viewport, choose_viewport, nice_step, time_step_s
@@ -292,6 +293,28 @@ def test_colors_of_movers_are_distinct_and_keep_to_rank() -> None:
         )
     )
     assert [role.agent.id for role in nearest.movers] == ["ego", "b", "a"]
+
+
+def test_an_agent_has_its_id_and_the_same_color_in_every_part_of_a_scenario() -> None:
+    """A film of two seconds, or of one agent, would rank the others anew and give them other colors than the page."""
+    scenario = make_scenario(
+        make_agent("ego", (0, 0), (10, 0)), make_agent("far", (0, 50), (5, 0)), make_agent("crosser", (0, 5), (5, 0))
+    )
+    whole = {role.agent.id: role.color for role in assign_roles(scenario).movers}
+    part = dataclasses.replace(scenario, agents=tuple(a for a in scenario.agents if a.id != "crosser"))
+    roles = assign_roles(part, agent_colors(scenario))
+    assert {role.agent.id: role.color for role in roles.movers} == {id: whole[id] for id in ("ego", "far")}
+    assert whole["far"] != whole["crosser"]
+    texts = [text.get_text() for text in still(part, roles).ax.texts]
+    assert any(text.startswith("far") for text in texts)
+
+
+def test_static_agents_have_their_ids_on_demand() -> None:
+    scenario = make_scenario(make_agent("ego", (0, 0), (10, 0)), make_agent("parked", (8, 4), (0, 0)))
+    for wanted in (False, True):
+        options = PlotOptions(label_static=wanted)
+        texts = [t.get_text() for t in still(scenario, assign_roles(scenario), Overlays(options=options)).ax.texts]
+        assert ("parked" in texts) == wanted
 
 
 def test_steps_are_round_numbers() -> None:

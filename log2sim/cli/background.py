@@ -23,11 +23,17 @@ def load_background(
 ) -> GroundMap:
     """Return the map of the ground in a PNG that `log2sim map` wrote, or that of a log, without the agents of the scenario.
 
+    Of a log without cameras it shows the intensity of the LiDAR.
+
     Raises
     ------
     LogError
-        When the file is no such map, or the log has no camera.
+        When the file is no such map, or the log has neither pictures nor intensity of the ground.
     """
+    from dataclasses import replace
+
+    import numpy as np
+
     from log2sim.errors import LogError
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
@@ -36,9 +42,14 @@ def load_background(
     if path.suffix.lower() == ".png":
         return read_png_map(path, scenario.map)
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
-    if not log.cameras:
-        raise LogError(f"{log.name}: the log has no camera, so there is no picture of the ground")
-    return map_of(log, scenario, progress)
+    ground = map_of(log, scenario, progress)
+    if ground.has_color:
+        return ground
+    known = np.isfinite(ground.intensity)
+    if not known.any():
+        raise LogError(f"{log.name}: the log has no pictures of the ground, and its sweeps have no intensity")
+    gray = np.rint(255 * np.nan_to_num(ground.intensity)).astype(np.uint8)
+    return replace(ground, color_bgr=np.dstack([gray] * 3), alpha=np.where(known, 255, 0).astype(np.uint8))
 
 
 def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], None]) -> GroundMap:

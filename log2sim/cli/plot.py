@@ -40,6 +40,7 @@ def plot(
     agents: Annotated[
         str | None, typer.Option(metavar="ID,ID", help="Show these agents alone.", show_default="all")
     ] = None,
+    label_static: Annotated[bool, typer.Option("--label-static", help="Write the ids of static agents too.")] = False,
     size: Annotated[
         str | None,
         typer.Option(
@@ -78,7 +79,9 @@ def plot(
     from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
     from log2sim.visualization.plot.tracks import plot_tracks, resolve_picture
 
-    options = PlotOptions(parse_size(size), fps, speed, start, stop, parse_extent(extent), parse_ids(agents))
+    options = PlotOptions(
+        parse_size(size), fps, speed, start, stop, parse_extent(extent), parse_ids(agents), label_static
+    )
     picture = resolve_picture(out)
     options.require_fits(picture.path.suffix.lower(), picture.path.name)
     check_targets(picture.path, overwrite=overwrite)

@@ -81,8 +81,8 @@ class Placed:
 
 
 def short_label(role: AgentRole) -> str:
-    """Return what marks a mover on the map where there is little room."""
-    return ("ego" if role.is_ego else role.label) + "?" * role.agent.is_doubtful
+    """Return the id of a mover."""
+    return printable(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
 
 
 def speed_text(agent: Agent) -> str:
@@ -93,11 +93,11 @@ def speed_text(agent: Agent) -> str:
 
 def full_label(role: AgentRole) -> str:
     """Return id and highest speed of a mover."""
-    return f"{printable(role.agent.id, MAX_ID_LETTERS)}{'?' * role.agent.is_doubtful} · {speed_text(role.agent)}"
+    return f"{short_label(role)} · {speed_text(role.agent)}"
 
 
-def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float) -> Placed:
-    """Find places for the labels of movers and doubtful agents, and for times along the ego's track.
+def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float, *, label_static: bool = False) -> Placed:
+    """Find places for the labels of movers, of doubtful or else all stationary agents, and for times along the ego's track.
 
     Notes
     -----
@@ -112,8 +112,8 @@ def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float) -> Plac
     for role in leading:
         _place_mover(role, short[role.agent.id], room, placed, tracks)
     for agent in roles.stationary:
-        if agent.is_doubtful:
-            _place_doubtful(agent, room, placed)
+        if agent.is_doubtful or label_static:
+            _place_stationary(agent, room, placed)
     if roles.movers and roles.movers[0].is_ego:
         _place_times(roles.movers[0].agent, times_step_s, room, placed)
     return placed
@@ -229,11 +229,12 @@ def _along(agent: Agent) -> Iterator[Anchor]:
         yield xy[round(share * (len(xy) - 1))], np.full(2, agent.size_m[1] / 2)
 
 
-def _place_doubtful(agent: Agent, room: LabelRoom, placed: Placed) -> None:
-    """Write the id of a doubtful stationary agent beside it, with the reason if there is room for it."""
+def _place_stationary(agent: Agent, room: LabelRoom, placed: Placed) -> None:
+    """Write the id of a stationary agent beside it, of a doubtful one with the reason if there is room for it."""
     anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
-    name, reason = f"{printable(agent.id, MAX_ID_LETTERS)}?", printable(why_doubtful(agent))
-    for text in (f"{name} {reason}", name):
+    name = printable(agent.id, MAX_ID_LETTERS) + "?" * agent.is_doubtful
+    reason = printable(why_doubtful(agent)) if agent.is_doubtful else ""
+    for text in (f"{name} {reason}", name) if reason else (name,):
         whole = text != name
         place = None if whole and len(reason) > MAX_REASON_LETTERS else room.place(text, DETAIL_PT, [anchor])
         if place is not None:

@@ -141,7 +141,7 @@ def legend_rows(
     if roles.movers:
         present = mark_step_s is None and not listed  # an animation whose labels tell the speed
         rows.append((_line("none"), "km/h: speed at this time" if present else "km/h: highest speed of each"))
-    for role in sorted(roles.movers, key=_reading_order):
+    for role in roles.movers:
         if role.leading and role.agent.id not in told:
             marker = "s" if role.is_ego else MARKERS[role.group]
             rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
@@ -208,21 +208,13 @@ def _axes_style(ax: Axes, view: Viewport, projected: bool) -> None:
         spine.set(color=FRAME, linewidth=0.8)
 
 
-def _reading_order(role: AgentRole) -> tuple[bool, int, str]:
-    """Sort the ego first, then labels by their number: 2 before 10."""
-    digits = "".join(c for c in role.label if c in "0123456789")
-    return (not role.is_ego, int(digits) if digits else 0, role.label)
-
-
 def _name(role: AgentRole) -> str:
     moving = speed_text(role.agent)
     if role.is_ego:
         return f"ego · {moving}"
-    if role.agent.id.startswith(role.agent.category):
-        return f"{printable(role.label, 9)} · {printable(role.agent.id, 20)} · {moving}"
-    text = f"{printable(role.label, 9)} · {role.agent.category} · {moving}"
-    room = 34 - len(text) - 3  # 34 letters fit into the column
-    return text if role.label == role.agent.id else f"{text} · {printable(role.agent.id, max(room, 4))}"
+    kind = "" if role.agent.id.startswith(role.agent.category) else f" · {role.agent.category}"
+    room = 34 - len(f"{kind} · {moving}")  # 34 letters fit into the column
+    return f"{printable(role.agent.id, max(room, 4))}{kind} · {moving}"
 
 
 def _line(color: str, **style: Any) -> Line2D:

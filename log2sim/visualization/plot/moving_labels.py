@@ -10,13 +10,13 @@ from matplotlib.text import Text
 
 from log2sim.datatypes import STANDSTILL_MPS
 from log2sim.geometry import Array
-from log2sim.visualization.plot.labels import MAX_ID_LETTERS, MOVER_PT, LabelRoom, short_label
+from log2sim.visualization.plot.labels import MOVER_PT, LabelRoom, short_label
 from log2sim.visualization.plot.roles import AgentRole, AgentRoles
-from log2sim.visualization.plot.style import FONT, halo, printable
+from log2sim.visualization.plot.style import FONT, halo
 from log2sim.visualization.plot.viewport import Viewport
 
 MAX_NAMED = 8
-"""With more leading movers labels are numbers, which the legend explains: names would cover the boxes of others."""
+"""With more leading movers their speeds are in the legend: longer labels would cover the boxes of others."""
 
 SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
 """Where a label may be beside its box, the best first."""
@@ -25,7 +25,7 @@ GAP_PT = 2.0
 
 
 def names_fit(roles: AgentRoles) -> bool:
-    """Tell whether labels of an animation are names with speeds, so that the legend need not list them."""
+    """Tell whether labels of an animation have speeds, so that the legend need not list them."""
     return sum(role.leading for role in roles.movers) <= MAX_NAMED
 
 
@@ -53,7 +53,7 @@ class MovingLabels:
     def _text_of(self, role: AgentRole, speed_mps: float) -> str:
         if not self._named:
             return short_label(role)
-        name = printable(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
+        name = short_label(role)
         moves = abs(speed_mps) >= STANDSTILL_MPS
         return f"{name} · {abs(speed_mps) * 3.6:.0f} km/h" if moves else name
 

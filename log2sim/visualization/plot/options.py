@@ -43,6 +43,8 @@ class PlotOptions:
         Two opposite corners of the part of the map, map frame. A picture of other proportions shows more of the map.
     agents : tuple of str or None
         Ids of the agents that are shown; None for all.
+    label_static : bool
+        Whether a still picture has the ids of static agents too, not of doubtful ones alone.
     """
 
     size_px: tuple[int, int] | None = None
@@ -52,10 +54,13 @@ class PlotOptions:
     stop_s: float | None = None
     extent_m: tuple[float, float, float, float] | None = None
     agents: tuple[str, ...] | None = None
+    label_static: bool = False
 
     def require_fits(self, suffix: str, name: str) -> None:
         """Raise `ConfigError` when a file with this suffix and name has no such options, or a value is out of its limits."""
         moving = suffix in MOVING
+        if moving and self.label_static:
+            raise ConfigError(f"label_static: {name} is a film; only still pictures have the ids of static agents")
         for option, value in (("fps", self.fps), ("speed", self.speed)):
             if value is not None and not moving:
                 raise ConfigError(f"{option}: {name} is a still picture; choose a name that ends in {_listed(MOVING)}")

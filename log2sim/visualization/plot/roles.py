@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,15 +24,12 @@ class AgentRole:
     ----------
     agent : Agent
     color : str
-    label : str
-        Shared by map and legend.
     leading : bool
         Whether it has its own color, a label and a line in the legend.
     """
 
     agent: Agent
     color: str
-    label: str
     leading: bool
 
     @property
@@ -53,8 +51,16 @@ class AgentRoles:
     stationary: tuple[Agent, ...]
 
 
-def assign_roles(scenario: Scenario, max_leading: int = len(PALETTE)) -> AgentRoles:
-    """Split agents into movers and stationary ones; movers by closest approach to the ego, without one by distance driven."""
+def agent_colors(scenario: Scenario) -> dict[str, str]:
+    """Return the colors of a scenario's movers by id: the one table of picture, film and page, of all that is in the file."""
+    return {role.agent.id: role.color for role in assign_roles(scenario).movers}
+
+
+def assign_roles(scenario: Scenario, colors: Mapping[str, str] | None = None) -> AgentRoles:
+    """Split agents into movers and stationary ones; movers by closest approach to the ego, without one by distance driven.
+
+    A part of a scenario takes the `colors` of the whole, see `agent_colors`.
+    """
     ego = scenario.ego
     moving = [a for a in scenario.others if is_moving(a)]
     if ego is not None:
@@ -62,12 +68,11 @@ def assign_roles(scenario: Scenario, max_leading: int = len(PALETTE)) -> AgentRo
     else:
         key = {a.id: -float(np.ptp(centers_xy(a), axis=0).sum()) for a in moving}
     moving.sort(key=lambda a: (key[a.id], a.id))
-    short = all(len(a.id) <= 4 for a in moving)
-    roles = [] if ego is None else [AgentRole(ego, INK, "ego", True)]
+    roles = [] if ego is None else [AgentRole(ego, INK, True)]
     for k, agent in enumerate(moving):
-        leading = k < max_leading
-        label = agent.id if short else str(k + 1)
-        roles.append(AgentRole(agent, PALETTE[k % len(PALETTE)] if leading else CROWD_COLOR, label, leading))
+        color = PALETTE[k] if k < len(PALETTE) else CROWD_COLOR
+        color = color if colors is None else colors.get(agent.id, CROWD_COLOR)
+        roles.append(AgentRole(agent, color, k < len(PALETTE)))
     return AgentRoles(tuple(roles), tuple(a for a in scenario.others if not is_moving(a)))
 
 

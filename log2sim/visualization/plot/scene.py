@@ -111,10 +111,10 @@ def _fit_labels(
         return lay_out(rows), rows, ()
     told = leading | {agent.id for agent in roles.stationary}
     layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, told))
-    placed = place_labels(roles, layout.view, mark_step_s)
+    placed = place_labels(roles, layout.view, mark_step_s, label_static=overlays.options.label_static)
     if not told <= placed.told | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
         layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, placed.told))
-        placed = place_labels(roles, layout.view, mark_step_s)
+        placed = place_labels(roles, layout.view, mark_step_s, label_static=overlays.options.label_static)
     return layout, _legend(scenario, roles, overlays, mark_step_s, placed.told), tuple(placed.labels)
 
 

@@ -189,7 +189,7 @@ def draw_charts(
         _draw_strip(ax, chart, timeline, span_s, last=k == count - 1, moving=moving)
         axes.append(ax)
     role = timeline.role
-    name = role.label if role.is_ego or role.label == role.agent.id else f"{role.label} · {role.agent.id}"
+    name = role.agent.id
     layout.figure.text(
         LEFT_IN / layout.width_in, (top + HEAD_IN - 0.16) / height, f"{printable(name, 40)} in the replay, driven by {_spoken(timeline.driver)}",
         family=FONT, fontsize=8.5, fontweight="bold", color=role.color, parse_math=False, va="baseline",

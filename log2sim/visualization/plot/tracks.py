@@ -19,7 +19,7 @@ from log2sim.visualization.plot.observers import draw_observers, tells_ends
 from log2sim.visualization.plot.options import MOVING, NO_OPTIONS, STILL, PlotOptions
 from log2sim.visualization.plot.overlays import NO_OVERLAYS, Overlays
 from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
-from log2sim.visualization.plot.roles import AgentRoles, assign_roles
+from log2sim.visualization.plot.roles import AgentRoles, agent_colors, assign_roles
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.selection import choose_span, cut_replay, cut_scenario, select_shown
 from log2sim.visualization.plot.warned import draw_warnings, warned_places
@@ -76,6 +76,7 @@ def plot_tracks(
     suffix = film.path.suffix.lower()
     options.require_fits(suffix, film.path.name)
     refuse_existing(film.path, overwrite=overwrite)
+    colors = agent_colors(scenario)
     scenario, replay = select_shown(scenario, replay, options)
     span = choose_span(scenario, options)
     overlays = Overlays(
@@ -88,7 +89,7 @@ def plot_tracks(
         options=options,
     )
     scenario = cut_scenario(scenario, span)
-    roles = assign_roles(scenario)
+    roles = assign_roles(scenario, colors)
     if suffix in MOVING:
         from log2sim.visualization.plot.animation import write_animation
 
