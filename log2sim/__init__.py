@@ -9,7 +9,7 @@ from log2sim.version import __version__
 
 if TYPE_CHECKING:
     from log2sim.batch.run import reconstruct_all
-    from log2sim.cli.installation import examine as examine_installation
+    from log2sim.cli.doctor import examine as examine_installation
     from log2sim.config import Config
     from log2sim.datatypes.scenario import Scenario
     from log2sim.edit.apply import edit as edit_scenario
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from log2sim.evaluation.metrics.evaluator import evaluate
     from log2sim.export.exporters import export as export_scenario
     from log2sim.export.openscenario.read import load as import_scenario
+    from log2sim.logs.excerpt import summarize as summarize_log
     from log2sim.logs.native.writer import write_log
     from log2sim.logs.opening import open_log
-    from log2sim.logs.summary import summarize as summarize_log
     from log2sim.logs.validation import validate_log
-    from log2sim.mapping.builder import map_ground
     from log2sim.pipeline import reconstruct
     from log2sim.prediction.prediction import predict_scenario
+    from log2sim.road.builder import map_ground
     from log2sim.simulation.runner import replay
-    from log2sim.synth.write import write_synthetic
-    from log2sim.visualization.notebook.progress import show_progress
+    from log2sim.synth.synthesis import write_synthetic
     from log2sim.visualization.page.writer import write_page as view
-    from log2sim.visualization.plot.axes import plot
+    from log2sim.visualization.plot.scene import plot
+    from log2sim.visualization.progress import show_progress
 
 _PLACES = {
     "Config": "log2sim.config:Config",
@@ -40,22 +40,22 @@ _PLACES = {
     "detect_log": "log2sim.evaluation.detection.detect_log:detect_log",
     "edit_scenario": "log2sim.edit.apply:edit",
     "evaluate": "log2sim.evaluation.metrics.evaluator:evaluate",
-    "examine_installation": "log2sim.cli.installation:examine",
+    "examine_installation": "log2sim.cli.doctor:examine",
     "export_scenario": "log2sim.export.exporters:export",
     "import_scenario": "log2sim.export.openscenario.read:load",
-    "map_ground": "log2sim.mapping.builder:map_ground",
+    "map_ground": "log2sim.road.builder:map_ground",
     "open_log": "log2sim.logs.opening:open_log",
-    "plot": "log2sim.visualization.plot.axes:plot",
+    "plot": "log2sim.visualization.plot.scene:plot",
     "predict_scenario": "log2sim.prediction.prediction:predict_scenario",
     "reconstruct": "log2sim.pipeline:reconstruct",
     "reconstruct_all": "log2sim.batch.run:reconstruct_all",
     "replay": "log2sim.simulation.runner:replay",
-    "show_progress": "log2sim.visualization.notebook.progress:show_progress",
-    "summarize_log": "log2sim.logs.summary:summarize",
+    "show_progress": "log2sim.visualization.progress:show_progress",
+    "summarize_log": "log2sim.logs.excerpt:summarize",
     "validate_log": "log2sim.logs.validation:validate_log",
     "view": "log2sim.visualization.page.writer:write_page",
     "write_log": "log2sim.logs.native.writer:write_log",
-    "write_synthetic": "log2sim.synth.write:write_synthetic",
+    "write_synthetic": "log2sim.synth.synthesis:write_synthetic",
 }
 """The functions of commands whose names are folders of the package have longer names."""
 

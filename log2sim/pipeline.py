@@ -9,55 +9,47 @@ from typing import Any
 import numpy as np
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.confidence.rating import rate_agents
-from log2sim.agents.ego import ego_agent, ego_path, with_pose_errors
-from log2sim.agents.estimate import estimate_agents
-from log2sim.agents.heading.decide import decide_headings
-from log2sim.agents.observers import with_observers
-from log2sim.agents.plausibility.judge import judge
-from log2sim.agents.plausibility.recording import Recording
-from log2sim.agents.plausibility.static_life import extend_static
-from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
-from log2sim.agents.simplify import simplify
-from log2sim.calibration.check import check_calibration
+from log2sim.agents.confidence import rate_agents
+from log2sim.agents.conflicts import extend_static
+from log2sim.agents.estimate import (
+    camera_entries,
+    ego_agent,
+    ego_path,
+    estimate_agents,
+    provenance_of,
+    roadside_sensors,
+    simplify,
+    with_observers,
+    with_pose_errors,
+)
+from log2sim.agents.evidence import Recording
+from log2sim.agents.heading import decide_headings
+from log2sim.agents.judge import judge
 from log2sim.config import Config
-from log2sim.cooperation.registration import register_road
-from log2sim.datatypes import ENDS, Agent, Fault, Log, Measurements, Scenario, Track
-from log2sim.describe import Recorded, describe
+from log2sim.datatypes import Fault, Log, Measurements, Scenario
 from log2sim.errors import NothingToReconstruct
-from log2sim.fusion_level import FusionLevel
-from log2sim.localization.choice import localize
-from log2sim.localization.pose_choice import GIVEN, PoseChoice
-from log2sim.logs.time_checks import say_without_pose
-from log2sim.outcome import RunOutputs, stage_outcomes
+from log2sim.files.stages import StageClock
+from log2sim.geometry import NS_PER_S
+from log2sim.localization.choice import GIVEN, PoseChoice, localize
+from log2sim.localization.mounts import check_calibration
+from log2sim.localization.roadside import register_road
+from log2sim.logs.checks import say_without_pose
 from log2sim.perception.first_pass import Observations, observe
-from log2sim.perception.fusion import fuse
-from log2sim.perception.given_detectors import GivenDetector, sort_detectors
-from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
-from log2sim.perception.sync import Schedule, synchronize
-from log2sim.plan import Plan, Stage, make_plan
-from log2sim.report import extended_report, report_of
-from log2sim.run_detectors import Detectors, create_detectors
-from log2sim.sensors import Sensors, choose_detector, select_sensors
-from log2sim.stage_clock import StageClock
-from log2sim.tracking.merging import track_ends
-from log2sim.tracking.recorded import mark_unrecorded
+from log2sim.perception.fusion import fuse_by_end
+from log2sim.perception.homography_stage import fit_homographies, place_by_homography
+from log2sim.perception.run_detectors import Detectors, GivenDetector, create_detectors, sort_detectors
+from log2sim.perception.sync import Schedule, schedule_of
+from log2sim.plan import Plan, choose_detector, make_plan, select_sensors
+from log2sim.report import report_of, stage_outcomes
+from log2sim.road.describe import describe
+from log2sim.tracking.tracker import mark_unrecorded, track_ends
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What came of a run.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    report : dict
-        A document of `schemas/report-1.json`.
-    log : Log
-        As it was used: with the poses that were chosen, without the LiDARs that are out of range.
-    """
+    """What came of a run: the scenario, a report as of `schemas/report-1.json`, and the log as it was used."""
 
     scenario: Scenario
     report: dict[str, Any]
@@ -74,26 +66,10 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What the stages of one run share.
+    """What the stages of one run share: the sensors in one map and on one clock, the ticks, and the plan.
 
-    Attributes
-    ----------
-    log : Log
-        Without the LiDARs that are out of range.
-    config : Config
-    plan : Plan
-    schedule : Schedule
-        The ticks, and the frames and sweeps of each.
-    detectors : Detectors
-    clock : StageClock
-    report_progress : callable
-        Called as `report_progress(stage, done, total)`.
-    poses : PoseChoice
-        Where the poses of `log` come from.
-    faults : tuple of Fault
-        Of poses, clocks and mounts.
-    registration : sequence of dict
-        How the road's sensors were registered, one entry for each roadside unit.
+    `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
+    `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`.
     """
 
     log: Log
@@ -102,7 +78,7 @@ class Run:
     schedule: Schedule
     detectors: Detectors
     clock: StageClock
-    report_progress: Progress
+    progress: Progress
     poses: PoseChoice = GIVEN
     faults: tuple[Fault, ...] = ()
     registration: Sequence[dict[str, Any]] = ()
@@ -144,152 +120,111 @@ def reconstruct(
         When neither an ego nor any agent was found.
     """
     run = start(log, config or Config(), detector=detector, progress=progress, cache=cache)
-    observations = first_pass(run)
-    return look_around(run, observations, second_pass(run, observations))
+    return infer_scenario(run, observe_log(run))
 
 
 def start(
     log: Log, config: Config, *, detector: Any = None, progress: Progress | None = None, cache: bool = True
 ) -> Run:
-    """Choose the poses and the sensors, check their calibration, synchronize them, and plan the run."""
+    """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
-    config = given.config
-    clock, report_progress = StageClock(), progress or (lambda *_: None)
+    clock, progress = StageClock(), progress or (lambda *_: None)
     with clock.stage("poses"):
-        log, poses = localize(log, config, progress=report_progress)
-    config = choose_detector(log, config)
+        log, poses = localize(log, given.config, progress=progress)
+    config = choose_detector(log, given.config)
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
-        log, faults = check_calibration(log, config, sensors, progress=report_progress)
+        log, faults = check_calibration(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.sensor for fault in faults if fault.treatment == "left_out"])
     with clock.stage("registration"):
-        road = register_road(log, config, sensors, progress=report_progress)
-        log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
-    report_progress("load", 0, 0)
-    detectors = create_detectors(sensors.restrict(log), config, given, cache=cache)
+        road = register_road(log, config, sensors, progress=progress)
+        sensors = sensors.without([fault.sensor for fault in road.faults if fault.treatment == "left_out"])
+    progress("load", 0, 0)
+    log = sensors.restrict(road.log)
+    detectors = create_detectors(log, config, given, cache=cache)
     with clock.stage("sync"):
-        schedule = schedule_of(log, config, sensors)
-    plan = make_plan(log, config, sensors, schedule.t_ns)
+        schedule = schedule_of(log, sensors.cameras, config)
+    plan = make_plan(road.log, config, sensors, schedule.t_ns)
     faults = (*poses.faults, *faults, *road.faults)
-    return Run(
-        sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses, faults, road.figures
-    )
+    return Run(log, config, plan, schedule, detectors, clock, progress, poses, faults, road.figures)
 
 
-def schedule_of(log: Log, config: Config, sensors: Sensors) -> Schedule:
-    """Synchronize the sensors of a run."""
-    return synchronize(
-        sensors.restrict(log),
-        sensors.cameras,
-        reference=config.sync.reference,
-        max_residual_s=config.sync.max_residual_s,
-        start_s=config.start_s,
-        stop_s=config.stop_s,
-    )
-
-
-def first_pass(run: Run) -> Observations:
+def observe_log(run: Run) -> Observations:
     """Detect and measure, tick by tick."""
-    run.report_progress("detect and measure", 0, len(run.schedule))
+    config, stage = run.config, "detect and measure"
+    run.progress(stage, 0, len(run.schedule))
     return observe(
         run.log,
         run.schedule,
         run.detectors.images,
         run.plan,
-        mode=run.config.measure.mode,
-        max_range_m=run.config.measure.max_range_m,
+        mode=config.measure.mode,
+        max_range_m=config.measure.max_range_m,
         clock=run.clock,
-        progress=lambda done, total: run.report_progress("detect and measure", done, total),
+        progress=lambda done, total: run.progress(stage, done, total),
         lidar_detector=run.detectors.sweeps,
-        sweeps=run.config.lidar.sweeps,
+        sweeps=config.lidar.sweeps,
         cache=run.detectors.cache,
     )
 
 
-def second_pass(run: Run, observations: Observations) -> Result:
-    """Go on from the observations, which stay as they are, to the scenario and the report."""
-    log, config, plan, t_ns = run.log, run.config, run.plan, run.schedule.t_ns
-    with run.clock.stage("topdown"):
+def infer_scenario(run: Run, observations: Observations) -> Result:
+    """Go on from observations, which stay as they are, to the scenario and the report."""
+    log, config, plan, schedule, clock = run.log, run.config, run.plan, run.schedule, run.clock
+    timeline = Timeline(schedule.t_ns, int(schedule.t_ns[0]))
+    with clock.stage("topdown"):
         rng = np.random.default_rng(config.seed)
-        homographies = fit_homographies(log, observations, plan, estimation_options(config.topdown), rng=rng)
+        homographies = fit_homographies(log, observations, plan, config.topdown, rng=rng)
         placed = place_by_homography(log, observations, homographies)
-    with run.clock.stage("fuse"):
-        across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
-        ends = [fuse(of_end, across=across) for of_end in split_by_end(placed, plan)]
-        measurements = ends[0] if len(ends) == 1 else [Measurements.join(rows) for rows in zip(*ends)]
-    with run.clock.stage("track", run.report_progress):
-        tracks = track_ends(
-            ends,
-            t_ns,
-            birth_score=config.track.birth_score,
-            max_gap_s=config.track.max_gap_s,
-            min_life_s=config.track.min_life_s,
-        )
-        tracks = mark_unrecorded(tracks, observations.recorded(run.schedule))
-    ego, agents = agents_of(run, tracks, observations)
-    if ego is None and not agents:
-        raise NothingToReconstruct(
-            f"{log.name}: {say_without_pose(log, t_ns)}, and no object was detected in {len(t_ns)} ticks"
-        )
-    return result_of(run, ego, RunOutputs(observations, measurements, homographies, tuple(agents), run.clock))
-
-
-def split_by_end(measurements: Sequence[Measurements], plan: Plan) -> list[Sequence[Measurements]]:
-    """Return the measurements by tick of what is tracked together: each end where tracks are joined, else everything."""
-    if plan.fusion is not FusionLevel.TRACKS:
-        return [measurements]
-    return [[rows.take(rows.seen_by[:, k]) for rows in measurements] for k in range(len(ENDS))]
-
-
-def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> tuple[Agent | None, list[Agent]]:
-    """Make agents of tracks, judged and rated together; the ego, if its poses are known, is returned separately."""
-    log, t_ns = run.log, run.schedule.t_ns
-    timeline = Timeline(t_ns, int(t_ns[0]))
-    with run.clock.stage("smooth", run.report_progress):
-        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=run.config.smooth.enabled)
-        candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
+    with clock.stage("fuse"):
+        by_end = fuse_by_end(placed, plan)
+        measurements = by_end[0] if len(by_end) == 1 else [Measurements.join(rows) for rows in zip(*by_end)]
+    with clock.stage("track", run.progress):
+        tracks = track_ends(by_end, schedule.t_ns, config.track)
+        tracks = mark_unrecorded(tracks, observations.recorded(schedule))
+    with clock.stage("smooth", run.progress):
+        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
+        candidates = decide_headings(candidates, ego_path(log, schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
-    with run.clock.stage("judge", run.report_progress):
-        seen = run.schedule.without_frames(observations.unseen)
-        recording = Recording(log, seen, observations.obstacles, timeline)
-        judged = judge(candidates, ego, recording)
+    with clock.stage("judge", run.progress):
+        searched = schedule.without_frames(observations.unseen)
+        judged = judge(candidates, ego, Recording(log, searched, observations.obstacles, timeline))
         rated = rate_agents(judged, timeline, lidar=bool(log.lidars))
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
-        if run.config.track.static_for_all:
+        if config.track.static_for_all:
             agents = extend_static(agents, ego, observations.obstacles, timeline)
-        limit = run.config.track.quarantine_confidence
-        agents = [replace(a, quarantined=True) if a.confidence < limit else a for a in agents]
+        agents = [replace(a, quarantined=a.confidence < config.track.quarantine_confidence) for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
-        return ego, simplify(agents) if ego is not None else agents
+        agents = simplify(agents) if ego is not None else agents
+    if ego is None and not agents:
+        reason = say_without_pose(log, schedule.t_ns)
+        raise NothingToReconstruct(f"{log.name}: {reason}, and no object was detected in {len(schedule)} ticks")
 
-
-def result_of(run: Run, ego: Agent | None, outputs: RunOutputs) -> Result:
-    """Assemble the scenario and the report of a run."""
-    log, config, t_ns = run.log, run.config, run.schedule.t_ns
-    outcomes = stage_outcomes(run.plan, outputs)
-    faults = [fault.to_dict(int(t_ns[0])) for fault in (*run.faults, *outputs.observations.faults)]
-    scenario = scenario_of(
-        log,
-        t_ns,
-        [ego, *outputs.agents] if ego is not None else outputs.agents,
-        cameras=camera_entries(log, run.plan.cameras, outputs.homographies),
-        stages=[outcome.to_dict() for outcome in outcomes],
+    faults = [fault.to_dict(timeline.t0_ns) for fault in (*run.faults, *observations.faults)]
+    scenario = Scenario(
+        name=log.name,
+        t0_ns=timeline.t0_ns,
+        duration_s=float((schedule.t_ns[-1] - schedule.t_ns[0]) / NS_PER_S),
+        agents=(*([] if ego is None else [ego]), *agents),
+        map=log.map,
+        cameras=tuple(camera_entries(log, plan.cameras, homographies)),
+        sensors=roadside_sensors(log, config.measure.max_range_m),
         provenance={
             **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
             **({"faults": faults} if faults else {}),
         },
     )
-    report = report_of(log, config, run.schedule, outputs, outcomes, scenario)
-    added = {"poses": run.poses.to_dict(), "faults": faults, "registration": list(run.registration)}
-    cached = {"detection_cache": None if run.detectors.cache is None else run.detectors.cache.figures()}
-    return Result(scenario, {**report, **added, **cached}, log)
-
-
-def look_around(run: Run, observations: Observations, result: Result) -> Result:
-    """Describe the scenario of a run: lanes, colors of vehicles, traffic lights."""
-    used = run.log.changed(cameras={name: run.log.cameras[name] for name in run.plan.cameras})
-    recorded = Recorded(used, run.config, run.plan, observations, run.clock, run.report_progress)
-    description = describe(result.scenario, recorded)
-    stages = [*result.scenario.stages, *(outcome.to_dict() for outcome in description.outcomes)]
-    scenario = replace(description.scenario, stages=tuple(stages))
-    return replace(result, scenario=scenario, report=extended_report(result.report, description, run.clock))
+    description = describe(scenario, log, config, plan, observations.lights, clock, run.progress)
+    outcomes = (*stage_outcomes(plan, observations, homographies, agents, clock), *description.outcomes)
+    scenario = replace(description.scenario, stages=tuple(outcome.to_dict() for outcome in outcomes))
+    cache = run.detectors.cache
+    report = {
+        **report_of(log, config, schedule, observations, measurements, homographies, outcomes, scenario, clock),
+        "unreadable": {**description.unreadable, **observations.unreadable},
+        **description.figures,
+        "poses": run.poses.to_dict(),
+        "faults": faults,
+        "registration": list(run.registration),
+        "detection_cache": None if cache is None else cache.figures(),
+    }
+    return Result(scenario, report, log)

@@ -1,22 +1,95 @@
-"""What a run took and what can be known of its quality without truth, as `report.json` holds it."""
+"""What came of a run: what each stage did, and what can be known of its quality without truth, as `report.json` holds it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from log2sim.agents.estimate import TOLERANCE_M
 from log2sim.config import Config
-from log2sim.datatypes import Log, Measurements, Scenario
-from log2sim.describe import Description
-from log2sim.documents import rounded
+from log2sim.datatypes import Agent, Log, Measurements, Scenario
+from log2sim.files.documents import rounded
+from log2sim.files.stages import StageClock
 from log2sim.geometry import NS_PER_S
-from log2sim.outcome import Outcome, RunOutputs
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
-from log2sim.stage_clock import StageClock
+from log2sim.plan import DESCRIBING, Decision, HomographyScope, Outcome, Plan, Stage
 from log2sim.version import __version__
+
+
+def stage_outcomes(
+    plan: Plan,
+    observations: Observations,
+    homographies: Mapping[str, CameraHomography],
+    agents: Sequence[Agent],
+    clock: StageClock,
+) -> tuple[Outcome, ...]:
+    """Join the decisions of a plan with what the stages did, in the plan's order, but for those that describe the scenario."""
+    found: Mapping[Stage, Callable[[Decision], Outcome]] = {
+        Stage.MOTION_COMPENSATION: lambda d: _compensation(d, observations),
+        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, plan.picture_stride, observations, clock),
+        Stage.HOMOGRAPHY: lambda d: _homography(d, plan.homography, homographies),
+        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(agents),
+        Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(agents),
+    }
+    return tuple(found.get(d.stage, Outcome)(d) for d in plan.decisions if d.stage not in DESCRIBING)
+
+
+def _compensation(planned: Decision, observations: Observations) -> Outcome:
+    counts, total = observations.sweeps, sum(observations.sweeps.values())
+    if not planned.kept or not total:
+        return Outcome(planned)
+    if counts["in the log"] == total:
+        return Outcome(Decision(planned.stage, False, "the sweeps of the log are compensated already"))
+    if counts["in the log"] + counts["no times"] == total:
+        return Outcome(Decision(planned.stage, False, "the points have no times of their own"))
+    if counts["at rest"]:
+        reason = f"{planned.reason}; it stands still during {counts['at rest']} of {total} sweeps"
+        return Outcome(Decision(planned.stage, counts["moving"] > 0, reason))
+    return Outcome(planned)
+
+
+def _detection(planned: Decision, picture_stride: int, observations: Observations, clock: StageClock) -> Outcome:
+    seconds = clock.seconds
+    skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
+    if planned.kept or not detected:
+        return Outcome(planned)
+    if not skipped:
+        return Outcome(Decision(planned.stage, True, "no camera was empty long enough to skip a frame"))
+    names = ", ".join(f"{name} {n}" for name, n in sorted(observations.frames_skipped.items()))
+    reason = f"{skipped} of {skipped + detected} frames are between two in which nothing was found: {names}"
+    if picture_stride > 1:
+        reason = f"{planned.reason}; {skipped} of {skipped + detected} frames were not"
+    each_s = (seconds.get("decode", 0.0) + seconds.get("detect", 0.0)) / max(detected, 1)
+    how = f"estimated: {1e3 * each_s:.3g} ms a frame (measured on {detected}), times {skipped}"
+    return Outcome(Decision(planned.stage, False, reason), round(skipped * each_s, 4), how)
+
+
+def _homography(planned: Decision, scope: HomographyScope, homographies: Mapping[str, CameraHomography]) -> Outcome:
+    if scope is HomographyScope.NONE:
+        return Outcome(planned)
+    if not homographies:
+        return Outcome(Decision(planned.stage, False, "every detection has LiDAR points or no foot in the image"))
+    return Outcome(Decision(planned.stage, True, f"{planned.reason}: {', '.join(homographies)}"))
+
+
+def _static(agents: Sequence[Agent]) -> Outcome:
+    static = sum(a.static for a in agents)
+    reason = f"{static} of {len(agents)} agents are static: one pose for each" if static else "no agent is static"
+    return Outcome(Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, not static, reason))
+
+
+def _waypoints(agents: Sequence[Agent]) -> Outcome:
+    stage, left_out = Stage.WAYPOINT_AT_EVERY_TICK, sum(a.quality.get("waypoints_left_out", 0) for a in agents)
+    if not left_out:
+        return Outcome(Decision(stage, True, "no agent moves straight at constant speed"))
+    total = left_out + sum(len(a.waypoints) for a in agents)
+    reason = f"{left_out} of {total} lie within {TOLERANCE_M * 100:.0f} cm of the line between their neighbors"
+    return Outcome(Decision(stage, False, reason))
+
 
 DETECTOR_STAGES = ("detect",)
 
@@ -25,12 +98,14 @@ def report_of(
     log: Log,
     config: Config,
     schedule: Schedule,
-    outputs: RunOutputs,
+    observations: Observations,
+    measurements: Sequence[Measurements],
+    homographies: Mapping[str, CameraHomography],
     outcomes: Sequence[Outcome],
     scenario: Scenario,
+    clock: StageClock,
 ) -> dict[str, Any]:
-    """Assemble the report of a finished run."""
-    clock, observations = outputs.clock, outputs.observations
+    """Assemble what a report says of the stages of a finished run."""
     ticks = len(schedule)
     return {
         "report_version": 1,
@@ -42,22 +117,10 @@ def report_of(
         "plan": [outcome.to_report() for outcome in outcomes],
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
         "without_pose": _without_pose(log, schedule),
-        "unreadable": observations.records.summary() if observations.records is not None else {},
         "detections": observations.detections,
-        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in outputs.homographies.items()},
-        "measurements": _measurement_counts(outputs.measurements),
+        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
+        "measurements": _measurement_counts(measurements),
         "agents": _agent_counts(scenario),
-    }
-
-
-def extended_report(report: dict[str, Any], description: Description, clock: StageClock) -> dict[str, Any]:
-    """Return the report of a run whose scenario was described since, with the times of all stages."""
-    return {
-        **report,
-        **_times(clock, report["ticks"]),
-        "plan": [*report["plan"], *(outcome.to_report() for outcome in description.outcomes)],
-        "unreadable": {**description.reader.summary(), **report["unreadable"]},
-        **description.figures,
     }
 
 

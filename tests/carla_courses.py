@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import Agent, Scenario, Waypoints
-from log2sim.simulation.carla.assets import BY_CATEGORY
+from log2sim.simulation.carla.data import BY_CATEGORY
 
 SIZES = {blueprint: size_m for offers in BY_CATEGORY.values() for blueprint, size_m in offers.items()}
 

@@ -71,12 +71,13 @@ def trigger_s(event: Element) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """A road walked in small steps: `s_m` (N,), its reference line (N, 3) x, y, z, and lane centers by lane id."""
+    """A road walked in small steps: `s_m` (N,), its reference line (N, 3) x, y, z, and centers and widths of lanes by their ids."""
 
     road: Element
     s_m: Array
     line: Array
     centers: dict[int, Array]
+    widths: dict[int, Array]
 
 
 def walk(road: Element, step_m: float = 0.02) -> Sampled:
@@ -96,7 +97,7 @@ def walk(road: Element, step_m: float = 0.02) -> Sampled:
     stations, points = np.concatenate(s), np.concatenate(xyh)
     z = _cubics(road.findall("elevationProfile/elevation"), "s", stations)
     line = np.column_stack([points[:, :2], z])
-    return Sampled(road, stations, line, _centers(road, stations, line, points[:, 2]))
+    return Sampled(road, stations, line, *_lanes(road, stations, line, points[:, 2]))
 
 
 def _cubics(nodes: list[Element], station: str, s_m: Array) -> Array:
@@ -108,18 +109,19 @@ def _cubics(nodes: list[Element], station: str, s_m: Array) -> Array:
     return out
 
 
-def _centers(road: Element, s_m: Array, line: Array, heading: Array) -> dict[int, Array]:
+def _lanes(road: Element, s_m: Array, line: Array, heading: Array) -> tuple[dict[int, Array], dict[int, Array]]:
     offset = _cubics(road.findall("lanes/laneOffset"), "s", s_m)
     (section,) = road.findall("lanes/laneSection")
     left = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(len(s_m))])
-    found = {}
+    found, widths = {}, {}
     for side, sign in (("left", 1.0), ("right", -1.0)):
         edge = offset.copy()
         for lane in sorted(section.iterfind(f"{side}/lane"), key=lambda n: abs(int(n.attrib["id"]))):
             width = _cubics(lane.findall("width"), "sOffset", s_m)
+            widths[int(lane.attrib["id"])] = width
             found[int(lane.attrib["id"])] = line + (edge + sign * width / 2)[:, None] * left
             edge = edge + sign * width
-    return found
+    return found, widths
 
 
 def roads(path: Path, step_m: float = 0.02) -> list[Sampled]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.mapping.ground_map import GroundMap
+from log2sim.road.ground_map import GroundMap
 
 ASPHALT, WHITE, YELLOW, GRASS, CONCRETE = (92, 91, 90), (214, 216, 216), (50, 160, 205), (60, 110, 80), (150, 158, 160)
 FINE = 4  # masks are drawn so much finer than cells

@@ -9,16 +9,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from log2sim.appearance.colors import ColorSampler, _Scene, _to_box
-from log2sim.appearance.lab import lab_of_linear, linear_of_lab
-from log2sim.appearance.light import CAMERA_WHITE, estimate_light, linear_values, mirrored_share, reflectances, veil_of
-from log2sim.appearance.paint import find_paint
-from log2sim.appearance.surface import hit_block, hit_vehicle
-from log2sim.appearance.verdict import geometric_median
-from log2sim.appearance.views import choose_views
-from log2sim.color_names import name_of, to_lab
 from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes.color_names import name_of, to_lab
 from log2sim.perception.lidar.projection import view_of
+from log2sim.road.colors import (
+    ColorSampler,
+    _Scene,
+    _to_box,
+    choose_views,
+    find_paint,
+    geometric_median,
+    lab_of_linear,
+    linear_of_lab,
+)
+from log2sim.road.light import (
+    CAMERA_WHITE,
+    estimate_light,
+    hit_block,
+    hit_vehicle,
+    linear_values,
+    mirrored_share,
+    reflectances,
+    veil_of,
+)
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 

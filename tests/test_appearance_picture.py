@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from test_appearance_colors import PAINTS, street
 
-from log2sim.appearance.one_picture import color_of_picture, cut_out, where_paint_is
-from log2sim.appearance.pixel_model import cells_of, explain_paint, paint_model
-from log2sim.appearance.views import boxes_at, choose_views
-from log2sim.color_names import name_indices, name_of
 from log2sim.datatypes import COLOR_NAMES
+from log2sim.datatypes.color_names import name_indices, name_of
 from log2sim.geometry import NS_PER_S, inverse, project_boxes
+from log2sim.road.color_picture import cells_of, color_of_picture, cut_out, explain_paint, paint_model, where_paint_is
+from log2sim.road.colors import boxes_at, choose_views
 
 
 @pytest.mark.slow

@@ -14,8 +14,9 @@ import pytest
 from lidar_networks import write_network
 from test_layers import RANKED, ROOT
 
-from log2sim import Config, registry
+from log2sim import Config
 from log2sim.datatypes import Log
+from log2sim.files import plugins
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 
 TEXT = (ROOT / "log2sim" / "README.md").read_text(encoding="utf-8")
@@ -58,7 +59,7 @@ def test_the_pipeline_calls_the_functions_of_the_table_in_their_order() -> None:
 
 
 def test_every_kind_of_plug_in_is_explained() -> None:
-    for kind in registry.BUILT_IN:
+    for kind in plugins.BUILT_IN:
         assert f"kind `{kind}`" in TEXT
 
 

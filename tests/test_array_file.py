@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.array_file import ArrayFile, ArrayList, StoredArray, array_lengths, join_arrays, take_arrays
 from log2sim.datatypes import Measurements, Obstacles, Rays
-from log2sim.perception.obstacle_list import ObstacleList
+from log2sim.files.arrays import ArrayFile, ArrayList, StoredArray, array_lengths, join_arrays, take_arrays
+from log2sim.perception.first_pass import ObstacleList
 
 DTYPES = (np.float32, np.float64, np.int64, np.uint8)
 

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from log2sim.errors import LogError, MissingExtra, RecordError
-from log2sim.logs.arrow import parquet_rows
-from log2sim.logs.arrow.ipc import declared_size
-from log2sim.logs.arrow.parquet_rows import ParquetRows
-from log2sim.logs.arrow.tables import TableLimits, read_columns
+from log2sim.logs import arrow
+from log2sim.logs.arrow import ParquetRows, TableLimits, declared_size, read_columns
 
 pa = pytest.importorskip("pyarrow")
 feather = pytest.importorskip("pyarrow.feather")
@@ -231,7 +229,7 @@ def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
 def test_rows_in_any_order_are_those_of_the_columns(
     tmp_path: Path, group: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parquet_rows, "MAX_KEPT_BYTES", 5_000)
+    monkeypatch.setattr(arrow, "MAX_KEPT_BYTES", 5_000)
     path = write(tmp_path / "a.parquet", table(40), row_group_size=group)
     columns, rows = read_columns(path, KINDS), ParquetRows(path, {**KINDS, "x": "int"}, optional=("x",))
     assert len(rows) == 40

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.perception.lidar.azimuth_index import AzimuthIndex
+from log2sim.perception.lidar.cloud import AzimuthIndex
 
 SENSOR = np.array([0.0, 0.0, 1.9], dtype=np.float32)
 

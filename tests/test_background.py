@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from log2sim.perception.background import AHEAD, work_ahead
+from log2sim.perception.frames import AHEAD, work_ahead
 
 PATIENCE_S = 20.0
 

@@ -16,21 +16,17 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from log2sim import reconstruct_all
-from log2sim.batch import cluster
+from log2sim.batch import run as cluster
 from log2sim.batch.discovery import FoundLog, find_logs
 from log2sim.batch.evaluation import pool
-from log2sim.batch.folder import BatchFolder, BatchSettings
-from log2sim.batch.jobs import MAX_NAME_CHARS, make_jobs
-from log2sim.batch.page import html_of
-from log2sim.batch.rows import Row
-from log2sim.batch.table import write_parquet
+from log2sim.batch.folder import MAX_NAME_CHARS, BatchFolder, BatchSettings, Row, html_of, make_jobs, write_parquet
 from log2sim.cli import batch as command
 from log2sim.config import Config
-from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError, PluginError
-from log2sim.links import following_links
-from log2sim.run_detectors import check_detectors
-from log2sim.threads import usable_threads
+from log2sim.files.documents import check
+from log2sim.files.inputs import following_links
+from log2sim.files.stages import usable_threads
+from log2sim.perception.run_detectors import check_detectors
 
 EVIL = "<script>alert('{{root}}')</script>&\"'"
 

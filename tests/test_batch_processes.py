@@ -15,9 +15,7 @@ from batch_logs import FAST, install_reader, lay_out_logs, tell
 from command_line import run
 
 from log2sim.batch.discovery import find_logs
-from log2sim.batch.folder import BatchFolder
-from log2sim.batch.jobs import make_jobs
-from log2sim.batch.rows import Row
+from log2sim.batch.folder import BatchFolder, Row, make_jobs
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 120

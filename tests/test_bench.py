@@ -12,39 +12,43 @@ import pytest
 from command_line import names, run
 from worlds import tiny_log
 
-from log2sim.config import Config
-from log2sim.config_sections import Section, TopdownConfig
+from log2sim.config import Config, Section, TopdownConfig
 from log2sim.datatypes import Agent, Detections, Frame, Log, Measurements, Scenario, Waypoints
-from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError
-from log2sim.evaluation.bench.benchmark import Benchmark, bench
-from log2sim.evaluation.bench.bootstrap import confidence_not_worse, error_interval, error_of
-from log2sim.evaluation.bench.document import document, format_table
-from log2sim.evaluation.bench.label_placement import short_name
-from log2sim.evaluation.bench.localization import (
+from log2sim.evaluation.bench.benchmark import Benchmark, bench, document, format_table, short_name
+from log2sim.evaluation.bench.runs import BenchContext, detect_once, make_context
+from log2sim.evaluation.bench.runs import timed_first_pass as run_first_pass
+from log2sim.evaluation.bench.scores import (
+    CUTOFF_M,
+    Scope,
     at_tick,
+    jitter,
     score_homographies,
     score_measurements,
+    score_scenario,
     split_holdout,
     true_positions,
 )
-from log2sim.evaluation.bench.pareto import Point, pareto_front, recommend
-from log2sim.evaluation.bench.runs import BenchContext, make_context
-from log2sim.evaluation.bench.runs import first_pass as run_first_pass
-from log2sim.evaluation.bench.scores import CUTOFF_M, Scope, jitter, score_scenario
-from log2sim.evaluation.bench.settings import choices, default_settings, make_grid
-from log2sim.evaluation.bench.shared_detections import detect_once
+from log2sim.evaluation.bench.settings import (
+    Point,
+    choices,
+    confidence_not_worse,
+    default_settings,
+    error_interval,
+    error_of,
+    make_grid,
+    pareto_front,
+    recommend,
+)
+from log2sim.files.documents import check
 from log2sim.geometry import Array, Camera, apply_homography
-from log2sim.perception.detect.classes import COCO_80
-from log2sim.perception.detect.layouts import LAYOUTS
-from log2sim.perception.detect.onnx_detector import OnnxDetector
-from log2sim.perception.detect.onnx_model import OnnxModel
-from log2sim.perception.detect.preprocessing import InputSpec
+from log2sim.perception.detect.layouts import COCO_80, LAYOUTS, InputSpec
+from log2sim.perception.detect.onnx_detector import OnnxDetector, OnnxModel
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
-from log2sim.pipeline import schedule_of
-from log2sim.sensors import choose_detector, select_sensors
+from log2sim.perception.sync import schedule_of
+from log2sim.plan import choose_detector, select_sensors
 
 FirstPass = tuple[BenchContext, Observations, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})
@@ -448,7 +452,7 @@ def test_every_frame_is_decoded_and_detected_once(tiny: tuple[Log, Scenario]) ->
     log = replace(
         log, streams={**log.streams, "front": replace(stream, read=lambda k: (decoded.append(k), stream.read(k))[1])}
     )
-    schedule = schedule_of(log, LABELS, select_sensors(log, LABELS))
+    schedule = schedule_of(log, select_sensors(log, LABELS).cameras, LABELS)
     detectors = {"a": Counting(), "b": Counting()}
     told: list[tuple[int, int]] = []
     found, decoding_s = detect_once(
@@ -484,7 +488,7 @@ def test_unreadable_frames_have_no_detections_and_none_at_all_is_an_error(tiny: 
 
         return replace(log, streams={**log.streams, "front": replace(stream, read=read)})
 
-    schedule = schedule_of(log, LABELS, select_sensors(log, LABELS))
+    schedule = schedule_of(log, select_sensors(log, LABELS).cameras, LABELS)
     found, _ = detect_once(broken(3), schedule, {"a": Counting()}, decode=True, progress=lambda done, total: None)
     assert len(found["a"].found) == len(schedule) - 3
     with pytest.raises(LogError, match="none of the 10 records asked for can be read"):
@@ -645,7 +649,7 @@ def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: p
     def interrupted(*arguments: Any, **options: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("log2sim.evaluation.bench.runs.second_pass", interrupted)
+    monkeypatch.setattr("log2sim.evaluation.bench.runs.infer_scenario", interrupted)
     ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--quiet")
     assert ran.code == 130
     assert "interrupted" in ran.err

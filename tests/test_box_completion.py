@@ -9,19 +9,20 @@ from hypothesis import strategies as st
 from worlds import measured_row, scan, standing
 
 from log2sim.datatypes import CATEGORIES, TYPICAL_SIZE_M
-from log2sim.perception.box_completion import (
+from log2sim.perception.boxes import (
     CORNER_ROUNDING_SHARE,
     FACING_END,
     SENSOR_MOTION_M,
     SIDE_END,
     complete_box,
     corner_correction,
+    extents,
     oriented_covariance,
     place_boxes,
     provisional_sizes,
     real_ends,
+    rotate,
 )
-from log2sim.perception.box_fitting import extents, rotate
 
 QUARTER = np.pi / 2
 # Of the corners of a car of 1.8 m.

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log2sim.perception.box_fitting import (
-    align_to,
-    extents,
-    fit_yaw,
-    rotate,
-    subsample,
-)
+from log2sim.perception.boxes import align_to, extents, fit_yaw, rotate, subsample
 
 QUARTER = np.pi / 2
 FAR_M = np.array([5e5, 5e6])

@@ -12,21 +12,6 @@ import numpy as np
 import pytest
 
 from log2sim import Config, open_log, pipeline
-from log2sim.calibration import edge_views
-from log2sim.calibration.cameras import check_cameras
-from log2sim.calibration.corrections import turn_mount
-from log2sim.calibration.depth_edges import DepthEdges, find_depth_edges, keep_standing, read_depth_edges
-from log2sim.calibration.edge_alignment import (
-    SYSTEMATIC_RAD,
-    EdgeView,
-    YawEstimate,
-    estimate_yaw,
-    find_image_edges,
-    score_angles,
-)
-from log2sim.calibration.edge_views import EdgeViews, choose_moments, points_in_mount
-from log2sim.calibration.gray_images import read_gray
-from log2sim.calibration.image_flow import FlowPair, find_exchanged, flow_agreement
 from log2sim.datatypes import Fault, Log
 from log2sim.geometry import (
     Array,
@@ -40,7 +25,26 @@ from log2sim.geometry import (
     rotation_from_rpy,
     transform,
 )
-from log2sim.sensors import choose_detector, select_sensors
+from log2sim.localization import edges
+from log2sim.localization.clocks import turn_mount
+from log2sim.localization.edges import (
+    SYSTEMATIC_RAD,
+    DepthEdges,
+    EdgeView,
+    EdgeViews,
+    YawEstimate,
+    choose_moments,
+    estimate_yaw,
+    find_depth_edges,
+    find_image_edges,
+    keep_standing,
+    points_in_mount,
+    read_depth_edges,
+    read_gray,
+    score_angles,
+)
+from log2sim.localization.mounts import FlowPair, check_cameras, find_exchanged, flow_agreement
+from log2sim.plan import choose_detector, select_sensors
 
 SAMPLE = Path(__file__).parents[1] / "samples/crossing"
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -289,10 +293,10 @@ def test_only_frames_of_cameras_that_may_be_turned_are_all_looked_at(
         read.append((camera.name, index))
         return read_gray(stream, index, camera)
 
-    monkeypatch.setattr(edge_views, "read_gray", note)
+    monkeypatch.setattr(edges, "read_gray", note)
     checked(with_cameras(sample, yawed(sample.cameras["front"], 1.0)))
     counts = {name: sum(name == other for other, _ in read) for name in ("front", "front_right")}
-    assert counts == {"front": edge_views.MAX_FRAMES, "front_right": edge_views.MAX_FRAMES // 2}
+    assert counts == {"front": edges.MAX_FRAMES, "front_right": edges.MAX_FRAMES // 2}
     assert len(set(read)) == len(read)
 
 

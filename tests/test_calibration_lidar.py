@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 from localization_worlds import HOUSES, drive
 
-from log2sim.calibration.corrections import shift_stream, turn_mount
-from log2sim.calibration.lidar import check_lidars
-from log2sim.calibration.motion_fit import OFFSET, PITCH, YAW, fit_clock_and_mount
-from log2sim.calibration.sweep_pairs import MAX_SWEEPS, SweepPairs, choose_sweeps, pair_sweeps
-from log2sim.calibration.twists import adjoint_of, exp_of, log_of
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Stream
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, PoseTrack, apply, inverse, rotation_from_rpy
-from log2sim.sensors import Sensors
+from log2sim.localization.clocks import OFFSET, PITCH, YAW, check_lidars, fit_clock_and_mount, shift_stream, turn_mount
+from log2sim.localization.surfaces import MAX_SWEEPS, SweepPairs, adjoint_of, choose_sweeps, exp_of, log_of, pair_sweeps
+from log2sim.plan import Sensors
 
 TOP = "top"
 LIDAR = {"channels": 20, "azimuth_step_deg": 1.5}

@@ -25,8 +25,7 @@ from log2sim.errors import ConfigError
 from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
 from log2sim.simulation import follower
-from log2sim.simulation.carla.assets import BY_CATEGORY, nearest_assets
-from log2sim.simulation.carla.data import controller_data
+from log2sim.simulation.carla.data import BY_CATEGORY, controller_data, nearest_assets
 from log2sim.simulation.carla.player import CarlaActor, SampledTrajectory, VehicleController, main, size_table
 from log2sim.simulation.vehicles.parameters import parameters_for
 from log2sim.simulation.vehicles.vehicle import VehicleState

@@ -29,8 +29,7 @@ import carla_server
 from carla_server import Client
 
 from log2sim.simulation.carla import player
-from log2sim.simulation.carla.simulator import CarlaServer as CarlaServer
-from log2sim.simulation.carla.simulator import CarlaSimulator
+from log2sim.simulation.carla.simulator import CarlaServer, CarlaSimulator
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

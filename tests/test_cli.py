@@ -15,9 +15,9 @@ from worlds import tiny_toml
 import log2sim
 from log2sim import Scenario
 from log2sim.cli import entry
-from log2sim.documents import check
 from log2sim.errors import LogError, install_command
-from log2sim.registry import BUILT_IN
+from log2sim.files.documents import check
+from log2sim.files.plugins import BUILT_IN
 
 COMMANDS = (
     "reconstruct",

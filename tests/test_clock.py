@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from log2sim import stage_clock
-from log2sim.stage_clock import StageClock, peak_memory_mib
+from log2sim.files import stages
+from log2sim.files.stages import StageClock, peak_memory_mib
 
 
 class Hand:
@@ -24,7 +24,7 @@ class Hand:
 @pytest.fixture
 def hand(monkeypatch):
     made = Hand()
-    monkeypatch.setattr(stage_clock.time, "perf_counter", made)
+    monkeypatch.setattr(stages.time, "perf_counter", made)
     return made
 
 

@@ -14,8 +14,7 @@ from log2sim.edit.apply import edit
 from log2sim.edit.edits import Remove
 from log2sim.errors import CheckFailed
 from log2sim.simulation import Controls, Observation
-from log2sim.simulation.metrics.limits import require_strict
-from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.metrics.all_metrics import require_strict, summarize
 from log2sim.simulation.result import Replay, to_scenario
 from log2sim.simulation.runner import replay
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from matplotlib import colors as mcolors
 from skimage.color import rgb2lab
 
-from log2sim.color_names import name_indices, name_of, name_probabilities, to_lab, to_rgb
 from log2sim.datatypes import COLOR_NAMES
+from log2sim.datatypes.color_names import name_indices, name_of, name_probabilities, to_lab, to_rgb
 
 channel = st.integers(0, 255)
 

@@ -12,15 +12,23 @@ from hypothesis import strategies as st
 from test_size import T0_NS, measured, moved
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of
-from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, confidence_of, rate_agents
-from log2sim.agents.confidence.systematic import position_terms, speed_terms, with_systematic_errors, yaw_terms
-from log2sim.agents.confidence.weights import (
+from log2sim.agents.confidence import (
+    MAX_CONFIDENCE,
+    MIN_CONFIDENCE,
     POSITION_VARIANCE,
+    SIGNS,
     SPEED_VARIANCE,
     WITH_LIDAR,
     WITHOUT_LIDAR,
     YAW_VARIANCE,
+    Evidence,
+    confidence_of,
+    evidence_of,
+    position_terms,
+    rate_agents,
+    speed_terms,
+    with_systematic_errors,
+    yaw_terms,
 )
 from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate

@@ -13,10 +13,9 @@ from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
 from log2sim import config as config_module
-from log2sim.config import Config
-from log2sim.config_sections import Section, TopdownConfig, TrackConfig
-from log2sim.documents import load_schema
+from log2sim.config import Config, Section, TopdownConfig, TrackConfig
 from log2sim.errors import ConfigError
+from log2sim.files.documents import load_schema
 
 
 def write(folder: Path, text: str) -> Path:

@@ -12,9 +12,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
 
 from log2sim.config import Config
-from log2sim.cooperation.registration import RoadRegistration, register_road
 from log2sim.datatypes import Log
-from log2sim.sensors import choose_detector, select_sensors
+from log2sim.localization.roadside import RoadRegistration, register_road
+from log2sim.plan import choose_detector, select_sensors
 
 POLE = "pole0"
 

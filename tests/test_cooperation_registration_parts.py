@@ -8,17 +8,36 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from log2sim.calibration.twists import exp_of
-from log2sim.cooperation.common_objects import CommonObjects, ObjectTrack, link_boxes, track_of
-from log2sim.cooperation.estimate import Estimate, Sight, add_pose_errors, estimate_error
-from log2sim.cooperation.findings import Findings
-from log2sim.cooperation.free_space import Visibility, look_through
-from log2sim.cooperation.ground_match import common_ground, upright_points
-from log2sim.cooperation.pose_fit import Evidence, MatchedStructure
-from log2sim.cooperation.structure import RoadView, Surfaces, VehicleView, surfaces_of, view_from_road
-from log2sim.cooperation.units import Unit, correct_unit, units_of
 from log2sim.datatypes import Boxes3D, Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
+from log2sim.localization.roadside import (
+    Estimate,
+    Findings,
+    Sight,
+    Unit,
+    add_pose_errors,
+    correct_unit,
+    estimate_error,
+    units_of,
+)
+from log2sim.localization.roadside_fit import (
+    CommonObjects,
+    Evidence,
+    MatchedStructure,
+    ObjectTrack,
+    RoadView,
+    Surfaces,
+    VehicleView,
+    Visibility,
+    common_ground,
+    link_boxes,
+    look_through,
+    surfaces_of,
+    track_of,
+    upright_points,
+    view_from_road,
+)
+from log2sim.localization.surfaces import exp_of
 
 UNIT = Unit(("pole",), (), np.zeros(3))
 ERROR = np.array([0.3, -0.35, 0.2, 0.01, -0.02, 0.025])

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Boxes3D
+from log2sim.synth.raster import first_hit
 from log2sim.synth.scene import Gnss, load_scene
 from log2sim.synth.synthesis import synthesize
-from log2sim.synth.traffic_log import START_NS
-from log2sim.synth.triangles import first_hit
+from log2sim.synth.traffic_data import START_NS
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tools"))

@@ -13,30 +13,43 @@ from hypothesis import strategies as st
 from plain_settings import AGENTS_ALONE
 from worlds import rows_at, tiny_log, tiny_table
 
-from log2sim.agents.ends import Ends, _better_ends
-from log2sim.config import Config
-from log2sim.config_sections import LidarConfig
+from log2sim.agents.size import Ends, _better_ends
+from log2sim.config import Config, LidarConfig, TrackConfig
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.errors import LogError
-from log2sim.evaluation.bench.benchmark import bench
-from log2sim.evaluation.bench.document import document
+from log2sim.evaluation.bench.benchmark import bench, document
 from log2sim.evaluation.detection.detect_log import without_ego
-from log2sim.fusion_level import FusionLevel, fusion_level
 from log2sim.geometry import rectangle_iou, rotation_from_rpy, transform, wrap_angle
-from log2sim.perception.cooperative.alignment import align_parts, moving_boxes
-from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
-from log2sim.perception.cooperative.detector import EndsDetector, create_for_ends, detector_by_mounting
-from log2sim.perception.cooperative.matching import SeenBoxes, match_by_covariance, match_by_overlap
-from log2sim.perception.cooperative.merging import METHODS, fuse_boxes, merge_by_covariance
-from log2sim.perception.cooperative.offset import take_off_offset
-from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
-from log2sim.perception.detect3d.network_detector import open_shipped
-from log2sim.perception.lidar.cloud import Cloud, CloudSensor
-from log2sim.perception.lidar.measure_boxes import follow_box, measure_boxes
-from log2sim.perception.lidar.viewpoints import assemble_cloud, assemble_views, group_by_viewpoint, join_parts
-from log2sim.perception.prefetch import obstacles_of
+from log2sim.perception.alignment import align_parts, moving_boxes
+from log2sim.perception.cooperative import (
+    METHODS,
+    BoxErrors,
+    EndsDetector,
+    SeenBoxes,
+    create_for_ends,
+    detector_by_mounting,
+    estimate_errors,
+    fuse_boxes,
+    match_by_covariance,
+    match_by_overlap,
+    merge_by_covariance,
+    take_off_offset,
+)
+from log2sim.perception.detect3d.detectors import open_shipped
+from log2sim.perception.detect3d.network import level_points, viewpoints_xy
+from log2sim.perception.first_pass import obstacles_of
+from log2sim.perception.lidar.cloud import (
+    Cloud,
+    CloudSensor,
+    assemble_cloud,
+    assemble_views,
+    group_by_viewpoint,
+    join_parts,
+)
+from log2sim.perception.lidar.measure import follow_box, measure_boxes
 from log2sim.pipeline import reconstruct
-from log2sim.tracking.merging import merge_tracks, track_ends, velocities
+from log2sim.plan import FusionLevel, fusion_level
+from log2sim.tracking.tracker import merge_tracks, track_ends, velocities
 
 POST = {
     "name": "post",
@@ -357,8 +370,8 @@ def test_both_ends_share_the_life_of_a_short_track() -> None:
         return [track.measurements.take(track.tick == k) if k in track.tick else empty for k in ticks]
 
     a, b = track_of([2, 3, 4], line([2, 3, 4], 5.0)), track_of([5, 6, 7], line([5, 6, 7], 5.0), end=1)
-    options = {"birth_score": 0.4, "max_gap_s": 1.0, "min_life_s": 0.5}
-    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), **options)
+    config = TrackConfig(birth_score=0.4, max_gap_s=1.0, min_life_s=0.5)
+    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), config)
     assert found.tick.tolist() == [2, 3, 4, 5, 6, 7]
 
 

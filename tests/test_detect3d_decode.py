@@ -7,9 +7,18 @@ import pytest
 from lidar_networks import NAMES, empty_maps, encode, info
 
 from log2sim.geometry import box_corners_bev, overlap_area, wrap_angle
-from log2sim.perception.detect3d.centers import MAX_PEAKS, MIN_HEAT, decode_centers, peaks
-from log2sim.perception.detect3d.level_boxes import LevelBoxes, headings, sigmoid
-from log2sim.perception.detect3d.suppression import Rectangles, shared_area, suppress
+from log2sim.perception.detect3d.boxes import (
+    MAX_PEAKS,
+    MIN_HEAT,
+    LevelBoxes,
+    Rectangles,
+    decode_centers,
+    headings,
+    peaks,
+    shared_area,
+    sigmoid,
+    suppress,
+)
 
 LOW = np.array([-20.0, -12.0])
 SIZES = {

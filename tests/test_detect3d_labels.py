@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from test_detect_labels import CAR, SECOND, log_with
 
-from log2sim import registry
-from log2sim.config import Config
-from log2sim.config_sections import LidarConfig
+from log2sim.config import Config, LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
+from log2sim.files import plugins
 from log2sim.geometry import Array, box_corners_bev, points_in_box
 from log2sim.perception.detect3d.box_points import bounding_reach, most_points, points_of_boxes
 from log2sim.perception.detect3d.detectors import create_lidar_detector
@@ -82,7 +81,7 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
 
 
 def test_a_plug_in_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registry.BUILT_IN["lidar_detector"], "mine", "log2sim.perception.detect3d.labels:create")
+    monkeypatch.setitem(plugins.BUILT_IN["lidar_detector"], "mine", "log2sim.perception.detect3d.detectors:create")
     log = log_with((0, "car", (0.0, 0.0, 0.0), CAR))
     assert create_lidar_detector("lidar:mine", log, Config().lidar).name == "lidar:labels"
 

@@ -14,14 +14,14 @@ import pytest
 from lidar_networks import INFO, empty_maps, encode, info, write_network
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.perception.detect3d import level_points, network, network_detector
-from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
+from log2sim.perception.detect3d import detectors, network
+from log2sim.perception.detect3d import network as level_points
+from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, create_lidar_detector
 from log2sim.perception.detect3d.network import Network, NetworkInfo
-from log2sim.perception.detect3d.network_detector import NetworkDetector
 from log2sim.perception.lidar.cloud import Cloud
 
 ORIGIN = np.array([5000.0, -300.0, 12.0])
@@ -72,7 +72,7 @@ def fixed(monkeypatch: pytest.MonkeyPatch, *boxes: tuple[str, Sequence[float]], 
     """A detector that finds the boxes, on a grid of always the same window."""
     chosen: dict[str, Any] = {"decode": "centers", "min_score": None, "info": info(), **settings}
     known = FixedNetwork(boxes, chosen["info"], [])
-    monkeypatch.setattr(network_detector, "grid_window", lambda *_, **__: (known.low, (256, 256)))
+    monkeypatch.setattr(detectors, "grid_window", lambda *_, **__: (known.low, (256, 256)))
     return NetworkDetector("fixed", known, chosen["decode"], 40.0, chosen["min_score"])  # type: ignore[arg-type]
 
 
@@ -355,7 +355,7 @@ def test_a_range_that_no_grid_covers_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["vehicle", "roadside"])
 def test_missing_weights_are_one_clear_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(network_detector, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(detectors, "WEIGHTS", tmp_path)
     with pytest.raises(ConfigError, match=rf"detector 'lidar:{name}': its network .*{name}\.onnx is missing"):
         create_lidar_detector(f"lidar:{name}", LOG, LidarConfig())
     taller_is_hotter(tmp_path).rename(tmp_path / f"{name}.onnx")

@@ -14,11 +14,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 from lidar_training.clouds import draw_example
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion, match
+from log2sim.evaluation.detection.protocols import Criterion, match
 from log2sim.geometry import wrap_angle
-from log2sim.perception.detect3d.network_detector import WEIGHTS, describe_weakness, open_shipped
+from log2sim.perception.detect3d.detectors import WEIGHTS, describe_weakness, open_shipped
 
 VEHICLES = ("car", "truck", "bus")
 

@@ -9,8 +9,7 @@ import pytest
 from lidar_networks import empty_maps, encode, info
 from numpy.typing import NDArray
 
-from log2sim.perception.detect3d.level_boxes import LevelBoxes, sigmoid
-from log2sim.perception.detect3d.votes import bandwidths_m, cluster, decode_votes, mean_shift
+from log2sim.perception.detect3d.boxes import LevelBoxes, bandwidths_m, cluster, decode_votes, mean_shift, sigmoid
 
 LOW = np.array([-10.0, -10.0])
 CAR = (4.4, 1.8, 1.5)

@@ -9,10 +9,17 @@ import pytest
 
 from log2sim.datatypes import GROUP_OF, Detections
 from log2sim.geometry import box_iou
-from log2sim.perception.detect.preprocessing import InputSpec, Preprocessing, resize_as_tf1
-from log2sim.perception.detect.riders import join_riders
-from log2sim.perception.detect.suppression import suppress
-from log2sim.perception.detect.tiling import MAX_AUTO_TILES, OVERLAP, Tile, auto_tile_count, merge, plan_tiles
+from log2sim.perception.detect.layouts import InputSpec, Preprocessing, resize_as_tf1
+from log2sim.perception.detect.onnx_detector import (
+    MAX_AUTO_TILES,
+    OVERLAP,
+    Tile,
+    auto_tile_count,
+    join_riders,
+    merge,
+    plan_tiles,
+    suppress,
+)
 
 
 def detections(*rows: tuple[str, float, tuple[float, float, float, float]]) -> Detections:

@@ -11,8 +11,13 @@ import pytest
 from log2sim.datatypes import Detections, Frame, ImageLabels, Labels, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera, transform
-from log2sim.perception.detect.detectors import create_detector
-from log2sim.perception.detect.label_motion import LabelBoxes, drop_repeated_objects, interpolate_boxes, mutual_nearest
+from log2sim.perception.detect.detectors import (
+    LabelBoxes,
+    create_detector,
+    drop_repeated_objects,
+    interpolate_boxes,
+    mutual_nearest,
+)
 
 # Looks along map x from the origin, 1000 px focal length.
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -13,10 +13,11 @@ import pytest
 from log2sim.datatypes import Detections, Frame, Log
 from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Camera, box_iou
-from log2sim.perception.detect import ssd_convert, ssd_mobilenet
-from log2sim.perception.detect.classes import COCO_91
+from log2sim.perception.detect import ssd_mobilenet
+from log2sim.perception.detect import ssd_mobilenet as ssd_convert
 from log2sim.perception.detect.detectors import create_detector
-from log2sim.perception.detect.ssd_graph import fields, read_graph, read_tensor
+from log2sim.perception.detect.layouts import COCO_91
+from log2sim.perception.detect.ssd_mobilenet import fields, read_graph, read_tensor
 
 LOG = Log("empty", "log2sim", {}, {}, {})
 DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync/image_02/data"
@@ -165,7 +166,7 @@ def test_conversion_is_kept_and_repeated_only_when_the_file_changed(
 
 @needs_weights
 def test_anchors_tile_the_picture_as_the_paper_says() -> None:
-    from log2sim.perception.detect.ssd_convert import anchor_boxes
+    from log2sim.perception.detect.ssd_mobilenet import anchor_boxes
 
     anchors = anchor_boxes()
     assert anchors.shape == (1917, 4)

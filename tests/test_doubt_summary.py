@@ -9,10 +9,10 @@ import pytest
 from export_worlds import straight, world
 from test_layers import ROOT
 
-from log2sim.agents.smooth.feasibility import PHRASES
-from log2sim.cli.run_summary import doubt_lines
+from log2sim.agents.smooth.motion_model import PHRASES
+from log2sim.cli.reconstruct import doubt_lines
 from log2sim.datatypes import FLAGS, Agent, Doubt
-from log2sim.datatypes.doubtful import MAX_LISTED
+from log2sim.datatypes.agent import MAX_LISTED
 
 PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4)
 

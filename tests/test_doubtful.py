@@ -19,7 +19,7 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.export.exporters import Options, export, formats, with_doubtful
 from log2sim.export.openscenario.read import load
-from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.metrics.all_metrics import summarize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 

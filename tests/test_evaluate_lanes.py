@@ -11,14 +11,12 @@ import pytest
 from worlds import CAR, PARKED, tiny_log, tiny_scene
 
 from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario, Signal
-from log2sim.documents import check
 from log2sim.errors import ScenarioError
-from log2sim.evaluation.lanes.area import Area, sampled
-from log2sim.evaluation.lanes.figures import map_figures
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import format_table
-from log2sim.evaluation.signals import signal_figures
-from log2sim.synth.map_truth import map_features_of
+from log2sim.evaluation.road import Area, map_figures, sampled, signal_figures
+from log2sim.files.documents import check
+from log2sim.synth.truth import map_features_of
 
 ROAD = {"line": [[-60.0, 0.0], [80.0, 0.0]], "width_m": 8.0, "marking": "solid", "color": "white"}
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from command_line import names, run
 
-from log2sim import registry
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError, install_command
 from log2sim.export.exporters import Options, export, formats
+from log2sim.files import plugins
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
@@ -65,7 +65,7 @@ def test_a_format_does_not_replace_files_unasked(name: str, scenario: Scenario, 
 
 
 def test_a_format_says_what_it_loses_and_which_options_it_has(name: str) -> None:
-    exporter = registry.load("export", name)
+    exporter = plugins.load("export", name)
     assert exporter.loses
     assert set(exporter.options) <= {f.name for f in fields(Options)}
 
@@ -121,9 +121,9 @@ def test_a_projection_that_no_file_can_hold_is_refused(projection: str, scenario
 def test_a_missing_package_names_its_extra(
     to: str, module: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for loaded in [name for name in sys.modules if name.startswith("log2sim.export.viewers.foxglove")]:
+    for loaded in [name for name in sys.modules if name.startswith("log2sim.export.viewers")]:
         monkeypatch.delitem(sys.modules, loaded)
-    monkeypatch.delattr("log2sim.export.viewers.foxglove", raising=False)
+    monkeypatch.delattr("log2sim.export.viewers", raising=False)
     monkeypatch.setitem(sys.modules, module, None)
     ran = run("export", SAMPLE, "--to", to, "--out", tmp_path / "out")
     assert ran.code == 5
@@ -205,7 +205,7 @@ def test_what_each_format_loses_stands_in_the_readme() -> None:
     spec.loader.exec_module(tool)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert tool.with_table(readme) == readme
-    assert tool.table().count("\n") == 2 + len(registry.BUILT_IN["export"])
+    assert tool.table().count("\n") == 2 + len(plugins.BUILT_IN["export"])
 
 
 def test_a_writer_that_fails_leaves_nothing_behind(
@@ -219,7 +219,7 @@ def test_a_writer_that_fails_leaves_nothing_behind(
             (folder / "half").write_text("written")
             raise ScenarioError("agent 'x': cannot be held")
 
-    monkeypatch.setattr(registry, "load", lambda kind, name: Failing())
+    monkeypatch.setattr(plugins, "load", lambda kind, name: Failing())
     with pytest.raises(ScenarioError, match="agent 'x'"):
         export(scenario, "failing", tmp_path / "out")
     assert names(tmp_path) == []
@@ -229,6 +229,6 @@ def test_third_parties_add_formats_by_entry_points(
     scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     theirs = EntryPoint("theirs", "log2sim.export.csv_table:EXPORTER", "log2sim.export")
-    monkeypatch.setattr(registry, "installed", lambda kind: [theirs] if f"log2sim.{kind}" == theirs.group else [])
+    monkeypatch.setattr(plugins, "installed", lambda kind: [theirs] if f"log2sim.{kind}" == theirs.group else [])
     assert formats()[-1] == "theirs"
     assert [f.name for f in export(scenario, "theirs", tmp_path / "out")] == ["agents.csv"]

@@ -13,8 +13,7 @@ from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import MissingExtra, ScenarioError
 from log2sim.export import checks
 from log2sim.export.checks import export_notes, overlaps_at_entry, require_exportable, require_start_as_in_scenario
-from log2sim.export.exporters import export
-from log2sim.export.sampling import step_times
+from log2sim.export.exporters import export, step_times
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

@@ -15,8 +15,7 @@ from test_lane_graph import cross
 
 from log2sim.datatypes import MapFeatures, Marking, RoadBorder, Scenario, Signal
 from log2sim.export.exporters import export
-from log2sim.export.roads.lanes import lanes
-from log2sim.export.roads.signal_lanes import signal_lanes
+from log2sim.export.roads.opendrive import lanes, signal_lanes
 
 
 def along(y_m: float, first_m: float = -40.0, last_m: float = -9.0) -> np.ndarray:

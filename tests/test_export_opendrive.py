@@ -15,7 +15,7 @@ from export_readers import Sampled, distance, play, roads
 from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import Options, export
-from log2sim.export.roads.checks import require_roads
+from log2sim.export.roads.opendrive import require_roads
 from log2sim.export.roads.reference_line import ReferenceLine, fit, straight
 from log2sim.geometry import Array
 
@@ -248,11 +248,11 @@ def link_of(road: ElementTree.Element, tag: str) -> dict[str, str]:
     return {} if link is None else dict(link.attrib)
 
 
-@pytest.mark.parametrize("made", ["leaving", "crossing", "beside", "sample"])
+@pytest.mark.parametrize("made", ["leaving", "crossing", "beside", "oncoming", "sample"])
 def test_linked_lanes_meet_without_gap_or_kink(made: str, tmp_path: Path) -> None:
-    """Positions and headings at both sides of every link, walked by the reader of the tests, and links lead back."""
+    """Positions, widths and headings at both sides of every link, walked by the reader of the tests, and links lead back."""
     turn = agent(np.concatenate([line(30.0, 31), bend()[1:] + np.array([30.0, 0.0])]), "leaving", yaw_rad=np.concatenate([np.zeros(31), np.linspace(0, np.pi / 2, 60)[1:]]))  # fmt: skip
-    others = {"leaving": turn, "crossing": agent(line(40.0, 41, 1.2, (30.0, -20.0)), "crossing"), "beside": agent(line(40.0, 41, start=(5.0, 3.9)), "beside")}  # fmt: skip
+    others = {"leaving": turn, "crossing": agent(line(40.0, 41, 1.2, (30.0, -20.0)), "crossing"), "beside": agent(line(40.0, 41, start=(5.0, 3.9)), "beside"), "oncoming": agent(line(40.0, 41, np.pi, (50.0, 4.4)), "oncoming")}  # fmt: skip
     world = Scenario.load(SAMPLE) if made == "sample" else scenario(agent(line(60.0, 61)), others[made])
     found = {r.road.attrib["id"]: r for r in network(tmp_path, world)}
     met = 0
@@ -261,23 +261,70 @@ def test_linked_lanes_meet_without_gap_or_kink(made: str, tmp_path: Path) -> Non
         if link.get("elementType") != "road":
             continue
         other = found[link["elementId"]]
-        assert link["contactPoint"] == "start"
-        for lane in road.road.iterfind("lanes/laneSection/right/lane"):
+        point = {"start": 0, "end": -1}[link["contactPoint"]]
+        for lane in road.road.iterfind("lanes/laneSection/*/lane"):
             if lane.find("link/successor") is None:
                 continue
-            one, two = (
-                road.centers[int(lane.attrib["id"])],
-                other.centers[int(lane.find("link/successor").attrib["id"])],
-            )
-            np.testing.assert_allclose(one[-1], two[0], atol=0.005)
-            ahead = [np.arctan2(*(p[1] - p[0])[1::-1]) for p in (one[-2:], two[:2])]
+            own, linked = int(lane.attrib["id"]), int(lane.find("link/successor").attrib["id"])
+            one, two = road.centers[own], other.centers[linked]
+            assert road.widths[own][-1] == pytest.approx(other.widths[linked][point], abs=1e-3)
+            np.testing.assert_allclose(one[-1], two[point], atol=0.005)
+            ahead = [np.arctan2(*(p[1] - p[0])[1::-1]) for p in (one[-2:], two[:2] if point == 0 else two[:-3:-1])]
             assert abs(np.angle(np.exp(1j * (ahead[1] - ahead[0])))) < 0.02
             met += 1
-        back = link_of(other.road, "predecessor")
+        back = link_of(other.road, "successor" if point else "predecessor")
         assert back["elementId"] == (
             road.road.attrib["id"] if back["elementType"] == "road" else road.road.attrib["junction"]
         )
     assert met > 0
+
+
+def test_lanes_that_lead_opposite_ways_are_one_road_where_both_are(tmp_path: Path) -> None:
+    """With lane ids on both sides of the line between them, and linked with what goes on of the longer one."""
+    back = agent(line(30.0, 31, np.pi, (45.0, 3.6)), "back")
+    found = {r.road.attrib["id"]: r for r in network(tmp_path, scenario(agent(line(90.0, 91)), back))}
+    (both,) = (r for r in found.values() if len(r.centers) == 2)
+    assert set(both.centers) == {1, -1}
+    on = (both.line[:, 0] > 16) & (both.line[:, 0] < 44)
+    middles = {id: center[on, 1] for id, center in both.centers.items()}
+    ahead = min(middles, key=lambda id: middles[id].mean())
+    np.testing.assert_allclose(middles[ahead], 0.0, atol=0.06)
+    np.testing.assert_allclose(middles[-ahead], 3.6, atol=0.06)
+    assert 29 < float(both.road.attrib["length"]) < 32
+    for tag in ("predecessor", "successor"):
+        other = found[both.road.find(f"link/{tag}").attrib["elementId"]]
+        assert set(other.centers) == {-1}
+        linked = {id: both.road.find(f".//lane[@id='{id}']/link/{tag}") is not None for id in both.centers}
+        assert linked == {ahead: True, -ahead: False}
+
+
+def test_lanes_of_left_hand_traffic_stay_roads_of_their_own(tmp_path: Path) -> None:
+    """The line of a road lies to the left of the lanes along it, where in left-hand traffic the edge of the road is."""
+    back = agent(line(30.0, 31, np.pi, (45.0, -3.6)), "back")
+    for r in network(tmp_path, scenario(agent(line(90.0, 91)), back)):
+        assert set(r.centers) == {-1}
+        assert all(float(w.attrib["a"]) > 2 for w in r.road.iter("width"))
+
+
+def test_the_sample_s_two_way_roads_have_their_lanes_in_one_road_and_lose_no_link(tmp_path: Path) -> None:
+    """Every link of the scenario's lanes is in the file: from road to road, or through a connecting road."""
+    world = Scenario.load(SAMPLE)
+    found = network(tmp_path, world)
+    assert sorted(len(r.centers) for r in found if r.road.attrib["junction"] == "-1")[-4:] == [2, 2, 2, 2]
+    links = 0
+    for r in found:
+        if r.road.attrib["junction"] == "-1":
+            continue
+        for tag in ("predecessor", "successor"):
+            link = r.road.find(f"link/{tag}").attrib
+            (other,) = (o for o in found if o.road.attrib["id"] == link["elementId"])
+            lane = int(r.road.find(f"lanes/laneSection/right/lane/link/{tag}").attrib["id"])
+            there, here = {"start": 0, "end": -1}[link["contactPoint"]], {"predecessor": 0, "successor": -1}[tag]
+            np.testing.assert_allclose(other.centers[lane][there], r.centers[-1][here], atol=0.005)
+            leaving = (lane < 0) == (link["contactPoint"] == "end")
+            assert leaving == (tag == "predecessor")
+            links += 1
+    assert links == sum(len(a.predecessors) + len(a.successors) for a in world.map_features.lanes if a.junction)
 
 
 def test_a_road_leads_the_way_that_a_reversing_ego_faces(tmp_path: Path) -> None:
@@ -307,11 +354,41 @@ def test_sumo_8445_local_plus_offset_are_coordinates_of_the_projection(tmp_path:
     """eclipse-sumo/sumo#8445, #12802; esmini#189; carla#2383: where the local origin lies has to be in the file."""
     export(scenario(agent(bend() + np.array([25_300.0, 0.0]))), "openscenario", tmp_path)
     header = ElementTree.parse(tmp_path / "road.xodr").find("header")
-    assert header.findtext("geoReference") == UTM.projection
     offset = [float(header.find("offset").attrib[k]) for k in "xyz"]
     assert offset == [456000.0 + 25000.0, 5428000.0, 100.0]
     (road,) = roads(tmp_path / "road.xodr")
     assert road.line[0, 0] == pytest.approx(290.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [
+        UTM.projection,
+        "+proj=utm +zone=56 +south +ellps=WGS84 +units=m +no_defs +type=crs",
+        "+proj=tmerc +lat_0=49.0069 +lon_0=8.4037 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs",
+        "+proj=merc +R=6378137 +lon_0=8.4228 +k_0=0.6559 +x_0=0 +y_0=-4117000.7 +units=m +no_defs",
+        "+proj=aeqd +R=6371000 +lat_0=1.29 +lon_0=103.78 +x_0=0 +y_0=0 +units=m +no_defs",
+    ],
+)
+def test_the_geo_reference_gives_latitude_and_longitude_in_the_words_of_esmini(projection: str, tmp_path: Path) -> None:
+    """A position of the road's file has within 1 mm the place that PROJ computes from the scenario."""
+    from pyproj import Geod, Proj
+
+    offset = (456000.0, 5428000.0, 100.0) if "utm" in projection else (0.0, 0.0, 0.0)
+    world = scenario(agent(bend() + np.array([25_300.0, 0.0])), map=MapFrame(projection=projection, offset_m=offset))
+    export(world, "openscenario", tmp_path)
+    header = ElementTree.parse(tmp_path / "road.xodr").find("header")
+    words = dict(word.partition("=")[::2] for word in header.findtext("geoReference").split())
+    known = "a axis b ellps k k_0 lat_0 lon_0 lon_wrap over pm proj units vunits x_0 y_0 datum geoidgrids zone towgs84"
+    assert {w.removeprefix("+") for w in words} <= set(known.split())
+    assert {"+lat_0", "+lon_0"} <= set(words)
+    shift = np.array([float(header.find("offset").attrib[k]) for k in "xy"])
+    (_, x, y, *_), *_ = play(tmp_path / "scenario.xosc")["ego"].vertices
+    own = Proj(header.findtext("geoReference"))(x + shift[0], y + shift[1], inverse=True)
+    to_scenario = shift - offset[:2]
+    truth = Proj(projection)(x + to_scenario[0] + offset[0], y + to_scenario[1] + offset[1], inverse=True)
+    assert Geod(ellps="WGS84").inv(*own, *truth)[2] < 1e-3
+    assert abs(own[1]) > 1
 
 
 def test_scenarionet_103_the_shift_is_in_the_files_and_undone_by_an_import(tmp_path: Path) -> None:

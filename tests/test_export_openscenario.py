@@ -131,10 +131,56 @@ def test_axles_stand_within_the_box_and_the_front_one_before_the_rear(tmp_path: 
         assert 0 < front < 4.6
 
 
-def test_a_color_is_told_as_players_read_it(tmp_path: Path) -> None:
+def test_a_color_is_told_as_players_read_it(revision: str, tmp_path: Path) -> None:
+    """ScenarioRunner plays 1.0 and splits at commas; esmini prints an error for everything but hexadecimal digits."""
+    from log2sim.export.openscenario.read import load
+
     red = agent(line(), color={"rgb": [200, 10, 0], "name": "red"})
-    assert written(tmp_path, scenario(red))["ego"].properties()["color"] == "200,10,0"
+    expected = "200,10,0" if revision == "1.0" else "#C80A00"
+    assert written(tmp_path, scenario(red), revision)["ego"].properties()["color"] == expected
+    assert load(tmp_path / "scenario.xosc").agents[0].color == {"rgb": [200, 10, 0], "name": "red"}
     assert "color" not in written(tmp_path, scenario(agent(line())))["ego"].properties()
+
+
+def test_an_external_ego_has_a_place_a_speed_and_a_controller_and_no_trajectory(revision: str, tmp_path: Path) -> None:
+    """The conventions of esmini's ExternalController, and of ScenarioRunner's external_control in 1.0."""
+    followed = written(tmp_path, guest(), revision)
+    export(guest(), "openscenario", tmp_path, Options(revision=revision, ego="external"), overwrite=True)
+    ego, guest_ = (play(tmp_path / "scenario.xosc")[name] for name in ("ego", "guest"))
+    assert len(ego.vertices) == 0
+    assert not ego.events
+    np.testing.assert_array_equal(guest_.vertices, followed["guest"].vertices)
+    assert ego.init.find(".//WorldPosition").attrib == followed["ego"].init.find(".//WorldPosition").attrib
+    assert float(ego.init.find(".//AbsoluteTargetSpeed").attrib["value"]) == pytest.approx(5.0)
+    root = ElementTree.parse(tmp_path / "scenario.xosc").getroot()
+    assert len(list(root.iter("ControllerAction"))) == 1
+    if revision == "1.0":
+        (module,) = ego.init.iterfind(".//AssignControllerAction/Controller/Properties/Property")
+        assert module.attrib == {"name": "module", "value": "external_control"}
+        overridden = ego.init.find(".//OverrideControllerValueAction")
+        assert {node.attrib["active"] for node in overridden} == {"false"}
+        assert len(overridden) == 6
+    else:
+        properties = ego.node.find("ObjectController/Controller/Properties")
+        assert {p.attrib["name"]: p.attrib["value"] for p in properties}["esminiController"] == "ExternalController"
+        activated = ego.init.find(".//ControllerAction/ActivateControllerAction")
+        assert activated.attrib == {"longitudinal": "true", "lateral": "true"}
+
+
+def test_an_external_ego_has_to_be_there_on_wheels_from_the_start(tmp_path: Path) -> None:
+    late, walker = agent(line(), first_s=1.0), agent(line(), category="pedestrian")
+    for world in (scenario(agent(line(), "car-1")), scenario(late), scenario(walker)):
+        with pytest.raises(ConfigError, match="--ego external"):
+            export(world, "openscenario", tmp_path, Options(ego="external"))
+    with pytest.raises(ConfigError, match="has no such option"):
+        export(scenario(agent(line())), "csv", tmp_path, Options(ego="external"))
+    scenario(agent(line())).save(tmp_path / "s.json")
+    result = run("export", tmp_path / "s.json", "--to", "openscenario", "--ego", "external", "--out", tmp_path / "out")
+    assert result.code == 0
+    assert len(play(tmp_path / "out" / "scenario.xosc")["ego"].vertices) == 0
+    scenario(agent(line(), "external")).save(tmp_path / "named.json")
+    result = run("export", tmp_path / "named.json", "--to", "csv", "--ego", "external", "--out", tmp_path / "csv")
+    assert result.code == 0
 
 
 def test_ids_become_unique_names_and_stay_known(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from test_measure import boxes, cloud_of, view_ahead
 from worlds import scan, standing
 
-from log2sim.perception.lidar.few_points import measure_few_points
+from log2sim.perception.lidar.clusters import measure_few_points
 from log2sim.perception.lidar.measure import measure_view
 
 PERSON = (0.4, 0.4, 1.75)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from log2sim import documents
-from log2sim.documents import read_json, refuse_existing, replaced, rounded, write_json
 from log2sim.errors import ConfigError, LogError, ScenarioError
+from log2sim.files import documents
+from log2sim.files.documents import read_json, refuse_existing, replaced, rounded, write_json
 
 
 def test_a_file_appears_whole(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from worlds import camera_ahead, outline_px, scan, standing
 from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
 from log2sim.errors import LogError, RecordError
+from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import base_pose, observe
 from log2sim.perception.frames import RecordReader
@@ -19,9 +20,7 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
-from log2sim.plan import make_plan
-from log2sim.sensors import select_sensors
-from log2sim.stage_clock import StageClock
+from log2sim.plan import make_plan, select_sensors
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -9,7 +9,7 @@ import pytest
 from worlds import measured_row, rows_at, scan, standing
 
 from log2sim.datatypes import Measurements
-from log2sim.perception.box_fitting import rotate
+from log2sim.perception.boxes import rotate
 from log2sim.perception.fusion import fuse_tick
 
 T0_NS = 1_700_000_000_000_000_000

@@ -12,9 +12,8 @@ from worlds import tiny_log
 from log2sim import Config, reconstruct
 from log2sim.datatypes import Boxes3D, Detections, Frame, Log
 from log2sim.errors import PluginError
-from log2sim.perception.detect.checked_detector import FunctionDetector, detections_of
-from log2sim.perception.detect.detectors import create_detector
-from log2sim.perception.given_detectors import sort_detectors
+from log2sim.perception.detect.detectors import FunctionDetector, create_detector, detections_of
+from log2sim.perception.run_detectors import sort_detectors
 
 
 @pytest.fixture(scope="module")

@@ -10,15 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.ego import ego_agent, with_pose_errors
+from log2sim.agents.estimate import ego_agent, with_pose_errors
 from log2sim.datatypes import FAULT_KINDS, Agent, Log, Stream, Waypoints
 from log2sim.geometry import Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
-from log2sim.localization.checked_poses import CheckedPoses
 from log2sim.localization.choice import localize_like
-from log2sim.localization.given_poses import MAX_SIGMA_M, check_poses
-from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR, fit_path
-from log2sim.localization.path_noise import noise_of
-from log2sim.localization.pose_faults import list_faults
+from log2sim.localization.given_poses import MAX_SIGMA_M, CheckedPoses, check_poses, list_faults
+from log2sim.localization.path import POSITION_PRIOR, YAW_PRIOR, fit_path, noise_of
 
 NS = 1_000_000_000
 

@@ -8,8 +8,7 @@ from worlds import Solid, camera_ahead, scan, standing
 
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.lidar.ground import Ground, estimate_ground
-from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.perception.lidar.cloud import Ground, assemble_cloud, estimate_ground
 
 T0_NS = 1_700_000_000_000_000_000
 

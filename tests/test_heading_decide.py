@@ -9,8 +9,8 @@ import pytest
 from worlds import rows_at
 
 from log2sim.agents.candidate import Timeline, candidate_of
-from log2sim.agents.heading.course import turn_to_courses
-from log2sim.agents.heading.decide import decide_headings
+from log2sim.agents.heading import decide_headings
+from log2sim.agents.moving import turn_to_courses
 from log2sim.agents.size import TrackGeometry
 from log2sim.config import Config
 from log2sim.datatypes import TYPICAL_SIZE_M, Boxes3D, Doubt, Track, Waypoints

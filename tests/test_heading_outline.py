@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from test_size import bare
 
-from log2sim.agents.heading import outline
+from log2sim.agents import heading
 from log2sim.datatypes import Waypoints
-from log2sim.perception.box_fitting import rotate
+from log2sim.perception.boxes import rotate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import fit_outline
@@ -38,7 +38,7 @@ def odds_of(seen, turn=0.0, shift=(0.0, 0.0), yaw=0.0, ground_m=0.0):
         t_s=t, x_m=np.full(2, shift[0]), y_m=np.full(2, shift[1]), z_m=np.zeros(2), yaw_rad=np.full(2, turn + yaw),
         speed_mps=np.zeros(2), observed=np.ones(2, dtype=bool), sigma_xy_m=np.full(2, 0.1),
     )  # fmt: skip
-    return outline.outline_log_odds(replace(track, measurements=m), w, np.array([0.0, 0.1, 0.2]), tuple(seen.size_m))
+    return heading.outline_log_odds(replace(track, measurements=m), w, np.array([0.0, 0.1, 0.2]), tuple(seen.size_m))
 
 
 def test_most_fronts_are_found_and_sure_ones_are_right(vehicles):
@@ -60,8 +60,8 @@ def test_a_box_that_ends_too_early_is_as_long_as_its_points(vehicles):
         key=lambda v: len(v.xyz) * (np.ptp(v.xyz[:, 0]) > 0.95 * v.size_m[0]),
     )
     size = seen.size_m * [0.85, 1.0, 1.0]
-    short = outline.outline_of(seen.xyz, size, seen.view_m)
-    exact = outline.outline_of(seen.xyz, seen.size_m, seen.view_m)
+    short = heading.outline_of(seen.xyz, size, seen.view_m)
+    exact = heading.outline_of(seen.xyz, seen.size_m, seen.view_m)
     assert np.mean(short.cells != exact.cells) < 0.08
 
 
@@ -72,17 +72,17 @@ def test_neighbors_behind_a_gap_and_the_ground_are_no_part_of_it():
         [side[:50] * 0.1 + [2.9, 0.0, 1.0], side[:50] * [1, 1, 0], side[:50] + np.array([0.0, 1.0, 0.0])]
     )
     alone, among = (
-        outline.outline_of(p, np.array([4.4, 1.8, 1.5]), np.array([0.0, 9.0]))
+        heading.outline_of(p, np.array([4.4, 1.8, 1.5]), np.array([0.0, 9.0]))
         for p in (side, np.vstack([side, others]))
     )
     np.testing.assert_array_equal(alone.cells, among.cells)
 
 
 def test_few_points_say_nothing():
-    assert outline.outline_of(np.ones((5, 3)), np.array([4.4, 1.8, 1.5]), np.array([9.0, 9.0])) is None
+    assert heading.outline_of(np.ones((5, 3)), np.array([4.4, 1.8, 1.5]), np.array([9.0, 9.0])) is None
     track = bare([(5.0, 5.0)] * 3)
     w = Waypoints(
         t_s=np.zeros(1), x_m=np.ones(1), y_m=np.ones(1), z_m=np.ones(1), yaw_rad=np.ones(1), speed_mps=np.zeros(1),
         observed=np.ones(1, dtype=bool), sigma_xy_m=np.ones(1),
     )  # fmt: skip
-    assert outline.outline_log_odds(track, w, np.arange(3.0), (4.4, 1.8, 1.5)) == 0.0
+    assert heading.outline_log_odds(track, w, np.arange(3.0), (4.4, 1.8, 1.5)) == 0.0

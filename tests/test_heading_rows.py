@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from log2sim.agents.heading.rows import ALIKE_ACROSS, ALIKE_ALONG, find_rows, headings_of
-from log2sim.log_odds import probability_of
+from log2sim.agents.heading import ALIKE_ACROSS, ALIKE_ALONG, find_rows, headings_of
+from log2sim.datatypes.log_odds import probability_of
 
 
 def rows_of(poses, lengths_m=None, stands=None):

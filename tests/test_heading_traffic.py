@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.agents.heading.traffic import MEETING_LOG_ODDS, USUALLY_RIGHT, side_log_odds, street_axis, street_log_odds
-from log2sim.perception.box_fitting import rotate
+from log2sim.agents.heading import MEETING_LOG_ODDS, USUALLY_RIGHT, side_log_odds, street_axis, street_log_odds
+from log2sim.perception.boxes import rotate
 
 ANGLES = st.floats(-np.pi, np.pi)
 

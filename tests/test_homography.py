@@ -24,11 +24,17 @@ from log2sim.geometry import (
     rotation_from_rpy,
     transform,
 )
-from log2sim.perception.homography.camera_fit import FOOT_SIGMA_PX, fit_camera
 from log2sim.perception.homography.correspondences import Correspondences, foot_points
-from log2sim.perception.homography.estimate import METHODS, EstimationOptions, estimate_homography
+from log2sim.perception.homography.estimate import (
+    FOOT_SIGMA_PX,
+    METHODS,
+    EstimationOptions,
+    estimate_homography,
+    fit_camera,
+    place_obstacle,
+    spanned_height_m,
+)
 from log2sim.perception.homography.fit import HomographyFit
-from log2sim.perception.homography.placement import place_obstacle, spanned_height_m
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])

@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 
 from log2sim.geometry import apply_homography, rotation_from_rpy
-from log2sim.perception.homography.baselines import ground_from_sizes
-from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.correspondences import Correspondences, ground_from_sizes
 from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
 from log2sim.perception.homography.fit import HomographyFit
-from log2sim.perception.homography.hypotheses import draw_samples, solve_samples
 from log2sim.perception.homography.normalized import (
     CHI2_2DOF_99,
     NormalizedCorrespondences,
     bounded_losses,
+    linearize,
+    nearest_poses,
+    noise_factors,
+    pose_tangent,
+    scale_free_basis,
     squared_errors,
 )
-from log2sim.perception.homography.planar_pose import nearest_poses, pose_tangent
-from log2sim.perception.homography.refine import linearize, noise_factors, scale_free_basis
+from log2sim.perception.homography.ransac import draw_samples, solve_samples
 
 K = np.array([[2050.0, 0.0, 960.0], [0.0, 2050.0, 640.0], [0.0, 0.0, 1.0]])
 HEIGHT_M = 2.1

@@ -7,16 +7,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import Log, Measurements, Stream
 from log2sim.geometry import Camera, PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import EstimationOptions
-from log2sim.perception.homography.rig import Rig, RigState, foot_homography, road_homography, rotation_of
-from log2sim.perception.homography.rig_feet import fit_feet
-from log2sim.perception.homography.rig_fit import RigFit, fit_rig
-from log2sim.perception.homography.rig_plane import HeightRows, find_plane, tilt_of_ticks
-from log2sim.perception.homography.rig_rows import RigRows, heights_of, linearize_feet
+from log2sim.perception.homography.rig import (
+    HeightRows,
+    Rig,
+    RigRows,
+    RigState,
+    find_plane,
+    foot_homography,
+    heights_of,
+    linearize_feet,
+    road_homography,
+    rotation_of,
+    tilt_of_ticks,
+)
+from log2sim.perception.homography.rig_fit import RigFit, fit_feet, fit_rig
 from log2sim.perception.homography_stage import fit_homographies, list_rigs
 from log2sim.plan import HomographyScope, Plan
 
@@ -277,11 +286,11 @@ def test_the_stage_fits_together_what_it_can_and_says_why_the_rest_is_apart() ->
     seen.ground = {n: [c] for n, c in world.ground.items()}
     plan = Plan(tuple(cameras), (), HomographyScope.ALL_CAMERAS)
     rng = np.random.default_rng(0)
-    fits = fit_homographies(log_of(cameras), seen, plan, EstimationOptions(together=True), rng=rng)
+    fits = fit_homographies(log_of(cameras), seen, plan, TopdownConfig(rig="together"), rng=rng)
     assert list(fits) == list(cameras)
     assert all(fits[n].rig is not None and fits[n].source == "obstacles and ground of 4 cameras" for n in world.cameras)
     assert fits["low"].rig is None
     assert "(apart: its mount does not say how high" in fits["low"].source
-    apart = fit_homographies(log_of(cameras), seen, plan, EstimationOptions(), rng=rng)
+    apart = fit_homographies(log_of(cameras), seen, plan, TopdownConfig(), rng=rng)
     assert all(g.rig is None and "apart" not in g.source for g in apart.values())
     np.testing.assert_array_equal(apart["front"].road_at_tick(0), apart["front"].fit.at_tick(0))

@@ -14,13 +14,13 @@ import log2sim.pipeline
 from log2sim.config import Config
 from log2sim.datatypes import ImageLabels, Lidar, Log, Measurements, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.homography import camera_fit
+from log2sim.perception.homography import estimate
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll
-from log2sim.perception.homography.stabilization import two_folds
+from log2sim.perception.homography.pitch_roll import two_folds
 from log2sim.pipeline import reconstruct
-from log2sim.tracking.merging import track_ends
+from log2sim.tracking.tracker import track_ends
 
 T0_NS = 1_700_000_000_000_000_000
 TICKS = 40
@@ -128,7 +128,7 @@ def test_a_pitching_vehicle_places_far_cars_as_well_as_one_that_does_not_pitch(m
         assert movement["per_tick"]
         assert movement["pitch_sigma_deg"] == pytest.approx(pitch_deg, rel=0.2)
         with monkeypatch.context() as patch:
-            patch.setattr(camera_fit, "MIN_SIGNIFICANCE_SIGMA", np.inf)
+            patch.setattr(estimate, "MIN_SIGNIFICANCE_SIGMA", np.inf)
             fixed = outcome(log, patch)
         assert (stabilized.scatter_m < 1.15 * still.scatter_m).all()
         assert (fixed.scatter_m > 3 * still.scatter_m).all()
@@ -153,7 +153,7 @@ def test_a_camera_that_moves_on_its_own_is_found_by_the_obstacles_alone() -> Non
     shake_px = 2000 * np.radians(0.3) * rng.normal(size=ticks)
     feet = Correspondences(level + rng.normal(0.0, 1.5, level.shape) + np.outer(shake_px[tick], [0.0, 1.0]), xy, tick)
     ground = Correspondences(level + rng.normal(0.0, 0.3, level.shape), xy, tick)
-    fit, source = camera_fit.fit_camera(feet, ground, EstimationOptions(K=K), rng=np.random.default_rng(0))
+    fit, source = estimate.fit_camera(feet, ground, EstimationOptions(K=K), rng=np.random.default_rng(0))
     assert source == "obstacles"
     assert fit.pitch_roll is not None
     assert fit.pitch_roll.per_tick
@@ -169,7 +169,7 @@ def test_noise_of_the_obstacles_alone_is_no_movement() -> None:
         xy = np.column_stack([rng.uniform(8.0, 50.0, len(tick)), rng.uniform(-8.0, 8.0, len(tick))])
         uv = np.column_stack([960 - 2000 * xy[:, 1] / xy[:, 0], 600 + 2000 * 1.6 / xy[:, 0]])
         feet = Correspondences(uv + rng.normal(0.0, 4.0, uv.shape), xy, tick)
-        fit, _ = camera_fit.fit_camera(feet, Correspondences.join([]), EstimationOptions(), rng=rng)
+        fit, _ = estimate.fit_camera(feet, Correspondences.join([]), EstimationOptions(), rng=rng)
         accepted += fit.pitch_roll is not None and fit.pitch_roll.per_tick
     assert accepted == 0
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Obstacles, Stream
 from log2sim.geometry import PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography.fit import refused_fit
 from log2sim.perception.homography_stage import (
     CameraHomography,
@@ -87,7 +87,7 @@ def test_a_camera_on_the_ground_or_below_has_no_homography(at):
 
 def fit(log, seen, plan=None, method="time-aware"):
     rng = np.random.default_rng(RNG_SEED)
-    return fit_homographies(log, seen, plan or plan_with(), EstimationOptions(method), rng=rng)
+    return fit_homographies(log, seen, plan or plan_with(), TopdownConfig(method=method), rng=rng)
 
 
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from log2sim.agents.hypotheses import explain_track, main_place
-from log2sim.agents.motion_evidence import (
+from log2sim.agents.smooth.fixed_interval import (
     PLACE_SIGMA_M,
     REPEATED_SHARE,
     STANDING,

@@ -14,7 +14,7 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.exporters import Options, export
-from log2sim.export.openscenario import trajectories
+from log2sim.export.openscenario import read
 from log2sim.export.openscenario.read import load
 from log2sim.geometry import wrap_angle
 
@@ -202,7 +202,7 @@ def test_a_trajectory_that_entities_share_counts_for_each(tmp_path: Path, monkey
         )
     )
     assert len(load(tmp_path / "many.xosc").agents) == 2
-    monkeypatch.setattr(trajectories, "VERTEX_LIMIT", 100)
+    monkeypatch.setattr(read, "VERTEX_LIMIT", 100)
     with pytest.raises(ScenarioError, match="more than 100 vertices together"):
         load(tmp_path / "many.xosc")
 

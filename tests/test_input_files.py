@@ -13,28 +13,26 @@ from typing import Any
 
 import pytest
 
-from log2sim import input_files
 from log2sim.config import Config
-from log2sim.documents import read_json
 from log2sim.errors import ConfigError, LogError, RecordError, ScenarioError
 from log2sim.export.xml_text import read as read_xml
-from log2sim.input_files import TooLargeError, open_regular, read_bytes, read_file, read_text
-from log2sim.logs.arrow.parquet_rows import ParquetRows
-from log2sim.logs.arrow.tables import read_columns
-from log2sim.logs.images import read_image
-from log2sim.logs.kitti.drive import read_text as read_kitti_text
-from log2sim.logs.native.csv_tables import read_csv_table
+from log2sim.files import inputs
+from log2sim.files.documents import read_json
+from log2sim.files.inputs import TooLargeError, open_regular, read_bytes, read_file, read_text
+from log2sim.logs.arrow import ParquetRows, read_columns
+from log2sim.logs.kitti.labels import read_text as read_kitti_text
+from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.nuscenes.tables import scan_records
 from log2sim.logs.pandaset.unpickle import read_pickled_table
+from log2sim.logs.records import read_image, read_sweep
 from log2sim.logs.ros.bag import open_container
-from log2sim.logs.ros.chunked import ChunkedFile
-from log2sim.logs.sweeps import read_sweep
+from log2sim.logs.ros.containers import ChunkedFile
 from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
 from log2sim.perception.detect import ssd_mobilenet
-from log2sim.perception.detect.onnx_model import load_model
+from log2sim.perception.detect.onnx_detector import load_model
 from log2sim.perception.detect3d.network import load_network
 from log2sim.simulation.carla import player
-from log2sim.synth.lidar_models import lidar_model
+from log2sim.synth.returns import lidar_model
 from log2sim.synth.scene import load_scene
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="no named pipes there")
@@ -136,7 +134,7 @@ def test_a_file_that_grows_while_it_is_read_is_not_read_beyond_the_limit(
             read_counts.append(min(count, 7))
             return b"y" * read_counts[-1]
 
-    monkeypatch.setattr(input_files, "open_regular", lambda path, buffering: Growing())
+    monkeypatch.setattr(inputs, "open_regular", lambda path, buffering: Growing())
     with pytest.raises(TooLargeError, match="101 bytes, more than the 100"):
         read_bytes(path, 100)
     assert sum(read_counts) == 101
@@ -148,7 +146,7 @@ def test_what_became_a_pipe_after_it_was_looked_at_does_not_hang(
     (tmp_path / "file").write_bytes(b"x")
     os.mkfifo(tmp_path / "pipe")
     regular = os.stat(tmp_path / "file")
-    monkeypatch.setattr(input_files.os, "stat", lambda path: regular)
+    monkeypatch.setattr(inputs.os, "stat", lambda path: regular)
     with pytest.raises(OSError, match="is a named pipe"):
         open_regular(tmp_path / "pipe")
 

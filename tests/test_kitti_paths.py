@@ -11,7 +11,7 @@ from test_track import OPTIONS, line, names_of, record, seen, stamps
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.tracking.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
+from log2sim.tracking.forward import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
 from log2sim.tracking.tracker import track
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log2sim.lanes.detection.curves import fit_curve
+from log2sim.road.strokes import fit_curve
 
 
 @pytest.mark.parametrize("shift", [(50.0, 20.0), (-4000.0, 10000.0)])

@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.graph.coverage import find_covered
-from log2sim.lanes.graph.driven_paths import collect_paths
-from log2sim.lanes.graph.lane_graph import infer_lanes
-from log2sim.lanes.graph.polyline import Polyline
+from log2sim.road.lane_graph import find_covered, infer_lanes
+from log2sim.road.polyline import Polyline, collect_paths
 
 
 def turn_left(radius_m: float = 9.0) -> Array:

@@ -11,7 +11,7 @@ from command_line import run
 from export_paths import agent, line, scenario
 
 from log2sim.datatypes import MapFeatures, MapLane
-from log2sim.lanes.lane_keeping import find_lane_changes, locate_in_lanes, summarize_lane_keeping
+from log2sim.road.lane_keeping import find_lane_changes, locate_in_lanes, summarize_lane_keeping
 
 
 def road() -> tuple[MapLane, ...]:

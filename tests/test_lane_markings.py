@@ -11,9 +11,8 @@ from painted_ground import ASPHALT, CONCRETE, GRASS, WHITE, YELLOW, Painter, das
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
-from log2sim.lanes.detection.curves import fit_curve, thin
-from log2sim.lanes.detection.markings import find_markings
-from log2sim.lanes.detection.strokes import is_dashed, stretches_of
+from log2sim.road.markings import find_markings
+from log2sim.road.strokes import fit_curve, is_dashed, stretches_of, thin
 
 GRAVEL = (120, 125, 130)
 EXTENT = (0.0, 50.0, -10.0, 14.0)

@@ -9,9 +9,7 @@ from painted_ground import Painter, dashes_of, line_of
 
 from log2sim.datatypes import Marking
 from log2sim.geometry import Camera, ground_homography
-from log2sim.lanes.detection.one_picture import find_markings_in_picture
-from log2sim.lanes.detection.road_shape import find_shape, join_lines
-from log2sim.lanes.detection.vanishing import find_vanishing_point
+from log2sim.road.lane_picture import find_markings_in_picture, find_shape, find_vanishing_point, join_lines
 
 OFFSETS = (-5.25, -1.75, 1.75, 5.25)
 

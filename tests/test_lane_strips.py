@@ -11,10 +11,9 @@ from test_lane_graph import require_consistent
 
 from log2sim.datatypes import MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.graph.directions import find_side_of_traffic
-from log2sim.lanes.graph.driven_paths import collect_paths
-from log2sim.lanes.graph.lane_graph import infer_lanes
-from log2sim.lanes.graph.strips import find_strips
+from log2sim.road.lane_graph import find_side_of_traffic, infer_lanes
+from log2sim.road.polyline import collect_paths
+from log2sim.road.strips import find_strips
 
 
 def along(y_m: float, first_m: float = 0.0, last_m: float = 100.0, radius_m: float = np.inf) -> Array:

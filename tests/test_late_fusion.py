@@ -11,13 +11,7 @@ from worlds import camera_ahead, outline_px, rows_at, standing
 
 from log2sim.datatypes import Boxes3D, Measurements
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.late_fusion import (
-    PAIR_WEIGHTS,
-    ImageMatches,
-    if_missed,
-    join_with_images,
-    match_boxes,
-)
+from log2sim.perception.fusion import PAIR_WEIGHTS, ImageMatches, if_missed, join_with_images, match_boxes
 from log2sim.perception.lidar.projection import View
 
 CAMERA = camera_ahead()

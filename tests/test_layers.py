@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import log2sim
-from log2sim import late_functions
 from log2sim.cli import app
+from log2sim.files import plugins
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -21,9 +21,9 @@ import imports  # noqa: E402
 
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (
-    "errors", "version", "plugin_checks", "registry", "threads", "late_functions", "log_odds", "numerals", "array_file", "input_files", "links", "cache_folder", "disk_cache", "outputs", "output_folders", "output_claims", "json_keys", "documents", "model_errors", "geometry", "datatypes", "color_names", "stage_clock", "config_sections", "config", "logs",
-    "synth", "tracking", "sensors", "fusion_level", "plan", "perception", "localization", "calibration", "cooperation", "agents", "mapping", "lanes", "appearance", "signals", "outcome", "describe", "report", "run_detectors", "pipeline", "prediction", "simulation", "edit", "export",
-    "visualization", "evaluation", "batch", "cli", "__init__", "__main__",
+    "errors", "version", "files", "geometry", "datatypes", "config", "logs", "synth", "tracking", "plan", "perception", "localization",
+    "agents", "road", "report", "pipeline", "prediction", "simulation", "edit", "export", "visualization", "evaluation", "batch", "cli",
+    "__init__", "__main__",
 )  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         log2sim.recontruct  # noqa: B018
 
 
-@pytest.mark.parametrize("place", late_functions.FUNCTIONS.values())
+@pytest.mark.parametrize("place", plugins.LATE_FUNCTIONS.values())
 def test_late_functions_are_of_higher_rooms_and_exist(place: str) -> None:
     module, _, name = place.partition(":")
     assert callable(getattr(importlib.import_module(module), name))

@@ -14,30 +14,27 @@ from worlds import CAR, PARKED, scan, standing, tiny_log
 
 import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
+import log2sim.perception.run_detectors
 import log2sim.pipeline
 import log2sim.plan
-import log2sim.run_detectors
-import log2sim.sensors
 from log2sim import Config, Scenario, reconstruct, replay
+from log2sim.agents.estimate import simplify_waypoints
 from log2sim.agents.hypotheses import Part
-from log2sim.agents.simplify import simplify_waypoints
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
-from log2sim.documents import check
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.files.documents import check
+from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack, transform
-from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse_tick
-from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
-from log2sim.perception.lidar.cloud import is_at_rest, sweep_to_map
-from log2sim.perception.lidar.viewpoints import assemble_cloud
-from log2sim.pipeline import Result, first_pass, second_pass, start
-from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan
-from log2sim.sensors import select_sensors
-from log2sim.stage_clock import StageClock
+from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
+from log2sim.pipeline import Result, infer_scenario, observe_log, start
+from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.report import stage_outcomes
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
@@ -214,7 +211,7 @@ def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyP
     assert not step["kept"]
     assert "post" in step["reason"]
     assert not reads
-    monkeypatch.setattr(log2sim.sensors, "MAX_LIDAR_RANGE_M", 1e9)
+    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
     full = run(log)
     assert entry(full, "use of every LiDAR")["kept"]
     assert sum(reads.values()) > 5
@@ -281,7 +278,7 @@ class Counting:
 
 def run_counting(log: Log, monkeypatch: pytest.MonkeyPatch, stride: int | None = None) -> tuple[Result, Counting]:
     detector = Counting(log)
-    monkeypatch.setattr(log2sim.run_detectors, "create_detector", lambda *a, **k: detector)
+    monkeypatch.setattr(log2sim.perception.run_detectors, "create_detector", lambda *a, **k: detector)
     if stride is not None:
         monkeypatch.setattr(log2sim.plan, "min_hits", lambda *a: stride)
     result = run(log, Config.load(detect={"name": "counting.onnx"}))
@@ -378,7 +375,7 @@ def test_a_look_that_could_not_be_read_found_nothing_out(both: Log, monkeypatch:
 def test_without_need_no_homography_is_fitted_and_nothing_changes(tiny: Log) -> None:
     without, every_camera = run(tiny), start(tiny, LABELS)
     every_camera = replace(every_camera, plan=replace(every_camera.plan, homography=HomographyScope.ALL_CAMERAS))
-    full = second_pass(every_camera, first_pass(every_camera))
+    full = infer_scenario(every_camera, observe_log(every_camera))
     step = entry(without, "homography")
     assert not step["kept"]
     assert without.report["homography"] == {}
@@ -398,7 +395,7 @@ def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> Non
     plan = plan_of(both)
     for bottom_px, wanted in ((250.0, {"back"}), (297.0, {"back"}), (298.0, set()), (300.0, set())):
         seen = Observations(measurements=[lost("back", bottom_px)], obstacles=[None])
-        fits = fit_homographies(both, seen, plan, EstimationOptions(), rng=np.random.default_rng(0))
+        fits = fit_homographies(both, seen, plan, TopdownConfig(), rng=np.random.default_rng(0))
         assert set(fits) == wanted
 
 
@@ -592,7 +589,7 @@ def test_the_time_saved_by_skipped_frames_is_that_of_the_others() -> None:
     clock.seconds.update({"decode": 1.0, "detect": 3.0})
     observations = Observations(frames_detected=40, frames_skipped={"back": 20})
     plan = Plan(("back",), (Decision(Stage.DETECTION_IN_EVERY_FRAME, False, "empty frames are skipped"),))
-    (outcome,) = stage_outcomes(plan, RunOutputs(observations, [], {}, (), clock))
+    (outcome,) = stage_outcomes(plan, observations, {}, (), clock)
     assert outcome.saved_s == pytest.approx(20 * 4.0 / 40)
     assert "20 of 60 frames" in outcome.decision.reason
 
@@ -601,4 +598,4 @@ def test_seconds_stand_in_the_report_and_not_in_the_scenario(tiny: Log) -> None:
     a, b = run(tiny), run(tiny)
     assert a.scenario.to_dict() == b.scenario.to_dict()
     assert all("saved_s" in p for p in a.report["plan"])
-    assert not any("saved_s" in p for p in a.scenario.plan)
+    assert not any("saved_s" in p for p in a.scenario.stages)

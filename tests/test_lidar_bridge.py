@@ -10,11 +10,10 @@ from localization_worlds import BEND, HOUSES, STRAIGHT, drive
 
 from log2sim.datatypes import Log
 from log2sim.geometry import PoseTrack
-from log2sim.localization import lidar_bridge
+from log2sim.localization import verdict
 from log2sim.localization.choice import localize_like
-from log2sim.localization.given_poses import check_poses
-from log2sim.localization.lidar_bridge import bridge_by_lidar
-from log2sim.localization.pose_faults import list_faults
+from log2sim.localization.given_poses import check_poses, list_faults
+from log2sim.localization.verdict import bridge_by_lidar
 
 pytest.importorskip("small_gicp")
 
@@ -62,7 +61,7 @@ def test_odometry_that_does_not_hold_the_way_is_not_used() -> None:
 def test_without_its_library_the_pose_stays_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
     log, _ = frozen_log(HOUSES, BEND)
     assert log.ego is not None
-    monkeypatch.setattr(lidar_bridge, "is_installed", lambda: False)
+    monkeypatch.setattr(verdict, "is_installed", lambda: False)
     checked = check_poses(log.ego)
     assert bridge_by_lidar(log, checked, silent) is checked
     (fault,) = list_faults(log, checked.stretches, None)

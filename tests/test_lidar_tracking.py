@@ -8,19 +8,11 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.confirmation import MIN_SWEEP_CONFIDENCE, followed_confidence
-from log2sim.agents.lidar_tracking import (
-    BoxState,
-    LidarMatch,
-    left_free,
-    match_box,
-    match_standing,
-    track_with_lidar,
-)
+from log2sim.agents.candidate import MIN_SWEEP_CONFIDENCE, followed_confidence
+from log2sim.agents.static import BoxState, LidarMatch, left_free, match_box, match_standing, track_with_lidar
 from log2sim.datatypes import Boxes3D, Measurements, Obstacles, Rays, Track
 from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.box_completion import place_boxes
-from log2sim.perception.box_fitting import rotate
+from log2sim.perception.boxes import place_boxes, rotate
 
 T0_NS = 1_700_000_000_000_000_000
 SIZE = np.array([4.4, 1.85, 1.6])

@@ -13,7 +13,7 @@ from log_encoders.world import world_log
 
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
-from log2sim.links import following_links, inside, require_links_inside
+from log2sim.files.inputs import following_links, inside, require_links_inside
 from log2sim.logs.opening import open_log
 
 

@@ -15,12 +15,10 @@ from log2sim import Config, reconstruct
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform, yaw_of
-from log2sim.localization.alignment import fit_to_given, level_on_ground
 from log2sim.localization.choice import localize, localize_like
-from log2sim.localization.ego_sweeps import densest_lidar
-from log2sim.localization.moving_points import move_points
-from log2sim.localization.odometry import Odometry, run_odometry
+from log2sim.localization.odometry import Odometry, densest_lidar, move_points, run_odometry
 from log2sim.localization.replaced import replace_poses
+from log2sim.localization.verdict import fit_to_given, level_on_ground
 from log2sim.perception.lidar.cloud import sweep_to_map
 
 LIDAR, AUTO = ({"source": name} for name in ("lidar", "auto"))

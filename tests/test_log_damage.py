@@ -20,12 +20,11 @@ from log2sim.config import Config
 from log2sim.datatypes import ImageRegions, Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Camera, PoseTrack
-from log2sim.logs.calibration_checks import list_calibration_problems
+from log2sim.logs.checks import Span, list_calibration_problems, list_time_problems, say_apart
 from log2sim.logs.excerpt import cut_log
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-from log2sim.logs.time_checks import Span, list_time_problems, say_apart
-from log2sim.sensors import select_sensors
+from log2sim.plan import select_sensors
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from log2sim.log_odds import log_odds_of, probability_of
+from log2sim.datatypes.log_odds import log_odds_of, probability_of
 
 
 @given(st.floats(1e-6, 1 - 1e-6))

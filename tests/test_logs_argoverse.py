@@ -16,11 +16,21 @@ from worlds import tiny_log
 from log2sim.datatypes import Log, MapFrame, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, points_in_box
-from log2sim.logs.argoverse.cities import CITIES, map_frame_of
-from log2sim.logs.argoverse.labels import CATEGORY_OF, NO_ROAD_USERS, read_labels, scan_time_ns
-from log2sim.logs.argoverse.reader import ANNOTATIONS, INTRINSICS, MOUNTS, POSES, READER
+from log2sim.logs.argoverse import (
+    ANNOTATIONS,
+    CATEGORY_OF,
+    CITIES,
+    INTRINSICS,
+    MOUNTS,
+    NO_ROAD_USERS,
+    POSES,
+    READER,
+    map_frame_of,
+    read_labels,
+    scan_time_ns,
+)
+from log2sim.logs.excerpt import summarize
 from log2sim.logs.opening import open_log
-from log2sim.logs.summary import summarize
 
 feather = pytest.importorskip("pyarrow.feather")
 

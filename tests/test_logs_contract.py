@@ -14,14 +14,13 @@ import pytest
 from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
 from log_encoders.world import RED, labels_at, world_log
 
-from log2sim import registry
 from log2sim.datatypes import CATEGORIES, Labels, Log, Stream, Sweep
 from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError
+from log2sim.files import plugins
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
-from log2sim.logs.calibration_checks import list_calibration_problems
-from log2sim.logs.images import decode_image
+from log2sim.logs.checks import list_calibration_problems, list_time_problems
 from log2sim.logs.opening import open_log
-from log2sim.logs.time_checks import list_time_problems
+from log2sim.logs.records import decode_image
 from log2sim.perception.lidar.cloud import deskew, has_motion, transform_rigidly
 
 # Opening may read the index, and where a size is stated nowhere else the first image; images are nearly all of a log.
@@ -189,7 +188,7 @@ def points_on(log: Log, lidar: str, i: int, track: str) -> tuple[Array, Array]:
 
 
 def test_every_built_in_reader_is_under_contract() -> None:
-    assert set(ENCODERS) == set(registry.BUILT_IN["log"])
+    assert set(ENCODERS) == set(plugins.BUILT_IN["log"])
 
 
 @pytest.mark.matrix
@@ -227,7 +226,7 @@ def test_several_sequences_are_listed_and_each_opens(name: str, case: Encoder, t
     if case.several is None:
         pytest.skip("the layout has one sequence")
     root = case.several(world_log(), tmp_path)
-    reader = registry.load("log", name)
+    reader = plugins.load("log", name)
     sequences = reader.sequences(root)
     assert len(sequences) == 2
     assert sequences == sorted(sequences)
@@ -494,7 +493,7 @@ def test_the_digest_is_of_the_log_alone(name: str, log: Log, copy: Path) -> None
 
 
 def test_other_folders_and_files_are_refused_in_one_line(name: str, case: Encoder, path: Path, tmp_path: Path) -> None:
-    reader = registry.load("log", name)
+    reader = plugins.load("log", name)
     (tmp_path / "empty").mkdir()
     (tmp_path / "words.txt").write_text("no log")
     for other in (tmp_path / "empty", tmp_path / "words.txt", tmp_path / "nothing"):

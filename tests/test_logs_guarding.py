@@ -18,12 +18,11 @@ from hypothesis import strategies as st
 from log_encoders.world import world_log
 from test_logs_contract import ENCODERS
 
-from log2sim import registry
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError, RecordError
-from log2sim.logs.guarding import guard_log, translate_parser_errors
+from log2sim.files import plugins
 from log2sim.logs.opening import open_log
-from log2sim.logs.sweeps import MAX_NPY_HEADER_BYTES, read_sweep
+from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, read_sweep, translate_parser_errors
 
 RAISED = [
     ValueError("odd"), TypeError("odd"), OverflowError("too large"), KeyError("x"), IndexError(), AttributeError("odd"),
@@ -85,7 +84,7 @@ def test_an_opening_that_fails_is_a_log_error(tmp_path: Path, monkeypatch: pytes
     def broken(*_: object) -> Any:
         raise OverflowError("int too large to convert to float")
 
-    monkeypatch.setattr(type(registry.load("log", "log2sim")), "open", broken)
+    monkeypatch.setattr(type(plugins.load("log", "log2sim")), "open", broken)
     with pytest.raises(LogError, match="cannot be read as format 'log2sim': OverflowError: int too large"):
         open_log(path)
 

@@ -11,8 +11,7 @@ import pytest
 from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, yaw_of
-from log2sim.logs.kitti.drive import EGO_T_IMU, poses_from_oxts, spin_offset_ns
-from log2sim.logs.kitti.labels import boxes_in_map
+from log2sim.logs.kitti.labels import EGO_T_IMU, boxes_in_map, poses_from_oxts, spin_offset_ns
 from log2sim.logs.opening import open_log
 
 FRAMES = 4

@@ -15,10 +15,10 @@ import pytest
 from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
-from log2sim.logs.geodesy import transverse_mercator
+from log2sim.logs.excerpt import summarize
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-from log2sim.logs.summary import summarize
+from log2sim.logs.stamps import transverse_mercator
 from log2sim.logs.validation import validate_log
 
 T0_NS = 1_700_000_000_123_456_789

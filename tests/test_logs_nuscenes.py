@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from log_encoders.nuscenes import TURN_NS, encode, hdl32_world
 from log_encoders.world import labels_at
 
-from log2sim import Config, reconstruct, registry
+from log2sim import Config, reconstruct
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.files import plugins
 from log2sim.geometry import NS_PER_S, apply, inverse, points_in_box
 from log2sim.logs.nuscenes import tables
-from log2sim.logs.nuscenes.labels import turn_ends
-from log2sim.logs.nuscenes.sweeps import FIRING_NS, read_sweep
+from log2sim.logs.nuscenes.scene import FIRING_NS, read_sweep, turn_ends
 from log2sim.logs.opening import open_log
-from log2sim.logs.spinning import compute_scan_offset_ns
+from log2sim.logs.stamps import compute_scan_offset_ns
 from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 
 KEY_EVERY = 5
@@ -270,7 +270,7 @@ def test_files_of_a_partial_download_are_left_out_and_counted(root: Path, spoila
 
 def test_the_table_log_json_is_no_log_of_ours(root: Path) -> None:
     """Whichever order readers are asked in."""
-    native = registry.load("log", "log2sim")
+    native = plugins.load("log", "log2sim")
     assert not native.matches(root)
     assert not native.matches(root / "v1.0-mini")
 

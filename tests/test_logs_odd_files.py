@@ -25,15 +25,13 @@ from log2sim.errors import LogError, RecordError, ScenarioError
 from log2sim.export.exporters import Options, export
 from log2sim.export.openscenario.read import load
 from log2sim.export.xml_text import require_number
+from log2sim.files.documents import parse_float, parse_int
 from log2sim.geometry import PoseTrack
-from log2sim.logs.calibration_checks import problems_of
-from log2sim.logs.guarding import guard_log
-from log2sim.logs.label_checks import without_impossible_labels
-from log2sim.logs.native.csv_tables import read_csv_table
+from log2sim.logs.checks import problems_of, without_impossible_labels
+from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.opening import open_log
-from log2sim.logs.sweeps import sweep_of
-from log2sim.numerals import parse_float, parse_int
-from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.logs.records import guard_log, sweep_of
+from log2sim.perception.lidar.cloud import assemble_cloud
 
 Encode = Callable[[Log, Path], Path]
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
-from log2sim import registry
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
+from log2sim.files import plugins
 from log2sim.geometry import (
     NS_PER_S,
     PoseTrack,
@@ -29,10 +29,10 @@ from log2sim.geometry import (
     transform,
     wrap_angle,
 )
+from log2sim.logs.excerpt import summarize
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.stamps import strictly_increasing
-from log2sim.logs.summary import summarize
 
 SWEEP_SUFFIXES = (".bin", ".npz", ".npy", ".pcd", ".gz")
 _listeners: list[list[str]] = []
@@ -115,13 +115,13 @@ def test_a_recorded_log_opens_without_its_sweeps(real_data: Path, path: str) -> 
 
 def test_installed_packages_are_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_log(tiny_log(observe=False, duration_s=0.3)[0], tmp_path / "log")
-    asked, real = [], registry.installed
+    asked, real = [], plugins.installed
 
     def installed(kind: str) -> EntryPoints:
         asked.append(kind)
         return real(kind)
 
-    monkeypatch.setattr(registry, "installed", installed)
+    monkeypatch.setattr(plugins, "installed", installed)
     assert open_log(tmp_path / "log").format == "log2sim"
     assert asked == ["log"]
 

@@ -17,10 +17,8 @@ from log_encoders.world import world_log
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.pandaset.labels import PERIOD_NS, read_labels
-from log2sim.logs.pandaset.reader import georeference
-from log2sim.logs.pandaset.sweeps import SweepFiles
-from log2sim.logs.spinning import compute_scan_offset_ns
+from log2sim.logs.pandaset.reader import PERIOD_NS, SweepFiles, georeference, read_labels
+from log2sim.logs.stamps import compute_scan_offset_ns
 
 
 def test_a_label_is_timed_by_its_direction() -> None:

@@ -18,16 +18,13 @@ from hypothesis import strategies as st
 from log2sim.datatypes import CATEGORIES, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, RollingShutter, rotation_from_rpy, transform
-from log2sim.logs.calibration_checks import list_calibration_problems
-from log2sim.logs.images import read_image
-from log2sim.logs.kitti.drive import parse_oxts
-from log2sim.logs.kitti.labels import parse_labels
-from log2sim.logs.native.csv_tables import read_csv_table
+from log2sim.logs.checks import list_calibration_problems, list_time_problems
+from log2sim.logs.kitti.labels import parse_labels, parse_oxts
+from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.unpickle import read_pickled_table
-from log2sim.logs.sweeps import read_sweep
-from log2sim.logs.time_checks import list_time_problems
+from log2sim.logs.records import read_image, read_sweep
 
 COLUMNS = {"t_ns": "int", "x_m": "float", "name": "str", "flag": "bool"}
 

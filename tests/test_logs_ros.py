@@ -17,10 +17,9 @@ from rosbags.highlevel import AnyReader
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
-from log2sim.logs.geodesy import transverse_mercator
-from log2sim.logs.kitti.drive import EGO_T_IMU as EGO_T_KITTI_IMU
-from log2sim.logs.ros.bag import Bag
-from log2sim.logs.ros.recordings import find_recordings
+from log2sim.logs.kitti.labels import EGO_T_IMU as EGO_T_KITTI_IMU
+from log2sim.logs.ros.bag import Bag, find_recordings
+from log2sim.logs.stamps import transverse_mercator
 
 CONTAINERS = [
     Style("bag"), Style("bag", "lz4"), Style("bag", "bz2"), Style("db3"), Style("db3", "message"), Style("mcap"),

@@ -27,16 +27,13 @@ from log2sim.cli import app
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.geometry import NS_PER_S, RollingShutter, transform
-from log2sim.logs.ros import bag, chunked, ego
+from log2sim.logs.ros import bag, containers, frames
 from log2sim.logs.ros import messages as ros_messages
-from log2sim.logs.ros.bag import Topic, open_container
-from log2sim.logs.ros.chunked import Chunk, ChunkedFile, decompress
-from log2sim.logs.ros.ego import measure_ground_m
-from log2sim.logs.ros.messages import decode_bytes, definition_fields
-from log2sim.logs.ros.recordings import find_recordings
+from log2sim.logs.ros.bag import Topic, find_recordings, open_container
+from log2sim.logs.ros.containers import Chunk, ChunkedFile, decompress
+from log2sim.logs.ros.frames import measure_ground_m
+from log2sim.logs.ros.messages import TopicSettings, decode_bytes, definition_fields, note_other_clocks
 from log2sim.logs.ros.roles import assign_roles
-from log2sim.logs.ros.settings import TopicSettings
-from log2sim.logs.ros.stamping import note_other_clocks
 
 CONTAINERS = ("bag", "db3", "mcap")
 
@@ -400,7 +397,7 @@ def test_a_bag_of_one_lidar_alone_has_its_frame_and_the_road_below_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured: list[Sweep] = []
-    monkeypatch.setattr(ego, "measure_ground_m", lambda s, T: (measured.append(s), measure_ground_m(s, T))[1])
+    monkeypatch.setattr(frames, "measure_ground_m", lambda s, T: (measured.append(s), measure_ground_m(s, T))[1])
     path = bag_of(tmp_path, Style("bag"), lambda m: m if m[2] == "/top/points" else None)
     log = open_log(path)
     assert not measured  # opening reads no sweep
@@ -688,7 +685,7 @@ def test_a_chunk_that_says_to_unpack_to_what_no_sensor_measures_is_not_unpacked(
     file = ChunkedFile(tmp_path / "a.bag")
     file.chunks = [Chunk(0, len(sound), 8 << 20, "bz2"), Chunk(len(sound), len(bomb), 250_000_000, "bz2")]
     assert len(file.unpacked(0)) == 8 << 20
-    monkeypatch.setattr(chunked, "unpack_part", lambda *_: pytest.fail("it is unpacked"))
+    monkeypatch.setattr(containers, "unpack_part", lambda *_: pytest.fail("it is unpacked"))
     for read in (lambda: file.unpacked(1), lambda: file.within(1, 0, 100, ahead=True), lambda: file.within(1, 0, 100)):
         with pytest.raises(ValueError, match="says to unpack to 250000000, more than 256 times as many"):
             read()

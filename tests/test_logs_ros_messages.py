@@ -17,13 +17,17 @@ from rosbags.typesys import get_types_from_msg
 
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, apply, inverse, project, rotation_from_rpy, transform
-from log2sim.logs.ros.calibration import CalibrationProblem, camera_from_info
-from log2sim.logs.ros.clouds import offsets_ns, sweep_from
-from log2sim.logs.ros.ego import measure_ground_m
-from log2sim.logs.ros.frames import FrameTree
-from log2sim.logs.ros.livox import sweep_from_livox
-from log2sim.logs.ros.pictures import ENCODINGS, encoded_from, image_from
-from log2sim.logs.ros.settings import LidarTopic, StaticTransform
+from log2sim.logs.ros.frames import FrameTree, measure_ground_m
+from log2sim.logs.ros.messages import LidarTopic, StaticTransform, sweep_from_livox
+from log2sim.logs.ros.sensors import (
+    ENCODINGS,
+    CalibrationProblem,
+    camera_from_info,
+    encoded_from,
+    image_from,
+    offsets_ns,
+    sweep_from,
+)
 
 STAMP_NS, PERIOD_NS = 1_700_000_000_123_456_789, 1e8
 PLAIN = LidarTopic(topic="/points")

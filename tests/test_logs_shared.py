@@ -7,9 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log2sim.logs.notes import count_words, defer_notes, note_left_out
-from log2sim.logs.record_files import list_numbered_files
-from log2sim.logs.spinning import compute_scan_offset_ns, compute_turn_share, select_spaced
+from log2sim.logs.records import list_numbered_files
+from log2sim.logs.stamps import (
+    compute_scan_offset_ns,
+    compute_turn_share,
+    count_words,
+    defer_notes,
+    note_left_out,
+    select_spaced,
+)
 
 
 @pytest.mark.parametrize("start_deg", [180.0, 144.0, 0.0, -179.0])

@@ -24,9 +24,9 @@ from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import Camera, apply, box_iou, inverse, points_in_box, project, project_boxes, wrap_angle
 from log2sim.logs.opening import open_log
 from log2sim.logs.waymo import reader, tfrecord
-from log2sim.logs.waymo.assembly import PACIFICA, camera_of, ego_vehicle_of
+from log2sim.logs.waymo.messages import WireError
+from log2sim.logs.waymo.reader import PACIFICA, camera_of, ego_vehicle_of
 from log2sim.logs.waymo.segment import CameraCalibration, LaserCalibration
-from log2sim.logs.waymo.wire import WireError
 from log2sim.pipeline import reconstruct
 
 START_BYTES = 12

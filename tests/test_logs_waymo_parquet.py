@@ -16,7 +16,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply
 from log2sim.logs.opening import open_log
-from log2sim.logs.waymo.components import read_poses
+from log2sim.logs.waymo.parquet_reader import read_poses
 from log2sim.perception.lidar.cloud import sweep_to_map
 
 pyarrow = pytest.importorskip("pyarrow")

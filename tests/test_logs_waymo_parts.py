@@ -27,7 +27,7 @@ from log_encoders.waymo import (
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
 from log2sim.logs.waymo import tfrecord
-from log2sim.logs.waymo.crc32c import LANES, crc32c, masked_crc32c
+from log2sim.logs.waymo.messages import BYTES, WireError, doubles, doubles_by_number, fields_of, text, varints
 from log2sim.logs.waymo.range_images import (
     column_azimuths,
     points_of,
@@ -37,8 +37,7 @@ from log2sim.logs.waymo.range_images import (
     turn_of,
 )
 from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
-from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
-from log2sim.logs.waymo.wire import BYTES, WireError, doubles, doubles_by_number, fields_of, text, varints
+from log2sim.logs.waymo.tfrecord import LANES, RecordFile, crc32c, masked_crc32c, starts_like_tfrecord
 
 LASER = LaserCalibration(np.eye(4), np.array([-0.3, -0.1, 0.0, 0.05]), (0.0, 0.0))
 

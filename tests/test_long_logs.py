@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
-from log2sim import Config, array_file
+from log2sim import Config
 from log2sim.datatypes import Log
-from log2sim.pipeline import first_pass, second_pass, start
+from log2sim.files import arrays
+from log2sim.pipeline import infer_scenario, observe_log, start
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from looped_log import loop_log
@@ -25,8 +26,8 @@ def held_after(log: Log, times: int) -> tuple[int, int]:
     tracemalloc.start()
     run = start(loop_log(log, times), config)
     before = tracemalloc.get_traced_memory()[0]
-    observations = first_pass(run)
-    result = second_pass(run, observations)
+    observations = observe_log(run)
+    result = infer_scenario(run, observations)
     gc.collect()
     held = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
@@ -52,7 +53,7 @@ def test_a_looped_log_goes_on_where_it_ended() -> None:
 @pytest.mark.slow
 def test_what_is_held_of_a_tick_is_far_less_than_what_is_kept_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     log, _ = tiny_log()
-    monkeypatch.setattr(array_file, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(arrays, "MEMORY_BYTES", 0)
     (few, short), (many, long) = held_after(log, 2), held_after(log, 6)
     # All in memory, it is 90 KB a tick.
     assert (long - short) / (many - few) < 20_000

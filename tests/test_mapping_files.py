@@ -13,9 +13,8 @@ import tifffile
 
 from log2sim.datatypes import MapFrame
 from log2sim.errors import ConfigError, LogError
-from log2sim.mapping.files import lowest_m, read_png_map, world_file_of, write_map, write_world_file
-from log2sim.mapping.geokeys import geokeys_of
-from log2sim.mapping.ground_map import GroundMap
+from log2sim.road.ground_map import GroundMap
+from log2sim.road.map_files import geokeys_of, lowest_m, read_png_map, world_file_of, write_map, write_world_file
 
 PROJECTIONS = {
     "kitti": "+proj=merc +R=6378137 +lon_0=8.4228 +k_0=0.6559113 +x_0=0 +y_0=-4117000.68 +units=m +no_defs",

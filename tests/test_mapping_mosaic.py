@@ -20,8 +20,8 @@ from log2sim.geometry import (
     transform,
     undistort,
 )
-from log2sim.mapping.ground_view import GroundView
-from log2sim.mapping.mosaic import Mosaic, render_birdseye, write_image
+from log2sim.road.mosaic import Mosaic, render_birdseye, write_image
+from log2sim.road.pictures import GroundView
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 K = np.array([[800.0, 0, 640], [0, 800.0, 360], [0, 0, 1]])

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log2sim.calibration.surfaces import Registration
-from log2sim.calibration.twists import exp_of, log_of
 from log2sim.datatypes import Lidar, Log, Scenario, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.mapping.pose_refinement import Keyframe, corrected, place_as_given, refine_poses, solve_twists
+from log2sim.localization.pose_refinement import Keyframe, corrected, place_as_given, refine_poses, solve_twists
+from log2sim.localization.surfaces import Registration, exp_of, log_of
 from log2sim.perception.frames import RecordReader
 
 T_NS = np.arange(0, 41) * 100_000_000 + 10**18

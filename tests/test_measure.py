@@ -9,10 +9,9 @@ from worlds import Solid, camera_ahead, outline_px, scan, standing
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections
 from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.box_fitting import rotate
-from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.boxes import rotate
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
 from log2sim.perception.lidar.clusters import continued_sides
-from log2sim.perception.lidar.ground import ON_GROUND_M
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.projection import View
 

@@ -8,23 +8,24 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.box_votes import (
+from log2sim.agents.candidate import HIDDEN_S, agent_confidence, image_confidence, is_confirmed, sweep_confidence
+from log2sim.agents.moving import heading_log_odds
+from log2sim.agents.size import (
     TICK_CORRELATION,
     independent,
     independent_along,
     mean_box_axis,
+    moving_geometry,
+    static_geometry,
     typical_box_size,
     weighted_median,
 )
-from log2sim.agents.confirmation import HIDDEN_S, agent_confidence, image_confidence, is_confirmed, sweep_confidence
-from log2sim.agents.heading.box_headings import heading_log_odds
-from log2sim.agents.size import moving_geometry, static_geometry
 from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
 from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, wrap_angle
-from log2sim.perception.box_completion import BOX_SIGMA_M, box_sigma, weighted_center
+from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
-from log2sim.tracking.recorded import mark_unrecorded
+from log2sim.perception.lidar.measure import measure_boxes, outside_ego
+from log2sim.tracking.tracker import mark_unrecorded
 
 ORIGIN = np.array([500.0, -200.0, 3.0])
 SENSOR = (0.0, 0.0, 1.9)

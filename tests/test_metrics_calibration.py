@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from log2sim.evaluation.metrics.calibration import normalized_errors, reliability
+from log2sim.evaluation.metrics.correctness import normalized_errors, reliability
 
 
 def test_the_calibration_error_of_two_bins_by_hand():

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
 from log2sim.datatypes import CATEGORIES, Agent, Doubt, Scenario
-from log2sim.documents import check
 from log2sim.errors import ScenarioError
-from log2sim.evaluation.metrics.align import reconstructed_states, truth_states
-from log2sim.evaluation.metrics.comparison import Selection, compare
+from log2sim.evaluation.metrics.comparison import Selection, compare, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import format_table, format_verdict
 from log2sim.evaluation.metrics.verdicts import MEASURES, REPORTED, judge
+from log2sim.files.documents import check
 
 TICKS = len(T_S)
 WALK = {"category": "pedestrian", "size_m": (0.6, 0.6, 1.7)}

@@ -10,10 +10,10 @@ import pytest
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
 from log2sim.datatypes import MapFrame
-from log2sim.documents import check
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import columns_text, format_table, format_verdict
+from log2sim.files.documents import check
 
 FIGURES = ("recall", "precision", "position_rmse_m", "yaw_median_deg", "speed_rmse_mps", "mota", "hota", "counts")
 

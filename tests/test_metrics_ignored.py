@@ -10,11 +10,10 @@ import pytest
 from worlds import tiny_log
 
 from log2sim.datatypes import Agent, IgnoreRegions, ImageRegions, LabelView, MapFrame, Scenario, Waypoints
-from log2sim.documents import check
 from log2sim.errors import LogError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.label_views import ignore_regions_of
-from log2sim.evaluation.metrics.truth import truth_from_log
+from log2sim.evaluation.metrics.truth import ignore_regions_of, truth_from_log
+from log2sim.files.documents import check
 from log2sim.geometry import Camera, box_corners, transform
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log

@@ -8,9 +8,8 @@ import warnings
 import numpy as np
 import pytest
 
-from log2sim.evaluation.metrics.clear_mot import associate, mota, switches
-from log2sim.evaluation.metrics.hota import hota
-from log2sim.evaluation.metrics.pairs import assign, gate_m, near_pairs
+from log2sim.evaluation.metrics.comparison import assign, associate, gate_m, mota, near_pairs, switches
+from log2sim.evaluation.metrics.evaluator import hota
 
 
 def random_tracks(seed, truths=8, others=9, ticks=40, arena_m=14.0):

@@ -11,8 +11,16 @@ import pytest
 from log2sim.datatypes import Labels, Lidar, Log, Scenario, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.truth import is_static, nearest_record, speed_along, truth_from_log, with_points
-from log2sim.evaluation.metrics.visibility import PointGrid, convex_hull, image_shares
+from log2sim.evaluation.metrics.truth import (
+    PointGrid,
+    convex_hull,
+    image_shares,
+    is_static,
+    nearest_record,
+    speed_along,
+    truth_from_log,
+    with_points,
+)
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, points_in_box, rotation_from_rpy, transform
 
 NS = 1_000_000_000

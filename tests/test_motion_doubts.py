@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
+from log2sim.agents.moving import jump_doubts, motion_doubts, sideways_doubts
 from log2sim.agents.size import TrackGeometry
 from log2sim.agents.static import yaw_sigma
 from log2sim.datatypes import CATEGORIES, MAX_SPEED_MPS, Detections, Measurements, Waypoints

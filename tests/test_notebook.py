@@ -17,16 +17,17 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
-from log2sim import late_functions, plot
+from log2sim import plot
 from log2sim.datatypes import Log, Scenario, Stream
-from log2sim.datatypes.waypoint_table import COLUMNS
+from log2sim.datatypes.scenario import COLUMNS
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError, ScenarioError
+from log2sim.files import plugins
 from log2sim.perception.sync import synchronize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.visualization.notebook import html, thumbnails
-from log2sim.visualization.notebook.show import labels_of
-from log2sim.visualization.overlay.moment import labels_at, read_moment
+from log2sim.visualization import notebook
+from log2sim.visualization.notebook import labels_of
+from log2sim.visualization.overlay import labels_at, read_moment
 
 EVIL = "<script>window.hacked = 1</script>\"'<img src=x onerror=hacked>"
 MAX_PAGE_BYTES = 150_000
@@ -145,10 +146,10 @@ def test_the_html_names_doubts_and_collisions(scenario: Scenario, replayed: Repl
     doubted = replace(
         scenario, agents=tuple(replace(a, confidence=0.2) if a.id == "car" else a for a in scenario.agents)
     )
-    assert re.search(r"doubtful\s+car\b", Tags(html.html_of(doubted)).text)
+    assert re.search(r"doubtful\s+car\b", Tags(notebook.html_of(doubted)).text)
     event = {"belongs_to": "replay", "t_s": 0.5, "agents": ["ego", "car"]}
     crashed = replace(replayed, metrics={**replayed.metrics, "collisions": [event]})
-    assert "ego and car at 0.50 s" in Tags(html.html_of(crashed)).text
+    assert "ego and car at 0.50 s" in Tags(notebook.html_of(crashed)).text
 
 
 def test_a_log_without_cameras_shows_a_sweep(log: Log) -> None:
@@ -160,7 +161,7 @@ def test_what_cannot_be_drawn_is_left_out(scenario: Scenario, log: Log, monkeypa
     def broken(*arguments: Any) -> Any:
         raise RuntimeError
 
-    monkeypatch.setattr(html, "thumbnail_of_scenario", broken)
+    monkeypatch.setattr(notebook, "thumbnail_of_scenario", broken)
     page = scenario._repr_html_()
     assert page is not None
     assert "<img" not in page
@@ -170,8 +171,8 @@ def test_what_cannot_be_drawn_is_left_out(scenario: Scenario, log: Log, monkeypa
         raise RecordError("broken")
 
     dark = log.changed(streams={n: Stream(n, s.t_ns, unreadable) for n, s in log.streams.items()})
-    assert thumbnails.thumbnails_of_log(dark) == []
-    monkeypatch.setitem(late_functions.FUNCTIONS, "html_of", "log2sim.nowhere:html_of")
+    assert notebook.thumbnails_of_log(dark) == []
+    monkeypatch.setitem(plugins.LATE_FUNCTIONS, "html_of", "log2sim.nowhere:html_of")
     assert scenario._repr_html_() is None
 
 
@@ -370,4 +371,4 @@ def test_plot_makes_a_figure_of_its_own(scenario: Scenario, monkeypatch: pytest.
 
 def test_an_empty_scenario_can_be_shown() -> None:
     nothing = Scenario("nothing", 0, 0.0, ())
-    assert "<img" in html.html_of(nothing)
+    assert "<img" in notebook.html_of(nothing)

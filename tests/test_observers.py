@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.observers import spans_of_ticks
+from log2sim.agents.estimate import spans_of_ticks
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Scenario, Waypoints, retime_spans
 from log2sim.edit.apply import edit
 from log2sim.edit.edits import Shift, Speed
 from log2sim.errors import ConfigError
 from log2sim.logs.opening import open_log
-from log2sim.sensors import choose_detector, select_sensors
+from log2sim.plan import choose_detector, select_sensors
 from log2sim.tracking.forward import MAX_MISSES
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"

@@ -16,20 +16,26 @@ import pytest
 from command_line import names, run
 from worlds import tiny_toml
 
-from log2sim import output_folders, outputs
-from log2sim.cli.process import Ended, TolerantStream, ending_by_signals
-from log2sim.documents import check_targets, refuse_below_file, replaced, write_json
+from log2sim.cli.shared import Ended, TolerantStream, ending_by_signals
 from log2sim.errors import ConfigError
 from log2sim.export import exporters
-from log2sim.output_claims import claim, holding_claims
-from log2sim.output_folders import replaced_folder
-from log2sim.outputs import refusing_to_replace, temporary_beside, together
+from log2sim.files import outputs
+from log2sim.files import outputs as output_folders
+from log2sim.files.documents import check_targets, refuse_below_file, replaced, write_json
+from log2sim.files.outputs import (
+    claim,
+    holding_claims,
+    refusing_to_replace,
+    replaced_folder,
+    temporary_beside,
+    together,
+)
 
 DIES = """
 import os, sys
 from pathlib import Path
-from log2sim.documents import replaced
-from log2sim.outputs import temporary_beside
+from log2sim.files.documents import replaced
+from log2sim.files.outputs import temporary_beside
 with replaced(Path(sys.argv[1]) / "a.json") as temporary:
     temporary.write_text("half")
     folder = temporary_beside(Path(sys.argv[1]) / "a")
@@ -222,7 +228,7 @@ def test_output_that_nobody_can_read_changes_no_exit_code(end: str) -> None:
 
 PRINTS = """
 import os, sys
-from log2sim.cli.process import tolerating_lost_output
+from log2sim.cli.shared import tolerating_lost_output
 with tolerating_lost_output():
     with open(sys.argv[1], "w") as file:
         os.write(1, b"of a library")
@@ -258,7 +264,7 @@ def test_scenario_report_and_picture_of_a_run_appear_together_or_not_at_all(
             raise problem
         return sound(temporary, target)
 
-    monkeypatch.setattr("log2sim.documents.put", fails)
+    monkeypatch.setattr("log2sim.files.documents.put", fails)
     ran = run(*command, *options)
     assert ran.code == (130 if isinstance(problem, KeyboardInterrupt) else 2)
     assert isinstance(problem, KeyboardInterrupt) or "s.json: cannot be written: No space left on device" in ran.line
@@ -319,8 +325,8 @@ def test_every_command_refuses_a_folder_that_cannot_be_written_before_its_work(c
 HOLDS = """
 import sys, time
 from pathlib import Path
-from log2sim.documents import {check}
-from log2sim.output_claims import holding_claims
+from log2sim.files.documents import {check}
+from log2sim.files.outputs import holding_claims
 with holding_claims():
     {check}(Path(sys.argv[1]), overwrite=False)
     print("held", flush=True)

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from log2sim.agents.candidate import AgentCandidate
-from log2sim.agents.duplicates import suppress_duplicates
-from log2sim.agents.naming import name_agents
+from log2sim.agents.candidate import AgentCandidate, name_agents
+from log2sim.agents.judge import suppress_duplicates
 from log2sim.datatypes import Agent, Waypoints
 
 

@@ -14,8 +14,7 @@ from worlds import camera_ahead, tiny_log
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, RecordError
 from log2sim.geometry import RollingShutter, apply, box_corners, inverse, line_time_s, points_in_box, project_moving
-from log2sim.visualization.overlay.moment import labels_at, read_moment
-from log2sim.visualization.overlay.picture import draw_moment
+from log2sim.visualization.overlay import draw_moment, labels_at, read_moment
 
 SPEED_MPS, TURN_RADPS = 12.0, 0.4
 

@@ -22,21 +22,20 @@ from worlds import tiny_toml
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
-from log2sim.documents import read_json
 from log2sim.errors import ConfigError, Log2SimError, LogError, ScenarioError
-from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.export.exporters import Options, export
 from log2sim.export.openscenario.read import load
 from log2sim.export.roads.opendrive import require_roads
 from log2sim.export.xml_text import read
-from log2sim.logs.arrow.tables import read_columns
-from log2sim.logs.kitti.drive import calibration_entry, read_calibration
+from log2sim.files.documents import read_json
+from log2sim.logs.arrow import read_columns
+from log2sim.logs.kitti.labels import calibration_entry, read_calibration
 from log2sim.logs.nuscenes.tables import scan_records
 from log2sim.logs.opening import open_log
-from log2sim.logs.ros.messages import definition_fields
-from log2sim.logs.ros.settings import read_settings
-from log2sim.logs.waymo.wire import WireError, fields_of
-from log2sim.simulation.metrics.limits import parse_limits
+from log2sim.logs.ros.messages import definition_fields, read_settings
+from log2sim.logs.waymo.messages import WireError, fields_of
+from log2sim.simulation.metrics.all_metrics import parse_limits
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 from log2sim.synth.scene import load_scene

@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Camera
-from log2sim.perception.frames import RecordReader
-from log2sim.perception.kept_sweeps import KeepingReader
-from log2sim.perception.picture_pass import look_again
+from log2sim.perception.frames import KeepingReader, RecordReader, look_again
 
 SIZE = (64, 48)
 K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1.0]])

@@ -16,9 +16,9 @@ from worlds import PARKED, tiny_log
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.datatypes import Labels, Log, Stream
-from log2sim.documents import check, write_json
 from log2sim.errors import ConfigError, LogError, NothingToReconstruct, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.files.documents import check, write_json
 from log2sim.pipeline import Result
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from worlds import CAR, PARKED, WALKER, tiny_log, tiny_table
 
-from log2sim.config import Config
-from log2sim.config_sections import LidarConfig
+from log2sim.config import Config, LidarConfig
 from log2sim.datatypes import Agent, Boxes3D, Detections, Frame, Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
@@ -19,7 +18,7 @@ from log2sim.geometry import inverse, project_boxes, wrap_angle
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.pipeline import Detectors, Result, first_pass, reconstruct, second_pass, start
+from log2sim.pipeline import Detectors, Result, infer_scenario, observe_log, reconstruct, start
 
 ALL_AROUND = [{**tiny_table()["lidar"][0], "azimuth_deg": [-180.0, 180.0], "azimuth_step_deg": 1.0, "channels": 20}]
 BEHIND = PARKED | {"id": "behind", "pose": [-9.0, 4.0, 200.0]}
@@ -131,7 +130,7 @@ def run_with(log: Log, images: Images | None, sweeps: Sweeps | None) -> Result:
     name = "+".join(["labels"] * (images is not None) + ["lidar:labels"] * (sweeps is not None))
     started = start(log, Config.load(settings=[f"detect.name={name}"]))
     started = replace(started, detectors=Detectors(images, sweeps))
-    return second_pass(started, first_pass(started))
+    return infer_scenario(replace(started, plan=started.plan.only_agents()), observe_log(started))
 
 
 def nothing(frame: Frame, found: Detections) -> Detections:

@@ -9,8 +9,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Camera, PoseTrack, transform
-from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan
-from log2sim.sensors import select_sensors
+from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
 
 
 def make_log(

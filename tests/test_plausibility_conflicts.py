@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from test_overlap import agent, candidate
 
-from log2sim.agents.candidate import Timeline
-from log2sim.agents.naming import name_agents
-from log2sim.agents.plausibility import box_table
-from log2sim.agents.plausibility.box_table import BoxTable
-from log2sim.agents.plausibility.conflicts import conflict_doubts, find_all_conflicts, find_conflicts, resolve_conflicts
-from log2sim.agents.plausibility.static_life import extend_static
+from log2sim.agents import evidence as box_table
+from log2sim.agents.candidate import Timeline, name_agents
+from log2sim.agents.conflicts import (
+    conflict_doubts,
+    extend_static,
+    find_all_conflicts,
+    find_conflicts,
+    resolve_conflicts,
+)
+from log2sim.agents.evidence import BoxTable
 from log2sim.datatypes import Obstacles, Rays
 
 T = np.linspace(0.0, 4.0, 5)

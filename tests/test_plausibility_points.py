@@ -9,16 +9,21 @@ import pytest
 from test_overlap import agent, candidate
 from worlds import rows_at
 
-from log2sim.agents.candidate import Timeline
-from log2sim.agents.plausibility.box_table import BoxTable
-from log2sim.agents.plausibility.dimensions import doubt_size
-from log2sim.agents.plausibility.evidence import image_height_share, weigh
-from log2sim.agents.plausibility.free_space import Ending, classify_rays, count_rays
-from log2sim.agents.plausibility.points import contradict, is_refuted, missing_nats, usual_detection_rate
-from log2sim.agents.plausibility.recording import Recording
-from log2sim.agents.plausibility.structure import find_surface, structure_shares
-from log2sim.agents.plausibility.views import shown_in_images
-from log2sim.agents.support import Support
+from log2sim.agents.candidate import Support, Timeline
+from log2sim.agents.evidence import (
+    BoxTable,
+    Ending,
+    Recording,
+    classify_rays,
+    count_rays,
+    doubt_size,
+    find_surface,
+    image_height_share,
+    shown_in_images,
+    structure_shares,
+    weigh,
+)
+from log2sim.agents.judge import contradict, is_refuted, missing_nats, usual_detection_rate
 from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Rays, Stream, Track
 from log2sim.geometry import NS_PER_S, Camera, transform
 from log2sim.perception.sync import Schedule
@@ -233,15 +238,17 @@ def test_what_no_ray_reaches_is_refuted_and_what_has_no_point_doubted():
     assert doubt.flag == "hardly_observed"
 
 
-VAN, BACK = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5)
+VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)
 
 
 @pytest.mark.parametrize(
     ("thing", "points", "pointless", "unreached"),
     [
-        # Images show a car behind a van; once the van is taken for it.
-        (VAN, [0, 0, 0, 30, 0], False, True),
-        (VAN, [0, 30, 0, 30, 30], False, False),
+        # Images show a car where the LiDAR sees a van before it, or look past its corner once.
+        (VAN, [0, 0, 0, 0, 0], True, True),
+        (VAN, [0, 0, 0, 30, 0], False, False),
+        # Of some rays that reach its place most go on.
+        (CORNER, [0, 0, 0, 0, 0], True, True),
         # Its points are those of what stands beside it, but rays end in it.
         (BACK, [0, 0, 0, 0, 0], True, False),
         (BACK, [9, 9, 9, 9, 9], False, False),

@@ -12,14 +12,13 @@ from matplotlib.collections import LineCollection
 
 from log2sim.datatypes import Agent, Doubt, Scenario
 from log2sim.geometry import Array, box_corners_bev
-from log2sim.visualization.plot import doubts, shapes
-from log2sim.visualization.plot.animated_artists import AnimatedArtists
+from log2sim.visualization.plot import layers, viewport
+from log2sim.visualization.plot.animation import AnimatedArtists
+from log2sim.visualization.plot.layers import NO_OVERLAYS
 from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.overlays import NO_OVERLAYS
-from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import Viewport
+from log2sim.visualization.plot.viewport import Viewport, assign_roles
 
 VIEW = Viewport(-20.0, 20.0, -20.0, 20.0, 0.1)
 
@@ -51,7 +50,7 @@ def striped(layout: FigureLayout) -> list[Array]:
 @pytest.mark.parametrize("spacing_m", [0.2, 0.5, 40.0])
 def test_stripes_cross_the_box_at_45_degrees(yaw: float, spacing_m: float) -> None:
     corners = box_corners_bev([[3.0, -2.0]], 4.4, 1.8, yaw)[0]
-    lines = shapes.stripes(corners, spacing_m)
+    lines = viewport.stripes(corners, spacing_m)
     c, s = np.cos(yaw), np.sin(yaw)
     local = (lines - [3.0, -2.0]) @ np.array([[c, -s], [s, c]])
     assert len(lines) >= 2
@@ -65,20 +64,20 @@ def test_stripes_cross_the_box_at_45_degrees(yaw: float, spacing_m: float) -> No
 
 def test_a_track_is_striped_where_it_is_doubtful() -> None:
     agent = doubted(straight("car"), (1.0, 2.0))
-    (part,) = doubts.doubtful_parts(agent)
+    (part,) = layers.doubtful_parts(agent)
     np.testing.assert_allclose(part[[0, -1], 0], [5.0, 10.0])
-    (whole,) = doubts.doubtful_parts(replace(straight("car"), confidence=0.49))
+    (whole,) = layers.doubtful_parts(replace(straight("car"), confidence=0.49))
     np.testing.assert_allclose(whole[[0, -1], 0], [0.0, 15.0])
-    assert list(doubts.doubtful_parts(doubted(straight("car"), (7.0, 8.0)))) == []
-    (moment,) = doubts.doubtful_parts(doubted(straight("car"), (1.0, 1.0)))
-    assert moment[-1, 0] - moment[0, 0] == pytest.approx(5.0 * doubts.MIN_SHOWN_S)  # a moment could not be seen
+    assert list(layers.doubtful_parts(doubted(straight("car"), (7.0, 8.0)))) == []
+    (moment,) = layers.doubtful_parts(doubted(straight("car"), (1.0, 1.0)))
+    assert moment[-1, 0] - moment[0, 0] == pytest.approx(5.0 * layers.MIN_SHOWN_S)  # a moment could not be seen
 
 
 def test_an_agent_is_doubted_while_a_doubt_holds() -> None:
     agent = doubted(straight("car"), (1.0, 2.0))
-    assert [doubts.is_doubted_at(agent, t) for t in (0.9, 1.0, 2.0, 2.1)] == [False, True, True, False]
-    assert not doubts.is_doubted_at(straight("car"), 1.0)
-    assert doubts.is_doubted_at(replace(straight("car"), confidence=0.49), 1e9)
+    assert [layers.is_doubted_at(agent, t) for t in (0.9, 1.0, 2.0, 2.1)] == [False, True, True, False]
+    assert not layers.is_doubted_at(straight("car"), 1.0)
+    assert layers.is_doubted_at(replace(straight("car"), confidence=0.49), 1e9)
 
 
 def test_boxes_are_hatched_where_they_are_doubtful() -> None:
@@ -112,8 +111,8 @@ def test_many_and_long_reasons_leave_the_legend_beside_the_map() -> None:
     ]
     layout = drawn(world(straight("ego"), *agents))
     rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
-    assert f"and {len(agents) - doubts.MAX_NAMED} more doubtful" in rows
-    assert all(len(line) <= doubts.LINE_LETTERS for row in rows for line in row.split("\n") if "doubtful" in row)
+    assert f"and {len(agents) - layers.MAX_NAMED} more doubtful" in rows
+    assert all(len(line) <= layers.LINE_LETTERS for row in rows for line in row.split("\n") if "doubtful" in row)
     layout.canvas.draw()
     assert layout.figure.legends[0].get_window_extent().y0 >= 0
 

@@ -15,15 +15,14 @@ from log2sim.datatypes import Scenario
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.visualization.plot.animated_artists import AnimatedArtists
-from log2sim.visualization.plot.collisions import new_collisions
+from log2sim.visualization.plot.animation import AnimatedArtists
+from log2sim.visualization.plot.layers import Overlays, new_collisions
 from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, TRACK_ALPHA
 from log2sim.visualization.plot.time_series import timeline_of
 from log2sim.visualization.plot.tracks import plot_tracks, still
+from log2sim.visualization.plot.viewport import assign_roles
 
 
 def named(key: str, id: str, **moved: float):

@@ -11,15 +11,13 @@ import pytest
 from log2sim.datatypes import TYPICAL_SIZE_M, Agent, MapFrame, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
-from log2sim.visualization.plot import shapes
-from log2sim.visualization.plot.animated_artists import AnimatedArtists
-from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.options import PlotOptions
-from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.roles import agent_colors, assign_roles
+from log2sim.visualization.plot import viewport
+from log2sim.visualization.plot.animation import AnimatedArtists
+from log2sim.visualization.plot.layers import Overlays
+from log2sim.visualization.plot.layout import FigureLayout, place_labels
 from log2sim.visualization.plot.style import PALETTE, printable
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import Viewport, choose_viewport, nice_step, time_step_s
+from log2sim.visualization.plot.viewport import Viewport, assign_roles, choose_viewport, nice_step, time_step_s
 
 
 def make_agent(
@@ -127,7 +125,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
         show(stage, t_s)
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail_half_way)
-    monkeypatch.setattr("log2sim.visualization.plot.animated_artists.AnimatedArtists.show", fail_later)
+    monkeypatch.setattr("log2sim.visualization.plot.animation.AnimatedArtists.show", fail_later)
     with pytest.raises(RuntimeError, match="disk"):
         plot_tracks(crossing(), out, overwrite=True)
     assert out.read_bytes() == b"good"
@@ -262,15 +260,15 @@ def test_north_is_named_only_when_the_map_knows_it() -> None:
 
 def test_boxes_have_the_real_size_and_heading() -> None:
     agent = make_agent("1", (3.0, 4.0), (0.0, 2.0))  # drives north: length 4.4 along y, width 1.85 along x
-    corners = shapes.footprints(agent, (3.0, 4.0), np.pi / 2)[0]
+    corners = viewport.footprints(agent, (3.0, 4.0), np.pi / 2)[0]
     expected = [(3 - 0.925, 4 + 2.2), (3 - 0.925, 4 - 2.2), (3 + 0.925, 4 - 2.2), (3 + 0.925, 4 + 2.2)]
     np.testing.assert_allclose(corners, expected, atol=1e-12)
-    assert shapes.heading_triangles(corners[None])[0, 2] == pytest.approx((3.0, 6.2))
+    assert viewport.heading_triangles(corners[None])[0, 2] == pytest.approx((3.0, 6.2))
 
 
 def test_arrows_point_the_way_of_travel() -> None:
     xy = np.column_stack([np.linspace(50, 0, 51), np.zeros(51)])
-    heads = shapes.arrows(xy, Viewport(0, 50, -10, 10, m_per_pt=0.1))
+    heads = viewport.arrows(xy, Viewport(0, 50, -10, 10, m_per_pt=0.1))
     assert len(heads) == 5  # 500 pt of way, one each 110 pt
     assert all(head[0, 0] < head[[1, 3], 0].min() for head in heads)
 
@@ -279,7 +277,7 @@ def test_filled_gaps_are_split_from_what_was_seen() -> None:
     agent = make_agent("1", (0.0, 0.0), (1.0, 0.0), count=6)
     observed = np.array([True, True, False, False, True, True])
     agent = dataclasses.replace(agent, waypoints=dataclasses.replace(agent.waypoints, observed=observed))
-    seen, filled = shapes.observed_and_filled(agent)
+    seen, filled = viewport.observed_and_filled(agent)
     assert [part[:, 0].round(6).tolist() for part in seen] == [[0.0, 0.1], [0.4, 0.5]]
     assert [part[:, 0].round(6).tolist() for part in filled] == [[0.1, 0.2, 0.3, 0.4]]
 
@@ -295,28 +293,6 @@ def test_colors_of_movers_are_distinct_and_keep_to_rank() -> None:
     assert [role.agent.id for role in nearest.movers] == ["ego", "b", "a"]
 
 
-def test_an_agent_has_its_id_and_the_same_color_in_every_part_of_a_scenario() -> None:
-    """A film of two seconds, or of one agent, would rank the others anew and give them other colors than the page."""
-    scenario = make_scenario(
-        make_agent("ego", (0, 0), (10, 0)), make_agent("far", (0, 50), (5, 0)), make_agent("crosser", (0, 5), (5, 0))
-    )
-    whole = {role.agent.id: role.color for role in assign_roles(scenario).movers}
-    part = dataclasses.replace(scenario, agents=tuple(a for a in scenario.agents if a.id != "crosser"))
-    roles = assign_roles(part, agent_colors(scenario))
-    assert {role.agent.id: role.color for role in roles.movers} == {id: whole[id] for id in ("ego", "far")}
-    assert whole["far"] != whole["crosser"]
-    texts = [text.get_text() for text in still(part, roles).ax.texts]
-    assert any(text.startswith("far") for text in texts)
-
-
-def test_static_agents_have_their_ids_on_demand() -> None:
-    scenario = make_scenario(make_agent("ego", (0, 0), (10, 0)), make_agent("parked", (8, 4), (0, 0)))
-    for wanted in (False, True):
-        options = PlotOptions(label_static=wanted)
-        texts = [t.get_text() for t in still(scenario, assign_roles(scenario), Overlays(options=options)).ax.texts]
-        assert ("parked" in texts) == wanted
-
-
 def test_steps_are_round_numbers() -> None:
     assert [nice_step(v) for v in (0.9, 1.0, 3.2, 7.0, 49.9, 100.0)] == [0.5, 1.0, 2.0, 5.0, 20.0, 100.0]
     assert time_step_s(6.0, 3, 10.0, 0.05) == 1.0
@@ -327,3 +303,28 @@ def test_steps_are_round_numbers() -> None:
 def test_letters_that_the_font_lacks_become_question_marks() -> None:
     assert printable("Straße 日 \n x") == "Straße ? x"
     assert len(printable("x" * 500)) == 80
+
+
+def test_a_part_of_a_scenario_keeps_the_colors_of_the_whole_and_labels_are_ids() -> None:
+    whole = many(8)
+    colors = {role.agent.id: role.color for role in assign_roles(whole).movers}
+    part = dataclasses.replace(whole, agents=whole.agents[:1] + whole.agents[4:])
+    assert {role.agent.id: role.color for role in assign_roles(part, whole).movers} == {
+        a.id: colors[a.id] for a in part.agents
+    }
+    assert {role.agent.id: role.color for role in assign_roles(part).movers} != {
+        a.id: colors[a.id] for a in part.agents
+    }
+    roles = assign_roles(whole)
+    placed = place_labels(roles, choose_viewport(roles).fitted(400, 400), 1.0)
+    assert placed.labels
+    assert all(
+        any(label.text.startswith(a.id) for a in whole.agents) or label.text.endswith(" s") for label in placed.labels
+    )
+
+
+def test_static_agents_have_labels_on_demand() -> None:
+    roles = assign_roles(crossing())
+    view = choose_viewport(roles).fitted(400, 400)
+    assert not any(label.text == "p" for label in place_labels(roles, view, 1.0).labels)
+    assert any(label.text == "p" for label in place_labels(roles, view, 1.0, static=True).labels)

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from plugin_packages import ROOT, SECTION, install, install_readme
 
-from log2sim import Config, Scenario, open_log, reconstruct, registry, replay
+from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError, PluginError
 from log2sim.export.exporters import export
+from log2sim.files import plugins
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.first_pass import cloud_origin
-from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
 from log2sim.simulation import load_policy
 
 PACKAGE = r"package 'broken 2\.1'"
@@ -64,11 +64,11 @@ def cloud_of(log: Log) -> Cloud:
 
 def test_there_is_an_example_of_every_kind(examples: Path) -> None:
     groups = set(re.findall(r"`log2sim\.(\w+)`", SECTION))
-    assert groups == set(registry.BUILT_IN)
+    assert groups == set(plugins.BUILT_IN)
     for kind in groups:
-        (name,) = set(registry.names(kind)) - set(registry.BUILT_IN[kind])
-        assert registry.load(kind, name) is not None
-        assert "package 'my-plugins 1.0'" in registry.say_plugin(kind, name)
+        (name,) = set(plugins.names(kind)) - set(plugins.BUILT_IN[kind])
+        assert plugins.load(kind, name) is not None
+        assert "package 'my-plugins 1.0'" in plugins.say_plugin(kind, name)
 
 
 def test_the_log_reader_opens_a_folder(examples: Path, tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_the_vehicle_model_drives(examples: Path, tiny_folder: Path) -> None:
 
 def test_help_lists_installed_plug_ins_and_imports_none(packages: Path) -> None:
     code = "raise SystemExit('imported')"
-    kinds = {kind: {f"my-{kind}": "mine:THING"} for kind in registry.BUILT_IN}
+    kinds = {kind: {f"my-{kind}": "mine:THING"} for kind in plugins.BUILT_IN}
     install(packages, "mine", code, {f"log2sim.{kind}": named for kind, named in kinds.items()})
     expected = {
         "reconstruct": ["--format my-log", "--detector my-detector", "--detector lidar:my-lidar_detector"],
@@ -209,7 +209,7 @@ def test_what_is_no_plug_in_is_one_line_that_names_the_package(
 ) -> None:
     broken(packages, kind, code)
     with pytest.raises(PluginError, match=rf"'mine' of {PACKAGE} \(broken:THING\): {message}") as raised:
-        registry.load(kind, "mine")
+        plugins.load(kind, "mine")
     assert "\n" not in str(raised.value)
 
 
@@ -337,14 +337,14 @@ def test_one_name_of_two_packages_is_refused(packages: Path) -> None:
     with pytest.raises(
         PluginError, match=r"detector 'mine': is declared by package 'first 1\.0' and package 'second 1\.0'"
     ):
-        registry.load("detector", "mine")
+        plugins.load("detector", "mine")
 
 
 def test_built_in_names_cannot_be_taken(packages: Path) -> None:
     install(packages, "taker", "THING = print", {"log2sim.detector": {"labels": "taker:THING"}})
-    create: Any = registry.load("detector", "labels")
-    assert create.__module__ == "log2sim.perception.detect.labels"
-    assert registry.names("detector").count("labels") == 1
+    create: Any = plugins.load("detector", "labels")
+    assert create.__module__ == "log2sim.perception.detect.detectors"
+    assert plugins.names("detector").count("labels") == 1
 
 
 def test_unknown_names_list_the_installed_ones(examples: Path, tiny_folder: Path) -> None:

@@ -13,9 +13,9 @@ from localization_worlds import BEND, HOUSES, LIDAR, drive
 
 from log2sim import Scenario, open_log
 from log2sim.datatypes import Lidar
-from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError
-from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.evaluation.detection.boxes import DetectedBoxes
+from log2sim.files.documents import check
 from log2sim.localization import choice
 from log2sim.localization.choice import localize_like
 from log2sim.logs.native.writer import write_log

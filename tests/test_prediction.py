@@ -17,14 +17,20 @@ from replay_maneuvers import agent_from, driven
 from replay_scenes import line, parked, walker
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
-from log2sim.documents import check
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.prediction import smoothing
-from log2sim.prediction.displacement import measure_predictions
-from log2sim.prediction.document import format_figures, prediction_document
+from log2sim.files.documents import check
+from log2sim.prediction import motion_table
+from log2sim.prediction.displacement import format_figures, measure_predictions, prediction_document
 from log2sim.prediction.motion_table import table_of, tabulate
-from log2sim.prediction.prediction import METHODS, Predictions, leads_of, predict_scenario, predict_table
-from log2sim.prediction.spread import ACCELERATION_S, drift_variance
+from log2sim.prediction.prediction import (
+    ACCELERATION_S,
+    METHODS,
+    Predictions,
+    drift_variance,
+    leads_of,
+    predict_scenario,
+    predict_table,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -218,19 +224,19 @@ def test_noisy_positions_choose_longer_averages() -> None:
 
 
 def test_an_average_over_a_steady_circle_does_not_lag(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(smoothing, "CONSTANTS_S", ((0.6, 0.6),))
+    monkeypatch.setattr(motion_table, "CONSTANTS_S", ((0.6, 0.6),))
     table = table_of(scene(circle(20.0, 6.0)))
-    velocity = smoothing.smooth_motion(table).velocity_mps[0, 60:100]
+    velocity = motion_table.smooth_motion(table).velocity_mps[0, 60:100]
     assert velocity == pytest.approx(table.velocity_mps[0, 60:100], abs=0.02)
 
 
 def test_turn_rates_are_what_drivers_can_do() -> None:
     table = table_of(scene(circle(20.0, 6.0), line("b", 0.0, speed=0.2)))
-    rates = smoothing.turn_rates(table)
+    rates = motion_table.turn_rates(table)
     assert rates[0, 5:90] == pytest.approx(6.0 / 20.0, rel=0.01)
     assert not rates[1].any()
     backing = agent_from(np.arange(4) * 0.1, [0, 0.5, 0.4, 0.9], [0, 0.4, 0, 0.4], np.zeros(4), [5, 5, -5, 5.0])
-    assert np.abs(smoothing.turn_rates(table_of(scene(backing), 0.1))).max() <= 8.8 / 0.5
+    assert np.abs(motion_table.turn_rates(table_of(scene(backing), 0.1))).max() <= 8.8 / 0.5
 
 
 def test_sigmas_grow_with_the_lead_and_shrink_while_an_agent_stands() -> None:

@@ -13,14 +13,11 @@ from test_prediction import circle, corner, line, parked, scene
 from log2sim.datatypes import STANDSTILL_MPS
 from log2sim.errors import ConfigError
 from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
-from log2sim.visualization.page import predictions as page_predictions
-from log2sim.visualization.page.columns import SCALES
-from log2sim.visualization.page.document import page_document
-from log2sim.visualization.page.predictions import EVERY_TICKS, predicted_columns
-from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
-from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.page import document as page_predictions
+from log2sim.visualization.page.document import EVERY_TICKS, SCALES, page_document, predicted_columns
+from log2sim.visualization.plot.layers import Overlays, PredictedPaths, draw_predictions
 from log2sim.visualization.plot.tracks import still
+from log2sim.visualization.plot.viewport import assign_roles
 
 
 def drawn(world, horizon_s: float) -> tuple[list[np.ndarray], list[np.ndarray]]:

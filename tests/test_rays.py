@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log2sim.perception.lidar.cloud import Cloud, CloudSensor
-from log2sim.perception.lidar.rays import CELL_RAD, sample_rays
+from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, sample_rays
 
 
 def cloud_of(xyz, *, height=None, sensors=(), t_s=None):

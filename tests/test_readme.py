@@ -22,7 +22,7 @@ import pytest
 import typer
 
 from log2sim.cli import entry
-from log2sim.logs.ros.settings import read_settings
+from log2sim.logs.ros.messages import read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from log2sim import Config, open_log, reconstruct
-from log2sim.documents import check
 from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
+from log2sim.files.documents import check
 
 pytestmark = [pytest.mark.slow, pytest.mark.real]
 

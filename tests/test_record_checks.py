@@ -10,19 +10,24 @@ import numpy as np
 import pytest
 from worlds import camera_ahead, scan, standing, tiny_log
 
-from log2sim.config import Config
-from log2sim.config_sections import MapConfig
+from log2sim.config import Config, MapConfig
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, transform
-from log2sim.mapping.builder import map_ground
-from log2sim.perception.record_checks.camera_watch import CameraWatch
-from log2sim.perception.record_checks.lidar_watch import LidarWatch
-from log2sim.perception.record_checks.records import RecordWatch
-from log2sim.perception.record_checks.spans import gaps_of, spans_of
-from log2sim.perception.record_checks.sweep_sketches import common_share, sketch_sweep
-from log2sim.perception.record_checks.thumbnails import measure_change, shows_nothing, shrink
+from log2sim.perception.records import (
+    CameraWatch,
+    LidarWatch,
+    RecordWatch,
+    common_share,
+    gaps_of,
+    measure_change,
+    shows_nothing,
+    shrink,
+    sketch_sweep,
+    spans_of,
+)
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
+from log2sim.road.builder import map_ground
 
 STEP_NS = 100_000_000
 COUNT = 10

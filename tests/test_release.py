@@ -19,7 +19,7 @@ from worlds import tiny_log
 
 import log2sim
 from log2sim.cli import app
-from log2sim.registry import BUILT_IN
+from log2sim.files.plugins import BUILT_IN
 from log2sim.version import FALLBACK, read_version
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,7 +34,7 @@ from importlib import resources
 import log2sim
 from log2sim.config import Config
 from log2sim.datatypes import Log
-from log2sim.documents import load_schema
+from log2sim.files.documents import load_schema
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 detector = create_lidar_detector("lidar:vehicle", Log("made", "log2sim", {}, {}, {}), Config().lidar)
 page = resources.files("log2sim.visualization.page").joinpath("page.html").read_text(encoding="utf-8")
@@ -77,7 +77,7 @@ def test_the_citation_names_the_project_and_its_papers() -> None:
 def test_telemetry_is_off_wherever_a_model_is_opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import onnxruntime
 
-    from log2sim.perception.onnx_session import open_session
+    from log2sim.perception.detect3d.network import open_session
 
     called: list[str] = []
     monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: called.append("off"))
@@ -86,7 +86,7 @@ def test_telemetry_is_off_wherever_a_model_is_opened(monkeypatch: pytest.MonkeyP
     assert called == ["off", "session"]
     opening = re.compile(r"InferenceSession\(")
     sources = [f for f in (ROOT / "log2sim").rglob("*.py") if opening.search(f.read_text(encoding="utf-8"))]
-    assert [f.name for f in sources] == ["onnx_session.py"]
+    assert [f.name for f in sources] == ["network.py"]
 
 
 def call(*command: str | Path, cwd: Path, **variables: str) -> str:

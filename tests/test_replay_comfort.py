@@ -10,10 +10,17 @@ from command_line import run
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
 from scipy.signal import savgol_filter
 
-from log2sim.documents import write_json
 from log2sim.errors import CheckFailed, ConfigError
-from log2sim.simulation.metrics.comfort import LIMITS, _derivative, comfort
-from log2sim.simulation.metrics.limits import check_limits, check_strict, parse_limits, require_strict
+from log2sim.files.documents import write_json
+from log2sim.simulation.metrics.all_metrics import (
+    LIMITS,
+    _derivative,
+    check_limits,
+    check_strict,
+    comfort,
+    parse_limits,
+    require_strict,
+)
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
@@ -197,7 +204,7 @@ def test_a_limit_nearly_named_is_guessed():
 
 
 def test_the_summary_of_a_driven_ego_is_about_the_ego():
-    from log2sim.simulation.metrics.summary import summarize
+    from log2sim.simulation.metrics.all_metrics import summarize
 
     driven = replay(hard_braking(), ego=lambda seen: Controls(-3.0, 0.0))
     assert "least time to collision of the ego" in summarize(driven)

@@ -11,11 +11,17 @@ from replay_scenes import line
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
 from log2sim.geometry import rectangles_overlap
-from log2sim.simulation.metrics import post_encroachment_time
-from log2sim.simulation.metrics.box_tracks import BoxTracks
-from log2sim.simulation.metrics.conflicts import conflicts, most_critical
-from log2sim.simulation.metrics.post_encroachment_time import CROSSING_RAD, post_encroachment_times
-from log2sim.simulation.metrics.time_to_collision import HORIZON_S, time_to_touch, times_to_collision
+from log2sim.simulation.metrics import conflicts as post_encroachment_time
+from log2sim.simulation.metrics.collisions import BoxTracks
+from log2sim.simulation.metrics.conflicts import (
+    CROSSING_RAD,
+    HORIZON_S,
+    conflicts,
+    most_critical,
+    post_encroachment_times,
+    time_to_touch,
+    times_to_collision,
+)
 from log2sim.simulation.runner import replay
 
 SIZE = np.array([[4.0, 2.0, 1.5]])

@@ -10,9 +10,14 @@ from scipy.optimize import brentq
 from log2sim.errors import ScenarioError
 from log2sim.geometry import rectangles_overlap, wrap_angle
 from log2sim.simulation.metrics import collisions as collisions_module
-from log2sim.simulation.metrics.box_tracks import BoxTracks
-from log2sim.simulation.metrics.collisions import collisions, contacts
-from log2sim.simulation.metrics.continuous_collision import MAX_STEPS, RelativeMotion, first_contact
+from log2sim.simulation.metrics.collisions import (
+    MAX_STEPS,
+    BoxTracks,
+    RelativeMotion,
+    collisions,
+    contacts,
+    first_contact,
+)
 from log2sim.simulation.runner import replay
 
 SPACING_S = 0.05

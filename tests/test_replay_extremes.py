@@ -302,7 +302,7 @@ def test_headings_that_flicker_about_pi_are_one_heading():
 @pytest.fixture
 def _exact_numbers(monkeypatch):
     """States as they are, not rounded for the file."""
-    monkeypatch.setattr("log2sim.simulation.replay_result.STATE_DIGITS", 12)
+    monkeypatch.setattr("log2sim.simulation.runner.STATE_DIGITS", 12)
 
 
 @pytest.mark.usefixtures("_exact_numbers")

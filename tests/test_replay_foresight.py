@@ -13,9 +13,8 @@ from test_prediction import circle
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.simulation.reactive.foresight import MotionForesight
-from log2sim.simulation.reactive.path_table import PathTable
-from log2sim.simulation.reactive.swept_corridor import HORIZON_S
+from log2sim.simulation.corridors import HORIZON_S, PathTable
+from log2sim.simulation.reactive import MotionForesight
 from log2sim.simulation.runner import replay as run
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"

@@ -18,9 +18,8 @@ from replay_scenes import LENGTH_M, Speed, gap, line, parked, walker
 from log2sim.datatypes import Scenario, Trajectory
 from log2sim.edit import Lateral, edit
 from log2sim.errors import ConfigError
-from log2sim.simulation.policy import Controls
-from log2sim.simulation.policy_loading import load_policy
-from log2sim.simulation.reactive.path_table import scenario_times_of_positions
+from log2sim.simulation.corridors import scenario_times_of_positions
+from log2sim.simulation.policy import Controls, load_policy
 from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world, replay
 

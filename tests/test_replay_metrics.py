@@ -9,11 +9,8 @@ from replay_maneuvers import agent_from, driven, lane_change, scenario_of
 from log2sim.datatypes import Trajectory
 from log2sim.errors import CheckFailed
 from log2sim.geometry import rectangles_overlap
-from log2sim.simulation.metrics.box_tracks import BoxTracks
-from log2sim.simulation.metrics.collisions import SCENARIO_MARGIN_M, SCENARIO_WINDOW_S, collisions, contacts
-from log2sim.simulation.metrics.limits import check_strict, require_strict
-from log2sim.simulation.metrics.summary import summarize
-from log2sim.simulation.metrics.tracking_error import tracking_errors
+from log2sim.simulation.metrics.all_metrics import check_strict, require_strict, summarize, tracking_errors
+from log2sim.simulation.metrics.collisions import SCENARIO_MARGIN_M, SCENARIO_WINDOW_S, BoxTracks, collisions, contacts
 from log2sim.simulation.runner import replay
 
 T_S = np.arange(0, 41) * 0.1

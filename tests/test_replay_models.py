@@ -9,7 +9,7 @@ import pytest
 from replay_maneuvers import agent_from, driven, lane_change, ramp, scenario_of
 
 from log2sim.errors import ConfigError
-from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.metrics.all_metrics import summarize
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay

@@ -12,11 +12,9 @@ from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
 
 from log2sim.datatypes import Scenario, Trajectory
 from log2sim.errors import ConfigError
-from log2sim.simulation.policy import Controls
-from log2sim.simulation.policy_loading import load_policy
-from log2sim.simulation.reactive.idm import idm_parameters, leader_demand, rate_response
-from log2sim.simulation.reactive.path_table import PathTable, scenario_times_of_distance
-from log2sim.simulation.reactive.swept_corridor import _nearest_edge
+from log2sim.simulation.corridors import PathTable, _nearest_edge, scenario_times_of_distance
+from log2sim.simulation.policy import Controls, load_policy
+from log2sim.simulation.reactive import idm_parameters, leader_demand, rate_response
 from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world
 from log2sim.simulation.runner import replay as run

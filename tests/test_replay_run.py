@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, scenario_of
 
-from log2sim.documents import check, write_json
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.simulation.policy import Controls
-from log2sim.simulation.policy_loading import load_policy
+from log2sim.files.documents import check, write_json
+from log2sim.simulation.policy import Controls, load_policy
 from log2sim.simulation.result import Replay, to_scenario
 from log2sim.simulation.runner import replay
 

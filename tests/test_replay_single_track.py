@@ -10,7 +10,6 @@ import pytest
 from replay_maneuvers import agent_from
 from scipy.integrate import solve_ivp
 
-from log2sim.simulation.vehicles.dynamic import step_dynamic
 from log2sim.simulation.vehicles.parameters import PUBLISHED, parameters_for, published_parameters
 from log2sim.simulation.vehicles.single_track import (
     Chassis,
@@ -18,6 +17,7 @@ from log2sim.simulation.vehicles.single_track import (
     StepInput,
     linear_displacement,
     linear_slips,
+    step_dynamic,
     step_single_track,
 )
 from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleControls, VehicleState, step_bicycle

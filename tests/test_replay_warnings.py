@@ -15,14 +15,10 @@ from replay_scenes import LENGTH_M, line, parked, walker
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.prediction.motion_table import table_of
+from log2sim.simulation.expected_motion import EgoPath, EgoStates, WarningSettings
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.simulation.warnings.ego_path import EgoPath, EgoStates
-from log2sim.simulation.warnings.policy import BrakeWhenWarned
-from log2sim.simulation.warnings.sentences import describe_warnings
-from log2sim.simulation.warnings.settings import WarningSettings
-from log2sim.simulation.warnings.warn import warn
-from log2sim.simulation.warnings.watch import Watch
+from log2sim.simulation.warnings import BrakeWhenWarned, Watch, describe_warnings, warn
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 TOWN_MPS = 30 / 3.6
@@ -277,9 +273,52 @@ def test_a_standing_ego_is_not_warned() -> None:
     assert warn(scene).events == ()
 
 
-def test_a_scenario_without_an_ego_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no agent 'ego'"):
-        warn(scenario_of(line("a", 0.0)))
+def test_without_an_ego_each_vehicle_is_warned_as_an_ego_would_be() -> None:
+    """Two encounters far from each other: of a car and a walker, and of two cars head-on, each of which is warned."""
+    p = crossing_walker(8.0)
+    (expected,) = warn(scenario_of(town_ego(), p)).events
+    far = 5000.0
+    one = line("one", far, speed=10.0, duration_s=12.0)
+    two = line("two", far + 180.0, speed=10.0, duration_s=12.0, yaw=np.pi)
+    standing = line("standing", far, speed=0.0, duration_s=12.0, y_m=50.0)
+    scene = scenario_of(replace(town_ego(), id="car"), p, one, two, standing)
+    found = {(e.driver, e.agent): e for e in warn(scene).events}
+    assert set(found) == {("car", "p"), ("one", "two"), ("two", "one")}
+    assert found["car", "p"] == replace(expected, driver="car")
+    assert found["one", "two"].ttc_s == pytest.approx(found["two", "one"].ttc_s, abs=2e-3)
+    doubtful = replace(line("doubtful", far, speed=10.0, duration_s=12.0, y_m=90.0), quarantined=True)
+    scene = replace(scene, agents=(*scene.agents, doubtful))  # who is not in the replay
+    hit = {(e.driver, e.agent): e.collision_s for e in warn(scene, replay(scene, dt_s=0.05)).events}
+    assert hit["one", "two"] == hit["two", "one"] == pytest.approx((180.0 - LENGTH_M) / 20.0, abs=0.1)
+
+
+def test_a_vehicle_that_the_end_does_not_know_cannot_be_warned() -> None:
+    car, p = replace(town_ego(), id="car"), crossing_walker(8.0)
+    known = scenario_of(seen(car, road=(0.0, 14.0)), seen(p, road=(0.0, 14.0)))
+    assert [e.driver for e in warn(known, ends="road").events] == ["car"]
+    assert warn(scenario_of(seen(car, vehicle=(0.0, 14.0)), seen(p, road=(0.0, 14.0))), ends="road").events == ()
+    two = [
+        line(name, x, speed=10.0, duration_s=12.0, yaw=yaw) for name, x, yaw in (("a", 0.0, 0.0), ("b", 180.0, np.pi))
+    ]
+    unknown = scenario_of(*(seen(a, vehicle=(0.0, 12.0)) for a in two))
+    (missed,) = warn(unknown, replay(unknown, dt_s=0.05), ends="road").events
+    assert missed.warned is None
+
+
+def test_nobody_to_warn_is_told_before_anything_is_simulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def simulate(*_: object, **__: object) -> None:
+        raise AssertionError("simulated")
+
+    monkeypatch.setattr("log2sim.simulation.runner.replay", simulate)
+    world = scenario_of(line("a", 0.0, speed=0.0), crossing_walker(8.0))
+    with pytest.raises(ConfigError, match="nobody could be warned"):
+        warn(world)
+    world.save(tmp_path / "s.json")
+    for options in ([], ["--brake"]):
+        assert "no agent 'ego'" in run_command("replay", tmp_path / "s.json", "--warn", "road", *options).line
+
+
+def test_settings_of_warnings_have_limits() -> None:
     with pytest.raises(ConfigError, match="expected one of vehicle, road, both"):
         WarningSettings("rode")
     with pytest.raises(ConfigError, match="reaction_s is -1"):

@@ -17,14 +17,12 @@ from matplotlib.figure import Figure
 from log2sim import Scenario
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, RoadBorder, Signal, Waypoints
 from log2sim.geometry import Array
-from log2sim.visualization.page.columns import SCALES
-from log2sim.visualization.page.features import feature_columns
+from log2sim.visualization.page.document import SCALES, feature_columns
 from log2sim.visualization.page.writer import write_page
 from log2sim.visualization.plot import style
-from log2sim.visualization.plot.road_features import SignalLights, draw_road, lane_arrows, lane_outline, road_rows
-from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.layers import SignalLights, draw_road, lane_arrows, lane_outline, road_rows
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import Viewport
+from log2sim.visualization.plot.viewport import Viewport, assign_roles
 
 X_M = np.linspace(-10.0, 40.0, 51)
 

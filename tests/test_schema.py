@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from log2sim import documents
 from log2sim.errors import ScenarioError
+from log2sim.files import documents
 
 COLUMN = {"type": "array", "minItems": 1, "maxItems": 5, "items": {"type": "number", "minimum": -10, "maximum": 10}}
 FLAGS = {"type": "array", "items": {"type": "boolean"}}

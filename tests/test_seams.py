@@ -8,37 +8,36 @@ import numpy as np
 import pytest
 
 from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Stream
-from log2sim.evaluation.bench.seams import SeamBench
-from log2sim.geometry import (
-    Array,
-    Camera,
-    PoseTrack,
-    apply_homography,
-    ground_homography,
-    rotation_from_rpy,
-    transform,
-)
-from log2sim.mapping.fused_tick import fuse_tick
+from log2sim.evaluation.bench.runs import SeamBench
+from log2sim.geometry import Array, Camera, PoseTrack, apply_homography, ground_homography, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit
-from log2sim.perception.homography.registration import register_patches
 from log2sim.perception.homography.rig import Rig, RigState, foot_homography, rotation_of
 from log2sim.perception.homography.rig_fit import RigFit
-from log2sim.perception.homography.rig_seams import fit_mounts, moved_by_turn, with_mounts
-from log2sim.perception.homography.seams import (
+from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.seams import (
+    SeamPictures,
     SeamPlace,
     SeamView,
+    align_seams,
     find_seams,
+    fit_mounts,
+    ground_points,
     measure_seam,
     misalignment_m,
+    moved_by_turn,
+    register_patches,
+    roads_at,
+    standing_at,
     summarize_seams,
+    ticks_of,
+    turn_mounts,
+    with_mounts,
 )
-from log2sim.perception.homography_stage import CameraHomography
-from log2sim.perception.seam_cover import ground_points, standing_at
-from log2sim.perception.seam_stage import SeamPictures, align_seams, roads_at, ticks_of, turn_mounts
 from log2sim.perception.sync import Schedule
+from log2sim.road.mosaic import fuse_tick
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 T0_NS = 1_700_000_000_000_000_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,8 @@ import pytest
 from command_line import names, run
 from worlds import tiny_log, tiny_table
 
-from log2sim import registry
 from log2sim.datatypes import Scenario
+from log2sim.files import plugins
 from log2sim.logs.native.writer import write_log
 
 TOP, FRONT = tiny_table()["lidar"][0], tiny_table()["camera"][0]
@@ -102,7 +103,7 @@ def test_the_scenario_is_drawn_replayed_changed_and_exported(
         ran = run(*command, "--quiet") if command[0] != "plot" else run(*command)
         assert ran.code == 0, (command, ran.err)
     ego = ("--ego", first) if name.startswith("roadside") else ()
-    for format in registry.names("export"):
+    for format in plugins.names("export"):
         if format == "rerun":
             continue  # needs its package
         ran = run("export", scenario, "--to", format, "--out", tmp_path / format, *ego, "--quiet")
@@ -135,9 +136,24 @@ def test_what_needs_a_camera_says_so(made: Callable[[str], tuple[Path, Path]], n
     assert "no camera, so there is no picture of the ground" in ran.line
     assert "bench compares methods for images" in run("bench", log, "--out", tmp_path / "bench").line
     assert names(tmp_path) == []
-    ran = run("plot", scenario, "--out", picture, "--background", log)
-    assert ran.code == 0, ran
-    assert names(tmp_path) == ["ground.png"]  # over the intensity of the LiDAR
+    # The ground in LiDAR intensities takes the place of a picture.
+    assert run("plot", scenario, "--out", picture, "--background", log).code == 0
+    assert names(tmp_path) == ["ground.png"]
+
+
+def test_sensors_at_the_road_stand_in_the_scenario_with_where_they_look(
+    made: Callable[[str], tuple[Path, Path]], tmp_path: Path
+) -> None:
+    scenario = Scenario.load(made("roadside")[1])
+    eye, pole = scenario.sensors
+    assert [(s["name"], s["kind"]) for s in (eye, pole)] == [("eye", "camera"), ("pole", "lidar")]
+    for sensor in (eye, pole):
+        assert (sensor["x_m"], sensor["y_m"], sensor["z_m"]) == pytest.approx((0.0, -6.0, 5.0), abs=1e-6)
+    assert eye["yaw_rad"] == pytest.approx(math.radians(20.0), abs=1e-6)
+    assert 0.5 < eye["fov_rad"] < 3.0
+    assert pole["fov_rad"] == pytest.approx(2 * math.pi)
+    moved = scenario.aligned_to(replace(scenario, map=replace(scenario.map, offset_m=(100.0, 0.0, 0.0))))
+    assert abs(moved.sensors[0]["x_m"]) == pytest.approx(100.0)
 
 
 @pytest.mark.slow

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from worlds import measured_row, rows_at, scan, standing
 
-from log2sim.agents.ends import ends_of
-from log2sim.agents.size import moving_geometry, static_geometry
-from log2sim.agents.standing import is_static
+from log2sim.agents.hypotheses import is_static
+from log2sim.agents.size import ends_of, moving_geometry, static_geometry
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, OtherView, Track
 from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.box_fitting import rotate
+from log2sim.perception.boxes import rotate
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -13,18 +13,25 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from log2sim.agents.smooth.feasibility import broken_limits, limit_doubts
 from log2sim.agents.smooth.fixed_interval import smooth_interval
-from log2sim.agents.smooth.heading import course_is_known, yaw_of_motion, yaw_sigma
-from log2sim.agents.smooth.motion_model import MotionModel
-from log2sim.agents.smooth.motion_prior import (
+from log2sim.agents.smooth.motion_model import (
+    MotionModel,
+    broken_limits,
+    course_is_known,
+    limit_doubts,
+    yaw_of_motion,
+    yaw_sigma,
+)
+from log2sim.agents.smooth.quadratic import (
     ACCELERATION_PRIOR_MPS2,
     KNOT_STEP_S,
     VELOCITY_PRIOR_MPS,
     NoisyPositions,
+    from_band,
     place_knots,
+    selected_inverse,
+    to_band,
 )
-from log2sim.agents.smooth.quadratic import from_band, selected_inverse, to_band
 from log2sim.agents.smooth.smoother import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
 from log2sim.geometry import wrap_angle
 

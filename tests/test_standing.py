@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from test_size import measured
 
-from log2sim.agents.standing import is_static, robust_line
+from log2sim.agents.hypotheses import is_static, robust_line
 
 TRUCK = (18.0, 2.55, 3.8)
 

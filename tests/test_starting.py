@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from worlds import measured_row, scan, standing
 
-from log2sim.agents.hypotheses import explain_track
-from log2sim.agents.starting import starts_or_stops
+from log2sim.agents.hypotheses import explain_track, starts_or_stops
 from log2sim.datatypes import Measurements, Track
 
 SIZES = {"bus": (12.0, 2.55, 3.1), "car": (4.4, 1.85, 1.5)}

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from log2sim.errors import RecordError
-from log2sim.logs.pcd import parse_pcd
-from log2sim.logs.ros.clouds import sweep_from
-from log2sim.logs.ros.settings import LidarTopic
-from log2sim.logs.sweeps import read_sweep, sweep_of
+from log2sim.logs.records import parse_pcd, read_sweep, sweep_of
+from log2sim.logs.ros.messages import LidarTopic
+from log2sim.logs.ros.sensors import sweep_from
 from log2sim.logs.waymo.range_images import intensities_of
 from log2sim.logs.waymo.segment import RangeImages
 

@@ -11,20 +11,21 @@ from worlds import CAR, PARKED, tiny_log, tiny_scene
 from log2sim.geometry import transform
 from log2sim.synth.actors import MovingScene
 from log2sim.synth.backdrop import Backdrop
-from log2sim.synth.lamps import (
+from log2sim.synth.light import (
     BEAM_HALF_WIDTH,
     HEADLIGHT_REACH_M,
+    NIGHT,
+    NOON,
     STREET_HEIGHT_M,
     Lamp,
     headlights,
     lamplight,
+    light_of,
     street_lights,
 )
-from log2sim.synth.light import NIGHT, NOON, light_of
 from log2sim.synth.raycast import AIR, BUILDING, GROUND, USUAL_REFLECTANCE, cast_sweep
 from log2sim.synth.returns import BACKSCATTER_SHARE, MIN_SIGNAL, REFERENCE_RANGE_M
-from log2sim.synth.scene import Environment
-from log2sim.synth.scene_places import Road
+from log2sim.synth.scene import Environment, Road
 
 
 def image(seed: int = 0, index: int = 4, **environment: Any) -> np.ndarray:

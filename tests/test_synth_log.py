@@ -12,9 +12,9 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse
 from log2sim.synth.actors import EgoMotion, MovingScene
-from log2sim.synth.labels import FrameVisibility, LidarVisibility, visible_at
 from log2sim.synth.raycast import GROUND, cast_sweep
-from log2sim.synth.write import write_synthetic
+from log2sim.synth.synthesis import write_synthetic
+from log2sim.synth.truth import FrameVisibility, LidarVisibility, visible_at
 
 WALL = {"center": [25.0, 0.0], "size_m": [2.0, 120.0, 8.0]}
 

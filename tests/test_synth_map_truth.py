@@ -10,10 +10,9 @@ import shapely
 from worlds import tiny_log, tiny_scene
 
 from log2sim.datatypes import MapFeatures, Scenario
-from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground
-from log2sim.synth.map_truth import map_features_of
-from log2sim.synth.markings import GroundPlan, dashes_along, stretch
+from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground, GroundPlan, dashes_along, stretch
 from log2sim.synth.scene import Scene
+from log2sim.synth.truth import map_features_of
 
 CROSSING: dict[str, Any] = {
     "road": [

@@ -16,7 +16,7 @@ from log2sim.logs.opening import open_log
 from log2sim.synth.actors import MovingScene
 from log2sim.synth.raycast import BUILDING, EGO, cast_sweep
 from log2sim.synth.scene import load_scene, scene_from_table
-from log2sim.synth.write import synthesize, write_synthetic
+from log2sim.synth.synthesis import synthesize, write_synthetic
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "scenes" / "roadside.toml"
 POLE: dict[str, Any] = {

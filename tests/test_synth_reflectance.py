@@ -11,10 +11,9 @@ from worlds import tiny_log
 
 from log2sim.datatypes import Log, Scenario, Sweep
 from log2sim.geometry import Array, apply
-from log2sim.synth.ground import Ground
-from log2sim.synth.markings import GroundPlan
-from log2sim.synth.reflectance import REFLECTANCE, GroundReflectance
-from log2sim.synth.scene_places import Road
+from log2sim.synth.ground import Ground, GroundPlan
+from log2sim.synth.paint import REFLECTANCE, GroundReflectance
+from log2sim.synth.scene import Road
 
 DENSE: dict[str, Any] = {
     "name": "top",

@@ -9,14 +9,11 @@ from worlds import tiny_log, tiny_scene
 from log2sim.datatypes import Log
 from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth.backdrop import Backdrop
-from log2sim.synth.bodies import Body
-from log2sim.synth.ground import ASPHALT, GROUND_M_PER_PX, MARKING, MAX_TILES, MEADOW, TILE_PX, Ground
-from log2sim.synth.markings import GroundPlan
-from log2sim.synth.raster import NEAR_M, rasterize
-from log2sim.synth.render import SceneInstant, render
-from log2sim.synth.scene_places import Road
+from log2sim.synth.ground import ASPHALT, GROUND_M_PER_PX, MARKING, MAX_TILES, MEADOW, TILE_PX, Ground, GroundPlan
+from log2sim.synth.raster import NEAR_M, first_hit, rasterize
+from log2sim.synth.render import Body, SceneInstant, render
+from log2sim.synth.scene import Road
 from log2sim.synth.shapes import block
-from log2sim.synth.triangles import first_hit
 
 FORWARD = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]])
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from worlds import CAR, tiny_table
 
-from log2sim.documents import load_schema
 from log2sim.errors import ConfigError
+from log2sim.files.documents import load_schema
 from log2sim.synth.scene import load_scene, scene_from_table, scene_schema
 
 SAMPLE = Path(__file__).resolve().parent.parent / "samples" / "crossing.toml"

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from worlds import tiny_log
 
-from log2sim.evaluation.lanes.area import seen_ground
+from log2sim.evaluation.road import seen_ground
 
 
 def seen(agents: list[dict[str, Any]] | None = None, **changes: Any) -> Any:

@@ -9,13 +9,19 @@ from hypothesis import strategies as st
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import rotation_from_rpy
-from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel, lidar_model
-from log2sim.synth.polytope_caster import GROUND, cast_polytopes
-from log2sim.synth.polytope_hits import SensorState, Solid
+from log2sim.synth.polytope_caster import GROUND, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Material, box, column, ellipsoid, prism, tube, wheel
-from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
-from log2sim.synth.traffic import Road, Surface, labeled_cloud
-from log2sim.synth.traffic_random import draw_scene
+from log2sim.synth.returns import (
+    LIDAR_MODELS,
+    LidarModel,
+    ReturnModel,
+    Weather,
+    backscattered,
+    detected,
+    lidar_model,
+    reflected,
+)
+from log2sim.synth.traffic import Road, Surface, draw_scene, labeled_cloud
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)

@@ -11,7 +11,7 @@ from worlds import tiny_log, tiny_scene
 from log2sim.geometry import apply, inverse
 from log2sim.synth.actors import MovingScene
 from log2sim.synth.raycast import BUILDING, cast_sweep
-from log2sim.synth.traffic_lights import DEPTH_M, LENS_SPACING_M, WIDTH_M, signals_of
+from log2sim.synth.render import DEPTH_M, LENS_SPACING_M, WIDTH_M, signals_of
 
 LIGHT: dict[str, Any] = {
     "id": "a",

@@ -22,16 +22,16 @@ from replay_maneuvers import scenario_of
 from replay_scenes import LENGTH_M, line, parked
 from test_layers import ROOT
 
-from log2sim.cli import doctor, entry, installation
+from log2sim.cli import doctor, entry
+from log2sim.cli import doctor as installation
 from log2sim.cli.progress import Bars, progress
-from log2sim.cli.run_summary import look_line, missing_lines
-from log2sim.cli.tables import format_rows
+from log2sim.cli.reconstruct import look_line, missing_lines
+from log2sim.cli.shared import format_rows
 from log2sim.datatypes import MapFeatures, Scenario, say_agents, say_categories
-from log2sim.simulation.metrics.ego_figures import hardest_brake
-from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.metrics.all_metrics import hardest_brake, summarize
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.runner import replay
-from log2sim.visualization.notebook.progress import REDRAWN_EVERY_S, WORDS, show_progress
+from log2sim.visualization.progress import REDRAWN_EVERY_S, WORDS, show_progress
 
 GROUP = typer.main.get_command(entry.app)
 
@@ -265,7 +265,7 @@ def test_a_stage_of_unknown_length_ends_with_the_next_one() -> None:
 def test_rows_are_broken_at_the_width_of_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [("name", "one two three four five six seven eight nine ten eleven")]
     assert len(format_rows(rows)) == 1
-    monkeypatch.setattr("log2sim.cli.tables.terminal_width", lambda: 40)
+    monkeypatch.setattr("log2sim.cli.shared.terminal_width", lambda: 40)
     broken = format_rows(rows)
     assert max(map(len, broken)) <= 40
     assert broken[1].startswith("      ")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from worlds import tiny_toml
 
-from log2sim.perception.late_fusion import PAIR_WEIGHTS, PairWeights
+from log2sim.perception.fusion import PAIR_WEIGHTS, PairWeights
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import fit_late_fusion

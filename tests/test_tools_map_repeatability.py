@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from ground_worlds import World, empty_scenario, world_log
 
-from log2sim.config_sections import MapConfig
-from log2sim.mapping.builder import map_ground
-from log2sim.mapping.ground_map import GroundMap
+from log2sim.config import MapConfig
+from log2sim.road.builder import map_ground
+from log2sim.road.ground_map import GroundMap
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import map_repeatability as tool

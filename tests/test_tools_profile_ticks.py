@@ -11,7 +11,7 @@ import pytest
 
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
-from log2sim.logs.guarding import translate_parser_errors
+from log2sim.logs.records import translate_parser_errors
 from log2sim.perception.sync import Schedule
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -31,13 +31,13 @@ def test_time_is_given_to_the_innermost_function_of_log2sim() -> None:
 
     with pytest.raises(LogError), translate_parser_errors("here", LogError):
         raise Noticing
-    assert {profile_ticks.function_of(frame) for frame in frames} == {"logs.guarding.translate_parser_errors"}
+    assert {profile_ticks.function_of(frame) for frame in frames} == {"logs.records.translate_parser_errors"}
 
 
 @pytest.mark.parametrize(
     ("function", "part"),
     [
-        ("logs.guarding.guarded", "logs"),
+        ("logs.records.guarded", "logs"),
         ("perception.lidar.cloud.deskew", "perception.lidar"),
         ("perception.frames.get", "perception.frames"),
         ("pipeline.start", "pipeline"),

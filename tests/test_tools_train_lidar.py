@@ -25,11 +25,11 @@ from lidar_training.network import BOX, CATEGORY, HEAT, OUT_CHANNELS, SEGMENT, V
 from lidar_training.samples import CATEGORIES, Sample, Shard, augmented, draw_sample, grid_of, write_shard  # noqa: E402
 from lidar_training.targets import targets_of  # noqa: E402
 
-from log2sim.config_sections import LidarConfig  # noqa: E402
+from log2sim.config import LidarConfig  # noqa: E402
 from log2sim.errors import LogError  # noqa: E402
-from log2sim.perception.detect3d.centers import decode_centers  # noqa: E402
+from log2sim.perception.detect3d.boxes import decode_centers  # noqa: E402
+from log2sim.perception.detect3d.detectors import open_network  # noqa: E402
 from log2sim.perception.detect3d.network import NetworkInfo  # noqa: E402
-from log2sim.perception.detect3d.network_detector import open_network  # noqa: E402
 from log2sim.synth.traffic_data import TrafficSettings, write_traffic  # noqa: E402
 
 CELLS, CELL_M = 128, 0.25

@@ -23,14 +23,13 @@ from lidar_training.samples import CATEGORIES, Sample, write_shard
 from lidar_training.zou2021_export import export_zou2021
 from lidar_training.zou2021_targets import IGNORED, CellTargets, cell_targets
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.logs.opening import open_log
-from log2sim.perception.detect3d.grid import rasterize
-from log2sim.perception.detect3d.network import NetworkInfo, load_network
-from log2sim.perception.detect3d.network_detector import open_network
-from log2sim.perception.detect3d.votes import decode_votes
+from log2sim.perception.detect3d.boxes import decode_votes
+from log2sim.perception.detect3d.detectors import open_network
+from log2sim.perception.detect3d.network import NetworkInfo, load_network, rasterize
 from log2sim.perception.lidar.cloud import Cloud
 
 # Threads that wait for a busy core are slower than one.

@@ -16,10 +16,8 @@ from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.tracking.category import decide_category
-from log2sim.tracking.forward import track_forward
-from log2sim.tracking.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
-from log2sim.tracking.stitch import FORBIDDEN, _choose_joins, stitch
+from log2sim.tracking.forward import CENTER_SIGMA_M, innovation, measurement_noise, predict, track_forward, update
+from log2sim.tracking.stitch import FORBIDDEN, _choose_joins, decide_category, stitch
 from log2sim.tracking.tracker import min_hits, track
 
 PERIOD_S = 0.1

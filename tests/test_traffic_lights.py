@@ -10,12 +10,17 @@ import pytest
 
 from log2sim.datatypes import Detections, Log, Scenario, Signal
 from log2sim.geometry import box_corners, inverse, project
-from log2sim.perception.detect.classes import COCO_80, COCO_91, TRAFFIC_LIGHT, classes_from_names
-from log2sim.perception.light_boxes import LightBox, crop_lights, with_ranges
-from log2sim.signals.lamps import STATES, lamp_evidence
-from log2sim.signals.placing import place_lights
-from log2sim.signals.states import changes_of, most_probable_states, rates
-from log2sim.signals.traffic_lights import find_signals
+from log2sim.perception.detect.layouts import COCO_80, COCO_91, TRAFFIC_LIGHT, classes_from_names
+from log2sim.perception.detection_cache import LightBox, crop_lights, with_ranges
+from log2sim.road.signals import (
+    STATES,
+    changes_of,
+    find_signals,
+    lamp_evidence,
+    most_probable_states,
+    place_lights,
+    rates,
+)
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 

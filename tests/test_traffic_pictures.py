@@ -15,23 +15,16 @@ from scipy.spatial import ConvexHull
 from log2sim.errors import ConfigError
 from log2sim.geometry import apply, box_corners, inverse
 from log2sim.logs.opening import open_log
-from log2sim.synth.bodies import Body, samples_of
-from log2sim.synth.ground import Ground
-from log2sim.synth.light import NOON
-from log2sim.synth.markings import GroundPlan
-from log2sim.synth.polytope_mesh import meshes_of
-from log2sim.synth.polytopes import Material
+from log2sim.synth.backdrop import draw_terrain, sampled_ground
+from log2sim.synth.ground import Ground, GroundPlan
+from log2sim.synth.light import FAR_M, NOON, RenderCamera
+from log2sim.synth.polytopes import Material, meshes_of
 from log2sim.synth.raster import nearest_of
-from log2sim.synth.render import SceneInstant, segment
-from log2sim.synth.render_camera import RenderCamera
+from log2sim.synth.render import Body, SceneInstant, samples_of, segment
 from log2sim.synth.returns import ReturnModel, Weather
-from log2sim.synth.scenery import FAR_M
-from log2sim.synth.terrain_view import draw_terrain, sampled_ground
-from log2sim.synth.traffic import TrafficObject, TrafficScene
-from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, frame_of, write_traffic
-from log2sim.synth.traffic_motion import run_of
+from log2sim.synth.traffic import TrafficObject, TrafficScene, rig_of
+from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, frame_of, run_of, write_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
-from log2sim.synth.traffic_rig import rig_of
 
 CLEAR = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0, weather=Weather())
 SEE_THROUGH = (Material.GLASS, Material.LEAVES, Material.MESH)

@@ -22,13 +22,12 @@ from command_line import names, run
 from log2sim.datatypes import Agent, Doubt, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
-from log2sim.mapping.ground_map import GroundMap
+from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.runner import replay
-from log2sim.visualization.page.columns import SCALES, second_differences
-from log2sim.visualization.page.document import page_document
+from log2sim.visualization.page.document import SCALES, page_document, second_differences
 from log2sim.visualization.page.writer import html_of, write_page
 from log2sim.visualization.plot import style
-from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.viewport import assign_roles
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = ROOT / "samples" / "crossing" / "truth.json"
@@ -729,7 +728,7 @@ def test_pages_with_next_to_nothing_open(browser: Browser, tmp_path: Path, agent
 
 
 def test_a_map_of_the_ground_is_embedded_where_it_lies_and_stays_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("log2sim.visualization.page.background.MAX_BYTES", 20_000)
+    monkeypatch.setattr("log2sim.visualization.page.document.MAX_BYTES", 20_000)
     alpha = np.zeros((400, 420), np.uint8)
     alpha[10:390, 20:410] = 255
     color = np.random.default_rng(2).integers(0, 256, (400, 420, 3)).astype(np.uint8)

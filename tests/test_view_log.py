@@ -24,10 +24,21 @@ from log2sim.datatypes import Agent, Doubt, Lidar, Log, MapFrame, Scenario, Stre
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera, box_corners, project
 from log2sim.visualization.page.writer import write_page
-from log2sim.visualization.recording.choice import choose_cameras, records_within, take_at_rate, take_evenly
-from log2sim.visualization.recording.outlines import CORNERS, SEGMENTS, OutlineProjector, outline_of
-from log2sim.visualization.recording.points import MIN_HEIGHT_M, UNIT_M, PointsAbove, pack
-from log2sim.visualization.recording.recording import Recorded
+from log2sim.visualization.recording import (
+    CORNERS,
+    MIN_HEIGHT_M,
+    SEGMENTS,
+    UNIT_M,
+    OutlineProjector,
+    PointsAbove,
+    Recorded,
+    choose_cameras,
+    outline_of,
+    pack,
+    records_within,
+    take_at_rate,
+    take_evenly,
+)
 
 STEP_NS, FRAMES = 100_000_000, 21
 START_NS = 1_700_000_000_000_000_000

@@ -13,14 +13,12 @@ from test_replay_warnings import crossing_walker, seen, town_ego
 from log2sim.datatypes import Scenario
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.simulation.warnings.warn import warn
+from log2sim.simulation.warnings import warn
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.page.writer import write_page
-from log2sim.visualization.plot.observers import lines_of
-from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.layers import Overlays, lines_of, warned_places
 from log2sim.visualization.plot.tracks import still
-from log2sim.visualization.plot.warned import warned_places
+from log2sim.visualization.plot.viewport import assign_roles
 
 WARN_LIGHT = (179, 92, 0)
 

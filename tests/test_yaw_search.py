@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from log2sim.perception import yaw_search
-from log2sim.perception.box_fitting import rotate
-from log2sim.perception.yaw_search import correct_yaws, fit_yaws
+from log2sim.perception import boxes
+from log2sim.perception.boxes import correct_yaws, fit_yaws, rotate
 
 LENGTH_M, WIDTH_M, NOISE_M = 4.4, 1.85, 0.02
 
@@ -54,5 +53,5 @@ def test_the_division_into_parts_changes_nothing(monkeypatch):
     count = rng.integers(20, 400, 30)
     points = np.concatenate([side_points(rng, n, angle) for n, angle in zip(count, rng.uniform(0, 6, 30))])
     whole = fit_yaws(points, count)
-    monkeypatch.setattr(yaw_search, "MAX_OFFSETS", 1 << 12)
+    monkeypatch.setattr(boxes, "MAX_OFFSETS", 1 << 12)
     assert np.allclose(fit_yaws(points, count), whole, atol=1e-5)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Scenario
 from log2sim.geometry import Array, Camera, Mount, apply, box_corners, inverse, rotation_from_rpy, transform
-from log2sim.perception.box_completion import place_boxes
-from log2sim.perception.box_fitting import fit_extents, top_of
+from log2sim.perception.boxes import fit_extents, place_boxes, top_of
 from log2sim.synth.scene import Scene, scene_from_table
 from log2sim.synth.synthesis import synthesize
 

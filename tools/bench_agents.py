@@ -25,7 +25,7 @@ from log2sim.errors import Log2SimError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.synth.scene import load_scene
-from log2sim.synth.write import write_synthetic
+from log2sim.synth.synthesis import write_synthetic
 
 SHARES = ("invented", "duplicate", "in_ego", "wrong_speed", "wrong_motion", "backwards", "wrong_size", "wrong")
 HEADER = ["log", "agents", "ticks", "recall", "precision", *(s.replace("_", " ") for s in SHARES),

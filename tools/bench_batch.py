@@ -19,9 +19,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from log2sim.batch import plan_batch, run_batch
-from log2sim.batch.cluster import local_workers
-from log2sim.batch.rows import Row
-from log2sim.batch.table import sum_up
+from log2sim.batch.folder import Row, sum_up
+from log2sim.batch.run import local_workers
 from log2sim.cli.progress import progress
 from log2sim.config import Config
 from log2sim.logs.native.writer import write_log

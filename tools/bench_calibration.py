@@ -14,12 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from log2sim.calibration.lidar_faults import Findings
-from log2sim.calibration.motion_fit import OFFSET, YAW, fit_clock_and_mount
-from log2sim.calibration.sweep_pairs import SweepPairs, pair_sweeps
-from log2sim.calibration.twists import exp_of
-from log2sim.config_sections import CalibrationConfig
+from log2sim.config import CalibrationConfig
 from log2sim.geometry import NS_PER_S, inverse
+from log2sim.localization.clocks import OFFSET, YAW, Findings, fit_clock_and_mount
+from log2sim.localization.surfaces import SweepPairs, exp_of, pair_sweeps
 from log2sim.synth.scene import Scene, load_scene
 from log2sim.synth.synthesis import synthesize
 

@@ -29,7 +29,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import Log2SimError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.synth.scene import load_scene
-from log2sim.synth.write import write_synthetic
+from log2sim.synth.synthesis import write_synthetic
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HEADER = [

@@ -20,17 +20,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from bench_table import markdown, replace_section
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.logs.opening import open_log
-from log2sim.perception.detect3d.grid import grid_window, rasterize
-from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
-from log2sim.perception.detect3d.network_detector import WEIGHTS, NetworkDetector, open_shipped
+from log2sim.perception.detect3d.detectors import WEIGHTS, NetworkDetector, open_shipped
+from log2sim.perception.detect3d.network import grid_window, level_points, rasterize, viewpoints_xy
 from log2sim.perception.first_pass import cloud_origin
-from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.viewpoints import assemble_cloud
-from log2sim.synth.lidar_models import LIDAR_MODELS
-from log2sim.synth.traffic import Mount, labeled_cloud
-from log2sim.synth.traffic_random import draw_scene
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
+from log2sim.synth.returns import LIDAR_MODELS
+from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
 
 SWEEPS = 12
 REPEATS = 5

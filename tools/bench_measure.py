@@ -19,13 +19,12 @@ import numpy as np
 from log2sim import Config, Scenario, open_log
 from log2sim.datatypes import GROUP_OF, Log, Measurements
 from log2sim.evaluation.metrics.truth import truth_from_log
-from log2sim.perception.box_completion import provisional_sizes
+from log2sim.files.stages import StageClock
+from log2sim.perception.boxes import provisional_sizes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import observe
 from log2sim.perception.sync import synchronize
-from log2sim.plan import make_plan
-from log2sim.sensors import select_sensors
-from log2sim.stage_clock import StageClock
+from log2sim.plan import make_plan, select_sensors
 
 NEAREST_M = 4.0
 RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))

@@ -27,10 +27,9 @@ from log2sim import Config, open_log
 from log2sim.datatypes import GROUP_OF, Labels, Log
 from log2sim.errors import Log2SimError
 from log2sim.geometry import Array, PoseTrack, inverse
-from log2sim.localization.choice import localize
-from log2sim.localization.ego_sweeps import densest_lidar
-from log2sim.localization.pose_choice import PoseChoice
-from log2sim.localization.scatter import compare_poses
+from log2sim.localization.choice import PoseChoice, localize
+from log2sim.localization.odometry import densest_lidar
+from log2sim.localization.verdict import compare_poses
 
 MIN_LABELS, MIN_SEEN_S = 10, 1.0
 # A vehicle stands where a line through its positions is slower than this by one of the poses.

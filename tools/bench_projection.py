@@ -13,7 +13,7 @@ import numpy as np
 from bench_table import markdown, optional, timed
 
 from log2sim.geometry import Camera
-from log2sim.perception.box_fitting import upper_median
+from log2sim.perception.boxes import upper_median
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
 Array = np.ndarray[Any, Any]

@@ -14,9 +14,9 @@ import numpy as np
 from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of
 
 from log2sim.config import Config
-from log2sim.cooperation.registration import RoadRegistration, register_road
 from log2sim.datatypes import Log
-from log2sim.sensors import choose_detector, select_sensors
+from log2sim.localization.roadside import RoadRegistration, register_road
+from log2sim.plan import choose_detector, select_sensors
 
 TARGET_M, TARGET_DEG, TARGET_S = 0.1, 0.3, 0.02
 RATES_HZ = (10.0, 5.0, 2.0, 20.0)

@@ -18,10 +18,10 @@ from log2sim.geometry import Camera
 from log2sim.synth.light import light_of
 from log2sim.synth.render import render
 from log2sim.synth.scene import Environment, load_scene
+from log2sim.synth.synthesis import synthesize
+from log2sim.synth.traffic import rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
-from log2sim.synth.traffic_rig import rig_of
-from log2sim.synth.write import synthesize
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 SIZE_PX = (960, 600)

@@ -33,7 +33,7 @@ from vehicle_maneuvers import (
     start_of,
 )
 
-from log2sim.documents import write_json
+from log2sim.files.documents import write_json
 from log2sim.geometry import Array, cos_sin
 from log2sim.simulation.vehicles.single_track import Chassis, Slips, StepInput, linear_displacement, linear_slips
 from log2sim.simulation.vehicles.vehicle import along_arc

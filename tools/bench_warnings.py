@@ -17,7 +17,7 @@ from labeled_drives import kitti_tracking, labeled_log
 
 from log2sim.datatypes import EGO, Scenario
 from log2sim.simulation.runner import replay
-from log2sim.simulation.warnings.warn import warn
+from log2sim.simulation.warnings import warn
 
 # A driver who has to react within 1.5 s, or passes within 1 s of another, is in a conflict (Hyden 1987; Allen et al. 1978).
 CONFLICT_TTC_S, CONFLICT_PET_S = 1.5, 1.0

@@ -21,18 +21,17 @@ import numpy as np
 
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Detections, Frame, Log, Scenario, Stream
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.truth import points_in_labels, truth_from_log
+from log2sim.files.stages import StageClock
 from log2sim.geometry import Array, nearest_index
-from log2sim.log_odds import probability_of
-from log2sim.perception.detect.labels import MIN_SIDE_PX
+from log2sim.perception.detect.detectors import MIN_SIDE_PX
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
-from log2sim.pipeline import Run, first_pass, second_pass, start
-from log2sim.run_detectors import Detectors
-from log2sim.stage_clock import StageClock
+from log2sim.perception.run_detectors import Detectors
+from log2sim.pipeline import Run, infer_scenario, observe_log, start
 from log2sim.synth.traffic import TrafficScene
-from log2sim.synth.traffic_data import TrafficSettings, draw_traffic
-from log2sim.synth.traffic_log import log_of
+from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, log_of
 
 # Ticks a second, and how long a log of that rate lasts, s.
 RATES = ((10.0, 2.5), (10.0, 4.5), (5.0, 6.0), (2.0, 9.0))
@@ -66,7 +65,9 @@ class Case:
     truth: Scenario
 
     def second(self) -> Any:
-        return second_pass(replace(self.run, clock=StageClock()), self.observations)
+        return infer_scenario(
+            replace(self.run, clock=StageClock(), plan=self.run.plan.only_agents()), self.observations
+        )
 
 
 @dataclass(frozen=True)
@@ -252,11 +253,11 @@ def cases_of(seed: int, index: int) -> list[Case]:
 def _case(log: Log, scene: TrafficScene, truth: Scenario, detector: str, seed: int) -> Case:
     run = start(log, Config.load(settings=[f"detect.name={detector}"]))
     images = None if run.detectors.images is None else SimulatedDetector(log, scene, seed)
-    observations = first_pass(replace(run, detectors=Detectors(images, run.detectors.sweeps)))
+    observations = observe_log(replace(run, detectors=Detectors(images, run.detectors.sweeps)))
     observations.records = None
     kept = run.log.changed(streams={k: Stream(k, np.asarray(s.t_ns), silent) for k, s in run.log.streams.items()})
     named = [None if d is None else Named(d.name) for d in (images, run.detectors.sweeps)]
-    run = replace(run, log=kept, detectors=Detectors(*named), clock=None, report_progress=silent)
+    run = replace(run, log=kept, detectors=Detectors(*named), clock=None, progress=silent)
     kind = detector.replace("labels", "images") + ("" if log.lidars else ", no LiDAR")
     return Case(f"{log.name} ({kind})", run, observations, truth)
 

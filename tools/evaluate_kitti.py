@@ -24,8 +24,8 @@ from kitti_boxes import Boxes, read_tracks
 from kitti_scene import Index, Matcher, Scene, make_scene
 
 from log2sim.errors import Log2SimError
-from log2sim.evaluation.metrics.hota import hota
-from log2sim.evaluation.metrics.pairs import Pairs
+from log2sim.evaluation.metrics.comparison import Pairs
+from log2sim.evaluation.metrics.evaluator import hota
 from log2sim.geometry import Array
 
 RECALL_STEPS = 40

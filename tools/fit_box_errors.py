@@ -2,7 +2,7 @@
 
 Random scenes with exact truth are cast, searched by the networks for vehicles and for the roadside, and each box is matched
 with the truth by overlap. The logarithm of the error of each side is regressed on points and distance; the weights are those of
-`log2sim.perception.cooperative.box_errors.WEIGHTS`.
+`log2sim.perception.cooperative.WEIGHTS`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ import numpy as np
 from lidar_training.clouds import draw_example
 from scipy.optimize import minimize
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, GROUPS, Boxes3D
 from log2sim.geometry import Array, wrap_angle
-from log2sim.perception.box_fitting import rotate
-from log2sim.perception.cooperative.box_errors import side_terms, yaw_terms
-from log2sim.perception.cooperative.refinement import refine_boxes
-from log2sim.perception.detect3d.network_detector import open_shipped
-from log2sim.perception.detect3d.suppression import Rectangles, shared_area
+from log2sim.perception.boxes import rotate
+from log2sim.perception.cooperative import refine_boxes, side_terms, yaw_terms
+from log2sim.perception.detect3d.boxes import Rectangles, shared_area
+from log2sim.perception.detect3d.detectors import open_shipped
 
 # A box that overlaps an object less is none of it.
 MIN_IOU = 0.1

@@ -1,7 +1,7 @@
 """Fit the weights by which agents are rated, and those of their systematic errors, on synthetic logs.
 
     python tools/confidence_logs.py --logs 60 --seed 2 --out FOLDER
-    python tools/fit_confidence.py FOLDER > log2sim/agents/confidence/weights.py
+    python tools/fit_confidence.py FOLDER > log2sim/agents/confidence.py
 
 Goes on from the first passes that the former made, judges the agents as `evaluate` does, and prints the module. Tables of
 logs that were held out go to stderr: each fifth of the logs is rated by weights that fit the others.
@@ -23,17 +23,25 @@ from numpy.typing import NDArray
 
 from log2sim import pipeline
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of, seen_share, yaw_at_measurements
-from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE
-from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
+from log2sim.agents.confidence import (
+    MAX_CONFIDENCE,
+    MIN_CONFIDENCE,
+    SIGNS,
+    Evidence,
+    evidence_of,
+    position_terms,
+    seen_share,
+    speed_terms,
+    yaw_at_measurements,
+    yaw_terms,
+)
 from log2sim.datatypes import CATEGORIES, Agent
-from log2sim.evaluation.metrics.calibration import reliability
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.comparison import Selection
-from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE
+from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
 from log2sim.evaluation.metrics.verdicts import judge
 from log2sim.geometry import Array
-from log2sim.log_odds import probability_of
 
 Table = dict[str, float]
 

@@ -4,7 +4,7 @@
 
 Every scene is made with the seed and its truth; a pair of an image box and a projected box of the sweep is right where an
 agent of that group is at its place. The weights are the most likely ones of a logistic function, with those of independent
-evidence as prior, and are printed as `log2sim/perception/late_fusion.py` holds them.
+evidence as prior, and are printed as `log2sim/perception/fusion.py` holds them.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Measurements, Scenario
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception import first_pass
-from log2sim.perception.late_fusion import PAIR_WEIGHTS, ImageMatches, PairWeights, logit
+from log2sim.perception.fusion import PAIR_WEIGHTS, ImageMatches, PairWeights, logit
 from log2sim.perception.lidar.projection import View
-from log2sim.pipeline import first_pass as run_first_pass
-from log2sim.pipeline import start
+from log2sim.pipeline import observe_log, start
 from log2sim.synth.scene import load_scene
 from log2sim.synth.synthesis import synthesize
 
@@ -45,7 +44,7 @@ def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, N
 
     first_pass.match_boxes = match
     try:
-        run_first_pass(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
+        observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
     finally:
         first_pass.match_boxes = original
     parts = [_features(boxes, matches, truth) for boxes, matches in found]

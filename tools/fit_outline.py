@@ -1,4 +1,4 @@
-"""Fit the weights of `log2sim/agents/heading/outline_weights.py` to random vehicles that simulated LiDARs pass.
+"""Fit the weights of `log2sim/agents/heading.py` to random vehicles that simulated LiDARs pass.
 
     python tools/fit_outline.py --vehicles 4000 --test 500
 
@@ -14,16 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from log2sim.agents.heading.outline import HEIGHT_CELLS, Outline, outline_of
+from log2sim.agents.heading import HEIGHT_CELLS, Outline, outline_of
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import rotation_from_rpy
-from log2sim.log_odds import probability_of
-from log2sim.perception.box_fitting import rotate, subsample
-from log2sim.synth.lidar_models import LIDAR_MODELS
-from log2sim.synth.polytope_caster import cast_polytopes
-from log2sim.synth.polytope_hits import SensorState, Solid
-from log2sim.synth.returns import ReturnModel
-from log2sim.synth.traffic import Surface
-from log2sim.synth.traffic_random import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS
+from log2sim.perception.boxes import rotate, subsample
+from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
+from log2sim.synth.returns import LIDAR_MODELS, ReturnModel
+from log2sim.synth.traffic import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS, Surface
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "log2sim" / "agents" / "heading" / "outline_weights.py"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from log2sim import registry
+from log2sim.files import plugins
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 BEGIN, END = "<!-- formats: begin -->\n", "<!-- formats: end -->\n"
@@ -13,8 +13,8 @@ BEGIN, END = "<!-- formats: begin -->\n", "<!-- formats: end -->\n"
 def table() -> str:
     """A row for every built-in format, in the order of the registry."""
     rows = ["| `--to` | options | what it cannot hold |", "|---|---|---|"]
-    for name in registry.BUILT_IN["export"]:
-        exporter = registry.load("export", name)
+    for name in plugins.BUILT_IN["export"]:
+        exporter = plugins.load("export", name)
         options = ", ".join(f"`--{option}`" for option in exporter.options)
         rows.append(f"| `{name}` | {options} | {exporter.loses} |")
     return "\n".join(rows) + "\n"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import VEHICLE, Measurements, seen_from
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform
-from log2sim.logs.kitti import drive
+from log2sim.logs.kitti import labels
 
 PERIOD_NS = 100_000_000
 CATEGORY_OF = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "cyclist"}
@@ -47,8 +47,8 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     The ego motion holds t x y z qx qy qz qw of the IMU, one row a frame in order; its stamps are not those of the frames and
     are not used. Without it the axes of the car stand for the map.
     """
-    c = drive.read_calibration(calib)
-    P = drive.calibration_entry(c, calib, (3, 4), "P2")
+    c = labels.read_calibration(calib)
+    P = labels.calibration_entry(c, calib, (3, 4), "P2")
     if ego_motion is None:
         return View(np.repeat(transform(EGO_R_CAM, np.zeros(3))[None], frames, axis=0), P, motion_known=False)
     rows = _poses(ego_motion)
@@ -59,7 +59,7 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
 
 
 def _poses(path: Path) -> Array:
-    lines = [line.split() for line in drive.read_text(path).splitlines() if line.strip()]
+    lines = [line.split() for line in labels.read_text(path).splitlines() if line.strip()]
     for k, words in enumerate(lines, start=1):
         if len(words) != 8:
             raise LogError(f"{path}, line {k}: {len(words)} columns, expected 8: t x y z qx qy qz qw")
@@ -74,15 +74,15 @@ def _poses(path: Path) -> Array:
 
 def _rect_T_imu(c: Mapping[str, Array], path: Path) -> Array:
     rect = transform(
-        drive.checked_rotation(
-            drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
+        labels.checked_rotation(
+            labels.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
         ),
         np.zeros(3),
     )
     links = []
     for keys in (("Tr_velo_to_cam", "Tr_velo_cam"), ("Tr_imu_to_velo", "Tr_imu_velo")):
-        m = drive.calibration_entry(c, path, (3, 4), *keys)
-        links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
+        m = labels.calibration_entry(c, path, (3, 4), *keys)
+        links.append(transform(labels.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
     return np.asarray(rect @ links[0] @ links[1], dtype=np.float64)
 
 

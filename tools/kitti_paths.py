@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Measurements, Track
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
+from log2sim.tracking.forward import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from kitti_rows import Index, Mask, Rows, end_rows, first_of_run, last_of_run, n
 from kitti_scene import same_frame
 
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.tracking.category import MAX_PEDESTRIAN_SPEED_MPS
+from log2sim.tracking.stitch import MAX_PEDESTRIAN_SPEED_MPS
 
 PEDESTRIAN, RIDER = "Pedestrian", "Cyclist"
 SAME_OBJECT_M = 0.6

@@ -9,7 +9,7 @@ import numpy as np
 from kitti_boxes import Boxes, overlap_3d
 from numpy.typing import NDArray
 
-from log2sim.evaluation.metrics.pairs import assign
+from log2sim.evaluation.metrics.comparison import assign
 from log2sim.geometry import Array
 
 NEIGHBORS = {"Car": "Van", "Pedestrian": "Person_sitting"}

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from log2sim.geometry import Camera, apply
-from log2sim.lanes.detection.one_picture import PictureMarkings, find_markings_in_picture
+from log2sim.road.lane_picture import PictureMarkings, find_markings_in_picture
 
 WITHIN_PX = 20
 DRAWN_PX = 5

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from log2sim.synth.scene import load_scene
-from log2sim.synth.write import write_synthetic
+from log2sim.synth.synthesis import write_synthetic
 
 SAMPLES = Path(__file__).resolve().parent.parent / "samples"
 SEED = 1

@@ -18,15 +18,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.config_sections import MapConfig
+from log2sim.config import MapConfig
 from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array
+from log2sim.localization.pose_refinement import refine_poses
 from log2sim.logs.opening import open_log
-from log2sim.mapping.builder import map_ground
-from log2sim.mapping.ground_map import GroundMap
-from log2sim.mapping.pose_refinement import refine_poses
 from log2sim.perception.frames import RecordReader
+from log2sim.road.builder import map_ground
+from log2sim.road.ground_map import GroundMap
 
 PATCH_M, STRIDE_M, SEARCH_M = 3.0, 1.5, 0.5
 # Parts of a patch that must be known in both maps.

@@ -36,7 +36,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, RecordError
 from log2sim.logs.opening import open_log
 from log2sim.perception.sync import Schedule
-from log2sim.pipeline import Run, first_pass, look_around, second_pass, start
+from log2sim.pipeline import Run, infer_scenario, observe_log, start
 
 PACKAGE = str(Path(log2sim.__file__).parent) + os.sep
 TASKS = Path("/proc/self/task")
@@ -173,8 +173,8 @@ def measure(open_anew: Callable[[], Log], config: Config) -> tuple[Measured, Sch
     def reconstruct() -> None:
         run = start(log, config, cache=False)
         kept.append(run)
-        observations = first_pass(run)
-        look_around(run, observations, second_pass(run, observations))
+        observations = observe_log(run)
+        infer_scenario(run, observations)
 
     with Sampler() as sampler:
         _, times = times_of(reconstruct)

@@ -10,17 +10,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.calibration.corrections import shift_stream
-from log2sim.calibration.twists import exp_of
 from log2sim.datatypes import EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel
-from log2sim.synth.polytope_caster import cast_polytopes
-from log2sim.synth.polytope_hits import SensorState, Solid
-from log2sim.synth.traffic import Road, TrafficObject, TrafficScene
-from log2sim.synth.traffic_log import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS
-from log2sim.synth.traffic_motion import TrafficRun, run_of
-from log2sim.synth.traffic_random import draw_scene
+from log2sim.localization.clocks import shift_stream
+from log2sim.localization.surfaces import exp_of
+from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
+from log2sim.synth.returns import LIDAR_MODELS, LidarModel
+from log2sim.synth.traffic import Road, TrafficObject, TrafficScene, draw_scene
+from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS, TrafficRun, run_of
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 Kind = Literal["street", "open"]

@@ -37,11 +37,11 @@ from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_o
 from lidar_training.targets import targets_of
 
 from log2sim.batch.discovery import find_logs
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.errors import ConfigError, LogError
 from log2sim.logs.opening import open_log
+from log2sim.perception.detect3d.detectors import open_network
 from log2sim.perception.detect3d.network import load_network
-from log2sim.perception.detect3d.network_detector import open_network
 
 PER_SHARD = 100
 # Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.

@@ -32,9 +32,9 @@ from lidar_training.two_stream_boxes import (
 )
 from lidar_training.two_stream_inputs import inputs_of
 
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.logs.opening import open_log
-from log2sim.perception.detect3d.network_detector import WEIGHTS, open_network
+from log2sim.perception.detect3d.detectors import WEIGHTS, open_network
 
 TEST_SHARE = 0.15
 PEAK_RATE = 2e-3

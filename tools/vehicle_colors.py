@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.appearance.one_picture import PictureColor, color_of_picture
 from log2sim.datatypes import COLOR_NAMES, Frame, Log
+from log2sim.files.inputs import read_bytes
 from log2sim.geometry import Camera
-from log2sim.input_files import read_bytes
+from log2sim.road.color_picture import PictureColor, color_of_picture
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 MERGED = {"silver": "gray", "grey": "gray", "pink": "red", "magenta": "red", "purple": "blue", "cyan": "blue", "beige": "brown",

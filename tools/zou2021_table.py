@@ -40,9 +40,8 @@ from lidar_training.zou2021 import Zou2021Network
 from lidar_training.zou2021_export import export_zou2021
 
 from log2sim.logs.opening import open_log
-from log2sim.perception.detect3d.detectors import LidarDetector
+from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, NetworkDetector
 from log2sim.perception.detect3d.network import Network, load_network
-from log2sim.perception.detect3d.network_detector import WEIGHTS, NetworkDetector
 
 CHOICE_SEED, TEST_SEED = 3_000_000, 4_000_000
 """Scenes that training and calibration never draw."""

@@ -1,14 +1,38 @@
-"""Agents of all tracks: static ones get one pose, moving ones a trajectory, and both are matched with the LiDAR points."""
+"""Agents of all tracks, and the ego."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
+from log2sim.agents.smooth.motion_model import limit_doubts
+from log2sim.agents.smooth.smoother import signed_speed, smooth_track
 from log2sim.agents.static import static_candidates
-from log2sim.datatypes import Obstacles, Track
+from log2sim.config import Config
+from log2sim.datatypes import (
+    ENDS,
+    STANDSTILL_DRIFT_M,
+    STANDSTILL_MPS,
+    Agent,
+    Log,
+    Obstacles,
+    Span,
+    Track,
+    Waypoints,
+)
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, yaw_of
+from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.sync import Schedule
+from log2sim.tracking.forward import MAX_MISSES
+from log2sim.version import __version__
 
 
 def estimate_agents(
@@ -29,3 +53,239 @@ def estimate_agents(
     parts = [part for track in tracks for part in explain_track(track)]
     candidates = [moving_candidate(p.track, obstacles, timeline, smooth=smooth) for p in parts if not p.static]
     return candidates + static_candidates([p for p in parts if p.static], obstacles, timeline)
+
+
+# Standard deviations of ego positions and yaws from GNSS/INS with RTK or LiDAR odometry.
+EGO_SIGMA_M, EGO_SIGMA_RAD = 0.02, 0.002
+
+
+def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log") -> Agent | None:
+    """Make the ego an agent with a waypoint at every tick; None for a log without poses at them.
+
+    `source` says where the poses come from.
+    """
+    if log.ego is None:
+        return None
+    map_T_ego, valid = log.ego.at(timeline.t_ns)
+    if not valid.any():
+        return None
+    vehicle = log.ego_vehicle
+    center = log.ego_centers(map_T_ego[valid])
+    t, yaw = timeline.seconds(timeline.t_ns[valid]), yaw_of(map_T_ego[valid])
+    sigma_m = log.ego.sigmas_at(timeline.t_ns[valid], (EGO_SIGMA_M, EGO_SIGMA_RAD))[:, 0]
+    path = smooth_track(t, center[:, :2], sigma_m=sigma_m)
+    # Poses that bridge a gap are off together, so that smoothing does not make them better.
+    bridging_m2 = bridging_variances(log.ego, timeline.t_ns[valid])[:, 0]
+    speed = signed_speed(path.velocity_mps, yaw)
+    waypoints = Waypoints(
+        t_s=t,
+        x_m=path.xy_m[:, 0],
+        y_m=path.xy_m[:, 1],
+        z_m=center[:, 2],
+        yaw_rad=yaw,
+        speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
+        observed=np.ones(len(t), dtype=bool),
+        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2 + bridging_m2),
+    )
+    moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
+    return Agent(
+        "ego", "car", vehicle.size_m, waypoints, static=moved < STANDSTILL_DRIFT_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
+        doubts=limit_doubts(path.broken), quality={"source": source},
+    )  # fmt: skip
+
+
+def bridging_variances(poses: PoseTrack, t_ns: NDArray[np.int64]) -> Array:
+    """Return the variances (N, 2) of positions, m2, and yaws, rad2, at stamps (N,), beyond those of measured poses."""
+    sigmas = poses.sigmas_at(t_ns, (EGO_SIGMA_M, EGO_SIGMA_RAD))
+    known = zip((EGO_SIGMA_M, EGO_SIGMA_RAD), (poses.sigma_m, poses.sigma_yaw_rad), strict=True)
+    measured = np.array([usual if sigma is None else float(sigma.min()) for usual, sigma in known])
+    return np.asarray(np.maximum(sigmas**2 - measured**2, 0.0))
+
+
+def with_pose_errors(agent: Agent, log: Log, timeline: Timeline) -> Agent:
+    """Add to the standard deviations of an agent what the ego's poses are uncertain by where they bridge gaps.
+
+    An agent is placed by the pose of its tick, from which it is as far away as it is seen. One that stands is placed by the best
+    pose of its time.
+    """
+    w = agent.waypoints
+    if log.ego is None or log.ego.sigma_m is None:
+        return agent
+    ticks = timeline.t0_ns + np.round(w.t_s * NS_PER_S).astype(np.int64)
+    if agent.static:
+        ticks = timeline.t_ns[(timeline.t_ns >= ticks[0]) & (timeline.t_ns <= ticks[-1])]
+    variances = bridging_variances(log.ego, ticks)
+    if not variances.any():
+        return agent
+    away_m2 = np.sum((log.ego.at(ticks)[0][:, :2, 3] - _positions(agent, timeline.seconds(ticks))) ** 2, axis=1)
+    position, yaw = variances[:, 0] + away_m2 * variances[:, 1], variances[:, 1]
+    if agent.static:
+        position, yaw = (np.full(len(w), v.min()) for v in (position, yaw))
+    return replace(agent, waypoints=replace(
+        w,
+        sigma_xy_m=None if w.sigma_xy_m is None else np.sqrt(w.sigma_xy_m**2 + position),
+        sigma_yaw_rad=None if w.sigma_yaw_rad is None else np.sqrt(w.sigma_yaw_rad**2 + yaw),
+    ))  # fmt: skip
+
+
+def _positions(agent: Agent, t_s: Array) -> Array:
+    """Interpolate the positions (N, 2), m, of an agent at times (N,)."""
+    w = agent.waypoints
+    return np.stack([np.interp(t_s, w.t_s, w.x_m), np.interp(t_s, w.t_s, w.y_m)], axis=1)
+
+
+def ego_path(log: Log, schedule: Schedule) -> Array:
+    """Return x, y and heading (K, 3) of the ego at every tick, as evidence of the direction of traffic."""
+    if log.ego is None:
+        return np.zeros((0, 3))
+    map_T_ego, valid = log.ego.at(schedule.t_ns)
+    poses = map_T_ego[valid]
+    return np.column_stack([poses[:, :2, 3], yaw_of(poses)])
+
+
+def with_observers(candidate: AgentCandidate, agent: Agent, timeline: Timeline) -> Agent:
+    """Return an agent with the spans of time in which each end measured the candidate that it was made of."""
+    track = candidate.track
+    spans = {
+        end: spans_of_ticks(track.tick[seen], timeline)
+        for end, seen in zip(ENDS, track.measurements.seen_by.T)
+        if seen.any()
+    }
+    return replace(agent, observed_by=spans)
+
+
+def spans_of_ticks(tick: NDArray[np.int64], timeline: Timeline) -> tuple[Span, ...]:
+    """Return the spans, s, of rising ticks (n,); one goes on over as many missing ticks as a track does."""
+    t_s = timeline.seconds(timeline.t_ns[tick])
+    parts = np.split(t_s, np.flatnonzero(np.diff(tick) > MAX_MISSES + 1) + 1)
+    return tuple((float(part[0]), float(part[-1])) for part in parts)
+
+
+# Largest deviation of an omitted waypoint from the line between its neighbors: x, y, z, yaw, speed.
+TOLERANCE_M, TOLERANCE_RAD, TOLERANCE_MPS = 0.01, 0.002, 0.02
+# Of a standard deviation, as a share: an error of a tenth changes no decision. With the tolerance of what it belongs to.
+SIGMA_SHARE = 0.1
+MAX_INTERVAL_S = 1.0
+
+
+def simplify(agents: Sequence[Agent]) -> list[Agent]:
+    """Leave out waypoints of straight motion at constant speed; `quality` counts those left out."""
+    return [_simplified(agent) for agent in agents]
+
+
+def _simplified(agent: Agent) -> Agent:
+    waypoints = simplify_waypoints(agent.waypoints)
+    omitted = len(agent.waypoints) - len(waypoints)
+    if not omitted:
+        return agent
+    return replace(agent, waypoints=waypoints, quality={**agent.quality, "waypoints_left_out": omitted})
+
+
+def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
+    """Leave out the waypoints that linear interpolation restores, keeping intervals of at most `MAX_INTERVAL_S`.
+
+    Where `observed` changes, both neighbors are kept.
+    """
+    kept = waypoints_to_keep(waypoints)
+    if len(kept) == len(waypoints):
+        return waypoints
+    return waypoints.take(kept)
+
+
+def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
+    """Select the indices (K,) of the waypoints to keep, first and last among them.
+
+    Notes
+    -----
+    Greedy: from each kept waypoint the farthest next one is searched with steps that double, then halve.
+    """
+    columns, tolerances = _toleranced(w)
+    kept, last = [0], len(w) - 1
+    while kept[-1] < last:
+        start = kept[-1]
+        step, reach = 1, 1
+        while step and start + reach < last:
+            end = min(start + reach + step, last)
+            if _is_linear(w.t_s, columns, tolerances, start, end):
+                reach, step = end - start, 2 * step
+            else:
+                step //= 2
+        kept.append(start + reach)
+    return np.array(kept, dtype=np.intp)
+
+
+def _toleranced(w: Waypoints) -> tuple[Array, Array]:
+    """Return the columns (T, K) of waypoints and the tolerances (T, K) of each value."""
+    exact = np.full(len(w), 0.0)
+    columns = [(w.x_m, exact + TOLERANCE_M), (w.y_m, exact + TOLERANCE_M), (w.z_m, exact + TOLERANCE_M)]
+    columns += [(np.unwrap(w.yaw_rad), exact + TOLERANCE_RAD), (w.speed_mps, exact + TOLERANCE_MPS)]
+    sigmas = (w.sigma_xy_m, TOLERANCE_M), (w.sigma_yaw_rad, TOLERANCE_RAD), (w.sigma_speed_mps, TOLERANCE_MPS)
+    columns += [(s, tolerance + SIGMA_SHARE * s) for s, tolerance in sigmas if s is not None]
+    columns.append((w.observed.astype(np.float64), exact))
+    values, tolerances = zip(*columns)
+    return np.column_stack(values), np.column_stack(tolerances)
+
+
+def _is_linear(t: Array, columns: Array, tolerances: Array, start: int, end: int) -> bool:
+    """Decide whether the rows between two lie on the line between these, `observed` included."""
+    if t[end] - t[start] > MAX_INTERVAL_S or columns[start, -1] != columns[end, -1]:
+        return False
+    share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])
+    line = columns[start] + share[:, None] * (columns[end] - columns[start])
+    return bool((np.abs(columns[start + 1 : end] - line) <= tolerances[start + 1 : end]).all())
+
+
+def provenance_of(log: Log, config: Config, detector: str, poses: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a scenario was made from and how: log, version, name of the detector, source of the poses, settings, seed."""
+    return {
+        "log": {"name": log.name, "format": log.format, "digest": log.digest},
+        "log2sim_version": __version__,
+        "detector": detector,
+        "poses": dict(poses),
+        "config": config.to_dict(),
+        "seed": config.seed,
+        "history": ["reconstruct"],
+    }
+
+
+def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
+    """Return the sensors that are fixed in the map, as a scenario states them; LiDARs are taken to look all around."""
+    cameras = [
+        (name, c.mount_T_cam, 2 * math.atan(c.width_px / (2 * c.K[0, 0])))
+        for name, c in log.cameras.items()
+        if c.mount == "map"
+    ]
+    lidars = [(name, lidar.mount_T_lidar, 2 * math.pi) for name, lidar in log.lidars.items() if lidar.mount == "map"]
+    entries = []
+    for kind, sensors in (("camera", cameras), ("lidar", lidars)):
+        for name, map_T_sensor, fov_rad in sensors:
+            ahead = map_T_sensor[:2, 2 if kind == "camera" else 0]
+            place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
+            look = {"yaw_rad": math.atan2(ahead[1], ahead[0]), "fov_rad": fov_rad, "range_m": range_m}
+            entries.append({"name": name, "kind": kind, **place, **look})
+    return tuple(entries)
+
+
+def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:
+    """Return the cameras of a log with their homographies, as a scenario states them."""
+    return [_camera_entry(name, homographies.get(name), name in used) for name in log.cameras]
+
+
+def _camera_entry(name: str, ground: CameraHomography | None, used: bool) -> dict[str, Any]:
+    if ground is None or not ground.fit.ok:
+        return {"name": name, "used": used, "homography": None}
+    fit = ground.fit
+    finite_error = float(fit.error_m) if np.isfinite(fit.error_m) else None
+    return {
+        "name": name,
+        "used": used,
+        "homography": {
+            "ground_H_image": fit.ground_H_image.tolist(),
+            "source": ground.source,
+            "inliers": int(fit.inliers.sum()),
+            "correspondences": len(fit.inliers),
+            "error_m": finite_error,
+            "condition": float(fit.condition),
+            "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
+        },
+    }

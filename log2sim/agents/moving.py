@@ -1,37 +1,266 @@
-"""Moving agents: size once, LiDAR matches at ticks without a detection, and a smoothed trajectory."""
+"""Moving agents: one size, a smoothed trajectory, what motion and boxes say about the front, and doubts about the motion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of
-from log2sim.agents.confirmation import followed_confidence
-from log2sim.agents.heading.box_headings import heading_log_odds
-from log2sim.agents.heading.course import forward_log_odds
-from log2sim.agents.lidar_tracking import BoxState, LidarMatch, left_free, track_with_lidar
-from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
-from log2sim.agents.size import TrackGeometry, moving_geometry
-from log2sim.agents.smooth import feasibility
-from log2sim.agents.smooth.feasibility import limit_doubts
-from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
-from log2sim.agents.smooth.motion_model import MotionModel
+from log2sim.agents.candidate import (
+    REAR_AXLE_SHARE,
+    AgentCandidate,
+    Timeline,
+    candidate_of,
+    followed_confidence,
+    spans_of,
+)
+from log2sim.agents.size import TrackGeometry, independent, moving_geometry
+from log2sim.agents.smooth import motion_model
+from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel, limit_doubts
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
-from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, TYPICAL_SIZE_M, Obstacles, Track, Waypoints
+from log2sim.agents.static import BoxState, LidarMatch, left_free, track_with_lidar
+from log2sim.config import TrackConfig
+from log2sim.datatypes import (
+    GROUP_OF,
+    MAX_SPEED_MPS,
+    STANDSTILL_MPS,
+    TYPICAL_SIZE_M,
+    Boxes3D,
+    BoxEvidence,
+    Doubt,
+    Measurements,
+    Obstacles,
+    Track,
+    Waypoints,
+)
+from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
-from log2sim.perception.box_fitting import align_to
-from log2sim.tracking.motion import CENTER_SIGMA_M
+from log2sim.perception.boxes import align_to
+from log2sim.tracking.forward import CENTER_SIGMA_M, CHI2_2DOF_999
+from log2sim.tracking.tracker import VELOCITY_WINDOW_S, track, velocities
+
+# A probability nearer to 1 is not believed: networks are surer than right.
+MAX_HEADING_SCORE = 0.99
+# A box turned farther than this from the axis of the object says nothing about its front.
+MIN_AXIS_COS = 0.7
+
+
+def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
+    """Return the log-odds that the object of a track points along a yaw rather than backward; 0 without boxes.
+
+    Notes
+    -----
+    The sum of the log-odds of all ticks, scaled down to that of as many independent ones (`independent`).
+    """
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    along = np.cos(m.box_yaw_rad[rows] - np.broadcast_to(yaw_rad, len(m.t_ns))[rows])
+    rows, along = rows[np.abs(along) >= MIN_AXIS_COS], along[np.abs(along) >= MIN_AXIS_COS]
+    if len(rows) == 0:
+        return 0.0
+    p = np.clip(m.heading_score[rows], 0.5, MAX_HEADING_SCORE)
+    votes = np.sign(along) * log_odds_of(p)
+    return float(votes.mean()) * independent(len(rows))
+
+
+# Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand.
+FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
+# A way shorter than so many standard deviations of its ends may be noise.
+CERTAIN_SIGMAS = 4.0
+
+
+def forward_log_odds(speed_mps: float) -> float:
+    """Return the log-odds, in nats, that something that moves at a speed, at least 0, moves forward."""
+    return FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * speed_mps
+
+
+def course_log_odds(w: Waypoints, length_m: float) -> float:
+    """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way.
+
+    Notes
+    -----
+    The center of a standing vehicle seems to move by up to its length while more and more of it comes into view.
+    """
+    step_s = np.gradient(w.t_s) if len(w.t_s) > 1 else np.zeros(1)
+    certain_m = max(length_m, CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m)))
+    return _one_way(np.maximum(w.speed_mps, 0.0), step_s, certain_m) - _one_way(
+        np.maximum(-w.speed_mps, 0.0), step_s, certain_m
+    )
+
+
+def _one_way(speed_mps: Array, step_s: Array, certain_m: float) -> float:
+    """Return the log-odds for the direction in which something drives at speeds (T,), 0 at other times."""
+    distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
+    if time_s <= 0:
+        return 0.0
+    return min(forward_log_odds(distance_m / time_s), MAX_FORWARD_LOG_ODDS) * min(distance_m / certain_m, 1.0)
+
+
+def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Boxes3D]:
+    """Turn the boxes of T sweeps round whose objects move the other way, and give all that move the probability of their front.
+
+    Parameters
+    ----------
+    found : T Boxes3D
+        Map frame.
+    t_ns : (T,) int64
+        Stamps of the sweeps.
+
+    Notes
+    -----
+    Boxes are tracked. What a track moves around a sweep counts beside what the detector says of its box there; what stands, is
+    in one sweep alone, or is laid across its course stays as it is.
+    """
+    rows = [_placed(boxes) for boxes in found]
+    yaw, score = [b.yaw_rad.copy() for b in found], [b.heading_score.copy() for b in found]
+    for one in track(
+        rows, t_ns, birth_score=config.birth_score, max_gap_s=config.max_gap_s, min_life_s=config.min_life_s
+    ):
+        m, group, velocity = one.measurements, GROUP_OF[one.category], velocities(one)
+        speed, course = np.hypot(*velocity.T), np.arctan2(velocity[:, 1], velocity[:, 0])
+        t_s = (m.t_ns - m.t_ns[0]) / NS_PER_S
+        window_s = np.minimum(t_s + VELOCITY_WINDOW_S, t_s[-1]) - np.maximum(t_s - VELOCITY_WINDOW_S, 0.0)
+        along = np.cos(m.box_yaw_rad - course)
+        certain_m = CERTAIN_SIGMAS * CENTER_SIGMA_M[group]
+        # People are about as wide as long, so that their boxes have no axis.
+        moves = (speed * window_s >= certain_m) & ((np.abs(along) >= MIN_AXIS_COS) | (group == "pedestrian"))
+        for k in np.flatnonzero(moves):
+            tick = int(one.tick[k])
+            row = int(np.argmin(np.abs(found[tick].center_m - m.box_center_m[k]).sum(axis=1)))
+            own = float(log_odds_of(np.clip(m.heading_score[k], 0.5, MAX_HEADING_SCORE)))
+            odds = own + np.sign(along[k]) * min(forward_log_odds(float(speed[k])), MAX_FORWARD_LOG_ODDS)
+            score[tick][row] = probability_of(abs(odds))
+            if odds < 0:
+                yaw[tick][row] = wrap_angle(yaw[tick][row] + np.pi)
+    return [replace(b, yaw_rad=y, heading_score=s) for b, y, s in zip(found, yaw, score)]
+
+
+def _placed(boxes: Boxes3D) -> Measurements:
+    """Return a row for each box, placed at its center as exactly as centers of boxes are."""
+    sigma = np.array([CENTER_SIGMA_M[GROUP_OF[str(c)]] for c in boxes.category])
+    return replace(
+        Measurements.of_boxes(boxes, np.zeros(3)),
+        center_m=boxes.center_m,
+        covariance=sigma[:, None, None] ** 2 * np.eye(2),
+        source=np.full(len(boxes), "lidar", dtype="<U16"),
+    )
+
+
+# Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`heading.course.forward_log_odds`); out of a driveway or
+# to a better parking space it is some car lengths.
+MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
+# A speed counts as beyond a limit where it is by as many of its own standard deviations.
+SIGNIFICANT_SIGMAS = 2.0
+# A measurement is far from the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
+# outlier.
+MIN_BESIDE = 2
+# One measurement in twenty is an outlier; twice as many are more than that.
+MIN_BESIDE_SHARE = 0.1
+# No road vehicle is wider, mirrors included, so a longer side is its length (Directive 96/53/EC allows 2.6 m).
+MAX_WIDTH_M = 2.7
+# Above this speed a vehicle goes along its length, but for the slip angle, up to 30 degrees where it turns at full lock.
+MIN_COURSE_MPS, MAX_SLIP_RAD, MIN_ACROSS = 1.5, np.deg2rad(45.0), 3
+
+
+def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
+    """Doubt what moves faster than its category does, or reverses fast or far.
+
+    Parameters
+    ----------
+    w : Waypoints
+        One at every tick.
+    """
+    margin = 0.0 if w.sigma_speed_mps is None else SIGNIFICANT_SIGMAS * w.sigma_speed_mps
+    fast = np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category]
+    doubts = _doubts(w, fast, "speed", lambda k: f"moves at {_most(w.speed_mps[k]):.0f} m/s {_when(w.t_s, k)}")
+    if GROUP_OF[category] in ("vehicle", "two_wheeler"):
+        doubts += _doubts(w, _reverses(w, -w.speed_mps - margin), "reversing", lambda k: _words_of_reversing(w, k))
+    return doubts
+
+
+def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, ...]:
+    """Doubt a smoothed trajectory where several measurements in a row are far from it.
+
+    Parameters
+    ----------
+    t_s : (n,) float64, s
+        Times of the measurements.
+    residual_m : (n,) float64, m
+        Distances from the trajectory; NaN where not used.
+    sigma_m : (n,) float64, m
+        Standard deviations of the measurements, changing views included.
+    """
+    beside = np.nan_to_num(residual_m) > np.sqrt(CHI2_2DOF_999) * sigma_m
+    doubts = []
+    for rows in spans_of(beside) if beside.mean() >= MIN_BESIDE_SHARE else []:
+        if len(rows) >= MIN_BESIDE:
+            reason = f"measured up to {residual_m[rows].max():.1f} m off its path {_when(t_s, rows)}"
+            doubts.append(Doubt("jump", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])))
+    return tuple(doubts)
+
+
+def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: Array) -> tuple[Doubt, ...]:
+    """Doubt a vehicle whose length was measured to lie across its way most of the time.
+
+    Parameters
+    ----------
+    m : BoxEvidence
+        n rows.
+    t_s : (n,) float64, s
+    heading_rad : (n,) float64
+        Of the trajectory at these times.
+    speed_mps : (n,) float64, m/s
+        There.
+    """
+    has_box = np.isfinite(m.box_yaw_rad)
+    axis = np.where(has_box, m.box_yaw_rad, m.yaw_rad)
+    certain = (has_box | ((m.high_m - m.low_m)[:, 0] > MAX_WIDTH_M)) & (np.abs(speed_mps) > MIN_COURSE_MPS)
+    across = certain & (np.abs(wrap_angle(2 * (axis - heading_rad))) / 2 > MAX_SLIP_RAD)
+    rows = np.flatnonzero(across)
+    if len(rows) < MIN_ACROSS or len(rows) <= certain.sum() / 2:
+        return ()
+    reason = f"slides across its length {_when(t_s, rows)}"
+    return (Doubt("sideways", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])),)
+
+
+def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:
+    """Return where (T,) an agent reverses too fast, or farther than anybody does."""
+    backward = w.speed_mps < 0
+    wrong = np.zeros(len(w), dtype=bool)
+    for rows in spans_of(backward):
+        covered = float(np.hypot(np.diff(w.x_m[rows]), np.diff(w.y_m[rows])).sum())
+        wrong[rows] = bool((backward_mps[rows] > MAX_REVERSING_MPS).any()) or covered > MAX_REVERSING_M
+    return wrong
+
+
+def _doubts(
+    w: Waypoints, holds: NDArray[np.bool_], flag: str, words: Callable[[NDArray[np.intp]], str]
+) -> tuple[Doubt, ...]:
+    """Make a doubt of each span in which something holds (T,)."""
+    return tuple(Doubt(flag, words(k), float(w.t_s[k[0]]), float(w.t_s[k[-1]])) for k in spans_of(holds))
+
+
+def _words_of_reversing(w: Waypoints, k: NDArray[np.intp]) -> str:
+    return f"reverses at up to {_most(w.speed_mps[k]):.1f} m/s {_when(w.t_s, k)}"
+
+
+def _most(speed_mps: Array) -> float:
+    return float(np.abs(speed_mps).max())
+
+
+def _when(t_s: Array, k: NDArray[np.intp]) -> str:
+    first, last = f"{t_s[k[0]]:.1f}", f"{t_s[k[-1]]:.1f}"
+    return f"at {first} s" if first == last else f"from {first} to {last} s"
+
 
 # Spectral density of the jerk, m2/s5, of groups for which it is not estimated.
 JERK_DENSITY = {"pedestrian": 2.0}
 # Tightest ways of groups: that of road vehicles; of a bicycle with a wheelbase of 1.05 m whose front wheel is turned by 30 degrees,
 # tan(30 degrees) / 1.05 m; of others nothing is known.
 MAX_CURVATURE_1PM = {
-    "vehicle": feasibility.MAX_CURVATURE_1PM,
+    "vehicle": motion_model.MAX_CURVATURE_1PM,
     "two_wheeler": 0.55,
     "pedestrian": np.inf,
     "other": np.inf,

@@ -7,17 +7,256 @@ ends.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.box_votes import independent, mean_box_axis, mean_box_center, typical_box_size, weighted_quantile
-from log2sim.agents.ends import Ends, ends_of, persistent_points, static_ends
-from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
+from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, OtherView, Track
 from log2sim.geometry import Array
-from log2sim.perception import box_completion, box_fitting
+from log2sim.perception import boxes
+from log2sim.perception.boxes import box_sigma
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
+
+# Errors of one detector about one object are alike at neighboring ticks: correlation between any two of them.
+TICK_CORRELATION = 0.5
+# So many places of a long track do for how much its ticks have in common.
+MAX_PLACES = 200
+
+
+def independent(count: int) -> float:
+    """Return how many independent ticks are worth as much as `count` correlated ones, at most 1 / `TICK_CORRELATION`."""
+    return count / (1 + (count - 1) * TICK_CORRELATION) if count else 0.0
+
+
+def independent_along(xy_m: Array, length_m: float) -> float:
+    """Return how many independent ticks are worth as much as those at which an object of a length was at places (n, 2).
+
+    What a detector mistakes for a road user stays where it is. Something that moves on is seen from other sides and before other
+    things, so that errors at two places are the less alike the more lengths they are from each other.
+    """
+    count = min(len(xy_m), MAX_PLACES)
+    places = xy_m[np.linspace(0, len(xy_m) - 1, count).round().astype(np.intp)]
+    apart_m = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    alike = TICK_CORRELATION * np.exp(-apart_m / length_m)
+    np.fill_diagonal(alike, 1.0)
+    return float(count**2 / alike.sum())
+
+
+def typical_box_size(m: BoxEvidence) -> Array | None:
+    """Return the size (3,) of the boxes of a track, the median weighted by their points; None without boxes."""
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows) == 0:
+        return None
+    weight = box_sigma(m.points[rows]) ** -2
+    return np.array([weighted_median(m.box_size_m[rows, axis], weight) for axis in range(3)])
+
+
+def mean_box_center(m: BoxEvidence) -> tuple[Array, float]:
+    """Return the robust mean (2,) of the box centers of a track that stands, and its standard deviation; NaN without boxes."""
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows) == 0:
+        return np.full(2, np.nan), np.nan
+    sigma = box_sigma(m.points[rows])
+    center = np.array([weighted_median(m.box_center_m[rows, axis], sigma**-2) for axis in range(2)])
+    return center, float(np.median(sigma)) / np.sqrt(independent(len(rows)))
+
+
+def mean_box_axis(m: BoxEvidence) -> float | None:
+    """Return the mean yaw of the boxes of a track, in rad up to half turns; None without boxes."""
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows) == 0:
+        return None
+    weight, doubled = box_sigma(m.points[rows]) ** -2, 2 * m.box_yaw_rad[rows]
+    return float(np.arctan2(weight @ np.sin(doubled), weight @ np.cos(doubled))) / 2
+
+
+def weighted_median(values: Array, weight: Array) -> float:
+    """Return the smallest of the values (N,), N > 0, that half of the weight (N,) does not exceed."""
+    return weighted_quantile(values, weight, 0.5)
+
+
+def weighted_quantile(values: Array, weight: Array, share: float) -> float:
+    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(reached, reached[-1] * share)]])
+
+
+# Points of a static object are persistent if so many of the ticks have points in their cell.
+VOXEL_M = 0.15
+MIN_PERSISTENT_SHARE = 0.15
+MAX_POINTS_PER_TICK = 150
+# A side seen at a smaller angle than this (sine) shows its near end only: its far end rests on few rays, and the low hood of a
+# car on none. Trucks and buses are as high at the one end as at the other.
+MIN_SIDE_SINE, MIN_BOX_SIDE_SINE = 0.35, 0.15
+BOXES = ("truck", "bus")
+# A length axis is told by the lengths of the sides if the odds are e to one.
+CLEAR_LOG_ODDS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Ends of the points of an object along its length and width in n views.
+
+    Attributes
+    ----------
+    low, high : (n, 2) float64, m
+    real : (n, 2, 2) int
+        Kinds of the ends, see `box_completion.real_ends`.
+    gap_m : (n, 2, 2) float64
+        Distances between rays there, see `box_completion.end_gaps`.
+    """
+
+    low: Array
+    high: Array
+    real: NDArray[np.int64]
+    gap_m: Array
+
+    def take(self, rows: slice) -> Ends:
+        """Return the ends of some of the views."""
+        return Ends(self.low[rows], self.high[rows], self.real[rows], self.gap_m[rows])
+
+    def swapped(self) -> Ends:
+        """Return the ends along axes that are turned by a quarter turn."""
+        low = np.stack([self.low[:, 1], -self.high[:, 0]], axis=1)
+        high = np.stack([self.high[:, 1], -self.low[:, 0]], axis=1)
+        real = np.stack([self.real[:, 1], self.real[:, 0, ::-1]], axis=1)
+        gap_m = np.stack([self.gap_m[:, 1], self.gap_m[:, 0, ::-1]], axis=1)
+        return Ends(low, high, real, gap_m)
+
+
+def persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
+    """Keep the points (n, 3) of cells with points at several ticks, without those that belong to a neighbor at a single one."""
+    clusters = [boxes.subsample(c, MAX_POINTS_PER_TICK) for c in clusters if len(c)]
+    if not clusters:
+        return np.zeros((0, 3))
+    points = np.concatenate(clusters)
+    tick = np.repeat(np.arange(len(clusters)), [len(c) for c in clusters])
+    cell = np.floor(points[:, :2] / VOXEL_M).astype(np.int64)
+    cell -= cell.min(axis=0)
+    # Cell and tick in one number: sorting numbers is ten times as fast as sorting rows.
+    _, key = np.unique(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1], return_inverse=True)
+    count = np.bincount(np.unique(key * len(clusters) + tick) // len(clusters))
+    return points[count[key] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
+
+
+def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
+    """Fit the yaw of the points (n, 2) of a static track and find the ends (one view) of all its views together."""
+    m = track.measurements
+    axis = mean_box_axis(m)
+    yaw = boxes.fit_yaw(xy)[0] if axis is None else boxes.corrected_yaw(xy, axis)
+    low, high = boxes.extents(xy, yaw, max_trim_m=boxes.MAX_TRIM_M)
+    rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
+    if track.category in BOXES:
+        low, high = _reached(low, high, [m.points_of(k)[:, :2] - origin for k in rows.tolist()], yaw)
+    seen = [view for _, view in m.views_of(rows)]
+    sensor = boxes.rotate(np.array([v.sensor_m[:2] for v in seen]).reshape(-1, 2) - origin, -yaw)
+    visible = np.array([v.ends_visible for v in seen], dtype=bool).reshape(-1, 2)
+    views = boxes.real_ends(low, high, sensor, visible, min_sine=_min_sine(track.category))
+    steps = [boxes.azimuth_step_rad(boxes.rotate(v.cluster[:, :2] - v.sensor_m[:2], -yaw)) for v in seen]
+    gaps = boxes.end_gaps(np.array(steps), low - sensor, high - sensor, views)
+    # An end that is real from one viewpoint is real, and known as well as from the best one.
+    real = views.max(axis=0)
+    gap = np.where(views == real, gaps, np.inf).min(axis=0)
+    ends = Ends(low[None], high[None], real[None], gap[None])
+    if axis is None and _is_length_across(ends, boxes.rotate(m.sensor_m[:, :2] - origin, -yaw), track.category):
+        return yaw + np.pi / 2, ends.swapped()
+    return yaw, ends
+
+
+def _reached(low: Array, high: Array, views: list[Array], yaw_rad: float) -> tuple[Array, Array]:
+    """Widen ends (2,), (2,) of points that persist in their cells to where the points of enough views (n, 2) reach.
+
+    At the far end of a long side, rays are so far apart that they never meet a cell twice. Errors of poses widen it too,
+    which short vehicles cannot afford.
+    """
+    if not views:
+        return low, high
+    each = [boxes.extents(xy, yaw_rad, max_trim_m=boxes.MAX_TRIM_M) for xy in views]
+    lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
+    enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(views)), 2), len(views))
+    return np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
+
+
+def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
+    """Decide whether the length of an object is the second axis of its ends (one view), seen from sensors (K, 2)."""
+    low, high = (e[0] for e in boxes.corner_correction(
+        ends.low, ends.high, ends.real, np.array([TYPICAL_SIZE_M[category][1]]), gap_m=ends.gap_m
+    ))  # fmt: skip
+    whole = np.all(ends.real[0], axis=-1)
+    doubt_m = boxes.UNIFORM_SIGMA * ends.gap_m[0].sum(axis=-1)
+    log_odds = boxes.swapped_log_odds(high - low, whole, doubt_m, category)
+    if abs(log_odds) >= CLEAR_LOG_ODDS:
+        return log_odds > 0
+    typical = np.array(TYPICAL_SIZE_M[category])
+    return boxes.axes_swapped(ends.high[0] - ends.low[0], sensor - (ends.low + ends.high) / 2, typical)
+
+
+def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: Array) -> Ends:
+    """Find the ends of the points of measurements `rows` (n,), each relative to its viewpoint.
+
+    Of an end that is seen from two viewpoints counts the better view.
+
+    Parameters
+    ----------
+    yaw_rad : (n,) float64
+        Of the object at each of them.
+    velocity_mps : (n, 2) float64
+        By which points are moved to where they were at the time of the measurement.
+    """
+    views = track.measurements.views_of(rows)
+    count, place = len(rows), {k: i for i, k in enumerate(rows.tolist())}
+    of = np.array([place[k] for k, _ in views], dtype=np.intp)
+    seen = _ends_in_views([view for _, view in views], yaw_rad[of], velocity_mps[of], track.category)
+    out = seen.take(slice(count))
+    if len(views) == count:
+        return out
+    parts = [out.take(slice(i, i + 1)) for i in range(count)]
+    for j, i in enumerate(of[count:].tolist(), start=count):
+        ends = seen.take(slice(j, j + 1))
+        apart = boxes.rotate((views[j][1].sensor_m - views[i][1].sensor_m)[:2], -yaw_rad[i])
+        parts[i] = _better_ends(parts[i], replace(ends, low=ends.low + apart, high=ends.high + apart))
+    return join_ends(parts)
+
+
+def _ends_in_views(views: list[OtherView], yaw_rad: Array, velocity_mps: Array, category: str) -> Ends:
+    """Find the ends of the points of viewpoints (n,), relative to them, for yaws (n,) and velocities (n, 2)."""
+    low, high, step = np.zeros((len(views), 2)), np.zeros((len(views), 2)), np.zeros(len(views))
+    for k, view in enumerate(views):
+        xy = view.cluster[:, :2] - view.sensor_m[:2]
+        if view.cluster.shape[1] > 3:
+            xy = xy - view.cluster[:, 3:] * velocity_mps[k]
+        local = boxes.rotate(xy, -yaw_rad[k])
+        low[k], high[k] = boxes.extents_of_rotated(local, max_trim_m=boxes.MAX_TRIM_M)
+        step[k] = boxes.azimuth_step_rad(local)
+    visible = np.array([view.ends_visible for view in views], dtype=bool).reshape(-1, 2)
+    real = boxes.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(category))
+    return Ends(low, high, real, boxes.end_gaps(step, low, high, real))
+
+
+def _better_ends(one: Ends, other: Ends) -> Ends:
+    """Take each end from the view that knows it better; of two that do not, the outer one."""
+    outer = np.stack([other.low < one.low, other.high > one.high], axis=-1)
+    takes = (other.real > one.real) | ((other.real == one.real) & (other.gap_m < one.gap_m))
+    takes = np.where((one.real == 0) & (other.real == 0), outer, takes)
+    return Ends(
+        np.where(takes[..., 0], other.low, one.low),
+        np.where(takes[..., 1], other.high, one.high),
+        np.where(takes, other.real, one.real),
+        np.where(takes, other.gap_m, one.gap_m),
+    )
+
+
+def _min_sine(category: str) -> float:
+    return MIN_BOX_SIDE_SINE if category in BOXES else MIN_SIDE_SINE
+
+
+def join_ends(parts: list[Ends]) -> Ends:
+    """Join the ends of several views."""
+    return Ends(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Ends)))
+
 
 # Quantile of the lengths of fully observed sides that is taken for the size: stray points lengthen some, sparse points
 # shorten most.
@@ -76,16 +315,16 @@ def static_geometry(track: Track) -> TrackGeometry:
     height, z = _height(track)
     size, is_likely = _estimate_size(ends, track.category, height, known)
     low, high, real, gap = (column[0] for column in (ends.low, ends.high, ends.real, ends.gap_m))
-    center, sigma = box_completion.complete_box(low, high, size, real, known is not None, gap_m=gap)
+    center, sigma = boxes.complete_box(low, high, size, real, known is not None, gap_m=gap)
     box_xy, box_sigma_m = mean_box_center(m)
-    center, sigma = box_completion.weighted_center(
-        center, sigma, box_fitting.rotate(box_xy - origin[:2], -yaw), _with_size_error(box_sigma_m, known, size)
+    center, sigma = boxes.weighted_center(
+        center, sigma, boxes.rotate(box_xy - origin[:2], -yaw), _with_size_error(box_sigma_m, known, size)
     )
     n = len(m)
     return TrackGeometry(
         np.append(size, height),
-        np.tile(box_fitting.rotate(center, yaw) + origin[:2], (n, 1)),
-        np.tile(box_completion.oriented_covariance(sigma, yaw), (n, 1, 1)),
+        np.tile(boxes.rotate(center, yaw) + origin[:2], (n, 1)),
+        np.tile(boxes.oriented_covariance(sigma, yaw), (n, 1, 1)),
         np.full(n, np.median(z)),
         float(yaw),
         is_likely and _is_likely_height(size, height, track.category),
@@ -122,16 +361,16 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
     height, z = _height(track)
     size, is_likely = _estimate_size(ends, track.category, height, typical_box_size(m))
     has_box = np.isfinite(m.box_yaw_rad[rows])
-    center, sigma = box_completion.complete_box(ends.low, ends.high, size, ends.real, has_box, gap_m=ends.gap_m)
-    center, sigma = box_completion.weighted_center(
+    center, sigma = boxes.complete_box(ends.low, ends.high, size, ends.real, has_box, gap_m=ends.gap_m)
+    center, sigma = boxes.weighted_center(
         center,
         sigma,
-        box_fitting.rotate(m.box_center_m[rows, :2] - sensor, -yaw),
-        _with_size_error(box_completion.box_sigma(m.points[rows])[:, None], m.box_size_m[rows], size),
+        boxes.rotate(m.box_center_m[rows, :2] - sensor, -yaw),
+        _with_size_error(boxes.box_sigma(m.points[rows])[:, None], m.box_size_m[rows], size),
     )
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
-    xy[rows] = box_fitting.rotate(center, yaw) + sensor
-    covariance[rows] = box_completion.oriented_covariance(sigma, yaw)
+    xy[rows] = boxes.rotate(center, yaw) + sensor
+    covariance[rows] = boxes.oriented_covariance(sigma, yaw)
     is_likely = is_likely and height > MIN_SIZE_M[track.category][2]
     is_likely = is_likely and _is_likely_height(size, height, track.category)
     return TrackGeometry(np.append(size, height), xy, covariance, z, None, is_likely)
@@ -153,11 +392,11 @@ def _estimate_size(ends: Ends, category: str, height_m: float, known: Array | No
     is_vehicle = GROUP_OF[category] == "vehicle"
     largest = np.minimum(limit, [np.inf, MAX_ROAD_WIDTH_M]) if is_vehicle else limit
     expected = np.minimum(typical if known is None else known[:2], largest)
-    spread = np.log(limit / smallest) / box_fitting.LIMIT_SIGMAS
+    spread = np.log(limit / smallest) / boxes.LIMIT_SIGMAS
     enough, share = np.exp(-MAX_SHORT_SIGMAS * spread) * typical, spread if known is None else BOX_SIZE_SIGMA_SHARE
-    low, high = box_completion.corner_correction(ends.low, ends.high, ends.real, expected[1], gap_m=ends.gap_m)
+    low, high = boxes.corner_correction(ends.low, ends.high, ends.real, expected[1], gap_m=ends.gap_m)
     seen, whole = high - low, np.all(ends.real, axis=2)
-    variance = WHOLE_SIDE_SIGMA_M**2 + (box_completion.UNIFORM_SIGMA * ends.gap_m).sum(axis=2) ** 2
+    variance = WHOLE_SIDE_SIGMA_M**2 + (boxes.UNIFORM_SIGMA * ends.gap_m).sum(axis=2) ** 2
     least = np.quantile(ends.high - ends.low, SIZE_QUANTILE, axis=0)
     # What is shorter than a part that was seen at other times was not seen from end to end.
     used = whole & (seen + 2 * np.sqrt(variance) >= least) & (seen >= enough)
@@ -169,7 +408,7 @@ def _estimate_size(ends: Ends, category: str, height_m: float, known: Array | No
         prior = (share * expected)[axis] ** 2
         size[axis] = observed + error_of_all / (error_of_all + prior) * (expected[axis] - observed)
     # What lies between two rays is no evidence.
-    between = np.where(ends.real == box_completion.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
+    between = np.where(ends.real == boxes.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
     is_likely = _is_likely_size(seen - between, whole, np.maximum(expected, least), category)
     is_likely = is_likely and not _is_too_thin(seen, whole, category)
     return np.clip(np.maximum(size, least), smallest, largest), is_likely

@@ -1,23 +1,325 @@
-"""Static agents: one pose for all ticks of a track that does not move."""
+"""Static agents: one pose for all ticks of a track that does not move, and tracking by LiDAR alone where nothing was detected."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from log2sim.agents.box_votes import independent
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
-from log2sim.agents.hypotheses import Part, main_place
-from log2sim.agents.lidar_tracking import BoxState, match_standing
-from log2sim.agents.size import TrackGeometry, static_geometry
-from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
-from log2sim.agents.standing import robust_line
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Track, Waypoints
+from log2sim.agents.evidence import Ending, classify_rays
+from log2sim.agents.hypotheses import Part, main_place, robust_line
+from log2sim.agents.size import TrackGeometry, independent, static_geometry
+from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
-from log2sim.perception.box_fitting import rotate
-from log2sim.tracking.motion import CENTER_SIGMA_M
+from log2sim.perception.boxes import (
+    FACING_END,
+    MAX_TRIM_M,
+    SENSOR_SIGMA_M,
+    SIDE_END,
+    UNIFORM_SIGMA,
+    align_to,
+    complete_box,
+    corrected_yaw,
+    extents_of_rotated,
+    facing_ends,
+    oriented_covariance,
+    rotate,
+)
+from log2sim.perception.first_pass import OBSTACLE_REACH_M
+from log2sim.tracking.forward import CENTER_SIGMA_M
+
+MIN_POINTS = 8
+# Points up to this far outside the predicted box count as its own; a shell of this width around them is compared with it.
+MARGIN_M = 0.5
+SHELL_M = 1.0
+# With more points in the shell, relative to those in the box, the box is a part of a larger structure.
+MAX_SHELL_RATIO = 0.6
+# Largest distance of a match from its prediction along each side, and as a share of it: the box of a detector may be off so far.
+MAX_SHIFT_M, MAX_SHIFT_SHARE = 0.8, 0.1
+MAX_MISSES = 2
+# A match is rejected when a larger share of the box's length or width is unobserved: its position along that axis is
+# undetermined.
+MAX_HIDDEN_SHARE = 0.7
+# A ray that goes on behind a side by this passed it. Where more than this share of those toward a box go on, nothing is there.
+SIDE_DEPTH_M, MAX_THROUGH_SHARE = 0.3, 0.5
+# An end is where a ray passes within this distance of the last point.
+MAX_GAP_M = 1.5
+# Quantiles of the heights of points between which a side is: below a truck and above a hood rays pass.
+LEVELS = 0.25, 0.75
+# What ends on both sides and is shorter than this share of the box is something else.
+MIN_SIZE_SHARE = 0.5
+# Gains of the constant-velocity filter.
+POSITION_GAIN, VELOCITY_GAIN, YAW_GAIN = 0.6, 0.15, 0.3
+# What is longer than so many widths moves along its length.
+LONG_WIDTHS = 1.5
+# Slower objects keep their yaw.
+MIN_COURSE_SPEED_MPS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class LidarMatch:
+    """A tracked box found in the LiDAR points of a tick.
+
+    Attributes
+    ----------
+    t_ns : int
+        Mean time of its points.
+    xy_m : (2,) float64
+        Center, map frame.
+    covariance : (2, 2) float64
+        Of the center, m2.
+    yaw_rad : float
+        Direction of its sides; the predicted one where its points do not show it.
+    """
+
+    tick: int
+    t_ns: int
+    xy_m: Array
+    covariance: Array
+    yaw_rad: float
+    points: int
+
+
+@dataclass(frozen=True, eq=False)
+class BoxState:
+    """A box of known size and its motion at one time, in the map frame.
+
+    Attributes
+    ----------
+    xy_m : (2,) float64
+        Center.
+    velocity_mps : (2,) float64
+        Zero for a static box, which is expected at the same position at every tick.
+    size_m : (3,) float64
+        Length, width, height.
+    bottom_m : float
+        Height of its bottom face.
+    """
+
+    t_ns: int
+    xy_m: Array
+    velocity_mps: Array
+    yaw_rad: float
+    size_m: Array
+    bottom_m: float
+
+
+def track_with_lidar(
+    obstacles: Sequence[Obstacles | None], ticks: Sequence[int], t_ns: NDArray[np.int64], start: BoxState
+) -> list[LidarMatch]:
+    """Match a box at the given ticks, one after the other, from a known state.
+
+    A moving box is predicted with constant velocity, corrected at every match, and lost after `MAX_MISSES` ticks without a
+    match in a row.
+
+    Parameters
+    ----------
+    obstacles : T clouds, None at ticks without LiDAR
+    ticks : sequence of int
+        Forward or backward in time from the state.
+    t_ns : (T,) int64
+        Stamps of all ticks.
+    """
+    matches: list[LidarMatch] = []
+    state, misses, is_static = start, 0, not start.velocity_mps.any()
+    for tick in ticks:
+        cloud = obstacles[tick]
+        stamp_ns = int(t_ns[tick]) if cloud is None else cloud.stamp_ns
+        predicted = state.xy_m + state.velocity_mps * ((stamp_ns - state.t_ns) / NS_PER_S)
+        reached = cloud is not None and float(np.hypot(*(predicted - cloud.origin[:2]))) <= reach_of(state.size_m)
+        match = match_box(cloud, tick, replace(state, xy_m=predicted)) if cloud is not None and reached else None
+        if match is None:
+            misses += 1
+            if misses >= MAX_MISSES and not is_static:
+                break
+            continue
+        misses = 0
+        matches.append(match)
+        if not is_static:
+            state = _corrected(state, match)
+    return matches
+
+
+def match_standing(
+    obstacles: Sequence[Obstacles | None], boxes: Sequence[BoxState], known: Sequence[NDArray[np.int64]]
+) -> list[list[LidarMatch]]:
+    """Match boxes that stand at all ticks but those at which each is `known`; returns the matches of each.
+
+    Every cloud is looked at once, and only for the boxes that its points reach: a long log has many of both.
+    """
+    matches: list[list[LidarMatch]] = [[] for _ in boxes]
+    if not boxes:
+        return matches
+    place = np.array([box.xy_m for box in boxes])
+    reach = np.array([reach_of(box.size_m) for box in boxes])
+    measured = [set(ticks.tolist()) for ticks in known]
+    for tick, cloud in enumerate(obstacles):
+        if cloud is None:
+            continue
+        for k in np.flatnonzero(np.hypot(*(place - cloud.origin[:2]).T) <= reach).tolist():
+            match = None if tick in measured[k] else match_box(cloud, tick, boxes[k])
+            if match is not None:
+                matches[k].append(match)
+    return matches
+
+
+def reach_of(size_m: Array) -> float:
+    """Return how far from the origin of a cloud, m, a box may be to have points of it near."""
+    return OBSTACLE_REACH_M + _reach_around(size_m)
+
+
+def _reach_around(size_m: Array) -> float:
+    """Return how far from the center of a box, m, points are looked at."""
+    return float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
+
+
+def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
+    """Return the state at the time of a match, corrected toward it."""
+    dt_s = (match.t_ns - state.t_ns) / NS_PER_S
+    expected = state.xy_m + state.velocity_mps * dt_s
+    innovation = match.xy_m - expected
+    velocity, yaw_rad = state.velocity_mps, state.yaw_rad
+    if abs(dt_s) > 1e-3:
+        velocity = velocity + VELOCITY_GAIN * innovation / dt_s
+        yaw_rad = _turned(match.yaw_rad, velocity)
+        if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
+            axis = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+            velocity = (velocity @ axis) * axis
+    position = expected + POSITION_GAIN * innovation
+    return replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=yaw_rad)
+
+
+def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
+    """Match a predicted box, at the stamp of a cloud, against its points; None where they do not determine its position.
+
+    Notes
+    -----
+    Of a vehicle beside the sensor only a flank is seen, and of a long one not even all of that. It has the place across
+    from the flank, and the place along from an end behind which rays go on. A wall has no such ends.
+    """
+    size, yaw_rad = box.size_m, box.yaw_rad
+    near = cloud.near(box.xy_m, _reach_around(size))
+    z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - box.bottom_m)
+    near = near[(z > 0.15) & (z < size[2] + 0.4)]
+    if len(near) < MIN_POINTS:
+        return None
+    late_s = cloud.t_s[near, None].astype(np.float64)
+    local = rotate(cloud.xyz[near, :2] + (cloud.origin[:2] - box.xy_m) - late_s * box.velocity_mps, -yaw_rad)
+    outside_m = (np.abs(local) - size[:2] / 2).max(axis=1)
+    inside = outside_m <= MARGIN_M
+    in_shell = ~inside & (outside_m <= MARGIN_M + SHELL_M)
+    if inside.sum() < MIN_POINTS or in_shell.sum() > MAX_SHELL_RATIO * inside.sum():
+        return None
+    # The pose of what stands is known from all ticks.
+    turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
+    box = replace(box, yaw_rad=yaw_rad + turn_rad)
+    low, high = extents_of_rotated(rotate(local[inside], -turn_rad), max_trim_m=MAX_TRIM_M)
+    if np.any(high - low > size[:2] + 0.6):
+        return None
+    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
+    real, gap_m, rays = facing_ends(low, high, sensor), np.zeros((2, 2)), None
+    hidden = size[:2] - (high - low) > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)
+    if cloud.free is None and hidden.any():
+        return None
+    if cloud.free is not None and np.any(hidden | ~real.any(axis=1)):
+        rays = _rays_to(box, cloud.origin, cloud.free)
+        levels = np.quantile(cloud.xyz[near[inside], 2] + np.float32(cloud.origin[2] - box.bottom_m), LEVELS)
+        real, gap_m = _ends_by_rays(*rays, levels, low, high, real)
+        smaller = real.all(axis=1) & (high - low + gap_m.sum(axis=1) < MIN_SIZE_SHARE * size[:2])
+        if smaller.any() or (hidden.any() and not real.any(axis=1).all()):
+            return None
+    center, sigma = complete_box(low, high, size[:2], real, gap_m=gap_m)
+    if np.any(np.abs(center) > np.maximum(MAX_SHIFT_M, MAX_SHIFT_SHARE * size[:2])) or (
+        rays is not None and _passes(*rays, center, size)
+    ):
+        return None
+    sigma = np.hypot(sigma, UNIFORM_SIGMA * np.where(real.all(axis=1), gap_m.min(axis=1), gap_m.max(axis=1)))
+    mean_s = float(late_s[inside].mean())
+    return LidarMatch(
+        tick,
+        cloud.stamp_ns + round(mean_s * NS_PER_S),
+        rotate(center, box.yaw_rad) + box.xy_m + mean_s * box.velocity_mps,
+        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), box.yaw_rad),
+        box.yaw_rad,
+        int(inside.sum()),
+    )
+
+
+def left_free(
+    obstacles: Sequence[Obstacles | None], matches: Sequence[LidarMatch], size_m: Array, bottom_m: float
+) -> NDArray[np.bool_]:
+    """Mark the matches (n,), in rising time, whose place rays pass when the box is more than its length from there.
+
+    What a moving object was taken for does so; clutter along which a box drifts stays where it is.
+    """
+    places = np.array([match.xy_m for match in matches]).reshape(-1, 2)
+    marked = np.zeros(len(matches), dtype=bool)
+    for k, match in enumerate(matches):
+        away = np.flatnonzero(np.hypot(*(places - match.xy_m).T) > size_m[0])
+        # The last moment before it came, the first one after it went.
+        for other in (*away[away < k][-1:].tolist(), *away[away > k][:1].tolist()):
+            cloud = obstacles[matches[other].tick]
+            if cloud is not None and cloud.free is not None and not marked[k]:
+                box = BoxState(match.t_ns, match.xy_m, np.zeros(2), match.yaw_rad, size_m, bottom_m)
+                marked[k] = _passes(*_rays_to(box, cloud.origin, cloud.free), np.zeros(2), size_m)
+    return marked
+
+
+def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
+    """Return where rays start and end (K, 3) along the axes of a box, relative to the middle of its bottom at their times."""
+    place = np.append(box.xy_m, box.bottom_m) - origin + rays.t_s[:, None] * np.append(box.velocity_mps, 0.0)
+    start, end = rays.start - place, rays.end - place
+    start[:, :2], end[:, :2] = rotate(start[:, :2], -box.yaw_rad), rotate(end[:, :2], -box.yaw_rad)
+    return start, end
+
+
+def _ends_by_rays(
+    start: Array, end: Array, levels_m: Array, low: Array, high: Array, real: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array]:
+    """Find the ends next to which rays (K, 3) pass the sides that face the sensor, between two levels (2,).
+
+    Returns
+    -------
+    real : (2, 2) int
+        Kinds of the ends of the points, with those that face the sensor, `real`.
+    gap_m : (2, 2) float64
+        How far beyond the points the first ray passes.
+    """
+    ends, gap_m = real.copy(), np.zeros((2, 2))
+    for across, side in np.argwhere(real == FACING_END).tolist():
+        along, face, inward = 1 - across, (low, high)[side][across], (1.0, -1.0)[side]
+        before, behind = inward * (face - start[:, across]), inward * (end[:, across] - face)
+        passing = np.flatnonzero((before > 0) & (behind > SIDE_DEPTH_M))
+        share = (before / (before + behind))[passing, None]
+        at = start[passing] + share * (end - start)[passing]
+        at = at[(at[:, 2] > levels_m[0]) & (at[:, 2] < levels_m[1]), along]
+        for k, beyond in enumerate((low[along] - at, at - high[along])):
+            gap = float(beyond[beyond > 0].min(initial=np.inf))
+            if gap < MAX_GAP_M and not ends[along, k]:
+                ends[along, k], gap_m[along, k] = SIDE_END, gap
+    return ends, gap_m
+
+
+def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
+    """Return whether most of several rays toward the solid part of a box of a size (3,) at a center (2,) go on behind it."""
+    first = start - np.append(center, size[2] / 2)
+    (ending,) = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
+    passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
+    return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
+
+
+def _turned(yaw_rad: float, velocity: Array) -> float:
+    """Turn a yaw toward the course of a velocity (2,), up to half turns, if it is fast enough."""
+    speed = float(np.hypot(*velocity))
+    if speed < MIN_COURSE_SPEED_MPS:
+        return yaw_rad
+    course = align_to(float(np.arctan2(velocity[1], velocity[0])), yaw_rad, np.pi)
+    return yaw_rad + YAW_GAIN * float(np.arctan2(np.sin(course - yaw_rad), np.cos(course - yaw_rad)))
+
 
 # Standard deviations of a yaw known up to half a turn: of the box of one tick, and the least of any.
 BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = 0.1, 0.005

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from log2sim import registry
 from log2sim.errors import ConfigError, LogError
-from log2sim.links import follows_links
-from log2sim.logs.opening import find_reader
-from log2sim.logs.reader import Reader
+from log2sim.files import plugins
+from log2sim.files.inputs import follows_links
+from log2sim.logs.opening import Reader, find_reader
 
 MAX_LEVELS = 8
 """Below the root; data sets have up to four (split, date, drive, sensor)."""
@@ -29,8 +28,6 @@ class FoundLog:
         Path of the log below the root, with the sequence where one folder holds several; unique within a format.
     path : Path
         What `open_log` takes.
-    format : str
-    sequence : str
     """
 
     id: str
@@ -65,12 +62,12 @@ def find_logs(
     Notes
     -----
     A log is reported at the deepest folder that its reader accepts. Nothing below a folder that is a log itself is another one. Hidden
-    folders are skipped, and links are followed only where that was asked for (`log2sim.links.following_links`).
+    folders are skipped, and links are followed only where that was asked for (`log2sim.files.inputs.following_links`).
     """
     if not root.exists():
         raise LogError(f"{root}: no such folder; give a folder with logs")
-    names = registry.names("log") if format == "auto" else [format]
-    readers: dict[str, Reader] = {name: registry.load("log", name) for name in names}
+    names = plugins.names("log") if format == "auto" else [format]
+    readers: dict[str, Reader] = {name: plugins.load("log", name) for name in names}
     if root.is_file():
         found = _of_file(root, format)
     else:
@@ -84,7 +81,7 @@ def find_logs(
 
 def _of_file(root: Path, format: str) -> list[FoundLog]:
     name = find_reader(root) if format == "auto" else format
-    reader: Reader = registry.load("log", name)
+    reader: Reader = plugins.load("log", name)
     return [FoundLog(_text(sequence), root, name, sequence) for sequence in reader.sequences(root)]
 
 

@@ -12,9 +12,8 @@ from typing import Any
 from log2sim.batch.discovery import FoundLog, find_logs
 from log2sim.batch.folder import LOGS, SCENARIO_FILE, BatchFolder
 from log2sim.datatypes import Scenario
-from log2sim.documents import rounded
 from log2sim.errors import Log2SimError, LogError
-from log2sim.evaluation.metrics.clear_mot import mota
+from log2sim.evaluation.metrics.comparison import mota
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import (
     MAX_NAMED,
@@ -25,6 +24,7 @@ from log2sim.evaluation.metrics.table import (
     recall_text,
     verdict_text,
 )
+from log2sim.files.documents import rounded
 
 Figures = dict[str, Any]
 LoadTruth = Callable[[FoundLog, Scenario], Scenario]
@@ -46,7 +46,6 @@ class Scope:
     Attributes
     ----------
     max_range_m : float, m, optional
-    categories : sequence of str, optional
     """
 
     max_range_m: float | None = None
@@ -65,12 +64,10 @@ def evaluate_batch(
 
     Parameters
     ----------
-    folder : BatchFolder
     truth : Path
         Folder in which the logs have the same places as in the batch's own.
     load_truth : callable
         Returns the truth of a log for a scenario.
-    scope : Scope
     progress : callable
         Called as `progress(done, total)`.
 

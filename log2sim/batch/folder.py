@@ -1,25 +1,219 @@
-"""The folder of a batch: its settings, a folder for each log, and the tables."""
+"""The folder of a batch, a row for each of its logs, and the tables of all."""
 
 from __future__ import annotations
 
+import base64
 import glob
+import hashlib
+import html
+import re
 import secrets
 import shutil
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
+from importlib import resources
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from log2sim.batch.rows import Row
+from log2sim.batch.discovery import FoundLog
 from log2sim.config import Config
-from log2sim.documents import read_json, write_json
 from log2sim.errors import ConfigError, LogError
-from log2sim.model_errors import first_problem
-from log2sim.output_claims import claim
-from log2sim.output_folders import replaced_folder
-from log2sim.outputs import is_left_over, is_temporary, remove
+from log2sim.files.documents import first_problem, read_json, replaced, write_json
+from log2sim.files.outputs import claim, is_left_over, is_temporary, remove, replaced_folder
 from log2sim.version import __version__
+
+MAX_NAME_CHARS = 80
+"""Of a folder; file systems take 255 bytes, and temporary names are longer."""
+HASH_DIGITS = 8
+_SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
+_UNSAFE_CHARS = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one log.
+
+    Attributes
+    ----------
+    out : str
+        Folder of the batch, absolute.
+    token : str
+        Of the batch; a folder of that name without it is another one.
+    name : str
+        Of the folder for the log.
+    log : str
+        `FoundLog.id`.
+    path : str
+        What `open_log` takes, absolute.
+    cache : bool
+        Whether detections in pictures are kept, and taken from earlier runs.
+    attempts : int
+        1 at the first run.
+    """
+
+    out: str
+    token: str
+    name: str
+    log: str
+    path: str
+    format: str
+    sequence: str
+    cache: bool = True
+    attempts: int = 1
+
+
+def make_jobs(logs: Sequence[FoundLog], out: Path, token: str, *, cache: bool = True) -> list[Job]:
+    """Return a job for each log, with a name for its folder that no other has and that any file system takes."""
+    plain = [_plain_name(log.id) for log in logs]
+    # Some file systems do not tell upper from lower case.
+    count = Counter(name.lower() for name in plain)
+    names = [
+        name if name == log.id and count[name.lower()] == 1 else f"{name}-{_hash(f'{log.format}:{log.id}')}"
+        for log, name in zip(logs, plain)
+    ]
+    return [
+        Job(str(out.absolute()), token, name, log.id, str(log.path.absolute()), log.format, log.sequence, cache)
+        for log, name in zip(logs, names)
+    ]
+
+
+def _plain_name(text: str) -> str:
+    """Return a text with letters, digits, "._-" alone, no dot in front, and of a limited length."""
+    if len(text) <= MAX_NAME_CHARS and _SAFE.fullmatch(text):
+        return text
+    return _UNSAFE_CHARS.sub("_", text).strip("._-")[-MAX_NAME_CHARS:] or "log"
+
+
+def _hash(text: str) -> str:
+    return sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:HASH_DIGITS]
+
+
+MAX_ERROR_CHARS = 2000
+"""Of a message in a table; `error.txt` has all of it."""
+
+Count = Annotated[int | None, Field(ge=0)]
+Amount = Annotated[float | None, Field(ge=0)]
+
+
+class Row(BaseModel):
+    """One log of a batch; figures are None where it failed.
+
+    Attributes
+    ----------
+    name : str
+        Of its folder.
+    log : str
+        Its path below the root, with the sequence where a folder holds several.
+    status : str
+        "done" or "failed".
+    error_kind : str
+        Class of the error; empty without one.
+    error : str
+        Its message.
+    attempts : int
+        How often it was run, 2 after a repetition.
+    ticks : int
+    duration_s : float, s
+    agents, static, doubtful : int
+        Agents without the ego, those of them that stand all the time, and all that the scenario doubts.
+    faults, unreadable : int
+        Faults of sensors and poses, and records that could not be read.
+    seconds, cpu_s : float, s
+        Wall time and time of the processor, from opening the log to writing its files.
+    peak_memory_mib : float, MiB
+        Largest resident memory of the worker so far.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    name: str
+    log: str
+    format: str
+    sequence: str
+    status: Literal["done", "failed"]
+    error_kind: str = ""
+    error: str = ""
+    attempts: Annotated[int, Field(ge=1)] = 1
+    ticks: Count = None
+    duration_s: Amount = None
+    agents: Count = None
+    static: Count = None
+    doubtful: Count = None
+    faults: Count = None
+    unreadable: Count = None
+    seconds: Amount = None
+    cpu_s: Amount = None
+    peak_memory_mib: Amount = None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the log was reconstructed."""
+        return self.status == "done"
+
+
+def done_row(job: Job, report: dict[str, Any], spent: dict[str, Any]) -> Row:
+    """Return the row of a log that was reconstructed, with what it took: `seconds`, `cpu_s` and `peak_memory_mib`."""
+    agents = report["agents"]
+    return Row(
+        **_identity(job),
+        status="done",
+        ticks=report["ticks"],
+        duration_s=round(report["duration_s"], 6),
+        agents=agents["total"],
+        static=agents["static"],
+        doubtful=len(agents["doubtful"]),
+        faults=len(report["faults"]),
+        unreadable=sum(stream["count"] for stream in report["unreadable"].values()),
+        **spent,
+    )
+
+
+def failed_row(job: Job, kind: str, message: str, spent: dict[str, Any] | None = None) -> Row:
+    """Return the row of a log that failed."""
+    text = message[:MAX_ERROR_CHARS].encode("utf-8", "backslashreplace").decode()
+    return Row(**_identity(job), status="failed", error_kind=kind, error=text, **(spent or {}))
+
+
+def _identity(job: Job) -> dict[str, Any]:
+    texts = {key: getattr(job, key) for key in ("name", "log", "format", "sequence")}
+    return {key: text.encode("utf-8", "backslashreplace").decode() for key, text in texts.items()} | {
+        "attempts": job.attempts
+    }
+
+
+SUMMED = ("ticks", "duration_s", "agents", "static", "doubtful", "faults", "unreadable", "seconds", "cpu_s")
+
+
+def write_parquet(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows, one for each log, with the columns of `Row`."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    kinds = {int: pa.int64(), float: pa.float64(), str: pa.string()}
+    fields = [(name, kinds[_plain_type(field.annotation)]) for name, field in Row.model_fields.items()]
+    values = {name: [getattr(row, name) for row in rows] for name, _ in fields}
+    table = pa.table(values, schema=pa.schema(fields))
+    with replaced(path) as temporary:
+        parquet.write_table(table, temporary)
+
+
+def _plain_type(annotation: Any) -> type:
+    """Return the type of the values of a field, where it may be absent or is one of several texts."""
+    parts = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+    return next((kind for kind in (int, float) if kind in parts), str)
+
+
+def sum_up(rows: Sequence[Row]) -> dict[str, float]:
+    """Return the count of logs that are done and that failed, and the sums of the figures of those that are done."""
+    done = [row for row in rows if row.is_done]
+    sums = {name: sum(getattr(row, name) or 0 for row in done) for name in SUMMED}
+    return {"done": len(done), "failed": len(rows) - len(done), **sums}
+
 
 SETTINGS_FILE = "batch.json"
 LOGS = "logs"
@@ -35,12 +229,10 @@ class BatchSettings(BaseModel):
     ----------
     token : str
         Random, so that workers on other machines can tell whether they see the same folder.
-    log2sim_version : str
     root : str
         Folder that is searched for logs, absolute.
     format : str
         Format that is looked for, or "auto".
-    follow_links : bool
     config : dict
         Settings of the reconstruction.
     """
@@ -76,13 +268,7 @@ class BatchSettings(BaseModel):
 
 @dataclass(frozen=True)
 class BatchFolder:
-    """A folder of a batch.
-
-    Attributes
-    ----------
-    path : Path
-    settings : BatchSettings
-    """
+    """A folder of a batch."""
 
     path: Path
     settings: BatchSettings
@@ -181,3 +367,126 @@ def _flat(document: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in document.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
+
+
+MAX_ROWS = 5000
+"""Of each table, which browsers lay out in a second; the Parquet file has all."""
+COLUMNS = (
+    ("log", "log", ""),
+    ("format", "format", ""),
+    ("ticks", "ticks", "d"),
+    ("duration_s", "duration s", ".1f"),
+    ("agents", "agents", "d"),
+    ("static", "static", "d"),
+    ("doubtful", "doubtful", "d"),
+    ("faults", "faults", "d"),
+    ("unreadable", "unreadable", "d"),
+    ("seconds", "seconds", ".2f"),
+    ("cpu_s", "CPU s", ".2f"),
+    ("peak_memory_mib", "peak MiB", ".0f"),
+    ("attempts", "attempts", "d"),
+)
+
+
+def write_batch_page(path: Path, rows: Sequence[Row], settings: BatchSettings, *, total: int) -> None:
+    """Write the page of a batch: sums, what failed and why, and the figures of each log.
+
+    Parameters
+    ----------
+    total : int
+        Logs of the batch; those without a row were not run yet.
+    """
+    with replaced(path) as temporary:
+        temporary.write_text(html_of(rows, settings, total), encoding="utf-8")
+
+
+def html_of(rows: Sequence[Row], settings: BatchSettings, total: int) -> str:
+    """Assemble the page; its content security policy allows its own script and style by their hashes and nothing else."""
+    style, script = (_file(name) for name in ("page.css", "page.js"))
+    failed, done = ([row for row in rows if row.is_done == wanted] for wanted in (False, True))
+    parts = {
+        "policy": f"default-src 'none'; script-src '{_page_hash(script)}'; style-src '{_page_hash(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'",
+        "style": style,
+        "script": script,
+        "root": html.escape(settings.root),
+        "version": html.escape(settings.log2sim_version),
+        "summary": "".join(_figures(rows, total)),
+        "failures": _failures(failed),
+        "logs": _logs(done),
+    }
+    # One pass: inserted text is not searched again, so no name of a log can be taken for a placeholder.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
+
+
+def _figures(rows: Sequence[Row], total: int) -> Iterable[str]:
+    """Yield the sums as entries of a list of descriptions."""
+    sums = sum_up(rows)
+    agents = f"{sums['agents']:,.0f} ({sums['static']:,.0f} static, {sums['doubtful']:,.0f} doubtful)"
+    figures = {
+        "logs": f"{total:,}",
+        "done": f"{sums['done']:,.0f}",
+        "failed": f"{sums['failed']:,.0f}",
+        "not run yet": f"{total - len(rows):,}" if total > len(rows) else "",
+        "agents": agents,
+        "recorded": f"{sums['duration_s'] / 3600:,.2f} h, {sums['ticks']:,.0f} ticks",
+        "CPU time": f"{sums['cpu_s'] / 3600:,.2f} h",
+    }
+    for name, value in figures.items():
+        if value:
+            mark = ' class="alert"' if name == "failed" and sums["failed"] else ""
+            yield f"<div{mark}><dt>{name}</dt><dd>{value}</dd></div>"
+
+
+def _failures(rows: Sequence[Row]) -> str:
+    """Return the section of the logs that failed, with a count of each kind of error; empty without any."""
+    if not rows:
+        return ""
+    kinds = ", ".join(
+        f"{count} {html.escape(kind)}" for kind, count in Counter(r.error_kind for r in rows).most_common()
+    )
+    lines = [
+        f"<tr><td>{_linked(row)}</td><td>{html.escape(row.format)}</td><td>{html.escape(row.error_kind)}</td>"
+        f"<td class=error>{html.escape(row.error)}</td><td class=n>{row.attempts}</td></tr>"
+        for row in rows[:MAX_ROWS]
+    ]
+    head = "".join(f"<th>{title}</th>" for title in ("log", "format", "error", "message", "attempts"))
+    return _section("Failed", f"{len(rows):,}: {kinds}", head, lines, len(rows))
+
+
+def _logs(rows: Sequence[Row]) -> str:
+    """Return the section of the logs that are done."""
+    head = "".join(f"<th{' class=n' if form else ''}>{title}</th>" for _, title, form in COLUMNS)
+    lines = [f"<tr>{''.join(_cell(row, name, form) for name, _, form in COLUMNS)}</tr>" for row in rows[:MAX_ROWS]]
+    return _section("Logs", f"{len(rows):,} done", head, lines, len(rows)) if rows else ""
+
+
+def _section(title: str, note: str, head: str, lines: Sequence[str], count: int) -> str:
+    left_out = f"<p>The first {MAX_ROWS:,} of {count:,}; table.parquet has all.</p>" if count > MAX_ROWS else ""
+    body = "\n".join(lines)
+    return (
+        f"<section><h2>{title} <small>{note}</small></h2>{left_out}<div class=scroll><table><thead><tr>{head}</tr></thead>"
+        f"<tbody>\n{body}\n</tbody></table></div></section>"
+    )
+
+
+def _cell(row: Row, name: str, form: str) -> str:
+    value = getattr(row, name)
+    if name == "log":
+        return f"<td>{_linked(row)}</td>"
+    if not form:
+        return f"<td>{html.escape(value)}</td>"
+    return f'<td class=n data-v="{value}">{value:{form}}</td>' if value is not None else "<td class=n>-</td>"
+
+
+def _linked(row: Row) -> str:
+    """Return the name of a log as a link to its folder beside the page."""
+    return f'<a href="logs/{html.escape(row.name)}/">{html.escape(row.log)}</a>'
+
+
+def _page_hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _file(name: str) -> str:
+    return resources.files("log2sim.batch").joinpath(name).read_text(encoding="utf-8")

@@ -2,29 +2,259 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
+import signal
+import socket
+import time
+import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from log2sim.batch.cluster import Workers, connect, import_dask
+import cv2
+from distributed import Worker, WorkerPlugin
+
 from log2sim.batch.discovery import find_logs
-from log2sim.batch.folder import BatchFolder, BatchSettings
-from log2sim.batch.jobs import Job, make_jobs
-from log2sim.batch.page import write_batch_page
-from log2sim.batch.rows import Row, failed_row
-from log2sim.batch.table import write_parquet
+from log2sim.batch.folder import (
+    REPORT_FILE,
+    ROW_FILE,
+    SCENARIO_FILE,
+    BatchFolder,
+    BatchSettings,
+    Job,
+    Row,
+    done_row,
+    failed_row,
+    is_batch,
+    make_jobs,
+    write_batch_page,
+    write_parquet,
+)
 from log2sim.config import Config
-from log2sim.errors import ConfigError, Log2SimError
-from log2sim.links import follows_links
-from log2sim.run_detectors import check_detectors
+from log2sim.errors import ConfigError, Log2SimError, MissingExtra
+from log2sim.files.documents import write_json
+from log2sim.files.inputs import following_links, follows_links
+from log2sim.files.outputs import replaced_folder
+from log2sim.files.stages import peak_memory_mib, thread_limits, usable_threads
+from log2sim.logs.opening import open_log
+from log2sim.perception.run_detectors import check_detectors
+from log2sim.pipeline import reconstruct
+from log2sim.version import __version__
 
 if TYPE_CHECKING:
-    from distributed import Future
+    from distributed import Client, Future
+
+
+def run_job(job: Job) -> tuple[dict[str, Any], bool]:
+    """Reconstruct a log and write its folder.
+
+    Returns
+    -------
+    row : dict
+        Of `log2sim.batch.folder.Row`.
+    may_repeat : bool
+        Whether another run may succeed: the log failed by something else than what is wrong with it or with the settings.
+
+    Raises
+    ------
+    ConfigError
+        When the folder of the batch is not visible here, or belongs to another version of log2sim.
+    """
+    folder, config = _batch_of(job.out, job.token)
+    target, spent = folder.log_folder(job.name), _stopwatch()
+    try:
+        with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
+            log = open_log(job.path, format=job.format, sequence=job.sequence)
+            result = reconstruct(log, config, cache=job.cache)
+            result.scenario.save(unfinished / SCENARIO_FILE)
+            write_json(unfinished / REPORT_FILE, result.report)
+            row = done_row(job, result.report, spent())
+            write_json(unfinished / ROW_FILE, row.model_dump())
+        return row.model_dump(), False
+    except Log2SimError as error:
+        row, may_repeat, text = failed_row(job, type(error).__name__, str(error), spent()), False, str(error)
+    except Exception as error:  # whatever it is, the other logs go on
+        row = failed_row(job, type(error).__name__, f"internal error: {type(error).__name__}: {error}", spent())
+        may_repeat, text = True, traceback.format_exc()
+    folder.write_failure(row, text)
+    return row.model_dump(), may_repeat
+
+
+@lru_cache(maxsize=1)
+def _batch_of(out: str, token: str) -> tuple[BatchFolder, Config]:
+    """Return the batch in a folder and its settings, once the process is set up for it."""
+    where = f"worker on {socket.gethostname()}"
+    if not is_batch(Path(out)):
+        raise ConfigError(f"{where}: does not see {out}; workers need the same folders under the same names")
+    folder = BatchFolder.load(Path(out))
+    if folder.settings.token != token:
+        raise ConfigError(f"{where}: {out} holds another batch there; workers need the same folders")
+    _require_version(folder.settings, where)
+    cv2.setNumThreads(usable_threads())
+    return folder, Config.load(**folder.settings.config)
+
+
+def _require_version(settings: BatchSettings, where: str) -> None:
+    if settings.log2sim_version != __version__:
+        raise ConfigError(f"{where}: has log2sim {__version__}, the batch was begun with {settings.log2sim_version}")
+
+
+def _stopwatch() -> Callable[[], dict[str, float]]:
+    """Return a function that says what was spent since."""
+    wall, used = time.perf_counter(), time.process_time()
+
+    def spent() -> dict[str, float]:
+        return {
+            "seconds": round(time.perf_counter() - wall, 4),
+            "cpu_s": round(time.process_time() - used, 4),
+            "peak_memory_mib": round(peak_memory_mib(), 1),
+        }
+
+    return spent
+
+
+class Preparation(WorkerPlugin):  # type: ignore[misc]
+    """Imports what logs need before the first one comes, and leaves Ctrl-C to the process that started the workers.
+
+    A terminal sends Ctrl-C to all processes of a command.
+    """
+
+    name = "log2sim-batch"
+
+    def setup(self, worker: Worker) -> None:
+        """Prepare a worker; called in its main thread."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        import log2sim.batch.run  # noqa: F401
+
+
+HOST = "127.0.0.1"
+"""Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for certificates, too: other users of the
+machine do not get in."""
+PROTOCOLS = ("tcp://", "tls://")
+CONNECT_TIMEOUT_S = 20
+START_TIMEOUT_S = 120
+SETTINGS: dict[str, Any] = {
+    # A log whose worker dies is repeated at the end, on a new process; no log that merely waited there is blamed.
+    "distributed.scheduler.allowed-failures": 0,
+    "distributed.scheduler.worker-saturation": 1.0,
+    # Workers hold no data that could be spilled, and one that waits for memory to be freed would wait forever.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    # Each worker's parent notices when it dies; one that is merely slow on a busy machine goes on.
+    "distributed.scheduler.worker-ttl": None,
+    "distributed.comm.timeouts.connect": "120s",
+    "distributed.comm.timeouts.tcp": "120s",
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "10s",
+    # No pages: their servers would show what is run to whoever is on this machine.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Workers that a batch may use.
+
+    Attributes
+    ----------
+    client : distributed.Client
+    are_ours : bool
+        Whether they were started for this round of the batch, so that none ran a log in an earlier one.
+    """
+
+    client: Client
+    are_ours: bool
+
+    def others_than(self, address: str) -> list[str]:
+        """Return the addresses of all workers but one."""
+        return [a for a in self.client.scheduler_info(n_workers=-1)["workers"] if a != address]
+
+
+def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:
+    """Return so many worker processes on this machine, one for each core by default, or the workers of a scheduler."""
+    return local_workers(jobs or usable_threads()) if scheduler is None else workers_of(scheduler)
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Workers]:
+    """Start so many worker processes on this machine, each with its share of the cores and of the memory; stop them at the end.
+
+    Raises
+    ------
+    MissingExtra
+        Without Dask.
+    """
+    distributed, dask = import_dask()
+    from distributed.system import MEMORY_LIMIT
+
+    environment = {**thread_limits(max(1, usable_threads() // count)), "DASK_LOGGING__DISTRIBUTED": "critical"}
+    with (
+        dask.config.set(SETTINGS),
+        distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host=HOST,
+            protocol="tls://",
+            security=distributed.Security.temporary(),
+            dashboard_address=None,
+            worker_dashboard_address=None,
+            memory_limit=MEMORY_LIMIT // count,
+            silence_logs=logging.CRITICAL,
+            env=environment,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": f"{HOST}:0"},
+        ) as cluster,
+        distributed.Client(cluster, timeout=START_TIMEOUT_S) as client,
+    ):
+        client.register_plugin(Preparation())
+        yield Workers(client, are_ours=True)
+
+
+@contextmanager
+def workers_of(address: str) -> Iterator[Workers]:
+    """Use the workers of a scheduler that somebody started.
+
+    Raises
+    ------
+    MissingExtra
+        Without Dask.
+    ConfigError
+        When the address is none, or nobody answers there.
+    """
+    if not address.startswith(PROTOCOLS):
+        raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")
+    distributed, _ = import_dask()
+    try:
+        client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"--scheduler {address}: no Dask scheduler answers: {str(error).splitlines()[0]}; start one with dask scheduler"
+        ) from None
+    with client:
+        yield Workers(client, are_ours=False)
+
+
+def import_dask() -> tuple[Any, Any]:
+    """Return `distributed` and `dask`; raise `MissingExtra` where one of the packages that a batch needs is missing."""
+    try:
+        import cryptography  # noqa: F401  (for the certificates of a local cluster)
+        import dask
+        import distributed
+        import pyarrow  # noqa: F401  (for the tables at the end)
+    except ImportError:
+        raise MissingExtra("log2sim batch", "cluster") from None
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    return distributed, dask
+
 
 Progress = Callable[[int, int], None]
 Connect = Callable[[], AbstractContextManager[Workers]]
@@ -44,7 +274,6 @@ class Batch:
 
     Attributes
     ----------
-    folder : BatchFolder
     jobs : tuple of Job
         One for each log.
     done : mapping of str to Row
@@ -67,8 +296,6 @@ class Finished:
 
     Attributes
     ----------
-    job : Job
-    row : Row
     repetition : Job, optional
         To be run at the end.
     worker : str
@@ -88,7 +315,6 @@ def plan_batch(
 
     Parameters
     ----------
-    root, out : Path
     config : Config
         Settings of all runs.
     format : str
@@ -125,7 +351,6 @@ def run_batch(batch: Batch, connect: Connect, *, progress: Progress = lambda don
 
     Parameters
     ----------
-    batch : Batch
     connect : callable
         Returns a context manager of workers. It is called if there is something to do, and again for what is repeated, so that workers
         that are started for it are fresh ones.
@@ -242,8 +467,6 @@ def _run_once(
 
 def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
     """Run a job; what that needs is imported by workers alone."""
-    from log2sim.batch.worker import run_job
-
     return run_job(job)
 
 

@@ -12,7 +12,7 @@ from log2sim.cli.options import ConfigFile, Format, NoCache, Poses, Quiet, Setti
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from log2sim.batch.rows import Row
+    from log2sim.batch.folder import Row
 
 MAX_NAMED = 5
 
@@ -56,7 +56,7 @@ def batch(
     log2sim batch drives/ -o results/ --scheduler tcp://10.0.0.5:8786
     """
     from log2sim.batch import plan_batch, run_batch
-    from log2sim.batch.cluster import connect
+    from log2sim.batch.run import connect
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.errors import ConfigError, LogsFailed
@@ -86,7 +86,7 @@ def batch(
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    from log2sim.batch.table import sum_up
+    from log2sim.batch.folder import sum_up
 
     sums = sum_up(rows)
     return (

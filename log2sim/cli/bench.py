@@ -13,7 +13,7 @@ from log2sim.cli.options import (
     LogPath,
     Overwrite,
     Quiet,
-    Sequence,
+    SequenceName,
     Settings,
     Start,
     Stop,
@@ -41,7 +41,7 @@ def bench(
         ),
     ] = None,
     format: Format = "auto",
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
     range: Annotated[
         float | None, typer.Option(metavar="M", help="Compare agents up to this distance from the ego, in m.")
@@ -65,15 +65,14 @@ def bench(
     """
     from log2sim.cli.progress import progress
     from log2sim.config import Config
-    from log2sim.documents import check_targets, write_json
     from log2sim.evaluation.bench.benchmark import bench as run
-    from log2sim.evaluation.bench.document import document, format_table
-    from log2sim.evaluation.bench.figure import write_picture
+    from log2sim.evaluation.bench.benchmark import document, format_table, write_picture
     from log2sim.evaluation.bench.scores import Scope
     from log2sim.evaluation.metrics.truth import truth_at
+    from log2sim.files.documents import check_targets, write_json
+    from log2sim.files.outputs import together
     from log2sim.localization.choice import localize
     from log2sim.logs.opening import open_log
-    from log2sim.outputs import together
 
     check_targets(out / "bench.json", out / "bench.png", overwrite=overwrite)
     changes: dict[str, Any] = {"cameras": cameras, "start_s": start, "stop_s": stop}

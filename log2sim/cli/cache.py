@@ -9,7 +9,7 @@ import typer
 from log2sim.cli.options import AsJson, counted, say
 
 if TYPE_CHECKING:
-    from log2sim.disk_cache import DiskCache
+    from log2sim.files.cache import DiskCache
 
 
 def cache(
@@ -38,8 +38,7 @@ def cache(
     """
     import json
 
-    from log2sim.cache_folder import detection_folder
-    from log2sim.disk_cache import DiskCache
+    from log2sim.files.cache import DiskCache, detection_folder
 
     store = DiskCache(detection_folder())
     if max_mb is not None:
@@ -73,7 +72,7 @@ def summarize(store: DiskCache) -> dict[str, Any]:
 
 def describe(found: dict[str, Any]) -> list[str]:
     """Describe a cache in lines for people."""
-    from log2sim.cli.tables import format_rows
+    from log2sim.cli.shared import format_rows
 
     rows = [
         ("folder", found["folder"]),

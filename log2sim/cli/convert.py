@@ -13,7 +13,7 @@ from log2sim.cli.options import (
     LogPath,
     Overwrite,
     Quiet,
-    Sequence,
+    SequenceName,
     Start,
     Stop,
     camera_names,
@@ -27,7 +27,7 @@ def convert(
     log: LogPath,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
     format: Format = "auto",
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     start: Start = None,
     stop: Stop = None,
     cameras: Cameras = None,
@@ -41,7 +41,7 @@ def convert(
     log2sim convert samples/crossing --start 1 --stop 3 --cameras front -o part/
     """
     from log2sim.cli.progress import progress
-    from log2sim.documents import check_folder
+    from log2sim.files.documents import check_folder
     from log2sim.logs.excerpt import cut_log
     from log2sim.logs.native.writer import refuse_target, write_log
     from log2sim.logs.opening import open_log

@@ -14,7 +14,7 @@ from log2sim.cli.options import (
     Overwrite,
     Poses,
     Quiet,
-    Sequence,
+    SequenceName,
     Settings,
     Start,
     Stop,
@@ -37,7 +37,7 @@ def detect(
         ),
     ] = "lidar:vehicle",
     format: Format = "auto",
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     start: Start = None,
     stop: Stop = None,
     poses: Poses = None,
@@ -54,12 +54,12 @@ def detect(
     log2sim detect kitti_object/ --detector lidar:MODEL.onnx -o boxes.json
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.run_summary import pose_notes
+    from log2sim.cli.reconstruct import pose_notes
     from log2sim.config import Config
-    from log2sim.documents import check_targets
     from log2sim.evaluation.detection.detect_log import detect_log
+    from log2sim.files.documents import check_targets
     from log2sim.logs.opening import open_log
-    from log2sim.perception.detect3d.network_detector import describe_weakness
+    from log2sim.perception.detect3d.detectors import describe_weakness
 
     check_targets(out, overwrite=overwrite)
     changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "detect": {"name": detector}}

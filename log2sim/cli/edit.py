@@ -71,9 +71,9 @@ def edit(
     log2sim edit s.json --remove bus-1 --speed car-2=1.2 -o edited.json
     """
     from log2sim.datatypes import Scenario, list_doubtful, say_agents
-    from log2sim.documents import check_targets
     from log2sim.edit.apply import edit as run
     from log2sim.edit.edits import DropDoubtful as Drop
+    from log2sim.files.documents import check_targets
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)

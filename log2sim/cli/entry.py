@@ -31,12 +31,19 @@ from log2sim.cli import (
     view,
 )
 from log2sim.cli.options import fail, say
-from log2sim.cli.process import SIGNAL_CODE, Ended, ending_by_signals, tolerating_lost_output
-from log2sim.cli.shared import DEBUG, Debug, FollowLinks, add_command
+from log2sim.cli.shared import (
+    DEBUG,
+    SIGNAL_CODE,
+    Debug,
+    Ended,
+    FollowLinks,
+    add_command,
+    ending_by_signals,
+    tolerating_lost_output,
+)
 from log2sim.errors import Log2SimError
-from log2sim.links import OPTION, following_links
-from log2sim.output_claims import holding_claims
-from log2sim.outputs import refusing_to_replace
+from log2sim.files.inputs import OPTION, following_links
+from log2sim.files.outputs import holding_claims, refusing_to_replace
 from log2sim.version import __version__
 
 INTERRUPTED = 130

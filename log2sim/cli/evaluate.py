@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, Verbose, complete, say, say_written
+from log2sim.cli.options import Overwrite, Poses, Quiet, SequenceName, Verbose, complete, say, say_written
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -40,7 +40,7 @@ def evaluate(
             help="True boxes for the log of --truth: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
         ),
     ] = None,
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     poses: Poses = None,
     range: Annotated[
         float | None, typer.Option(metavar="M", help="Compare agents or boxes up to this distance from the ego, in m.")
@@ -81,13 +81,13 @@ def evaluate(
     log2sim evaluate boxes.json --truth kitti_tracking/ --sequence 0000 --protocol kitti
     """
     from log2sim.cli.progress import progress
-    from log2sim.documents import check_targets, read_json, write_json
     from log2sim.errors import ConfigError, ScenarioError
-    from log2sim.evaluation.detection.boxes_file import is_boxes_document
+    from log2sim.evaluation.detection.boxes import is_boxes_document
     from log2sim.evaluation.metrics.evaluator import evaluate as run
     from log2sim.evaluation.metrics.table import format_table, format_verdict
     from log2sim.evaluation.metrics.truth import load_truth
-    from log2sim.outputs import together
+    from log2sim.files.documents import check_targets, read_json, write_json
+    from log2sim.files.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
     wanted = [c.strip() for c in categories.split(",")] if categories else None
@@ -143,7 +143,7 @@ def evaluate(
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
     """Return the provenance of poses: as stated by what is evaluated, or as requested."""
-    from log2sim.config_sections import PosesConfig
+    from log2sim.config import PosesConfig
     from log2sim.errors import ConfigError
 
     if requested is None or requested == "auto":
@@ -244,9 +244,8 @@ def _boxes_figures(
 ) -> tuple[dict[str, Any], str]:
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
-    from log2sim.evaluation.detection.boxes_file import DetectedBoxes
-    from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
-    from log2sim.evaluation.detection.table import format_table, format_verdict
+    from log2sim.evaluation.detection.boxes import DetectedBoxes
+    from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes, format_table, format_verdict
 
     chosen = Options(**options)
     chosen.chosen()

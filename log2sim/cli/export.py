@@ -34,7 +34,11 @@ def export(
         Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose images and points are included.")
     ] = None,
     ego: Annotated[
-        str | None, typer.Option(metavar="AGENT", help="Agent to take as the ego, where the scenario has none.")
+        str | None,
+        typer.Option(
+            metavar="AGENT|external",
+            help="Agent to take as the ego, where the scenario has none; openscenario: external, another program drives the ego.",
+        ),
     ] = None,
     doubtful: Annotated[
         str,
@@ -55,24 +59,25 @@ def export(
     Examples
     --------
     log2sim export s.json --to openscenario -o xosc/
+    log2sim export s.json --to openscenario --ego external -o closed_loop/
     log2sim export s.json --to rerun --log samples/crossing -o rerun/
     """
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_folder
     from log2sim.export.checks import doubtful_note, export_notes
-    from log2sim.export.exporters import Options, with_doubtful, with_ego
+    from log2sim.export.exporters import EXTERNAL, Options, with_doubtful, with_ego
     from log2sim.export.exporters import export as run
+    from log2sim.files.documents import check_folder
     from log2sim.logs.opening import open_log
 
     check_folder(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
-    if ego is not None:
+    driver = EXTERNAL if ego == EXTERNAL and all(a.id != EXTERNAL for a in loaded.agents) else None
+    if ego is not None and driver is None:
         loaded = with_ego(loaded, ego)
     chosen = with_doubtful(loaded, doubtful)
     opened = open_log(log) if log is not None else None
-    files = run(
-        chosen, to, out, Options(revision, map, mode, opened), quarantined=doubtful == "all", overwrite=overwrite
-    )
+    options = Options(revision, map, mode, opened, driver)
+    files = run(chosen, to, out, options, quarantined=doubtful == "all", overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
     notes = export_notes(chosen)

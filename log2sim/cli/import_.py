@@ -22,8 +22,8 @@ def import_(
     --------
     log2sim import scenario.xosc -o s.json
     """
-    from log2sim.documents import check_targets
     from log2sim.export.openscenario.read import load
+    from log2sim.files.documents import check_targets
 
     check_targets(out, overwrite=overwrite)
     load(file).save(out)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, Sequence, choose, say, say_written
+from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, SequenceName, choose, say, say_written
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -30,7 +30,7 @@ def map_(
     ] = "color",
     cell: Annotated[float, typer.Option(metavar="M", help="Edge of a cell, in m.")] = 0.05,
     format: Format = "auto",
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -45,24 +45,24 @@ def map_(
 
     from log2sim.cli.progress import progress
     from log2sim.config import Config
-    from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
+    from log2sim.files.documents import check_targets
+    from log2sim.files.outputs import together
     from log2sim.logs.opening import open_log
-    from log2sim.mapping.builder import map_ground
-    from log2sim.mapping.files import (
+    from log2sim.perception.frames import RecordReader
+    from log2sim.road.builder import map_ground
+    from log2sim.road.map_files import (
         HEIGHT_STEP_M,
         LAYERS,
         Layer,
         check_name,
+        geokeys_of,
         known_cells,
         lowest_m,
         world_file_of,
         write_map,
         write_world_file,
     )
-    from log2sim.mapping.geokeys import geokeys_of
-    from log2sim.outputs import together
-    from log2sim.perception.frames import RecordReader
 
     check_name(out)
     world = world_file_of(out)

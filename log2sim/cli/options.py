@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from log2sim.errors import ConfigError
-from log2sim.registry import BUILT_IN
+from log2sim.files.plugins import BUILT_IN
 
 POSES = ("given", "lidar", "camera", "auto")
 
@@ -28,7 +28,7 @@ def complete_plugins(*kinds: str, prefix: str = "") -> Callable[[str], list[str]
     """Return a function by which a shell completes the name of a plug-in; installed ones are looked up only then."""
 
     def completed(incomplete: str) -> list[str]:
-        from log2sim.registry import names
+        from log2sim.files.plugins import names
 
         known = [prefix + name for kind in kinds for name in names(kind)]
         return [name for name in known if name.startswith(incomplete)]
@@ -44,7 +44,6 @@ def choose(flag: str, *choices: str, help: str, default: str | None = None) -> A
     flag : str
         Such as "--mode".
     choices : str
-    help : str
     default : str, optional
         What happens without the option, in words; needed where its default is None.
     """
@@ -83,7 +82,7 @@ Format = Annotated[
         autocompletion=lambda incomplete: [*complete("auto")(incomplete), *complete_plugins("log")(incomplete)],
     ),
 ]
-Sequence = Annotated[
+SequenceName = Annotated[
     str | None,
     typer.Option(metavar="NAME", help="Sequence to open, when the folder has several.", show_default="the only one"),
 ]

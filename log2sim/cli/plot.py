@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, Truth, say, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, SequenceName, Truth, say, say_written, write_to
 
 
 def plot(
@@ -59,7 +59,7 @@ def plot(
             show_default="1, or what fits into a minute, half a minute for a .gif",
         ),
     ] = None,
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -75,8 +75,8 @@ def plot(
     from log2sim.cli.progress import progress
     from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_targets
-    from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
+    from log2sim.files.documents import check_targets
+    from log2sim.visualization.plot.selection import PlotOptions, parse_extent, parse_ids, parse_size
     from log2sim.visualization.plot.tracks import plot_tracks, resolve_picture
 
     options = PlotOptions(
@@ -89,7 +89,7 @@ def plot(
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
     known = None
     if truth is not None:
-        from log2sim.evaluation.metrics.placing import place_truth
+        from log2sim.evaluation.metrics.evaluator import place_truth
         from log2sim.evaluation.metrics.truth import load_truth
 
         known = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]

@@ -41,7 +41,7 @@ class CommandWithPlugins(TyperCommand):
 
 def list_plugins(kinds: Mapping[str, str]) -> list[tuple[str, str]]:
     """List names, each behind the prefix of its kind, and packages of plug-ins, without importing them."""
-    from log2sim.registry import installed, package_of
+    from log2sim.files.plugins import installed, package_of
 
     return [
         (f"{prefix}{entry.name}", package_of(entry))

@@ -31,9 +31,9 @@ def predict(
     log2sim predict s.json --horizon 2 -o prediction.json
     """
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_targets, write_json
     from log2sim.errors import ConfigError
-    from log2sim.prediction.document import format_figures, prediction_document
+    from log2sim.files.documents import check_targets, write_json
+    from log2sim.prediction.displacement import format_figures, prediction_document
     from log2sim.prediction.prediction import METHODS, predict_scenario
 
     check_targets(out, overwrite=overwrite)

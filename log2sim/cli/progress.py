@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from log2sim.visualization.notebook.progress import OPENING, VALIDATING, say_stage
+from log2sim.visualization.progress import OPENING, VALIDATING, say_stage
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -61,7 +61,7 @@ def replay(
             "vehicle",
             "road",
             "both",
-            help="Warn of collisions with the ego by what the sensors at these ends observe.",
+            help="Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
         ),
     ] = None,
     brake: Annotated[bool, typer.Option("--brake", help="With --warn: the ego brakes when it is warned.")] = False,
@@ -137,17 +137,16 @@ def replay(
     from log2sim.cli.edit import ids_of
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
     from log2sim.export.checks import doubtful_note, export_notes
+    from log2sim.files.documents import check_targets
     from log2sim.simulation.backends import external_simulator
-    from log2sim.simulation.metrics.limits import check_limits, parse_limits, require_strict
-    from log2sim.simulation.metrics.summary import MAX_LISTED, summarize
-    from log2sim.simulation.policy_loading import load_policy
+    from log2sim.simulation.expected_motion import WarningSettings
+    from log2sim.simulation.metrics.all_metrics import MAX_LISTED, check_limits, parse_limits, require_strict, summarize
+    from log2sim.simulation.policy import load_policy
     from log2sim.simulation.runner import replay as run
-    from log2sim.simulation.warnings.policy import BrakeWhenWarned
-    from log2sim.simulation.warnings.settings import WarningSettings
-    from log2sim.simulation.warnings.warn import warn as find_warnings
+    from log2sim.simulation.warnings import BrakeWhenWarned, warnable
+    from log2sim.simulation.warnings import warn as find_warnings
 
     check_targets(out, overwrite=overwrite)
     if out is not None and out.resolve() == scenario.resolve():
@@ -163,6 +162,8 @@ def replay(
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
     kept, left_out = _trusted(loaded, confidence, drop_doubtful=drop_doubtful)
+    if warning is not None:
+        warnable(kept if confidence is not None else kept.active)
     policy = load_policy(ego) if ego is not None else BrakeWhenWarned(warning) if brake else None
     moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as report_progress:

@@ -87,7 +87,7 @@ def synth(
     """
     from log2sim.cli.progress import progress
     from log2sim.synth.scene import load_scene
-    from log2sim.synth.write import write_synthetic
+    from log2sim.synth.synthesis import write_synthetic
 
     if (scene is None) == (traffic is None):
         raise ConfigError("give either a scene file or --traffic vehicle or --traffic roadside")

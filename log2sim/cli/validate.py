@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Format, Quiet, Sequence, say
+from log2sim.cli.options import Format, Quiet, SequenceName, say
 
 
 def validate(
@@ -19,7 +19,7 @@ def validate(
         ),
     ],
     format: Format = "auto",
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     quiet: Quiet = False,
 ) -> None:
     """Validate a file, or every record of a log.
@@ -39,7 +39,7 @@ def validate(
         from log2sim.cli.progress import progress
         from log2sim.logs.native.reader import READER
         from log2sim.logs.validation import list_gaps, validate_log
-        from log2sim.visualization.notebook.progress import VALIDATING
+        from log2sim.visualization.progress import VALIDATING
 
         opened = open_log(path, format=format, sequence=sequence)
         with progress(quiet=quiet) as report_progress:
@@ -58,9 +58,9 @@ def validate(
 
 def _validate_file(path: Path) -> None:
     from log2sim.datatypes import Scenario
-    from log2sim.documents import check, read_json
     from log2sim.errors import ScenarioError
-    from log2sim.evaluation.detection.boxes_file import DetectedBoxes, is_boxes_document
+    from log2sim.evaluation.detection.boxes import DetectedBoxes, is_boxes_document
+    from log2sim.files.documents import check, read_json
     from log2sim.simulation.result import Replay
 
     document = read_json(path, ScenarioError)

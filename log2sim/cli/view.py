@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, Sequence, camera_names, say, write_to
+from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, SequenceName, camera_names, say, write_to
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from log2sim.datatypes import Log, Scenario
-    from log2sim.visualization.recording.recording import Recorded
+    from log2sim.visualization.recording import Recorded
 
 
 def view(
@@ -52,7 +52,7 @@ def view(
             show_default="that of --log",
         ),
     ] = None,
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -66,8 +66,8 @@ def view(
     from log2sim.cli.progress import progress
     from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario, say_agents
-    from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
+    from log2sim.files.documents import check_targets
     from log2sim.visualization.page.writer import write_page
 
     check_targets(out, overwrite=overwrite)
@@ -83,14 +83,14 @@ def view(
         "metrics": [] if metrics is None else [_metrics(metrics)],
     }
     if truth is not None:
-        from log2sim.evaluation.metrics.placing import place_truth
+        from log2sim.evaluation.metrics.evaluator import place_truth
         from log2sim.evaluation.metrics.truth import load_truth
 
         layers["truth"] = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
-            from log2sim.visualization.recording.recording import DEFAULT_MAX_BYTES
+            from log2sim.visualization.recording import DEFAULT_MAX_BYTES
 
             max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
             layers["recorded"] = _recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
@@ -119,8 +119,7 @@ def _recorded(
     """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
-    from log2sim.visualization.recording.choice import require_overlap
-    from log2sim.visualization.recording.recording import Recorded
+    from log2sim.visualization.recording import Recorded, require_overlap
 
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
     require_overlap(log, scenario)
@@ -140,9 +139,9 @@ def _metrics(path: Path) -> tuple[str, str]:
     LogError
         When it is none.
     """
-    from log2sim.documents import read_json
     from log2sim.errors import LogError
     from log2sim.evaluation.metrics.table import format_table, format_verdict
+    from log2sim.files.documents import read_json
 
     document = read_json(path, LogError)
     try:

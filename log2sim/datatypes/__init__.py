@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
-from log2sim.datatypes.agent import COLOR_NAMES, Agent
-from log2sim.datatypes.agent_counts import say_agents, say_categories
-from log2sim.datatypes.boxes3d import Boxes3D
+from log2sim.datatypes.agent import (
+    COLOR_NAMES,
+    FLAGS,
+    MIN_TRUSTED_CONFIDENCE,
+    STANDSTILL_DRIFT_M,
+    STANDSTILL_MPS,
+    Agent,
+    Doubt,
+    Trajectory,
+    Waypoints,
+    list_doubtful,
+    say_confidence,
+    why_doubtful,
+)
 from log2sim.datatypes.categories import (
     CATEGORIES,
     CATEGORY,
@@ -15,14 +26,41 @@ from log2sim.datatypes.categories import (
     MIN_SIZE_M,
     TYPICAL_SIZE_M,
 )
-from log2sim.datatypes.deferred import Deferred
-from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
-from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
-from log2sim.datatypes.ends import ENDS, ROAD, VEHICLE, Span, end_of, retime_spans, seen_from
+from log2sim.datatypes.detections import (
+    TUPLES,
+    Boxes3D,
+    BoxEvidence,
+    Detections,
+    Measurements,
+    Obstacles,
+    OtherView,
+    Rays,
+    Track,
+)
 from log2sim.datatypes.faults import FAULT_KINDS, Fault, Treatment
-from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
-from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
-from log2sim.datatypes.log import EgoVehicle, Frame, Lidar, Log, MapFrame, Stream
+from log2sim.datatypes.log import (
+    ENDS,
+    ROAD,
+    VEHICLE,
+    Deferred,
+    EgoVehicle,
+    Frame,
+    IgnoreRegions,
+    ImageLabels,
+    ImageRegions,
+    Labels,
+    LabelView,
+    Lidar,
+    Log,
+    MapFrame,
+    Span,
+    Stream,
+    Sweep,
+    Tick,
+    end_of,
+    retime_spans,
+    seen_from,
+)
 from log2sim.datatypes.map_features import (
     BORDER_KINDS,
     LANE_LINE_KINDS,
@@ -33,15 +71,7 @@ from log2sim.datatypes.map_features import (
     Marking,
     RoadBorder,
 )
-from log2sim.datatypes.measurements import TUPLES, BoxEvidence, Detections, Measurements, OtherView
-from log2sim.datatypes.obstacles import Obstacles
-from log2sim.datatypes.rays import Rays
-from log2sim.datatypes.scenario import EGO, VERSION, Scenario
-from log2sim.datatypes.signals import SIGNAL_STATES, Signal
-from log2sim.datatypes.tick import Sweep, Tick
-from log2sim.datatypes.tracks import Track
-from log2sim.datatypes.trajectory import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Trajectory
-from log2sim.datatypes.waypoints import Waypoints
+from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Signal, say_agents, say_categories
 
 __all__ = [
     "BORDER_KINDS",

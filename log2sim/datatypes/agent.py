@@ -1,24 +1,320 @@
-"""Road users: a box of one size on a trajectory."""
+"""Road users: a box of one size on a trajectory, with what speaks against it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.categories import CATEGORIES
-from log2sim.datatypes.doubts import MIN_TRUSTED_CONFIDENCE, Doubt
-from log2sim.datatypes.ends import Span
-from log2sim.datatypes.trajectory import Trajectory
-from log2sim.datatypes.waypoints import Waypoints
+from log2sim.datatypes.log import Span
 from log2sim.errors import ScenarioError
-from log2sim.geometry import Array
-from log2sim.numerals import short_repr
+from log2sim.files.documents import short_repr
+from log2sim.geometry import Array, wrap_angle
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """A trajectory of the box center as columns, map frame.
+
+    Attributes
+    ----------
+    t_s : (T,) float64, s
+        Strictly increasing times since the scenario's start.
+    x_m, y_m, z_m : (T,) float64, m
+        Box center.
+    yaw_rad : (T,) float64
+    speed_mps : (T,) float64, m/s
+        Along the heading, negative when reversing.
+    observed : (T,) bool
+        False where a gap was filled.
+    sigma_xy_m : (T,) float64, m
+        One standard deviation of the position.
+    sigma_yaw_rad, sigma_speed_mps : (T,) float64 or None
+        One standard deviation of heading and speed, for each waypoint; None where unknown. Half a turn is no part of
+        `sigma_yaw_rad`: whether front and back may be swapped is a doubt of the agent.
+    visible : (T,) bool or None
+        Whether the sensors could see the agent; only in truth.
+    lidar_points : (T,) float64 or None
+        LiDAR points in the agent's box, of all LiDARs together; only in truth.
+    """
+
+    __repr__ = short_repr
+
+    t_s: Array
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    observed: NDArray[np.bool_]
+    sigma_xy_m: Array
+    sigma_yaw_rad: Array | None = None
+    sigma_speed_mps: Array | None = None
+    visible: NDArray[np.bool_] | None = None
+    lidar_points: Array | None = None
+
+    FLOATS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m")
+    OPTIONAL_FLOATS = ("sigma_yaw_rad", "sigma_speed_mps")
+
+    def __post_init__(self) -> None:
+        """Check that all columns have one length; `ValueError` names the one that has another."""
+        for key, column in self.columns().items():
+            if len(column) != len(self.t_s):
+                raise ValueError(f"waypoints: {key} has {len(column)} values, t_s has {len(self.t_s)}")
+
+    def __len__(self) -> int:
+        """Return the number of waypoints."""
+        return len(self.t_s)
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the columns that there are, by name."""
+        names = (*self.FLOATS, "observed", *self.OPTIONAL_FLOATS, "visible", "lidar_points")
+        return {key: getattr(self, key) for key in names if getattr(self, key) is not None}
+
+    def take(self, index: Any) -> Self:
+        """Take the waypoints at `index`, integers in rising order, a slice or a mask."""
+        return type(self)(**{key: column[index] for key, column in self.columns().items()})
+
+    def problem(self) -> str | None:
+        """Describe the first defect: no waypoint, a value that is not finite, times that do not increase; None without."""
+        if len(self) == 0:
+            return "has no waypoints, expected at least one"
+        for key, column in self.columns().items():
+            finite = np.isfinite(column)
+            if not finite.all():
+                return f"waypoints.{key} is not finite at index {int(np.argmin(finite))}"
+        late = np.diff(self.t_s) <= 0
+        if late.any():
+            k = int(np.argmax(late)) + 1
+            return f"waypoints.t_s does not increase at index {k} ({self.t_s[k]:g} s)"
+        return None
+
+
+STANDSTILL_MPS = 0.15
+"""An agent stands when it is slower: half a kilometer per hour, the standard deviation of smoothed speeds of distant boxes."""
+
+STANDSTILL_DRIFT_M = 2.0 * STANDSTILL_MPS
+"""How far a standing agent may seem to move: 2 s at that speed, after which a smoothed drift is seen as motion."""
+
+MIN_DISCONTINUITY_M = 2.0
+"""A waypoint is discontinuous when it is farther than this from where the speeds lead, and"""
+
+MIN_DISCONTINUITY_MPS = 15.0
+"""when getting there would take this much more speed: no road user, but another object under the same id."""
+
+
+class TrajectoryStates(NamedTuple):
+    """Box centers on a trajectory, map frame.
+
+    Attributes
+    ----------
+    x_m, y_m, z_m : (N,) float64, m
+    yaw_rad : (N,) float64, in [-pi, pi)
+    speed_mps : (N,) float64, m/s
+        Along the heading.
+    """
+
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Cubic Hermite spline through the waypoints of a box center.
+
+    Attributes
+    ----------
+    t_s : (T,) float64, s
+    x_m, y_m : (T,) float64, m
+        Relative to `origin_m`, which keeps digits far from the origin of the map.
+    z_m : (T,) float64, m
+    yaw_rad : (T,) float64
+        Unwrapped.
+    speed_mps : (T,) float64, m/s
+    velocity_x_mps, velocity_y_mps : (T,) float64, m/s
+        Tangents of the spline.
+    discontinuous : (T - 1,) bool
+        Steps over which the log jumps instead of moving.
+    origin_m : (2,) tuple of float, m
+        The first waypoint.
+    """
+
+    t_s: Array
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    velocity_x_mps: Array
+    velocity_y_mps: Array
+    discontinuous: NDArray[np.bool_]
+    origin_m: tuple[float, float]
+
+    @classmethod
+    def through(cls, waypoints: Waypoints, rear_axle_offset_m: float = 0.0) -> Trajectory:
+        """Fit the trajectory of a box center that is `rear_axle_offset_m` ahead of the axle that rolls along the heading."""
+        w = waypoints
+        origin_m = (float(w.x_m[0]), float(w.y_m[0]))
+        x, y, yaw = w.x_m - origin_m[0], w.y_m - origin_m[1], np.unwrap(w.yaw_rad)
+        vx, vy = w.speed_mps * np.cos(yaw), w.speed_mps * np.sin(yaw)
+        jump = np.zeros(max(len(w) - 1, 0), dtype=bool)
+        if len(w) > 1:
+            span = np.diff(w.t_s)
+            miss = np.hypot(np.diff(x) - (vx[1:] + vx[:-1]) / 2 * span, np.diff(y) - (vy[1:] + vy[:-1]) / 2 * span)
+            jump = (miss > MIN_DISCONTINUITY_M) & (miss > MIN_DISCONTINUITY_MPS * span)
+            at_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
+            swing = np.where(at_jump, 0.0, rear_axle_offset_m * np.gradient(yaw, w.t_s))
+            vx, vy = _tangents(w.t_s, x, y, vx - swing * np.sin(yaw), vy + swing * np.cos(yaw), at_jump)
+        return cls(w.t_s, x, y, w.z_m, yaw, w.speed_mps, vx, vy, jump, origin_m)
+
+    def at(self, t_s: Array) -> TrajectoryStates:
+        """Interpolate at times (N,); before the first and after the last waypoint the end is held."""
+        x, y, yaw, speed = self.relative(t_s)
+        z = np.interp(t_s, self.t_s, self.z_m)
+        return TrajectoryStates(x + self.origin_m[0], y + self.origin_m[1], z, wrap_angle(yaw), speed)
+
+    def relative(self, t_s: Array) -> tuple[Array, Array, Array, Array]:
+        """Interpolate x, y relative to the origin, unwrapped yaw and speed at times (N,); the ends are held.
+
+        Position by cubics with the velocities of the waypoints (Hermite), yaw and speed linearly. Up to a discontinuity the
+        agent goes straight on.
+        """
+        t = np.clip(t_s, self.t_s[0], self.t_s[-1])
+        yaw, speed = np.interp(t, self.t_s, self.yaw_rad), np.interp(t, self.t_s, self.speed_mps)
+        if len(self.t_s) == 1:
+            return np.full(len(t), self.x_m[0]), np.full(len(t), self.y_m[0]), yaw, speed
+        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
+        span = self.t_s[i + 1] - self.t_s[i]
+        since = t - self.t_s[i]
+        x = hermite(self.x_m, self.velocity_x_mps, i, since, span)
+        y = hermite(self.y_m, self.velocity_y_mps, i, since, span)
+        jumps = self.discontinuous[i] & (t < self.t_s[i + 1])
+        if jumps.any():
+            x = np.where(jumps, self.x_m[i] + since * self.velocity_x_mps[i], x)
+            y = np.where(jumps, self.y_m[i] + since * self.velocity_y_mps[i], y)
+            yaw = np.where(jumps, self.yaw_rad[i], yaw)
+        return x, y, yaw, speed
+
+    def velocity(self, t_s: Array) -> tuple[Array, Array]:
+        """Compute the velocity vx, vy, m/s, at times (N,): the slope of the spline, straight on up to a discontinuity."""
+        t = np.clip(t_s, self.t_s[0], self.t_s[-1])
+        if len(self.t_s) == 1:
+            return np.full(len(t), self.velocity_x_mps[0]), np.full(len(t), self.velocity_y_mps[0])
+        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
+        span = self.t_s[i + 1] - self.t_s[i]
+        since = t - self.t_s[i]
+        vx = hermite_slope(self.x_m, self.velocity_x_mps, i, since, span)
+        vy = hermite_slope(self.y_m, self.velocity_y_mps, i, since, span)
+        jumps = self.discontinuous[i] & (t < self.t_s[i + 1])
+        return np.where(jumps, self.velocity_x_mps[i], vx), np.where(jumps, self.velocity_y_mps[i], vy)
+
+    def heights(self, t_s: Array) -> Array:
+        """Interpolate the height z of the box center at times (N,); the ends are held."""
+        return np.interp(t_s, self.t_s, self.z_m)
+
+    def discontinuity_times(self) -> Array:
+        """Return the times (J,) of the waypoints that the agent cannot have moved to."""
+        return self.t_s[1:][self.discontinuous]
+
+
+def _tangents(t_s: Array, x: Array, y: Array, vx: Array, vy: Array, at_jump: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Choose the velocities (T,) at the waypoints: the logged ones, or difference quotients where the two disagree.
+
+    Sideways steps of a pedestrian and a box labeled back to front would otherwise bend the spline into loops.
+    """
+    dx, dy = np.gradient(x, t_s), np.gradient(y, t_s)
+    differs = np.hypot(vx - dx, vy - dy) > 0.5 + 0.3 * np.hypot(dx, dy)
+    replaced = differs & ~at_jump
+    return np.where(replaced, dx, vx), np.where(replaced, dy, vy)
+
+
+def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:
+    """Evaluate cubics (..., N) through value[..., i] and value[..., i + 1] with their slopes, at `t` (N,) after the first."""
+    f = t / span
+    begin, end = value.take(i, axis=-1), value.take(i + 1, axis=-1)
+    begin_rise, end_rise, rise = span * slope.take(i, axis=-1), span * slope.take(i + 1, axis=-1), end - begin
+    return begin + f * (
+        begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise))
+    )
+
+
+def hermite_slope(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:
+    """Evaluate the slopes (N,) of the cubics of `hermite`."""
+    f = t / span
+    begin, end, rise = slope[i], slope[i + 1], (value[i + 1] - value[i]) / span
+    return begin + f * (2 * (3 * rise - 2 * begin - end) + 3 * f * (begin + end - 2 * rise))
+
+
+MIN_TRUSTED_CONFIDENCE = 0.5
+"""Agents below it are doubtful: by their confidence they are more likely wrong than right."""
+
+FLAGS = {
+    "acceleration": "accelerates or brakes harder than vehicles can",
+    "lateral_acceleration": "accelerates sideways harder than tires hold",
+    "curvature": "turns on a smaller circle than vehicles can",
+    "jerk": "changes its acceleration faster than brakes can",
+    "speed": "is faster than anything of its category",
+    "reversing": "drives backward fast or far",
+    "sideways": "slides across its length",
+    "jump": "its measurements are far from its trajectory",
+    "passes_through": "is in the place of another agent",
+    "in_ego": "touches the ego",
+    "empty": "LiDAR rays pass through its place",
+    "hardly_observed": "the LiDAR or the cameras look toward it and hardly ever show it",
+    "unlikely_size": "has a size that no road vehicle has",
+    "heading_ambiguous": "front and back may be swapped",
+}
+"""The flags that a reconstruction gives, and what each means."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One reason to doubt an agent.
+
+    Attributes
+    ----------
+    flag : str
+        Short name of the reason; those of a reconstruction are in `FLAGS`.
+    reason : str
+        In words for people, such as "passes through car-22 at 1.2 s".
+    start_s, end_s : float or None, s
+        When it holds; None for the whole life of the agent.
+    """
+
+    flag: str
+    reason: str
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def holds(self, t_s: Array) -> NDArray[np.bool_]:
+        """Return whether it holds at times (T,)."""
+        start = -np.inf if self.start_s is None else self.start_s
+        end = np.inf if self.end_s is None else self.end_s
+        return np.asarray((t_s >= start) & (t_s <= end))
+
+    def retimed(self, change: Callable[[float], float]) -> Doubt:
+        """Return the doubt of a trajectory whose times are put elsewhere by `change`, s to s."""
+        start_s, end_s = (None if t_s is None else change(t_s) for t_s in (self.start_s, self.end_s))
+        return replace(self, start_s=start_s, end_s=end_s)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry in a document of `schemas/scenario-1.json`."""
+        return {"flag": self.flag, "reason": self.reason, "start_s": self.start_s, "end_s": self.end_s}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Doubt:
+        """Read an entry that keeps the schema."""
+        return cls(entry["flag"], entry["reason"], entry.get("start_s"), entry.get("end_s"))
+
 
 COLOR_NAMES = ("black", "white", "gray", "silver", "red", "blue", "green", "yellow", "brown", "orange")
 """Names that reconstructed colors of vehicles have."""
@@ -60,7 +356,6 @@ class Agent:
         One of `CATEGORIES`.
     size_m : (3,) tuple of float, m
         Length, width, height.
-    waypoints : Waypoints
     static : bool
         Whether it never moves.
     rear_axle_offset_m : float, m
@@ -88,10 +383,10 @@ class Agent:
     rear_axle_offset_m: float = 0.0
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0
-    quarantined: bool = False
     quality: Mapping[str, Any] = field(default_factory=dict)
     doubts: tuple[Doubt, ...] = ()
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
+    quarantined: bool = False
 
     def __repr__(self) -> str:
         """Return category, size, times and confidence in one line."""
@@ -210,3 +505,29 @@ def _doubts_of(entry: Mapping[str, Any]) -> tuple[Doubt, ...]:
         return tuple(Doubt.from_dict(doubt) for doubt in entry["doubts"])
     flags = entry["quality"].get("flags")
     return tuple(Doubt(str(flag), f"breaks the limit of {flag}") for flag in flags) if isinstance(flags, list) else ()
+
+
+MAX_LISTED = 5
+
+
+def why_doubtful(agent: Agent) -> str:
+    """Say why an agent is doubtful: the reasons of its doubts, else its low confidence; empty when it is not doubtful."""
+    if agent.doubts:
+        return ", ".join(doubt.reason for doubt in agent.doubts)
+    return say_confidence(agent) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ""
+
+
+def say_confidence(agent: Agent) -> str:
+    """Say the confidence of an agent, rounded down, so that 0.499 is not shown as the limit that it misses."""
+    return f"confidence {math.floor(agent.confidence * 100 + 1e-9) / 100:.2f}"
+
+
+def list_doubtful(agents: Sequence[Agent], limit: int | None = MAX_LISTED) -> str:
+    """List agents on one line, each with why it is doubtful, else with its confidence; `limit` of many, or all without one.
+
+    Those with a doubt come first, since low confidence alone says less.
+    """
+    first = sorted(agents, key=lambda agent: not agent.doubts)[:limit]
+    named = [f"{agent.id} ({why_doubtful(agent) or say_confidence(agent)})" for agent in first]
+    rest = len(agents) - len(first)
+    return ", ".join(named) + (f" and {rest} more" if rest > 0 else "")

@@ -9,17 +9,320 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim import late_functions
-from log2sim.datatypes.deferred import Deferred
-from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
-from log2sim.datatypes.tick import Tick
-from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack
-from log2sim.numerals import short_repr
+from log2sim.errors import ScenarioError
+from log2sim.files import plugins
+from log2sim.files.documents import short_repr
+from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack, rotation_from_quaternion, transform
+
+T = TypeVar("T")
+
+
+class Deferred(Generic[T]):
+    """A dataclass field that also takes a function of no arguments; it is called when the field is first read.
+
+    For parts of a log that have to be read from large files: opening a log does not wait for what is not used. Without
+    arguments the field has no default.
+    """
+
+    def __init__(self, *default: T) -> None:
+        self._default = default
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Remember the name of the field."""
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> T: ...
+
+    def __get__(self, instance: object | None, owner: type) -> Any:
+        """Return the value; of the class, the default."""
+        if instance is None:
+            if not self._default:
+                raise AttributeError(self._name)
+            return self._default[0]
+        value = instance.__dict__[self._name]
+        if callable(value):
+            value = instance.__dict__[self._name] = value()
+        return value
+
+    def __set__(self, instance: object, value: T | Callable[[], T]) -> None:
+        """Store the value or the function that makes it."""
+        instance.__dict__[self._name] = value
+
+
+QUATERNION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class LabelView:
+    """The images of one camera in which objects were labeled.
+
+    Attributes
+    ----------
+    camera : Camera
+        Its mount is not used.
+    t_s : (F,) float64, s
+        Strictly increasing stamps since the start of the truth.
+    translation_m : (F, 3) float64, m
+        Of the camera in the map.
+    rotation_wxyz : (F, 4) float64
+        Unit quaternions of the camera in the map, scalar first.
+    region_frame : (R,) int64
+        Index into `t_s` of each region.
+    region_px : (R, 4) float64, px
+        u0, v0, u1, v1 of each part of an image without labels.
+    """
+
+    camera: Camera
+    t_s: Array
+    translation_m: Array
+    rotation_wxyz: Array
+    region_frame: NDArray[np.int64]
+    region_px: Array
+
+    @property
+    def map_T_cam(self) -> Array:
+        """Return the poses (F, 4, 4) of the camera."""
+        return transform(rotation_from_quaternion(self.rotation_wxyz), self.translation_m)
+
+
+@dataclass(frozen=True, eq=False)
+class IgnoreRegions:
+    """Where reconstructed objects are neither right nor false, because nothing was labeled there.
+
+    Attributes
+    ----------
+    views : tuple of LabelView
+        One for each labeled camera.
+    outside_views : bool
+        Whether objects outside all views were left without labels too.
+    categories : tuple of str
+        Categories that were left without labels everywhere.
+    """
+
+    views: tuple[LabelView, ...]
+    outside_views: bool
+    categories: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the part `unlabeled` of a document of `schemas/scenario-1.json`."""
+        document = {"outside_views": self.outside_views, "views": [_view_to_dict(v) for v in self.views]}
+        return {**document, "categories": list(self.categories)} if self.categories else document
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> IgnoreRegions:
+        """Build them from the part `unlabeled` of a document that keeps the schema.
+
+        Raises
+        ------
+        ScenarioError
+            When columns do not fit each other.
+        """
+        views = tuple(_view_from_dict(v, f"unlabeled.views[{k}]") for k, v in enumerate(document["views"]))
+        return cls(views, bool(document["outside_views"]), tuple(document.get("categories", ())))
+
+
+def _view_to_dict(view: LabelView) -> dict[str, Any]:
+    c = view.camera
+    return {
+        "camera": c.name,
+        "intrinsics": {
+            "width_px": int(c.width_px),
+            "height_px": int(c.height_px),
+            "fx_px": float(c.K[0, 0]),
+            "fy_px": float(c.K[1, 1]),
+            "cx_px": float(c.K[0, 2]),
+            "cy_px": float(c.K[1, 2]),
+            "distortion_model": c.distortion_model,
+            "distortion": [float(d) for d in c.distortion],
+        },
+        "t_s": view.t_s.tolist(),
+        "translation_m": view.translation_m.tolist(),
+        "rotation_wxyz": view.rotation_wxyz.tolist(),
+        "region_frame": view.region_frame.tolist(),
+        "region_px": view.region_px.tolist(),
+    }
+
+
+def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
+    i = entry["intrinsics"]
+    K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
+    model, lens = i.get("distortion_model", "none"), tuple(float(d) for d in i.get("distortion", ()))
+    camera = Camera(entry["camera"], i["width_px"], i["height_px"], K, "map", np.eye(4), model, lens)
+    t_s = np.array(entry["t_s"], dtype=np.float64)
+    position = np.array(entry["translation_m"], dtype=np.float64).reshape(-1, 3)
+    q = np.array(entry["rotation_wxyz"], dtype=np.float64).reshape(-1, 4)
+    frame = np.array(entry["region_frame"], dtype=np.int64)
+    box = np.array(entry["region_px"], dtype=np.float64).reshape(-1, 4)
+    if not len(t_s) == len(position) == len(q):
+        raise ScenarioError(
+            f"{where}: {len(t_s)} stamps, {len(position)} translations, {len(q)} rotations; expected equal"
+        )
+    if len(frame) != len(box) or np.any(frame >= len(t_s)):
+        raise ScenarioError(f"{where}: region_frame must hold one index of a stamp for each of the {len(box)} regions")
+    if np.any(np.diff(t_s) <= 0):
+        raise ScenarioError(f"{where}: t_s does not increase at index {int(np.argmax(np.diff(t_s) <= 0)) + 1}")
+    if np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > QUATERNION_TOLERANCE):
+        raise ScenarioError(f"{where}: rotation_wxyz must hold unit quaternions, scalar first")
+    return LabelView(camera, t_s, position, q, frame, box)
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Labeled 3D boxes of a log in the map frame, one row a box and stamp.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Absolute stamps.
+    track_id : (L,) str
+    category : (L,) str
+    center_m : (L, 3) float64, m
+        Box centers.
+    size_m : (L, 3) float64, m
+        Length, width, height.
+    yaw_rad : (L,) float64
+    visible : (L,) bool or None
+        As the log states it; None where it states nothing and visibility is computed.
+    cameras : tuple of str or None
+        The cameras in whose images alone objects were labeled; None when they were labeled all around.
+    kind : (L,) str or None
+        The log's own word for the category, such as "Van"; None where the log has none of its own.
+    occlusion : (L,) int64 or None
+        0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it.
+    labeled_ns : (F,) int64 or None
+        Increasing stamps of all that was labeled, also where nothing was there; None where the log does not state it.
+    never_labeled : tuple of str
+        Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI.
+    """
+
+    __repr__ = short_repr
+
+    t_ns: NDArray[np.int64]
+    track_id: NDArray[np.str_]
+    category: NDArray[np.str_]
+    center_m: Array
+    size_m: Array
+    yaw_rad: Array
+    visible: NDArray[np.bool_] | None = None
+    cameras: tuple[str, ...] | None = None
+    kind: NDArray[np.str_] | None = None
+    occlusion: NDArray[np.int64] | None = None
+    labeled_ns: NDArray[np.int64] | None = None
+    never_labeled: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ImageLabels:
+    """Labeled 2D boxes of one camera.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Absolute stamp of the frame.
+    box_px : (L, 4) float64, px
+        u0, v0, u1, v1.
+    category : (L,) str
+    """
+
+    __repr__ = short_repr
+
+    t_ns: NDArray[np.int64]
+    box_px: Array
+    category: NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRegions:
+    """Parts of the images of one camera in which objects were left without labels.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Absolute stamp of the frame.
+    box_px : (L, 4) float64, px
+        u0, v0, u1, v1.
+    """
+
+    __repr__ = short_repr
+
+    t_ns: NDArray[np.int64]
+    box_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """One LiDAR sweep.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Absolute time of the sweep.
+    xyz_m : (N, 3) float32 or float64, m
+        Finite points in `frame`.
+    frame : {"lidar", "map"}
+        "lidar": the sensor's frame; "map": already motion-compensated.
+    t_ns : (N,) int64 or None
+        Absolute stamps at which the points were measured; None when the log has none.
+    compensated_ns : int or None
+        For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each
+        point is in the sensor's frame at its own time.
+    intensity : (N,) float32 or None
+        How strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
+    """
+
+    __repr__ = short_repr
+
+    stamp_ns: int
+    xyz_m: NDArray[np.floating[Any]]
+    frame: Literal["lidar", "map"] = "lidar"
+    t_ns: NDArray[np.int64] | None = None
+    compensated_ns: int | None = None
+    intensity: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """One synchronized moment of a log.
+
+    Attributes
+    ----------
+    t_ns : int
+        Absolute stamp.
+    t_s : float, s
+        Since the first tick of the log.
+    images : mapping of str to (H, W, 3) uint8 BGR
+        By camera, without cameras that have no frame near the tick. A frame is decoded when it is asked for, and
+        `RecordError` says which one cannot be read.
+    sweeps : mapping of str to Sweep
+        By LiDAR, likewise.
+    image_ns : mapping of str to int
+        Absolute stamps of the frames.
+    map_T_ego : (4, 4) float64 or None
+        Pose of the ego; None where it is not known.
+    points : (N, 3) float64, m, map frame
+        Of all sweeps, each point where the sensor was at its own time. Made when they are first asked for.
+    """
+
+    t_ns: int
+    t_s: float
+    images: Mapping[str, NDArray[np.uint8]]
+    sweeps: Mapping[str, Sweep]
+    image_ns: Mapping[str, int]
+    map_T_ego: Array | None
+    points: Deferred[Array] = Deferred()
+
+    def __repr__(self) -> str:
+        """Return the time and the sensors, nothing of which is read."""
+        return f"<Tick at {self.t_s:.3f} s: {', '.join([*self.images, *self.sweeps]) or 'no record'}>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +331,6 @@ class Lidar:
 
     Attributes
     ----------
-    name : str
     mount : {"ego", "map"}
         Frame that it is fixed in: on the vehicle or at the roadside.
     mount_T_lidar : (4, 4) float64
@@ -111,7 +413,6 @@ class Log:
 
     Attributes
     ----------
-    name : str
     format : str
         Name of the reader.
     cameras, lidars : mapping of str to Camera, Lidar
@@ -119,8 +420,6 @@ class Log:
         By the name of the sensor.
     ego : PoseTrack or None
         None for a log of roadside sensors only.
-    ego_vehicle : EgoVehicle
-    map : MapFrame
     labels : Labels or None
         May be given as a function that reads them.
     image_labels : mapping of str to ImageLabels
@@ -171,7 +470,7 @@ class Log:
 
     def _repr_html_(self) -> str | None:
         """Return what a notebook shows: the sensors, and a picture of each camera."""
-        return late_functions.html_or_none(self)
+        return plugins.html_or_none(self)
 
     def ticks(
         self, cameras: Sequence[str] = (), *, start_s: float | None = None, stop_s: float | None = None
@@ -197,7 +496,7 @@ class Log:
         >>> for tick in log.ticks():
         ...     print(tick.t_s, tick.images["front"].shape, len(tick.points))
         """
-        ticks: Sequence[Tick] = late_functions.call("ticks_of", self, tuple(cameras), start_s=start_s, stop_s=stop_s)
+        ticks: Sequence[Tick] = plugins.call("ticks_of", self, tuple(cameras), start_s=start_s, stop_s=stop_s)
         return ticks
 
     def truth(self, cameras: Sequence[str] = ()) -> Any:
@@ -217,7 +516,7 @@ class Log:
         LogError
             For a log without labels.
         """
-        return late_functions.call("truth_of", self, cameras=tuple(cameras) or None)
+        return plugins.call("truth_of", self, cameras=tuple(cameras) or None)
 
     def show(self, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Any = None) -> Any:
         """Draw boxes and LiDAR points on the pictures of one moment.
@@ -233,7 +532,7 @@ class Log:
 
         Returns
         -------
-        log2sim.visualization.notebook.show.Picture
+        log2sim.visualization.notebook.Picture
             A notebook shows it; `save` writes it, `figure` is the figure.
 
         Raises
@@ -241,7 +540,7 @@ class Log:
         ConfigError
             For an unknown camera, and for a time outside the log.
         """
-        return late_functions.call("show_log", self, when, camera=camera, scenario=scenario)
+        return plugins.call("show_log", self, when, camera=camera, scenario=scenario)
 
     def changed(self, **changes: Any) -> Log:
         """Return the log with other values of some fields; unlike `dataclasses.replace`, what is deferred stays deferred."""
@@ -291,7 +590,6 @@ class Frame:
 
     Attributes
     ----------
-    camera : Camera
     t_ns : int
         Absolute stamp.
     image : callable
@@ -304,3 +602,32 @@ class Frame:
     t_ns: int
     image: Callable[[], NDArray[np.uint8]]
     encoded: Callable[[], bytes] | None = None
+
+
+VEHICLE, ROAD = "vehicle", "road"
+ENDS = (VEHICLE, ROAD)
+"""The ends in the order of the columns of `seen_by`."""
+
+Span = tuple[float, float]
+"""First and last time, s."""
+
+
+def end_of(sensor: Camera | Lidar) -> str:
+    """Return the end that a sensor belongs to: the vehicle's if it is mounted on the ego, else the road's."""
+    return VEHICLE if sensor.mount == "ego" else ROAD
+
+
+def seen_from(end: str, count: int) -> NDArray[np.bool_]:
+    """Return (count, 2) for rows that one end alone saw; no end for an empty name."""
+    return np.tile([end == name for name in ENDS], (count, 1))
+
+
+def retime_spans(
+    observed_by: Mapping[str, tuple[Span, ...]], change: Callable[[float], float], *, begin_s: float = -np.inf
+) -> dict[str, tuple[Span, ...]]:
+    """Put the spans of each end elsewhere in time by `change`, s to s; what ends before `begin_s` is left out."""
+    moved = {end: [(change(first), change(last)) for first, last in spans] for end, spans in observed_by.items()}
+    return {
+        end: tuple((max(first, begin_s), last) for first, last in spans if last >= begin_s)
+        for end, spans in moved.items()
+    }

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import ScenarioError
+from log2sim.files.documents import short_repr
 from log2sim.geometry import Array
-from log2sim.numerals import short_repr
 
 MARKING_KINDS = ("solid", "dashed", "stop_line", "crosswalk", "other")
 """Kinds of markings; lane lines are the first two, arrows and letters are "other"."""
@@ -227,9 +227,6 @@ class MapFeatures:
 
     Attributes
     ----------
-    markings : tuple of Marking
-    borders : tuple of RoadBorder
-    lanes : tuple of MapLane
     notes : tuple of str
         What is not there, and why.
     """

@@ -1,27 +1,236 @@
-"""The scenario: agents with their sizes and trajectories, as `scenario.json` holds them."""
+"""The scenario: agents, map features and signals, as `scenario.json` holds it."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from log2sim import late_functions
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
-from log2sim.datatypes.ignore_regions import IgnoreRegions
-from log2sim.datatypes.log import MapFrame
+from log2sim.datatypes.log import IgnoreRegions, MapFrame
 from log2sim.datatypes.map_features import MapFeatures
-from log2sim.datatypes.signals import Signal
-from log2sim.datatypes.waypoint_table import dataframe_of, dataset_of, write_parquet
-from log2sim.documents import check, read_json, write_json
-from log2sim.errors import ConfigError, ScenarioError
+from log2sim.errors import ConfigError, MissingExtra, ScenarioError
+from log2sim.files import plugins
+from log2sim.files.documents import check, read_json, replaced, short_repr, write_json
+from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.registry import nearest
+
+SIGNAL_STATES = ("red", "red_yellow", "yellow", "green", "off", "unknown")
+"""States of a traffic light; off: no lamp is lit; unknown: no camera shows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """A signal head of a traffic light.
+
+    Attributes
+    ----------
+    position_m : (3,) float64, m
+        Middle of its housing, map frame.
+    heading_rad : float or None
+        Direction that its lamps face, None where unknown.
+    t_s : (T,) float64, s
+        Strictly increasing times at which its state changes; the last state lasts to the end of the scenario.
+    state : (T,) str
+        Of `SIGNAL_STATES`, from each time on.
+    sigma_m : float, m
+        Standard deviation of the position along the axis on which it is largest.
+    confidence : float
+        Probability that it is a traffic light, there, in [0, 1].
+    cameras : tuple of str
+        That saw it.
+    """
+
+    __repr__ = short_repr
+
+    id: str
+    position_m: Array
+    heading_rad: float | None
+    t_s: Array
+    state: NDArray[np.str_]
+    sigma_m: float = 0.0
+    confidence: float = 1.0
+    cameras: tuple[str, ...] = ()
+
+    def at(self, t_s: ArrayLike) -> NDArray[np.str_]:
+        """Return its states (T,) at times (T,); unknown before its first time."""
+        k = np.searchsorted(self.t_s, np.atleast_1d(np.asarray(t_s, dtype=np.float64)), side="right") - 1
+        return np.asarray(np.where(k >= 0, self.state[np.maximum(k, 0)], "unknown"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry in a document of `schemas/scenario-1.json`."""
+        return {
+            "id": self.id,
+            "position_m": self.position_m.tolist(),
+            "heading_rad": None if self.heading_rad is None else float(self.heading_rad),
+            "t_s": self.t_s.tolist(),
+            "state": [str(state) for state in self.state],
+            "sigma_m": float(self.sigma_m),
+            "confidence": float(self.confidence),
+            "cameras": list(self.cameras),
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Signal:
+        """Read an entry that keeps the schema.
+
+        Raises
+        ------
+        ScenarioError
+            When it has not one state for each time, or its times do not increase.
+        """
+        t_s, state = np.array(entry["t_s"], dtype=np.float64), np.array(entry["state"], dtype=str)
+        if len(t_s) != len(state):
+            raise ScenarioError(f"signal '{entry['id']}': {len(t_s)} times, {len(state)} states; expected equal")
+        if np.any(np.diff(t_s) <= 0):
+            raise ScenarioError(f"signal '{entry['id']}': t_s does not increase")
+        return cls(
+            entry["id"],
+            np.array(entry["position_m"], dtype=np.float64),
+            entry["heading_rad"],
+            t_s,
+            state,
+            float(entry["sigma_m"]),
+            float(entry["confidence"]),
+            tuple(entry["cameras"]),
+        )
+
+
+COLUMNS: dict[str, tuple[str, str]] = {
+    "agent": ("", "id of the agent"),
+    "category": ("", "category of the agent"),
+    "t_s": ("s", "time since the start of the scenario"),
+    "x_m": ("m", "center of the box, map frame, east"),
+    "y_m": ("m", "center of the box, map frame, north"),
+    "z_m": ("m", "center of the box, map frame, up"),
+    "yaw_rad": ("rad", "heading, counter-clockwise from +x"),
+    "speed_mps": ("m/s", "along the heading, negative when reversing"),
+    "observed": ("", "false where a gap was filled"),
+    "sigma_xy_m": ("m", "standard deviation of the position"),
+    "sigma_yaw_rad": ("rad", "standard deviation of the heading, NaN where not known"),
+    "sigma_speed_mps": ("m/s", "standard deviation of the speed, NaN where not known"),
+    "length_m": ("m", "size of the agent"),
+    "width_m": ("m", "size of the agent"),
+    "height_m": ("m", "size of the agent"),
+    "static": ("", "whether the agent never moves"),
+    "confidence": ("1", "probability that the agent is right"),
+    "doubts": ("", "flags of what speaks against the agent, joined by commas"),
+}
+"""Unit and meaning of each column."""
+
+TEXTS, FLAGS = ("agent", "category", "doubts"), ("observed", "static")
+PER_AGENT = ("category", "length_m", "width_m", "height_m", "static", "confidence", "doubts")
+
+
+def columns_of(agents: Sequence[Agent]) -> dict[str, NDArray[Any]]:
+    """Return the columns (R,) with one row for each agent and waypoint, in the order of the agents."""
+    parts = [_columns_of(agent) for agent in agents]
+    return {key: np.concatenate([part[key] for part in parts] or [_none(key)]) for key in COLUMNS}
+
+
+def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
+    """Return the columns as a pandas DataFrame; `about` becomes its `attrs`.
+
+    Raises
+    ------
+    MissingExtra
+        When pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError:
+        raise MissingExtra("to_dataframe", "dataframe") from None
+    frame = pd.DataFrame(columns_of(agents))
+    frame.attrs = dict(about)
+    return frame
+
+
+def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
+    """Return the columns as an xarray Dataset along agents (A,) and the times of all waypoints (T,); `about` becomes its `attrs`.
+
+    Raises
+    ------
+    MissingExtra
+        When xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise MissingExtra("to_xarray", "xarray") from None
+    columns = columns_of(agents)
+    t_s, tick = np.unique(columns["t_s"], return_inverse=True)
+    counts = [len(agent.waypoints) for agent in agents]
+    row = np.repeat(np.arange(len(agents)), counts)
+    first = np.cumsum([0, *counts[:-1]]) if agents else np.zeros(0, dtype=np.intp)
+    along: dict[str, Any] = {}
+    for key, (unit, meaning) in COLUMNS.items():
+        values, about_key = columns[key], {"units": unit, "description": meaning}
+        if key in PER_AGENT:
+            along[key] = ("agent", values[first], about_key)
+        elif key not in ("agent", "t_s"):
+            table = np.full((len(agents), len(t_s)), False if key in FLAGS else np.nan)
+            table[row, tick] = values
+            along[key] = (("agent", "t_s"), table, about_key)
+    coordinates = {
+        "agent": [agent.id for agent in agents],
+        "t_s": ("t_s", t_s, {"units": "s", "description": COLUMNS["t_s"][1]}),
+    }
+    return xarray.Dataset(along, coords=coordinates, attrs=dict(about))
+
+
+def write_parquet(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
+    """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata.
+
+    Raises
+    ------
+    MissingExtra
+        When pyarrow is not installed.
+    ConfigError
+        When the file cannot be written.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise MissingExtra("to_parquet", "parquet") from None
+    columns = columns_of(agents)
+    kinds = {key: pa.string() if key in TEXTS else pa.bool_() if key in FLAGS else pa.float64() for key in COLUMNS}
+    fields = [
+        pa.field(key, kinds[key], nullable=False, metadata={"unit": unit, "description": meaning})
+        for key, (unit, meaning) in COLUMNS.items()
+    ]
+    schema = pa.schema(fields, metadata={key: str(value) for key, value in about.items()})
+    table = pa.table([pa.array(columns[key].tolist(), kinds[key]) for key in COLUMNS], schema=schema)
+    with replaced(path) as temporary:
+        pq.write_table(table, temporary)
+
+
+def _columns_of(agent: Agent) -> dict[str, NDArray[Any]]:
+    w, rows = agent.waypoints, len(agent.waypoints)
+    length, width, height = agent.size_m
+    doubts = ",".join(dict.fromkeys(doubt.flag for doubt in agent.doubts))
+    same: dict[str, Any] = {
+        "agent": agent.id, "category": agent.category, "length_m": length, "width_m": width, "height_m": height,
+        "static": agent.static, "confidence": agent.confidence, "doubts": doubts, "sigma_yaw_rad": np.nan,
+        "sigma_speed_mps": np.nan,
+    }  # fmt: skip
+    known = w.columns()
+    return {key: known[key] if key in known else np.full(rows, same[key], dtype=_kind(key)) for key in COLUMNS}
+
+
+def _kind(key: str) -> Any:
+    return object if key in TEXTS else bool if key in FLAGS else np.float64
+
+
+def _none(key: str) -> NDArray[Any]:
+    return np.zeros(0, dtype=_kind(key))
+
 
 VERSION = 1
 EGO = "ego"
@@ -34,13 +243,11 @@ class Scenario:
 
     Attributes
     ----------
-    name : str
     t0_ns : int
         Absolute time of t_s = 0.
     duration_s : float, s
     agents : tuple of Agent
         The ego is the one with id `EGO`, if there is one.
-    map : MapFrame
     cameras : tuple of mapping
         The cameras of the log with the homographies that were fitted.
     stages : tuple of mapping
@@ -51,7 +258,6 @@ class Scenario:
         Only in truth: where objects were left without labels; None when the labels are complete.
     map_features : MapFeatures or None
         Markings, borders and lanes; None where they were not looked for.
-    signals : tuple of Signal
     """
 
     name: str
@@ -65,6 +271,7 @@ class Scenario:
     ignore_regions: IgnoreRegions | None = None
     map_features: MapFeatures | None = None
     signals: tuple[Signal, ...] = ()
+    sensors: tuple[Mapping[str, Any], ...] = ()
 
     def __repr__(self) -> str:
         """Return name, agents and duration in one line."""
@@ -75,7 +282,7 @@ class Scenario:
 
     def _repr_html_(self) -> str | None:
         """Return what a notebook shows: the agents by category, and the tracks from above."""
-        return late_functions.html_or_none(self)
+        return plugins.html_or_none(self)
 
     def __getitem__(self, id: str) -> Agent:
         """Return an agent by its id, as in `scenario["car-1"]`; raises `KeyError` where there is none."""
@@ -190,7 +397,10 @@ class Scenario:
         shift = np.array([dx, dy, dz])
         features = None if self.map_features is None else self.map_features.moved(lambda points_m: points_m + shift)
         signals = tuple(replace(s, position_m=s.position_m + shift, t_s=s.t_s + later_s) for s in self.signals)
-        placed = replace(self, map_features=features, signals=signals)
+        sensors = tuple(
+            {**s, **{k: s[k] + d for k, d in zip(("x_m", "y_m", "z_m"), (dx, dy, dz))}} for s in self.sensors
+        )
+        placed = replace(self, map_features=features, signals=signals, sensors=sensors)
         return replace(placed, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
@@ -272,6 +482,8 @@ class Scenario:
             document["map_features"] = self.map_features.to_dict()
         if self.signals:
             document["signals"] = [signal.to_dict() for signal in self.signals]
+        if self.sensors:
+            document["sensors"] = [dict(sensor) for sensor in self.sensors]
         return document
 
     @classmethod
@@ -305,6 +517,7 @@ class Scenario:
             ignore_regions=IgnoreRegions.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
             signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
+            sensors=tuple(document.get("sensors", ())),
         )
         for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
             seen: set[str] = set()
@@ -313,3 +526,31 @@ class Scenario:
                     raise ScenarioError(f"{what} '{item.id}': the id occurs twice; ids must be unique")
                 seen.add(item.id)
         return scenario
+
+
+PLURALS = {"bus": "buses", "other": "others"}
+
+
+def say_agents(ids: Iterable[str]) -> str:
+    """Count agents by their ids, as all commands do: "12 agents and the ego", "1 agent", "no agent but the ego"."""
+    listed = list(ids)
+    others = sum(id != EGO for id in listed)
+    if EGO not in listed:
+        return f"{others} agent{'s' * (others != 1)}"
+    return f"{others} agent{'s' * (others != 1)} and the ego" if others else "no agent but the ego"
+
+
+def say_categories(agents: Sequence[Agent]) -> str:
+    """Count agents by category, most frequent first, with how many of each are static: "8 cars (3 static), 1 bus"."""
+    counts: dict[str, list[int]] = {}
+    for agent in agents:
+        count = counts.setdefault(agent.category, [0, 0])
+        count[0] += 1
+        count[1] += agent.static
+    ordered = sorted(counts.items(), key=lambda entry: (-entry[1][0], entry[0]))
+    return ", ".join(_say_category(category, total, static) for category, (total, static) in ordered)
+
+
+def _say_category(category: str, total: int, static: int) -> str:
+    noun = category if total == 1 else PLURALS.get(category, f"{category}s")
+    return f"{total} {noun}" + (f" ({static} static)" if static else "")

@@ -1,16 +1,127 @@
-"""Applies edits to a scenario, checks the result and records the edits in its provenance."""
+"""Applies edits to a scenario, checks what came of them, and records them in its provenance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any
 
-from log2sim.datatypes import Scenario
-from log2sim.edit.checks import warnings_of
+import numpy as np
+
+from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.edit.edits import Add, Agents, Edit, Only, Remove
+from log2sim.edit.motion import MIN_PATH_MPS, chords
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
-from log2sim.registry import nearest
+from log2sim.files.plugins import nearest
+from log2sim.geometry import Array
+from log2sim.simulation.metrics.all_metrics import OFF_PATH_M
+from log2sim.simulation.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
+from log2sim.simulation.runner import replay
+
+# The limits that a replay flags; pedestrians turn on the spot.
+CURVATURE_LIMITS_1PM = {"vehicle": MAX_CURVATURE_1PM, "two_wheeler": MAX_TWO_WHEELER_CURVATURE_1PM}
+STEP_S = 0.05
+SAME_CONTACT_S = 0.5
+RELATIVE_TOLERANCE = 1 + 1e-6
+
+
+def warnings_of(before: Scenario, after: Scenario) -> tuple[str, ...]:
+    """Return what is wrong with the edited scenario and not with its source, a line each, with agent, time and value."""
+    source = {a.id: a for a in before.agents}
+    changed = [a for a in after.agents if a is not source.get(a.id)]
+    infeasible = [line for a in changed for line in _infeasible(source.get(a.id), a)]
+    undrivable = () if infeasible else _undrivable(before, after, changed)
+    return (*_collisions(before, after, {a.id for a in changed}), *infeasible, *undrivable)
+
+
+def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterator[str]:
+    """Yield overlaps of boxes where the source has none of the same two agents within `SAME_CONTACT_S`."""
+    if not changed:
+        return
+    known: dict[frozenset[str], list[tuple[float, float]]] = {}
+    for event in _overlaps(before, changed):
+        known.setdefault(frozenset(event["agents"]), []).append((event["t_s"], event["until_s"]))
+    for event in _overlaps(after, changed):
+        begin_s, until_s = event["t_s"], event["until_s"]
+        spans = known.get(frozenset(event["agents"]), [])
+        if not any(b - SAME_CONTACT_S <= until_s and begin_s <= u + SAME_CONTACT_S for b, u in spans):
+            yield (
+                f"agents '{event['agents'][0]}' and '{event['agents'][1]}' collide at {begin_s:.2f} s "
+                f"at {event['relative_speed_mps']:.1f} m/s, which the source does not have"
+            )
+
+
+def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]:
+    """Return the collisions of an exact replay: pairs of boxes of which one moves or was moved."""
+    agents = (replace(a, static=a.static and not (a.id in changed and len(a.waypoints) > 1)) for a in scenario.agents)
+    replayed = replay(replace(scenario, agents=tuple(agents)), mode="exact", dt_s=STEP_S)
+    collisions: Sequence[dict[str, Any]] = replayed.metrics["collisions"]
+    return collisions
+
+
+@dataclass(frozen=True)
+class PeakValue:
+    """The largest value of a quantity, and its time."""
+
+    value: float
+    t_s: float
+
+
+def _undrivable(before: Scenario, after: Scenario, changed: Sequence[Agent]) -> Iterator[str]:
+    """Yield the agents that their vehicle model cannot keep on the edited path, though it could on that of the source."""
+    moving = tuple(a for a in changed if not a.static and GROUP_OF[a.category] != "pedestrian")
+    if not moving:
+        return
+    off_path = _off_path(replace(after, agents=moving))
+    same = tuple(a for a in before.agents if a.id in off_path and not a.static)
+    known = _off_path(replace(before, agents=same)) if same else {}
+    for agent in moving:
+        across_m = off_path.get(agent.id, 0.0)
+        if across_m > known.get(agent.id, 0.0):
+            yield f"agent '{agent.id}': its vehicle model leaves the path by {across_m:.2f} m, limit {OFF_PATH_M:g} m"
+
+
+def _off_path(scenario: Scenario) -> dict[str, float]:
+    """Return the agents of a replay that leave their path, with the largest distance across it, m."""
+    figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]
+    across = {name: entry.get("cross_track_max_m") for name, entry in figures.items()}
+    return {name: float(value) for name, value in across.items() if value is not None and value > OFF_PATH_M}
+
+
+def _infeasible(before: Agent | None, after: Agent) -> Iterator[str]:
+    """Yield acceleration and curvature beyond their limits and beyond those of the source."""
+    curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
+    for what, peak_of, limit, unit in (
+        ("acceleration", peak_acceleration, MAX_ACCEL_MPS2, "m/s2"),
+        ("curvature", peak_curvature, curvature_limit, "1/m"),
+    ):
+        peak = peak_of(after)
+        known = 0.0 if before is None else peak_of(before).value
+        if peak.value > max(limit, known) * RELATIVE_TOLERANCE:
+            yield f"agent '{after.id}': {what} {peak.value:.3g} {unit} at {peak.t_s:.2f} s, limit {limit:g} {unit}"
+
+
+def peak_acceleration(agent: Agent) -> PeakValue:
+    """Return the largest acceleration in m/s2, longitudinal and lateral combined, between two waypoints."""
+    w = agent.waypoints
+    span, speed = np.diff(w.t_s), (w.speed_mps[1:] + w.speed_mps[:-1]) / 2
+    _, turn = chords(w)
+    return _peak(w.t_s, np.hypot(np.diff(w.speed_mps), speed * turn) / span)
+
+
+def peak_curvature(agent: Agent) -> PeakValue:
+    """Return the largest curvature in 1/m between two waypoints, 0 where the agent stands."""
+    w = agent.waypoints
+    chord, turn = chords(w)
+    moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
+    return _peak(w.t_s, np.divide(np.abs(turn), np.abs(chord), out=np.zeros(len(turn)), where=moves))
+
+
+def _peak(t_s: Array, values: Array) -> PeakValue:
+    if len(values) == 0:
+        return PeakValue(0.0, float(t_s[0]))
+    k = int(np.argmax(values >= values.max() / RELATIVE_TOLERANCE))  # the first of those that are equal up to rounding
+    return PeakValue(float(values[k]), float(t_s[k] + t_s[k + 1]) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +130,6 @@ class Edited:
 
     Attributes
     ----------
-    scenario : Scenario
     warnings : tuple of str
         New collisions and infeasible motion.
     """
@@ -38,7 +148,6 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
 
     Parameters
     ----------
-    scenario : Scenario
     edits : sequence of Only, Remove, DropDoubtful, Replace, Add, Speed, Lateral, CutIn, Shift
         Each kind of motion at most once for an agent.
 

@@ -25,8 +25,8 @@ from log2sim.edit.motion import (
     sped_up_between,
 )
 from log2sim.errors import ConfigError
+from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
-from log2sim.registry import nearest
 
 MAX_STEP_S = 1.0
 """Waypoints of an agent that is added are at most so far apart, as those of a reconstruction."""

@@ -13,8 +13,7 @@ import numpy as np
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
-from log2sim.export.exporters import Options
-from log2sim.export.placement import ExportPlacement
+from log2sim.export.exporters import ExportPlacement, Options
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents, controller_data

@@ -18,11 +18,9 @@ from log2sim.datatypes import Agent, MapFrame, MapLane, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.csv_table import write_table
-from log2sim.export.exporters import Options
-from log2sim.export.roads.lanes import edges_of, lanes
-from log2sim.export.roads.marks import MarkFinder
-from log2sim.export.roads.signal_lanes import signal_lanes
-from log2sim.export.sampling import SampledMotion, sample_motion, sample_steps, step_times
+from log2sim.export.exporters import Options, SampledMotion, sample_motion, sample_steps, step_times
+from log2sim.export.roads.network import MarkFinder
+from log2sim.export.roads.opendrive import edges_of, lanes, signal_lanes
 from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array
 

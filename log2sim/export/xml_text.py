@@ -14,8 +14,8 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import iterparse
 
 from log2sim.errors import LogError, ScenarioError
-from log2sim.input_files import read_file
-from log2sim.numerals import parse_float
+from log2sim.files.documents import parse_float
+from log2sim.files.inputs import read_file
 
 SIZE_LIMIT_BYTES = 256 * 1024 * 1024
 DEPTH_LIMIT = 100

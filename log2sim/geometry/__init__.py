@@ -7,37 +7,53 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
-from log2sim.geometry.box_projection import ProjectedBoxes, box_lines, outline, project_boxes
-from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
+from log2sim.geometry.boxes import (
+    ProjectedBoxes,
+    box_corners,
+    box_corners_bev,
+    box_iou,
+    box_lines,
+    outline,
+    points_in_box,
+    project_boxes,
+)
 from log2sim.geometry.camera import (
     DISTORTION_LENGTHS,
     MIN_DEPTH_M,
     Camera,
     Mount,
     RollingShutter,
+    apply_homography,
     distort,
     fold_radius,
+    ground_homography,
+    homography_jacobian,
+    line_time_s,
     project,
+    project_moving,
     undistort,
 )
-from log2sim.geometry.homography import apply_homography, ground_homography, homography_jacobian
-from log2sim.geometry.overlap import (
+from log2sim.geometry.poses import PoseTrack
+from log2sim.geometry.rectangles import (
     bev_iou,
     overlap_area,
+    overlap_of_smaller,
     polygon_area,
+    rectangle_iou,
+    rectangle_overlap,
     rectangles_overlap,
     separating_axes,
+    upright_box_iou,
 )
-from log2sim.geometry.poses import PoseTrack
-from log2sim.geometry.rectangles import overlap_of_smaller, rectangle_iou, rectangle_overlap, upright_box_iou
-from log2sim.geometry.rolling_shutter import line_time_s, project_moving
-from log2sim.geometry.stamps import NS_PER_S, nearest_index, period_of
 from log2sim.geometry.transforms import (
+    NS_PER_S,
     Array,
     apply,
     cos_sin,
     inverse,
+    nearest_index,
     nearest_rotation,
+    period_of,
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_rpy,

@@ -1,11 +1,14 @@
-"""Boxes: corners of upright 3D boxes, points inside them, overlap of image boxes."""
+"""Upright 3D boxes: corners, points inside them, their images, and the overlap of image boxes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.geometry.transforms import Array
+from log2sim.geometry.camera import MIN_DEPTH_M, Camera, project
+from log2sim.geometry.transforms import Array, inverse
 
 
 def box_corners_bev(xy_m: ArrayLike, length_m: ArrayLike, width_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
@@ -76,3 +79,158 @@ def box_iou(a_px: ArrayLike, b_px: ArrayLike) -> Array:
     )
     union = area_a + area_b - overlap
     return np.asarray(np.divide(overlap, union, out=np.zeros_like(union), where=union > 0))
+
+
+# Edges and faces by corners in the order of `box_corners`; the last two edges cross out the front.
+EDGES = (
+    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
+    (0, 7), (3, 4),
+)  # fmt: skip
+FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+NEAR_M = 1.01 * MIN_DEPTH_M
+"""Boxes are clipped at this depth, so that every clipped vertex can be projected."""
+
+NEAR_PLANE: Array = np.array([[0.0, 0.0, 1.0, -NEAR_M]])
+VIEW_MARGIN = 1.3
+"""Barrel distortion shows somewhat more than a pinhole camera of the same focal length."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedBoxes:
+    """Boxes in one image; rows that are not valid hold NaN.
+
+    Attributes
+    ----------
+    valid : (L,) bool
+        Whether the image shows a part of the box.
+    box_px : (L, 4) float64
+        u0, v0, u1, v1, clipped to the image.
+    range_m : (L,) float64
+        Distance of the nearest corner from the camera.
+    """
+
+    valid: NDArray[np.bool_]
+    box_px: Array
+    range_m: Array
+
+
+def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera, cam_T_map: Array) -> ProjectedBoxes:
+    """Project upright boxes into an image.
+
+    Parameters
+    ----------
+    center_m, size_m, yaw_rad : (L, 3), (L, 3), (L,)
+        Boxes in the map frame; size is length, width, height.
+    cam_T_map : (4, 4)
+
+    Notes
+    -----
+    A box is clipped to the view before projection, so that one that extends behind the camera keeps its visible part. A box
+    that contains the camera is the vehicle that carries it and is not valid.
+    """
+    count = len(center_m)
+    box = np.full((count, 4), np.nan)
+    valid, range_m = np.zeros(count, dtype=bool), np.full(count, np.nan)
+    if not count:
+        return ProjectedBoxes(valid, box, range_m)
+    planes = view_planes(camera)
+    limit = np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    camera_map = inverse(cam_T_map)[None, :3, 3]
+    corners_cam = box_corners(center_m, size_m, yaw_rad) @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
+    inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0  # (L, 8, 5)
+    for i in np.flatnonzero(np.all(inside.any(axis=1), axis=1)):
+        if points_in_box(camera_map, center_m[i], size_m[i], float(yaw_rad[i]))[0]:
+            continue
+        vertices = corners_cam[i] if inside[i].all() else clip_box(corners_cam[i], planes)
+        uv = project(camera, vertices)[0] if len(vertices) else np.zeros((0, 2))
+        uv = np.clip(uv[np.isfinite(uv).all(axis=1)], 0, limit)
+        if len(uv) >= 3 and np.all(np.ptp(uv, axis=0) > 0):
+            valid[i] = True
+            box[i] = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+            range_m[i] = np.linalg.norm(corners_cam[i], axis=1).min()
+    return ProjectedBoxes(valid, box, range_m)
+
+
+def view_planes(camera: Camera) -> Array:
+    """Compute planes (5, 4) n, d of the view, cam frame: near, left, right, top, bottom; n . x + d >= 0 inside."""
+    K = camera.K
+    margin = VIEW_MARGIN if any(camera.distortion) else 1.0
+    left, right = -margin * K[0, 2] / K[0, 0], margin * (camera.width_px - K[0, 2]) / K[0, 0]
+    top, bottom = -margin * K[1, 2] / K[1, 1], margin * (camera.height_px - K[1, 2]) / K[1, 1]
+    return np.array([
+        [0, 0, 1, -NEAR_M], [1, 0, -left, 0], [-1, 0, right, 0], [0, 1, -top, 0], [0, -1, bottom, 0],
+    ])  # fmt: skip
+
+
+def clip_box(corners_cam: Array, planes: Array) -> Array:
+    """Clip a box, corners (8, 3), to the inside of planes (K, 4): vertices (V, 3), which may repeat.
+
+    Notes
+    -----
+    Sutherland and Hodgman (1974) on each face.
+    """
+    inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0
+    if inside.all():
+        return corners_cam
+    if not inside.any(axis=0).all():
+        return np.zeros((0, 3))
+    cutting = planes[~inside.all(axis=0)]
+    return np.concatenate([clip_polygon(corners_cam[list(face)], cutting) for face in FACES])
+
+
+def clip_polygon(polygon: Array, planes: Array) -> Array:
+    """Clip a flat convex polygon (P, 3) to the inside of planes (K, 4): vertices (V, 3)."""
+    for plane in planes:
+        if not len(polygon):
+            break
+        side = (polygon @ plane[:3] + plane[3]).tolist()
+        if min(side) >= 0:
+            continue
+        kept = []
+        for i, s in enumerate(side):
+            k = (i + 1) % len(side)
+            if s >= 0:
+                kept.append(polygon[i])
+            if (s >= 0) != (side[k] >= 0):
+                kept.append(polygon[i] + (polygon[k] - polygon[i]) * (s / (s - side[k])))
+        polygon = np.array(kept).reshape(-1, 3)
+    return polygon
+
+
+def box_lines(camera: Camera, corners_cam: Array) -> Array:
+    """Project the edges of a box with corners (8, 3), m, cam frame: line segments (E, 2, 2), px.
+
+    Edges are clipped at the near plane; segments outside the image are left out. The front is crossed out.
+
+    Notes
+    -----
+    With lens distortion each edge is approximated by eight segments.
+    """
+    ends = np.array([[corners_cam[a], corners_cam[b]] for a, b in EDGES])
+    ends = ends[(ends[..., 2] > NEAR_M).any(axis=1)]
+    if len(ends) == 0:
+        return np.zeros((0, 2, 2))
+    for a, b in ((0, 1), (1, 0)):
+        behind = ends[:, a, 2] < NEAR_M
+        p, q = ends[behind, a], ends[behind, b]
+        ends[behind, a] = q + (p - q) * ((q[:, 2] - NEAR_M) / (q[:, 2] - p[:, 2]))[:, None]
+    pieces = 1 if camera.distortion_model == "none" else 8
+    f = np.linspace(0, 1, pieces + 1)[None, :, None]
+    points = ends[:, None, 0] * (1 - f) + ends[:, None, 1] * f
+    uv = project(camera, points.reshape(-1, 3))[0].reshape(len(ends), pieces + 1, 2)
+    lines = np.stack([uv[:, :-1], uv[:, 1:]], axis=2).reshape(-1, 2, 2)
+    low, high = lines.min(axis=1), lines.max(axis=1)
+    touches = (high >= 0).all(axis=1) & (low[:, 0] < camera.width_px) & (low[:, 1] < camera.height_px)
+    return np.asarray(lines[touches & np.isfinite(lines).all(axis=(1, 2))])
+
+
+def outline(corners_cam: Array) -> Array:
+    """Project the part of a box, corners (8, 3), m, cam frame, in front of the camera onto the plane at depth 1.
+
+    Returns
+    -------
+    (V, 2) float64
+        Points whose convex hull is the outline; none for a box behind the camera.
+    """
+    vertices = clip_box(corners_cam, NEAR_PLANE)
+    return np.asarray(vertices[:, :2] / vertices[:, 2:])

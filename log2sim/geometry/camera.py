@@ -1,21 +1,24 @@
-"""Projection of points into images and back to rays, for pinhole cameras with and without lens distortion.
+"""Projection of points into images and back to rays, also with lines exposed one after the other, and homographies of the ground.
 
 The lens models are those of OpenCV: "brown" is Brown-Conrady with k1, k2, p1, p2, k3 and the rational k4..k6, "fisheye" is Kannala-Brandt.
+
+A homography `ground_H_image` (3, 3) maps pixels (u, v, 1), free of lens distortion, to ground positions (x, y) in m. With
+a third row that is positive below the horizon its sign tells which pixels see the ground.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from log2sim.geometry.transforms import Array
-from log2sim.numerals import short_repr
+from log2sim.files.documents import short_repr
+from log2sim.geometry.transforms import Array, inverse
 
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane, or behind it, are not projected."""
@@ -54,8 +57,6 @@ class Camera:
 
     Attributes
     ----------
-    name : str
-    width_px, height_px : int
     K : (3, 3) float64, px
         Camera matrix.
     mount : {"ego", "map"}
@@ -250,3 +251,146 @@ def _newton_step(camera: Camera, xy: Array, error: Array) -> Array:
 
 def _padded(coefficients: tuple[float, ...], count: int) -> tuple[float, ...]:
     return tuple(coefficients) + (0.0,) * (count - len(coefficients))
+
+
+# Poses during the readout; between them image coordinates are interpolated. A camera that turns at 1 rad/s with 2000 px focal
+# length and 0.1 s of readout moves its image by 12 px between two of them, which interpolation follows to less than 0.1 px.
+KNOTS = 17
+ITERATIONS = 3
+
+
+def line_time_s(camera: Camera, uv_px: Array) -> Array:
+    """Compute when the lines of pixels (N, 2) are exposed, s (N,), relative to the middle of the image; 0 for a global shutter.
+
+    Pixels outside the image take the time of its border, those of NaN that of the middle.
+    """
+    shutter = camera.rolling_shutter
+    if shutter is None:
+        return np.zeros(len(uv_px))
+    along, size_px = (1, camera.height_px) if shutter.direction in ("down", "up") else (0, camera.width_px)
+    share = np.nan_to_num(np.clip(uv_px[:, along] / size_px, 0.0, 1.0) - 0.5)
+    sign = 1.0 if shutter.direction in ("down", "right") else -1.0
+    return np.asarray(sign * shutter.readout_s * share)
+
+
+def project_moving(
+    camera: Camera, points: NDArray[np.floating[Any]], cam_T_points: Callable[[Array], Array]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Project points (N, 3), m, through a camera that moves while its image is read.
+
+    Parameters
+    ----------
+    points : (N, 3), m
+        In a frame in which they stand still.
+    cam_T_points : callable
+        Transforms (K, 4, 4) from that frame to the camera at times (K,), s, relative to the middle of the image.
+
+    Returns
+    -------
+    uv_px : (N, 2) float64
+        NaN where `project` gives NaN.
+    depth_m : (N,) float64
+        Along the optical axis at the time of the point's line.
+    valid : (N,) bool
+        In front of the camera and inside the image.
+
+    Notes
+    -----
+    The line in which a point appears depends on the pose at the time of that line: a fixed point, found by iteration from the
+    pose of the middle. It converges while the image of a point moves by less than the readout does.
+    """
+    shutter = camera.rolling_shutter
+    if shutter is None or shutter.readout_s <= 0:
+        local = _moved(points, cam_T_points(np.zeros(1))[0])
+        uv, valid = project(camera, local)
+        return uv, local[:, 2], valid
+    times = np.linspace(-0.5, 0.5, KNOTS) * shutter.readout_s
+    transforms = cam_T_points(times)
+    uv = project(camera, _moved(points, transforms[KNOTS // 2]))[0]
+    depth = np.zeros(len(points))
+    for _ in range(ITERATIONS):
+        place = (line_time_s(camera, uv) / shutter.readout_s + 0.5) * (KNOTS - 1)
+        uv, depth = _project_between(camera, points, transforms, place)
+    with np.errstate(invalid="ignore"):
+        valid = np.all((uv >= 0) & (uv < [camera.width_px, camera.height_px]), axis=1)
+    return uv, depth, valid
+
+
+def _project_between(
+    camera: Camera, points: NDArray[np.floating[Any]], transforms: Array, place: Array
+) -> tuple[Array, Array]:
+    """Interpolate the projections (N, 2) and depths (N,) of the two transforms around each place (N,) among them."""
+    before = np.minimum(place.astype(np.int64), KNOTS - 2)
+    weight = place - before
+    uv, depth = np.zeros((len(points), 2)), np.zeros(len(points))
+    for k in np.unique(before):
+        rows = before == k
+        for knot, share in ((k, 1 - weight[rows]), (k + 1, weight[rows])):
+            local = _moved(points[rows], transforms[knot])
+            uv[rows] += share[:, None] * project(camera, local)[0]
+            depth[rows] += share * local[:, 2]
+    return uv, depth
+
+
+def _moved(points: NDArray[np.floating[Any]], dst_T_src: Array) -> Array:
+    return np.asarray(points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3])
+
+
+MIN_CAMERA_HEIGHT_M = 1e-3
+
+
+def ground_homography(camera: Camera, dst_T_cam: Array, ground_z_m: float = 0.0) -> Array:
+    """Compute `ground_H_image` (3, 3) of the plane z = `ground_z_m` from a camera's calibration.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its lens distortion does not enter: pixels are to be undistorted.
+    dst_T_cam : (4, 4) float64
+        Pose of the camera in the frame of the ground positions.
+    ground_z_m : float
+        Height of the ground in that frame, m.
+
+    Returns
+    -------
+    (3, 3) float64
+        Its third row, applied to a pixel, is the inverse depth of the ground seen there: positive below the horizon.
+
+    Raises
+    ------
+    ValueError
+        When the camera lies in the plane, which it then sees edge-on.
+    """
+    if abs(dst_T_cam[2, 3] - ground_z_m) < MIN_CAMERA_HEIGHT_M:
+        raise ValueError(
+            f"camera '{camera.name}' lies in the ground plane z = {ground_z_m:g} m and cannot look onto it"
+        )
+    cam_T_dst = inverse(np.asarray(dst_T_cam, dtype=np.float64))
+    r, t = cam_T_dst[:3, :3], cam_T_dst[:3, 3]
+    image_H_ground = camera.K @ np.column_stack([r[:, 0], r[:, 1], r[:, 2] * ground_z_m + t])
+    return np.linalg.inv(image_H_ground).astype(np.float64)
+
+
+def apply_homography(ground_H_image: Array, uv_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Map pixels (N, 2) to the ground.
+
+    Returns
+    -------
+    xy_m : (N, 2) float64
+        Ground positions; NaN at and above the horizon.
+    below : (N,) bool
+        Whether the pixels lie below the horizon.
+    """
+    uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
+    q = uv @ ground_H_image[:, :2].T + ground_H_image[:, 2]
+    below = q[:, 2] > 0
+    return np.where(below[:, None], q[:, :2] / np.where(below, q[:, 2], 1.0)[:, None], np.nan), below
+
+
+def homography_jacobian(ground_H_image: Array, uv_px: ArrayLike) -> Array:
+    """Compute the derivatives (N, 2, 2) of ground positions by pixels (N, 2), m/px; unbounded at the horizon."""
+    uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
+    q = uv @ ground_H_image[:, :2].T + ground_H_image[:, 2]
+    xy = q[:, :2] / q[:, 2:]
+    slope = ground_H_image[None, :2, :2] - xy[:, :, None] * ground_H_image[None, 2:, :2]
+    return np.asarray(slope / q[:, 2, None, None])

@@ -8,15 +8,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.geometry.stamps import NS_PER_S
+from log2sim.files.documents import short_repr
 from log2sim.geometry.transforms import (
+    NS_PER_S,
     Array,
     quaternion_from_rotation,
     rotation_from_quaternion,
     slerp,
     transform,
 )
-from log2sim.numerals import short_repr
 
 # Poses of some logs are 1 ns apart; beyond the ends of a track motion is taken from poses at least this far apart, if there are.
 MIN_EXTRAPOLATION_BASE_NS = 10_000_000

@@ -1,4 +1,4 @@
-"""Rigid transforms, rotations and angles.
+"""Rigid transforms, rotations, angles and stamps in nanoseconds.
 
 Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
 Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
@@ -7,8 +7,40 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+NS_PER_S = 1_000_000_000
+
+
+def period_of(t_ns: NDArray[np.int64]) -> float:
+    """Return the median period of stamps (T,), s; 0 for a single one."""
+    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
+
+
+def nearest_index(stamps: NDArray[Any], t: ArrayLike) -> NDArray[np.int64]:
+    """Find the nearest stamp to each time.
+
+    Parameters
+    ----------
+    stamps : (F,) int64 ns or float64 s
+        In ascending order, at least one.
+    t : scalar or (T,)
+        In the unit of `stamps`.
+
+    Returns
+    -------
+    (T,) int64
+        Index into `stamps`; of two equally near ones the earlier.
+    """
+    t = np.atleast_1d(np.asarray(t))
+    after = np.minimum(np.searchsorted(stamps, t), len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = np.abs(stamps[before] - t) <= np.abs(stamps[after] - t)
+    return np.where(earlier, before, after).astype(np.int64, copy=False)
+
 
 Array = NDArray[np.float64]
 

@@ -3,29 +3,140 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Log
-from log2sim.documents import rounded
+from log2sim.datatypes import Fault, Log
 from log2sim.errors import ConfigError, LogError
+from log2sim.files.documents import rounded
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index, period_of
-from log2sim.localization.alignment import fit_to_given, level_on_ground
-from log2sim.localization.camera_motion import follow_camera, motion_camera
-from log2sim.localization.ego_sweeps import densest_lidar, lidars_on_ego, read_ego_sweep
-from log2sim.localization.estimate_figures import camera_figures, odometry_figures
-from log2sim.localization.given_poses import check_poses
-from log2sim.localization.lidar_bridge import bridge_by_lidar
-from log2sim.localization.odometry import Odometry, run_odometry
-from log2sim.localization.pose_choice import GIVEN, ORIGINS, PoseChoice
-from log2sim.localization.pose_faults import list_faults
-from log2sim.localization.registration import is_installed
+from log2sim.localization.camera_motion import CameraPath, follow_camera, motion_camera
+from log2sim.localization.given_poses import check_poses, list_faults
+from log2sim.localization.odometry import (
+    Odometry,
+    densest_lidar,
+    is_installed,
+    lidars_on_ego,
+    read_ego_sweep,
+    run_odometry,
+)
 from log2sim.localization.replaced import replace_poses
-from log2sim.localization.verdict import compare_with_given, unsure_share
+from log2sim.localization.verdict import (
+    bridge_by_lidar,
+    compare_with_given,
+    fit_to_given,
+    level_on_ground,
+    unsure_share,
+)
+
+ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera": "camera motion"}
+"""What a scenario says about the ego by the source of its poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseChoice:
+    """Where the poses of a run come from, and why.
+
+    Attributes
+    ----------
+    requested : str
+        As the settings say.
+    source : {"given", "lidar", "camera", "none"}
+        "none": no sensor is on an ego whose pose would have to be known.
+    reason : str
+        For people.
+    excess_m : mapping of str to float
+        How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
+        "apart"; empty where nothing was compared.
+    scatter_m : mapping of str to mapping of str to float
+        RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar".
+    estimate : mapping of str to Any
+        Figures of the odometry, JSON values; empty where none was run.
+    notes : tuple of str
+        What is doubtful about estimated poses.
+    during_ns : (int, int), optional
+        First and last stamp of what poses were estimated from; None for the whole log.
+    faults : tuple of Fault
+        Faults of given poses.
+    checked : bool
+        Whether given poses were checked, and repaired where that was needed.
+    """
+
+    requested: str
+    source: str
+    reason: str
+    excess_m: Mapping[str, float | None] = field(default_factory=dict)
+    scatter_m: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    estimate: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    during_ns: tuple[int, int] | None = None
+    faults: tuple[Fault, ...] = ()
+    checked: bool = True
+
+    @property
+    def origin(self) -> str:
+        """Name what the ego's path comes from."""
+        return ORIGINS.get(self.source, "none")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry `poses` of `schemas/report-1.json`."""
+        return {
+            "requested": self.requested,
+            "source": self.source,
+            "reason": self.reason,
+            "scatter_m": {name: dict(values) for name, values in self.scatter_m.items()},
+            "excess_m": dict(self.excess_m),
+            "estimate": dict(self.estimate),
+            "notes": list(self.notes),
+        }
+
+    def to_provenance(self) -> dict[str, Any]:
+        """Return what `localize_like` needs to find the same poses again."""
+        during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
+        return {"source": self.source, **during, **({} if self.checked else {"check": False})}
+
+
+GIVEN = PoseChoice("given", "given", "the log's own poses")
+
+
+def odometry_figures(found: Odometry) -> dict[str, Any]:
+    """Collect the figures of an odometry for the report."""
+    return {
+        "lidar": found.lidar,
+        "sweeps": found.sweeps,
+        "poses": len(found.t_ns),
+        "predicted": int(found.predicted.sum()),
+        "degenerate": int(found.degenerate.sum()),
+        "problems": found.problems,
+        "path_m": rounded(found.path_m, 3),
+        "overlap_median": _median(found.overlap),
+        "residual_median": _median(found.residual),
+        "constraint_median": _median(found.constraint),
+    }
+
+
+def camera_figures(found: CameraPath) -> dict[str, Any]:
+    """Collect the figures of camera motion for the report."""
+    steps = np.diff(found.start_T_ego[:, :3, 3], axis=0)
+    return {
+        "camera": found.camera,
+        "frames": found.frames,
+        "poses": len(found.t_ns),
+        "predicted": int(found.predicted.sum()),
+        "path_m": rounded(float(np.linalg.norm(steps, axis=1).sum()), 3),
+        "points_on_road_median": found.on_road,
+    }
+
+
+def _median(values: Array) -> float | None:
+    """Return the median of what is known, rounded."""
+    known = values[np.isfinite(values)]
+    return rounded(float(np.median(known)), 4) if len(known) else None
+
 
 # Without given poses odometry is still taken where up to this share of its poses is poorly held or predicted.
 MAX_UNSURE_SHARE_ALONE = 0.5
@@ -40,7 +151,6 @@ def localize(log: Log, config: Config, *, progress: Progress | None = None) -> t
 
     Parameters
     ----------
-    log : Log
     config : Config
         `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
     progress : callable, optional

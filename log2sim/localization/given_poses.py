@@ -1,4 +1,4 @@
-"""Poses of a log checked against what a vehicle can do: jumps, poses that freeze, and gaps, repaired as far as the motion around tells."""
+"""Poses of a log checked against what a vehicle can do, and repaired."""
 
 from __future__ import annotations
 
@@ -8,14 +8,130 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Fault, Log
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, yaw_of
-from log2sim.localization.checked_poses import CheckedPoses, Stretch
-from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR
-from log2sim.localization.path_noise import independent_noise
-from log2sim.localization.path_parts import Skip
-from log2sim.localization.path_repair import MAX_DENSE_S, Limits, RepairedPath, bridge, repair_path, runs_of
-from log2sim.localization.path_smoothing import smooth_path
-from log2sim.localization.pose_copies import leave_out_copies
+from log2sim.localization.path import (
+    MAX_DENSE_S,
+    POSITION_PRIOR,
+    YAW_PRIOR,
+    Limits,
+    RepairedPath,
+    Skip,
+    bridge,
+    independent_noise,
+    repair_path,
+    runs_of,
+    smooth_path,
+)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A time in which poses were repaired or are not known.
+
+    Attributes
+    ----------
+    kind : {"pose_jump", "frozen_poses", "gap", "skip", "copies"}
+        A skip is a step that stays: the position may have jumped, or stamps may miss some time.
+    first_ns, last_ns : int
+        Stamps of the first and the last pose in question; of a gap those around it.
+    shift_m, turn_rad : float
+        By how much poses were moved at most.
+    sigma_m : float
+        Largest standard deviation of a repaired position that is used.
+    unknown_s : float, s
+        For how long no pose is known well enough.
+    poses : int
+        Number of poses in question.
+    by : str
+        What bridges it.
+    """
+
+    kind: str
+    first_ns: int
+    last_ns: int
+    shift_m: float = 0.0
+    turn_rad: float = 0.0
+    sigma_m: float = 0.0
+    unknown_s: float = 0.0
+    poses: int = 0
+    by: str = "the motion around"
+
+    @property
+    def duration_s(self) -> float:
+        """Length, s."""
+        return (self.last_ns - self.first_ns) / NS_PER_S
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedPoses:
+    """Poses after the check.
+
+    Attributes
+    ----------
+    track : PoseTrack
+        The very poses that were given where nothing is wrong with them.
+    stretches : tuple of Stretch
+        In the order of time.
+    moved : bool
+        Whether given poses are not where they were, so that what was measured moves with them.
+    """
+
+    track: PoseTrack
+    stretches: tuple[Stretch, ...]
+    moved: bool = False
+
+
+# From rest a vehicle gets no farther than by this acceleration until the next pose; what is less is the last digit of a position.
+MAX_COPY_ACCELERATION_MPS2, MIN_COPY_STEP_M = 12.0, 0.1
+# One run or two may be poses that froze.
+MIN_RUNS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Copies:
+    """Poses without those that repeat others.
+
+    Attributes
+    ----------
+    track : PoseTrack
+        The very one that was given where none does.
+    first_ns, last_ns : int
+        Stamps of the first and the last copy.
+    worst_m : float
+        How far the ego has moved on at most.
+    """
+
+    track: PoseTrack
+    first_ns: int = 0
+    last_ns: int = 0
+    count: int = 0
+    worst_m: float = 0.0
+
+
+def leave_out_copies(track: PoseTrack) -> Copies:
+    """Leave out poses that are the same as the one before although the next one is far away, if that happens again and again."""
+    poses = track.map_T_ego
+    copy = np.append(False, (poses[1:] == poses[:-1]).all(axis=(1, 2)))
+    held, steps_m = [], []
+    for first, stop in runs_of(copy):
+        if stop == len(poses):
+            continue
+        dt_s = (track.t_ns[stop] - track.t_ns[stop - 1]) / NS_PER_S
+        step_m = float(np.linalg.norm(poses[stop, :3, 3] - poses[first, :3, 3]))
+        if step_m > max(MIN_COPY_STEP_M, MAX_COPY_ACCELERATION_MPS2 * dt_s**2):
+            held.append((first, stop))
+            steps_m.append(step_m)
+    if len(held) < MIN_RUNS:
+        return Copies(track)
+    rows = np.concatenate([np.arange(*run) for run in held])
+    last = len(poses) - int(np.argmin(copy[::-1]))
+    if last < len(poses) and len(poses) - last <= 2 * np.median([stop - first for first, stop in held]):
+        rows = np.append(rows, np.arange(last, len(poses)))
+    kept = np.setdiff1d(np.arange(len(poses)), rows)
+    thinned = replace(track, t_ns=track.t_ns[kept], map_T_ego=poses[kept])
+    return Copies(thinned, int(track.t_ns[rows[0]]), int(track.t_ns[rows[-1]]), len(rows), max(steps_m))
+
 
 # Vehicles on roads brake, speed up and turn with up to 10 m/s2; the rest is how their bodies pitch and bounce. They change their
 # yaw rate by less than 3 rad/s2 at the limit of their tires.
@@ -239,3 +355,130 @@ def _bridged(line: PoseTrack, evidence: _Evidence, around_ns: tuple[int, int]) -
     straight = line.at(t_ns[known])[0]
     turned = yaw.value[known, 0] - yaw_of(straight)
     return _Rows(t_ns[known], _placed(straight, xyz.value[known], turned), sigma_m[known], sigma_rad[known])
+
+
+# At 3 m/s2, which is brisk driving, a line between poses this far apart is off by 0.25 m; poses of 2 Hz are usual.
+MIN_SPARSE_S = float(np.sqrt(8 * 0.25 / 3.0))
+
+
+def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, int] | None) -> tuple[Fault, ...]:
+    """List the faults of given poses, those of the time that is used and of which something is recorded.
+
+    Parameters
+    ----------
+    stretches : sequence of Stretch
+        In the order of time.
+    during_ns : (int, int), optional
+        First and last stamp that is used; None for all.
+    """
+    if log.ego is None or not stretches:
+        return ()
+    records = np.unique(np.concatenate([stream.t_ns for stream in log.streams.values()] or [log.ego.t_ns]))
+    if during_ns is not None:
+        records = records[(records >= during_ns[0]) & (records <= during_ns[1])]
+    if not len(records):
+        return ()
+    ends_ns = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
+    relevant = [s for s in stretches if _concerns(s, records)]
+    skips = [_skip(s, int(records[0])) for s in relevant if s.kind == "skip"]
+    copies = [_copies(s, int(records[0])) for s in relevant if s.kind == "copies"]
+    wrong = [s for s in relevant if s.kind not in ("gap", "skip", "copies")]
+    # Where wrong poses are left out there is a gap, which is reported with them.
+    gaps = [
+        s
+        for s in relevant
+        if s.kind == "gap" and not any(w.first_ns < s.last_ns and s.first_ns < w.last_ns for w in wrong)
+    ]
+    repairs = [_repair(s, int(records[0]), ends_ns) for s in wrong]
+    lost = [_lost(s, int(records[0])) for s in gaps if s.unknown_s > 0]
+    sparse = [s for s in gaps if not s.unknown_s and s.duration_s >= MIN_SPARSE_S]
+    found = [*copies, *repairs, *skips, *lost, *([_sparse(sparse, int(records[0]))] if sparse else [])]
+    return tuple(sorted(found, key=lambda fault: fault.start_ns or 0))
+
+
+def _concerns(stretch: Stretch, records: NDArray[np.int64]) -> bool:
+    """Return whether something was recorded while poses are in question; of a gap between its ends."""
+    margin = 1 if stretch.kind == "gap" else 0
+    first, stop = np.searchsorted(records, [stretch.first_ns + margin, stretch.last_ns + 1 - margin])
+    return bool(stop > first)
+
+
+def _span(stretch: Stretch, start_ns: int) -> str:
+    first, last = (max((t - start_ns) / NS_PER_S, 0.0) for t in (stretch.first_ns, stretch.last_ns))
+    return f"from {first:.2f} to {last:.2f} s" if last > first else f"at {first:.2f} s"
+
+
+def _repair(stretch: Stretch, start_ns: int, ends_ns: tuple[int, int]) -> Fault:
+    """Describe a jump, or poses that froze."""
+    if stretch.kind == "frozen_poses":
+        what = f"the pose stays {_span(stretch, start_ns)} while the ego moves on by up to {stretch.shift_m:.1f} m"
+        done = f"{stretch.by} bridges it"
+    else:
+        by = [f"{stretch.shift_m:.1f} m"] if stretch.shift_m >= MIN_STEP_M else []
+        by += [f"{np.rad2deg(stretch.turn_rad):.1f} degrees"] if stretch.turn_rad >= MIN_STEP_RAD else []
+        what = f"the poses {_span(stretch, start_ns)} are off the others by {' and '.join(by)}, which no vehicle moves so fast"
+        done = "they are moved back"
+        if stretch.first_ns == ends_ns[0] or stretch.last_ns == ends_ns[1]:
+            done += " to those of the longer part, as which part is right does not show"
+    if stretch.unknown_s:
+        done += f"; for {stretch.unknown_s:.1f} s of it the pose is not known, and what was recorded then is left out"
+    values = {
+        "shift_m": round(stretch.shift_m, 3),
+        "turn_rad": round(stretch.turn_rad, 4),
+        "sigma_m": round(stretch.sigma_m, 3),
+        "duration_s": round(stretch.duration_s, 3),
+        "unknown_s": round(stretch.unknown_s, 3),
+    }
+    return Fault(
+        stretch.kind,
+        "ego",
+        f"{what}: {done}",
+        "left_out" if stretch.unknown_s else "corrected",
+        stretch.first_ns,
+        stretch.last_ns,
+        values,
+    )
+
+
+def _copies(stretch: Stretch, start_ns: int) -> Fault:
+    """Describe poses that repeat others."""
+    message = (
+        f"{stretch.poses} poses {_span(stretch, start_ns)} repeat the one before while the ego moves on by up to "
+        f"{stretch.shift_m:.1f} m, as those of a slower source do: they are not used"
+    )
+    values = {"shift_m": round(stretch.shift_m, 3), "poses": float(stretch.poses)}
+    return Fault("frozen_poses", "ego", message, "left_out", stretch.first_ns, stretch.last_ns, values)
+
+
+def _skip(stretch: Stretch, start_ns: int) -> Fault:
+    """Describe a step forward."""
+    message = (
+        f"the position steps by {stretch.shift_m:.1f} m {_span(stretch, start_ns)}, farther than a vehicle moves: it "
+        "jumped, or the stamps miss some time, which does not show; used as it is"
+    )
+    values = {"shift_m": round(stretch.shift_m, 3)}
+    return Fault("pose_jump", "ego", message, "kept", stretch.first_ns, stretch.last_ns, values)
+
+
+def _lost(stretch: Stretch, start_ns: int) -> Fault:
+    """Describe a gap that is too long to be bridged."""
+    message = (
+        f"no pose {_span(stretch, start_ns)}, too long for the motion around to bridge more than "
+        f"{max(stretch.duration_s - stretch.unknown_s, 0.0):.1f} s of it: what was recorded in the rest is left out"
+    )
+    values = {"duration_s": round(stretch.duration_s, 3), "unknown_s": round(stretch.unknown_s, 3)}
+    return Fault("sparse_poses", "ego", message, "left_out", stretch.first_ns, stretch.last_ns, values)
+
+
+def _sparse(gaps: Sequence[Stretch], start_ns: int) -> Fault:
+    """Describe gaps that are bridged."""
+    by = "the ego's motion" if gaps[0].by == Stretch.by else gaps[0].by
+    longest, sigma_m = max(s.duration_s for s in gaps), max(s.sigma_m for s in gaps)
+    whole = Stretch("gap", gaps[0].first_ns, gaps[-1].last_ns)
+    number = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+    message = (
+        f"poses are up to {longest:.2f} s apart {_span(whole, start_ns)} ({number}): {by} interpolates them, "
+        f"to {sigma_m:.2f} m (1 sigma)"
+    )
+    values = {"longest_s": round(longest, 3), "gaps": float(len(gaps)), "sigma_m": round(sigma_m, 3)}
+    return Fault("sparse_poses", "ego", message, "corrected", whole.first_ns, whole.last_ns, values)

@@ -1,18 +1,340 @@
-"""LiDAR odometry: poses of the ego from the sweeps of one LiDAR, registered one after the other with a map of the earlier ones."""
+"""LiDAR odometry: poses of the ego from the sweeps of one LiDAR, registered on a map of Gaussians.
+
+Voxelized GICP (Koide et al., ICRA 2021) as the library small_gicp implements it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log
-from log2sim.errors import LogError
-from log2sim.geometry import NS_PER_S, Array, transform
-from log2sim.localization.ego_sweeps import EgoSweep, compensated, read_ego_sweep, share_of_motion
-from log2sim.localization.registration import MIN_OVERLAP, Fit, SurfaceMap, motion_between
+from log2sim.datatypes import Log, Sweep
+from log2sim.errors import LogError, MissingExtra, RecordError
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    apply,
+    inverse,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    slerp,
+    transform,
+)
+
+# Transforms are interpolated between knots this far apart, which errs by 3e-6 rad at 1 rad/s: 0.3 mm at 100 m.
+KNOT_NS = 5_000_000
+MAX_KNOTS = 4096
+
+TransformAt = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
+"""Gives the transforms (K, 4, 4) at stamps (K,) and whether each is known."""
+
+
+def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T_src_at: TransformAt) -> Array | None:
+    """Transform points (N, 3), m, each by the transform at its own stamp (N,).
+
+    Returns
+    -------
+    (N, 3) float64, m, or None
+        None where a transform is not known.
+    """
+    if len(xyz_m) == 0:
+        return np.zeros((0, 3))
+    first, span = int(t_ns.min()), int(t_ns.max() - t_ns.min())
+    bins = min(-(-span // KNOT_NS), MAX_KNOTS)
+    if bins == 0:
+        dst_T_src, known = dst_T_src_at(np.array([first], dtype=np.int64))
+        return _moved(np.asarray(xyz_m, dtype=np.float64), dst_T_src[0]) if known.all() else None
+    knots = first + (np.arange(bins + 1) * span) // bins
+    dst_T_src, known = dst_T_src_at(knots)
+    if not known.all():
+        return None
+    place = (t_ns - first) * (bins / span)
+    k = np.minimum(place.astype(np.int64), bins - 1)
+    order = np.argsort(k, kind="stable")
+    edges = np.searchsorted(k[order], np.arange(bins + 1))
+    points, fraction = np.asarray(xyz_m, dtype=np.float64)[order], (place - k)[order, None]
+    out = np.empty_like(points)
+    for b in np.flatnonzero(np.diff(edges)).tolist():
+        rows = slice(edges[b], edges[b + 1])
+        begin = _moved(points[rows], dst_T_src[b])
+        out[rows] = begin + fraction[rows] * (_moved(points[rows], dst_T_src[b + 1]) - begin)
+    unsorted = np.empty_like(out)
+    unsorted[order] = out
+    return unsorted
+
+
+def _moved(points: Array, dst_T_src: Array) -> Array:
+    return np.asarray(points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3])
+
+
+# Nearer returns are of the ego's own body; farther ones are too sparse for surfaces.
+MIN_RANGE_M, MAX_RANGE_M = 2.5, 100.0
+# More points change neither the path nor the scatter of parked cars on recorded drives, and take time.
+MAX_POINTS = 60_000
+PROBED_SWEEPS = 3
+COVERAGE_VOXEL_M = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class EgoSweep:
+    """One sweep in the ego's frame.
+
+    Attributes
+    ----------
+    t_ref_ns : int
+        Stamp of the pose that the sweep gives, and to which it is compensated where `t_ns` is None.
+    xyz_m : (N, 3) float64, m
+        Points in the ego's frame; at their own times where `t_ns` is given.
+    t_ns : (N,) int64 or None
+        Stamps at which the points were measured; None where the ego's motion is out of them or their times are not known.
+    """
+
+    t_ref_ns: int
+    xyz_m: Array
+    t_ns: NDArray[np.int64] | None
+
+
+def lidars_on_ego(log: Log) -> list[str]:
+    """List the LiDARs on the ego that have records."""
+    return [
+        n for n, lidar in log.lidars.items() if lidar.mount == "ego" and n in log.streams and len(log.streams[n].t_ns)
+    ]
+
+
+def densest_lidar(log: Log) -> str | None:
+    """Choose the LiDAR on the ego whose sweeps show most of the surroundings; None without one that can be read.
+
+    One LiDAR alone, since those of one vehicle turn at different times: sweeps that are joined would need a motion for each.
+    """
+    names = lidars_on_ego(log)
+    if len(names) <= 1:
+        return names[0] if names else None
+    coverage = {name: _coverage(log, name) for name in names}
+    best = max(names, key=lambda name: coverage[name])
+    return best if coverage[best] else None
+
+
+def _coverage(log: Log, lidar: str) -> int:
+    """Count the voxels with points in one sweep; 0 where none of the first can be read."""
+    stream = log.streams[lidar]
+    for i in range(min(PROBED_SWEEPS, len(stream.t_ns))):
+        sweep = read_ego_sweep(log, lidar, i)
+        if sweep is not None and len(sweep.xyz_m):
+            return len(np.unique(np.floor(sweep.xyz_m / COVERAGE_VOXEL_M).astype(np.int64), axis=0))
+    return 0
+
+
+def read_ego_sweep(log: Log, lidar: str, index: int) -> EgoSweep | None:
+    """Read a sweep into the ego's frame; None where it cannot be read or, in the map frame, where the ego's pose is not known."""
+    try:
+        sweep: Sweep = log.streams[lidar].read(index)
+    except RecordError:
+        return None
+    return ego_sweep_of(log, lidar, sweep)
+
+
+def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:
+    """Bring a sweep into the ego's frame; points of the map frame go back by the log's own poses at their own times.
+
+    Of more than `MAX_POINTS` every second, third ... is taken.
+    """
+    ego_T_lidar = log.lidars[lidar].mount_T_lidar
+    step = max(-(-len(sweep.xyz_m) // MAX_POINTS), 1)
+    stamp_ns, t_ns = int(sweep.stamp_ns), None if sweep.t_ns is None else sweep.t_ns[::step]
+    measured = sweep.xyz_m[::step]
+    if sweep.frame == "map":
+        track = log.ego
+        if track is None:
+            return None
+        times = np.full(len(measured), stamp_ns, dtype=np.int64) if t_ns is None else t_ns
+        known = move_points(measured, times, lambda t: (inverse(track.at(t)[0]), track.at(t)[1]))
+        if known is None:
+            return None
+        xyz = known
+    else:
+        xyz = apply(ego_T_lidar, measured)
+        if sweep.compensated_ns is not None:
+            stamp_ns, t_ns = int(sweep.compensated_ns), None
+    away = np.linalg.norm(xyz - ego_T_lidar[:3, 3], axis=1)
+    near = (away > MIN_RANGE_M) & (away < MAX_RANGE_M)
+    return EgoSweep(stamp_ns, xyz[near], None if t_ns is None else t_ns[near])
+
+
+def compensated(sweep: EgoSweep, motion: Array, motion_s: float) -> Array:
+    """Take a constant motion out of a sweep: points (N, 3), m, in the ego's frame at its reference stamp.
+
+    Parameters
+    ----------
+    motion : (4, 4) float64
+        Pose of the ego after `motion_s` in its frame before.
+    motion_s : float, s
+    """
+    if sweep.t_ns is None or motion_s <= 0:
+        return sweep.xyz_m
+
+    def ref_T_ego(t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        share = (t_ns - sweep.t_ref_ns) / NS_PER_S / motion_s
+        return share_of_motion(motion, share), np.ones(len(t_ns), dtype=bool)
+
+    moved = move_points(sweep.xyz_m, sweep.t_ns, ref_T_ego)
+    return sweep.xyz_m if moved is None else moved
+
+
+def share_of_motion(motion: Array, share: Array) -> Array:
+    """Compute the parts (N, 4, 4) of a motion (4, 4) that is steady in the moving frame, for shares (N,) of its time.
+
+    Notes
+    -----
+    The translation is scaled, which leaves out the bend of the path: 4 mm in 0.1 s at 10 m/s and 0.3 rad/s.
+    """
+    q = np.repeat(quaternion_from_rotation(motion[:3, :3])[None], len(share), axis=0)
+    still = np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (len(share), 1))
+    return transform(rotation_from_quaternion(slerp(still, q, share)), share[:, None] * motion[:3, 3])
+
+
+VOXEL_M = 0.5
+MAP_VOXEL_M = 1.0
+NEIGHBORS = 10
+MAX_ITERATIONS = 30
+MIN_POINTS = 100
+# Share of the points that fall onto known surfaces: typical sweeps of a drive have 0.7 or more with their map; half of that is
+# left where a sweep shows another place.
+MIN_OVERLAP = 0.35
+# Surfaces are given a variance of 1e-3 along their normals by the library, and of 1 across them: a point on a surface square to
+# a direction adds 1 / (2 * 1e-3) of information about it, any other 1 / 2, so that a direction that nothing holds has a
+# constraint of 0.001. Noise of the normals raises that: simulated tunnels have 0.001 to 0.015, streets 0.006 to 0.1. Where it is
+# low, the fit is repeated from a start farther along that direction than a voxel; it is held if the fit comes back.
+INFORMATION_OF_POINT = 500.0
+MIN_CONSTRAINT, DOUBTFUL_CONSTRAINT = 0.002, 0.03
+PROBE_M = 1.5 * MAP_VOXEL_M
+MIN_RETURN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A registered sweep.
+
+    Attributes
+    ----------
+    pose : (4, 4) float64
+        Of the ego in the frame of the map.
+    overlap : float
+        Share of the sweep's points that fall onto known surfaces.
+    residual : float
+        Mean squared Mahalanobis distance of these points, without unit.
+    constraint : float
+        Share of points, as if all were square to it, that hold the weakest direction of translation.
+    weakest : (3,) float64
+        That direction, in the frame of the map.
+    covariance : (6, 6) float64
+        Of rotation vector and translation, rad and m; the inverse of the information matrix, hence optimistic.
+    """
+
+    pose: Array
+    overlap: float
+    residual: float
+    constraint: float
+    weakest: Array
+    covariance: Array
+
+
+def load_small_gicp() -> ModuleType:
+    """Import the library for registration.
+
+    Raises
+    ------
+    MissingExtra
+        Where it is not installed.
+    """
+    try:
+        import small_gicp
+    except ImportError:
+        raise MissingExtra("LiDAR odometry", "odometry") from None
+    module: ModuleType = small_gicp
+    return module
+
+
+def is_installed() -> bool:
+    """Return whether the library for registration is installed."""
+    try:
+        load_small_gicp()
+    except MissingExtra:
+        return False
+    return True
+
+
+class SurfaceMap:
+    """Surfaces of the sweeps so far, as one Gaussian in each voxel."""
+
+    def __init__(self) -> None:
+        self._library = load_small_gicp()
+        self._voxels = self._library.GaussianVoxelMap(MAP_VOXEL_M)
+
+    def surfaces_of(self, xyz_m: Array) -> Any:
+        """Thin out points (N, 3) and estimate their surfaces; None for fewer than `MIN_POINTS` of them."""
+        if len(xyz_m) < MIN_POINTS:
+            return None
+        surfaces, _ = self._library.preprocess_points(xyz_m, VOXEL_M, NEIGHBORS, 1)
+        return surfaces if surfaces.size() >= MIN_POINTS else None
+
+    def insert(self, surfaces: Any, pose: Array) -> None:
+        """Add surfaces of the ego's frame at a pose (4, 4); those without points for 100 sweeps are removed."""
+        self._voxels.insert(surfaces, pose)
+
+    def fit(self, surfaces: Any, guess: Array) -> Fit:
+        """Register surfaces from a guessed pose (4, 4)."""
+        found = self._library.align(self._voxels, surfaces, guess, max_iterations=MAX_ITERATIONS)
+        count = max(int(found.num_inliers), 1)
+        pose, information = np.array(found.T_target_source), np.array(found.H)
+        constraint, weakest = weakest_direction(information, count)
+        return Fit(
+            pose,
+            found.num_inliers / surfaces.size(),
+            2 * float(found.error) / count,
+            constraint,
+            pose[:3, :3] @ weakest,
+            np.linalg.pinv(information),
+        )
+
+    def holds(self, surfaces: Any, fit: Fit) -> bool:
+        """Return whether a fit holds every direction of motion, by fitting again from a start shifted along the weakest one."""
+        if not MIN_CONSTRAINT <= fit.constraint < DOUBTFUL_CONSTRAINT:
+            return fit.constraint >= DOUBTFUL_CONSTRAINT
+        shift = np.zeros((4, 4))
+        shift[:3, 3] = PROBE_M * fit.weakest
+        again = self._library.align(self._voxels, surfaces, fit.pose + shift, max_iterations=MAX_ITERATIONS)
+        stayed_m = float((np.array(again.T_target_source) - fit.pose)[:3, 3] @ fit.weakest)
+        return abs(stayed_m) < (1 - MIN_RETURN) * PROBE_M
+
+
+def weakest_direction(information: Array, points: int) -> tuple[float, Array]:
+    """Find the direction of translation that a registration holds least: its constraint and unit vector (3,), ego frame.
+
+    Parameters
+    ----------
+    information : (6, 6) float64
+        Of rotation and translation, in this order.
+
+    Notes
+    -----
+    The least eigenvalue of the information about translation alone, with rotation free (Zhang, Kaess, Singh, ICRA 2016, look at
+    the same eigenvalues).
+    """
+    rotation, both, translation = information[:3, :3], information[:3, 3:], information[3:, 3:]
+    alone = translation - both.T @ np.linalg.pinv(rotation) @ both
+    values, vectors = np.linalg.eigh((alone + alone.T) / 2)
+    return float(values[0]) / points / INFORMATION_OF_POINT, vectors[:, 0]
+
+
+def motion_between(first: Array, second: Array) -> Array:
+    """Compute the pose (4, 4) of the second in the frame of the first."""
+    return np.asarray(inverse(first) @ second)
+
 
 # Vehicles on roads brake with up to 10 m/s2; the rest is room for the error of two fits.
 MAX_ACCELERATION_MPS2, MAX_JUMP_M = 12.0, 0.5
@@ -31,7 +353,6 @@ class Odometry:
 
     Attributes
     ----------
-    lidar : str
     t_ns : (P,) int64
         Increasing stamps.
     odom_T_ego : (P, 4, 4) float64
@@ -74,7 +395,6 @@ def run_odometry(
 
     Parameters
     ----------
-    log : Log
     lidar : str
         One on the ego.
     during_ns : (int, int), optional

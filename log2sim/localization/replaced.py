@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels, Log, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, PoseTrack, apply, inverse, wrap_angle
-from log2sim.localization.moving_points import move_points
+from log2sim.localization.odometry import move_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,6 @@ class Replacement:
     ----------
     old : PoseTrack or None
         None where the log has no poses; then nothing but the ego is in its map.
-    new : PoseTrack
     """
 
     old: PoseTrack | None

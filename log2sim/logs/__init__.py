@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from log2sim.logs.opening import find_reader, open_log
-from log2sim.logs.reader import Reader
+from log2sim.logs.opening import Reader, find_reader, open_log
 
 __all__ = ["Reader", "find_reader", "open_log"]

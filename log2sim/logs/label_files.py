@@ -15,24 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, ImageRegions, Labels, Log
-from log2sim.documents import JSON_LIMIT_BYTES, read_json
 from log2sim.errors import LogError
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    rotation_from_quaternion,
-    rotation_from_rpy,
-    transform,
-    yaw_of,
-)
-from log2sim.input_files import read_file
+from log2sim.files.documents import JSON_LIMIT_BYTES, parse_float, parse_int, read_json
+from log2sim.files.inputs import read_file
+from log2sim.geometry import NS_PER_S, Array, rotation_from_quaternion, rotation_from_rpy, transform, yaw_of
+from log2sim.logs.checks import find_possible
 from log2sim.logs.kitti import labels as kitti
-from log2sim.logs.label_checks import find_possible
-from log2sim.logs.native.csv_tables import read_csv_table
-from log2sim.logs.native.labels import BOX_3D_COLUMNS, BOX_3D_OPTIONAL, boxes_3d
-from log2sim.logs.notes import count_words, note_damaged_rows
-from log2sim.logs.nuscenes import labels as nuscenes
-from log2sim.numerals import parse_float, parse_int
+from log2sim.logs.native.reader import BOX_3D_COLUMNS, BOX_3D_OPTIONAL, boxes_3d, read_csv_table
+from log2sim.logs.nuscenes import scene as nuscenes
+from log2sim.logs.stamps import count_words, note_damaged_rows
 
 EXPECTED = (
     "lines of KITTI's tracking labels, JSON of nuScenes (sample_annotation or results) or OpenLABEL, or a CSV table with the "

@@ -1,22 +1,88 @@
-"""Open a folder or a file of recorded data as a `Log` with the reader of its format."""
+"""Open a folder or a file of recorded data as a `Log` with the reader of its format; parts, digest and summary of logs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from log2sim import late_functions, registry
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, Log2SimError, LogError, PluginError
-from log2sim.links import following_links
-from log2sim.logs.calibration_checks import list_calibration_problems
-from log2sim.logs.guarding import guard_log, translate_parser_errors
-from log2sim.logs.label_checks import without_impossible_labels
-from log2sim.logs.reader import Reader
-from log2sim.logs.time_checks import list_time_problems
+from log2sim.files import plugins
+from log2sim.files.inputs import following_links
+from log2sim.logs.checks import list_calibration_problems, list_time_problems, without_impossible_labels
+from log2sim.logs.records import guard_log, translate_parser_errors
 
 __all__ = ["Reader", "find_reader", "open_log"]
+
+
+class Reader(Protocol):
+    """Reader of one log format.
+
+    To add a format, write a module with an object that has these members and register it: in `registry.BUILT_IN["log"]`,
+    or in another distribution as an entry point of the group "log2sim.log".
+
+    Attributes
+    ----------
+    name : str
+        Name that `--format` takes.
+    looks_for : str
+        What a folder of this format must contain, for messages.
+    suffixes : tuple of str
+        Of files that are logs by themselves, in lower case (".bag"); none for formats that are folders.
+
+    Notes
+    -----
+    A `Log` returned by `open` fulfills this contract:
+
+    - **Laziness.** `open` reads the index, calibration and poses. `Stream.read(i)` reads record i when it is called, from
+      any thread, and raises `RecordError` when that record is broken. Where stamps or labels must be read from large
+      files, they are deferred (`log2sim.datatypes.Deferred`).
+    - **Poses** are kept at every stamp at which the log holds one, be it that of an image or of a sweep: `Log.ego` is the union.
+      Its stamps may be 1 ns apart, so speeds are never differences of neighbors.
+    - **Stamps.** All stamps are int64 nanoseconds of one clock. `Stream.t_ns` increases strictly;
+      `log2sim.logs.stamps.strictly_increasing` sorts, drops repetitions and writes the notes. Fractions of seconds are
+      converted with `round`, never through float32.
+    - **Frames.** The map is local, x east, y north where that is known, z up, with coordinates small enough for float32
+      (move whole kilometers to `MapFrame.offset_m`). The ego frame is x forward, y left, z up; its origin is below the
+      middle of the rear axle, at `ground_z_ego_m` above the road. Cameras are x right, y down, z forward.
+      `mount_T_sensor` takes points of the sensor to its mount, the ego or, at the roadside, the map.
+    - **Sweeps.** `Sweep.stamp_ns` is the log's reference stamp, be it the start, the middle or the end of the turn. `t_ns` are the
+      times at which points were measured, or None. In frame "lidar" each point is in the sensor's frame at its own time, and the
+      motion of the ego is compensated downstream where there are times; with `compensated_ns` all points are in the sensor's frame
+      as it was at that stamp, as data sets that compensate give them. Frame "map" is compensated too. Rows are finite, in m.
+    - **Images** are (H, W, 3) uint8 BGR of the size of their calibration, never rotated. The stamp of an image is the middle of the
+      exposure of its middle line where the log states it. `Camera.distortion_model` is "none" for rectified images;
+      `Camera.rolling_shutter` says how lines are read. `Stream.encoded` gives the file of an image as the log holds it.
+    - **Labels** are in the map frame with sizes as length, width, height, centers of boxes, categories of
+      `log2sim.datatypes.CATEGORIES` and the stamp at which each object was measured, not that of the nearest frame.
+      `Labels.cameras` restricts them to objects in view of these cameras.
+    - **Errors.** An inconsistent log raises `LogError` that names file, record and what was expected; what the format lacks
+      goes into `Log.notes`. `digest` is a SHA-256 over index and calibration and over names and sizes of the records.
+    """
+
+    @property
+    def name(self) -> str:
+        """Name that `--format` takes."""
+
+    @property
+    def looks_for(self) -> str:
+        """What a folder of this format must contain."""
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """Suffixes of files that are logs by themselves."""
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the folder or file is a sequence of this format or holds some, by names and magic bytes alone."""
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences at `path`, sorted; one when it is itself a sequence. Never raises."""
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open the sequence of that name."""
+
 
 MAX_LISTED = 20
 # From a picture to the folder of its log.
@@ -40,13 +106,13 @@ def open_log(
     path : Path or str
         A sequence, or a folder that holds one or several; the file itself for formats of one file, such as a ROS bag.
     format : str
-        Name of a reader (`log2sim.registry.names("log")` lists them), or "auto" to find it.
+        Name of a reader (`log2sim.files.plugins.names("log")` lists them), or "auto" to find it.
     sequence : str, optional
         Which sequence of a root; needed only when it holds several.
     labels : Path or str, optional
         File with true boxes that take the place of those of the log; `log2sim.logs.label_files` has the formats.
     follow_links : bool, optional
-        Whether symbolic links may lead out of the log's folders. By default as in `log2sim.links.following_links`, else not.
+        Whether symbolic links may lead out of the log's folders. By default as in `log2sim.files.inputs.following_links`, else not.
 
     Raises
     ------
@@ -70,16 +136,16 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
     # Once: each asks which distributions are installed.
     usable = _usable_readers() if format == "auto" else None
     name = format if usable is None else _find_reader(root, usable)
-    reader: Reader = registry.load("log", name) if usable is None else usable.readers[name]
+    reader: Reader = plugins.load("log", name) if usable is None else usable.readers[name]
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
-    with registry.blaming("log", name):
+    with plugins.blaming("log", name):
         available = reader.sequences(root)
     chosen = _select_sequence(root, name, available, sequence)
     with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
-        with registry.blaming("log", name):
+        with plugins.blaming("log", name):
             opened = reader.open(root, chosen)
-        registry.require_type("log", name, opened, Log)
+        plugins.require_type("log", name, opened, Log)
         log = without_impossible_labels(guard_log(opened, str(root)))
     notes = [] if usable is None else [*_other_formats_note(root, name, usable.readers), *usable.defects]
     # Notes may wait for labels.
@@ -124,9 +190,9 @@ def _usable_readers() -> _UsableReaders:
     """Load all readers; a broken plug-in is told, and does not keep logs of other formats from being opened."""
     readers: dict[str, Reader] = {}
     defects = []
-    for name in registry.names("log"):
+    for name in plugins.names("log"):
         try:
-            readers[name] = registry.load("log", name)
+            readers[name] = plugins.load("log", name)
         except PluginError as error:
             defects.append(str(error))
     return _UsableReaders(readers, defects)
@@ -134,7 +200,7 @@ def _usable_readers() -> _UsableReaders:
 
 def _matches(name: str, reader: Reader, root: Path) -> bool:
     """Return whether a reader may read a path and matches it."""
-    with registry.blaming("log", name):
+    with plugins.blaming("log", name):
         return bool(_may_read(reader, root) and reader.matches(root))
 
 
@@ -166,7 +232,7 @@ def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:
 def _logs_below(root: Path) -> list[str]:
     """Return the logs below a folder, for who gave the folder of many; none where a short search finds none."""
     try:
-        return [str(log.path) for log in late_functions.call("find_logs", root, max_folders=MAX_FOLDERS_BELOW)]
+        return [str(log.path) for log in plugins.call("find_logs", root, max_folders=MAX_FOLDERS_BELOW)]
     except (Log2SimError, OSError):
         return []
 
@@ -183,11 +249,11 @@ def _may_read(reader: Reader, root: Path) -> bool:
 
 def _select_sequence(root: Path, name: str, available: list[str], sequence: str | None) -> str:
     if not available:
-        reader: Reader = registry.load("log", name)
+        reader: Reader = plugins.load("log", name)
         raise LogError(f"{root}: holds no sequence of format '{name}'; expected {reader.looks_for}")
     if sequence is not None:
         if sequence not in available:
-            hint = registry.nearest(sequence, available)
+            hint = plugins.nearest(sequence, available)
             raise ConfigError(f"{root}: no sequence '{sequence}'{hint}; there are: {_joined(available)}")
         return sequence
     if len(available) > 1:

@@ -1,11 +1,77 @@
-"""Order of the stamps of a stream."""
+"""Order of stamps, times of spinning LiDARs, notes of readers, and geodetic coordinates."""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NS_PER_S
+from log2sim.datatypes import MapFrame
+from log2sim.errors import LogError
+from log2sim.geometry import NS_PER_S, Array, rotation_from_rpy, transform
+
+
+def count_words(words: Iterable[str]) -> str:
+    """List words with their numbers, the most frequent first: "car (12), bus (1)"."""
+    counts = sorted(Counter(words).items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{word} ({count})" for word, count in counts)
+
+
+def note_left_out(kinds: Iterable[str], no_road_users: Collection[str], notes: list[str]) -> None:
+    """Note the labels that get no category.
+
+    Parameters
+    ----------
+    kinds : iterable of str
+        What the data set calls the object of each label that is left out.
+    no_road_users : collection of str
+        Kinds that are left out on purpose; others are not known.
+    notes : list of str
+        Takes a note for either of the two, where there are such labels.
+    """
+    kinds = list(kinds)
+    for reason, known in (("they are no road users", True), ("their kind is not known", False)):
+        words = [kind for kind in kinds if (kind in no_road_users) == known]
+        if words:
+            notes.append(f"labels left out because {reason}: {count_words(words)}")
+
+
+def note_damaged_rows(damaged: Sequence[str], total: int, notes: list[str]) -> None:
+    """Note the rows of a text that are left out because they cannot be read.
+
+    Parameters
+    ----------
+    damaged : sequence of str
+        Where each of them is and what is wrong with it.
+    total : int
+        Of all rows.
+    notes : list of str
+        Takes a note where there are such rows.
+
+    Raises
+    ------
+    LogError
+        When no row can be read.
+    """
+    if damaged and len(damaged) == total:
+        raise LogError(damaged[0])
+    if damaged:
+        notes.append(f"{len(damaged)} of {total} rows of labels are damaged and left out, first: {damaged[0]}")
+
+
+def defer_notes(notes: list[str], *readings: Callable[[], object]) -> Callable[[], tuple[str, ...]]:
+    """Return a function that reads what adds to the notes, such as the labels, and then returns the notes."""
+
+    def read() -> tuple[str, ...]:
+        for reading in readings:
+            reading()
+        return tuple(notes)
+
+    return read
+
 
 # Unix times beyond this do not fit into int64 nanoseconds.
 MAX_TIME_S = 9_000_000_000
@@ -83,3 +149,128 @@ def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.
         first = t_ns[order[repeated[0]]]
         notes.append(f"{what}: {len(repeated)} of {len(t_ns)} records repeat a stamp, first at stamp {first}; dropped")
     return np.delete(order, repeated), notes
+
+
+def compute_turn_share(xy_lidar: Array, start_azimuth_rad: float = np.pi) -> Array:
+    """Compute the share of a clockwise turn after which a LiDAR scans directions.
+
+    Parameters
+    ----------
+    xy_lidar : (N, >= 2) float64, m
+        Points, from the LiDAR.
+    start_azimuth_rad : float, rad
+        Direction in which the turn starts and ends, counter-clockwise from x, in (-pi, pi].
+
+    Returns
+    -------
+    (N,) float64
+        0 to 1; 1 only for directions that end the turn.
+    """
+    turned = (start_azimuth_rad - np.arctan2(xy_lidar[:, 1], xy_lidar[:, 0])) / (2 * np.pi)
+    return np.asarray(turned + (turned < 0))
+
+
+def compute_scan_offset_ns(xy_lidar: Array, turn_ns: int) -> NDArray[np.int64]:
+    """Compute the time (N,) at which a LiDAR scans directions, relative to the end of its turn.
+
+    Parameters
+    ----------
+    xy_lidar : (N, >= 2) float64, m
+        Points, from the LiDAR, which turns clockwise and starts and ends in the direction of -x.
+    turn_ns : int
+        Duration of the turn.
+    """
+    return np.round((compute_turn_share(xy_lidar) - 1) * turn_ns).astype(np.int64)
+
+
+def select_spaced(t_ns: NDArray[np.int64], track_id: NDArray[np.str_], min_step_ns: int) -> NDArray[np.intp]:
+    """Select the rows (M,) that keep the stamps of each track apart.
+
+    An object that crosses the direction in which the turns start is scanned at the end of one turn and at the start of the
+    next: the later one is dropped.
+
+    Parameters
+    ----------
+    t_ns : (N,) int64
+        Those of each track in the order of the turns.
+    track_id : (N,) str
+    min_step_ns : int
+        Rows sooner after the last one that was kept of their track are dropped.
+    """
+    last: dict[str, int] = {}
+    keep = []
+    for row, (t, track) in enumerate(zip(t_ns.tolist(), track_id.tolist())):
+        if track not in last or t - last[track] >= min_step_ns:
+            last[track] = t
+            keep.append(row)
+    return np.array(keep, dtype=np.intp)
+
+
+NORTH_STEP_DEG = 1e-5
+
+
+def map_frame_of(map_frame: MapFrame, latitude_deg: float, longitude_deg: float, altitude_m: float) -> MapFrame:
+    """Complete a map frame: the first fix becomes the origin where none is given, a transverse Mercator the projection."""
+    given = map_frame.latitude_deg is not None and map_frame.longitude_deg is not None
+    latitude = map_frame.latitude_deg if map_frame.latitude_deg is not None and given else latitude_deg
+    longitude = map_frame.longitude_deg if map_frame.longitude_deg is not None and given else longitude_deg
+    altitude = map_frame.altitude_m if map_frame.altitude_m is not None else altitude_m
+    return MapFrame(latitude, longitude, altitude, map_frame.projection or transverse_mercator(latitude, longitude))
+
+
+def transverse_mercator(latitude_deg: float, longitude_deg: float) -> str:
+    """PROJ string of a transverse Mercator projection about an origin, on the WGS 84 ellipsoid, in m."""
+    return f"+proj=tmerc +lat_0={latitude_deg!r} +lon_0={longitude_deg!r} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs"
+
+
+def poses_from_geodetic(map_frame: MapFrame, position: Array, attitude_rad: Array, *, where: str) -> Array:
+    """Poses (N, 4, 4) in projected coordinates of `map_frame`, before its offset is subtracted.
+
+    Yaw is counter-clockwise from true east and is turned to the grid's east by the meridian convergence.
+
+    Parameters
+    ----------
+    position : (N, 3) float64
+        Latitude and longitude in deg, altitude in m.
+    attitude_rad : (N, 3) float64, rad
+        Roll, pitch, yaw.
+    where : str
+        Names the projection in messages.
+
+    Raises
+    ------
+    LogError
+        When the projection is not one that PROJ knows or does not reach the points; begins with `where`.
+    """
+    forward = _projection(map_frame, where)
+    latitude_deg, longitude_deg, altitude_m = (np.ascontiguousarray(c) for c in position.T)
+    roll_rad, pitch_rad, yaw_rad = attitude_rad.T
+    x, y = forward(longitude_deg, latitude_deg)
+    north_x, north_y = forward(longitude_deg, latitude_deg + NORTH_STEP_DEG)
+    if not (np.isfinite(x).all() and np.isfinite(north_x).all()):
+        raise LogError(f"{where}: the projection '{map_frame.projection}' does not reach the GNSS fixes of the log")
+    convergence = np.arctan2(-(north_x - x), north_y - y)
+    z = altitude_m - (map_frame.altitude_m or 0.0)
+    return transform(rotation_from_rpy(roll_rad, pitch_rad, yaw_rad + convergence), np.stack([x, y, z], axis=-1))
+
+
+def geodetic_from_map(map_frame: MapFrame, xyz_m: Array, where: str) -> tuple[Array, Array, Array, Array]:
+    """Latitude, longitude (deg), altitude (m) and grid convergence (rad), each (N,), of local points (N, 3)."""
+    forward = _projection(map_frame, where)
+    x, y, z = (np.asarray(xyz_m) + map_frame.offset_m).T
+    longitude, latitude = forward(x, y, inverse=True)
+    north_x, north_y = forward(longitude, latitude + NORTH_STEP_DEG)
+    return latitude, longitude, z + (map_frame.altitude_m or 0.0), np.arctan2(-(north_x - x), north_y - y)
+
+
+def _projection(map_frame: MapFrame, where: str) -> Any:
+    from pyproj import Proj
+    from pyproj.exceptions import ProjError
+
+    try:
+        projection = Proj(map_frame.projection)
+    except ProjError:
+        raise LogError(f"{where}: '{map_frame.projection}' is not a projection that PROJ knows") from None
+    if projection.crs.is_geographic:
+        raise LogError(f"{where}: '{map_frame.projection}' has degrees, not meters; give a projected one")
+    return projection

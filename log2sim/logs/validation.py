@@ -9,9 +9,9 @@ import numpy as np
 
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import RecordError
+from log2sim.logs.excerpt import summarize_stamps
 from log2sim.logs.native.reader import READER
 from log2sim.logs.opening import open_log
-from log2sim.logs.summary import summarize_stamps
 
 MAX_POINT_DISTANCE_M = 1000.0
 

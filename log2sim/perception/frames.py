@@ -1,27 +1,55 @@
-"""Camera frames: records read, images decoded, detections in every frame but those between two empty ones."""
+"""Camera frames: records read, images decoded, detections in every frame, and a second look at pictures."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
+from log2sim.files.arrays import ArrayFile, ArrayList
+from log2sim.files.stages import StageClock
 from log2sim.perception.detect.detectors import Detector, detect_all
-from log2sim.perception.detection_cache import DetectionCache
-from log2sim.perception.light_boxes import MAX_CROPS, LightBox, crop_lights
-from log2sim.perception.picture_findings import PictureFindings
-from log2sim.perception.record_checks.records import RecordWatch
-from log2sim.perception.record_checks.thumbnails import Thumbnail, shrink
+from log2sim.perception.detection_cache import MAX_CROPS, DetectionCache, LightBox, PictureFindings, crop_lights
+from log2sim.perception.records import RecordWatch, Thumbnail, shrink
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
-from log2sim.stage_clock import StageClock
+
+Item = TypeVar("Item")
+Out = TypeVar("Out")
+
+BACKGROUND_THREADS = 2
+# Results that are made ahead of the one in use, which bounds the memory.
+AHEAD = 6
+
+
+def work_ahead(work: Callable[[Item], Out], items: Iterable[Item], ahead: int = AHEAD) -> Iterator[Out]:
+    """Yield what `work` makes of each item, in their order, made a few ahead by threads.
+
+    Reading, decompressing and arithmetic on arrays leave the interpreter to others meanwhile.
+    """
+    waiting: deque[Future[Out]] = deque()
+    pool = ThreadPoolExecutor(BACKGROUND_THREADS)
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        # Without waiting: an iterator that is left early may be closed by the garbage collector, in any thread, while that
+        # thread holds a lock that ending threads need.
+        pool.shutdown(wait=False, cancel_futures=True)
+
 
 # Of a frame that is not decoded.
 EMPTY: Thumbnail = np.zeros((0, 0), np.float32)
@@ -253,3 +281,92 @@ def _thumbnail_of(frame: Frame) -> Thumbnail | None:
         return shrink(frame.image())
     except RecordError:
         return None
+
+
+# Columns of a sweep with a row a point.
+COLUMNS = ("xyz_m", "t_ns", "intensity")
+
+
+class KeepingReader(RecordReader):
+    """Read records; the first `most` sweeps are kept in an `ArrayFile`, from where they come in milliseconds."""
+
+    def __init__(self, log: Log, most: int) -> None:
+        super().__init__(log)
+        self._most = most
+        self._kept: dict[tuple[str, int], tuple[Sweep, list[str], ArrayList]] = {}
+        self._file = ArrayFile()
+
+    def get(self, stream: str, index: int) -> Any | None:
+        """Read a record, or take it from those that are kept; None when it cannot be read."""
+        kept = self._kept.get((stream, index))
+        if kept is not None:
+            head, names, columns = kept
+            read: dict[str, Any] = dict(zip(names, columns, strict=True))
+            return replace(head, **read)
+        record = super().get(stream, index)
+        if isinstance(record, Sweep) and len(self._kept) < self._most:
+            self._keep((stream, index), record)
+        return record
+
+    def forget(self) -> None:
+        """Let go of all sweeps, and keep no more."""
+        self._most = 0
+        self._kept.clear()
+        self._file = ArrayFile()
+
+    def _keep(self, key: tuple[str, int], sweep: Sweep) -> None:
+        names = [name for name in COLUMNS if getattr(sweep, name) is not None]
+        columns = ArrayList([self._file.keep(getattr(sweep, name)) for name in names])
+        empty: dict[str, Any] = {name: getattr(sweep, name)[:0].copy() for name in names}
+        head = replace(sweep, **empty)
+        self._kept[key] = head, names, columns
+
+
+class PictureConsumer(Protocol):
+    """Something that is read from pictures."""
+
+    def frames(self) -> Mapping[str, NDArray[np.int64]]:
+        """Return the indices of the frames that it wants, by camera."""
+        ...
+
+    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
+        """Take a picture (H, W, 3); pictures come in the order of their stamps and are not to be changed."""
+        ...
+
+
+def look_again(
+    log: Log,
+    reader: RecordReader,
+    consumers: Sequence[PictureConsumer],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Give every consumer the pictures that it wants; return how many were decoded.
+
+    Pictures that cannot be read, that are black, or that repeat an earlier one are left out.
+    """
+    wanted = [consumer.frames() for consumer in consumers]
+    takers: dict[tuple[str, int], list[PictureConsumer]] = {}
+    for consumer, frames in zip(consumers, wanted, strict=True):
+        for camera, indices in frames.items():
+            for index in np.unique(indices).tolist():
+                takers.setdefault((camera, index), []).append(consumer)
+    order = sorted(takers, key=lambda key: (int(log.streams[key[0]].t_ns[key[1]]), key[0]))
+    for done, (camera, index, image, thumbnail) in enumerate(_decoded(reader, order)):
+        stamp_ns = int(log.streams[camera].t_ns[index])
+        if image is not None and reader.watch.cameras[camera].judge(stamp_ns, thumbnail) == "live":
+            for consumer in takers[camera, index]:
+                consumer.add(camera, index, image)
+        progress(done + 1, len(order))
+    return len(order)
+
+
+def _decoded(
+    reader: RecordReader, order: Sequence[tuple[str, int]]
+) -> Iterator[tuple[str, int, NDArray[np.uint8] | None, Thumbnail]]:
+    """Yield camera, index, picture (None where it cannot be read) and thumbnail, decoded a few ahead in threads."""
+
+    def decode(key: tuple[str, int]) -> tuple[str, int, NDArray[np.uint8] | None, Thumbnail]:
+        image = reader.get(*key)
+        return *key, image, np.zeros((0, 0), np.float32) if image is None else shrink(image)
+
+    return work_ahead(decode, order)

@@ -8,18 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.config_sections import TopdownConfig
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
 from log2sim.perception.first_pass import Observations, base_pose
-from log2sim.perception.homography.camera_fit import fit_camera
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import STREAM_METHODS, EstimationOptions
+from log2sim.perception.homography.estimate import (
+    STREAM_METHODS,
+    EstimationOptions,
+    fit_camera,
+    place_obstacle,
+    spanned_height_m,
+)
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
-from log2sim.perception.homography.placement import place_obstacle, spanned_height_m
-from log2sim.perception.homography.rig import Rig
+from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
-from log2sim.perception.homography.rig_plane import SAMPLES
 from log2sim.plan import HomographyScope, Plan
 
 # A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
@@ -46,8 +49,6 @@ class CameraHomography:
 
     Attributes
     ----------
-    camera : Camera
-    fit : HomographyFit
     source : str
         What it was fitted to, "calibration and flat ground" where a fit was refused, "none" where there is none.
     refusal : str
@@ -70,14 +71,8 @@ class CameraHomography:
         return self.fit.at_tick(tick) if self.rig is None else self.rig.road_at_tick(self.camera.name, tick)
 
 
-def estimation_options(config: TopdownConfig) -> EstimationOptions:
-    """Make the options of the estimator from the settings."""
-    together = config.rig == "together"
-    return EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=together)
-
-
 def fit_homographies(
-    log: Log, observed: Observations, plan: Plan, options: EstimationOptions, *, rng: np.random.Generator
+    log: Log, observed: Observations, plan: Plan, config: TopdownConfig, *, rng: np.random.Generator
 ) -> dict[str, CameraHomography]:
     """Fit the cameras that need a homography, by the scope of the plan.
 
@@ -86,6 +81,7 @@ def fit_homographies(
     """
     if plan.homography is HomographyScope.NONE:
         return {}
+    options = EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=config.rig == "together")
     wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
     together, why_apart = _fit_together(log, observed, plan, options, rng) if wanted else ({}, {})
     apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF
 from log2sim.geometry import Array
-from log2sim.prediction.motion_table import Complex, MotionTable
-from log2sim.prediction.smoothing import MIN_COURSE_MPS
+from log2sim.prediction.motion_table import MIN_COURSE_MPS, Complex, MotionTable
 
 SPACING_M = 0.5
 """Of the points of a path: the middle of a chord on a circle of 6 m is 5 mm off."""
@@ -180,8 +179,6 @@ def follow(paths: Paths, places: Places, speed_mps: Array, lead_s: Array) -> tup
 
     Parameters
     ----------
-    paths : Paths
-    places : Places
     speed_mps : (Q,) float64, m/s
     lead_s : (H,) float64, s
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from log2sim.errors import ConfigError
-from log2sim.registry import nearest
+from log2sim.files.plugins import nearest
 from log2sim.simulation.simulators import ExternalSimulator
 
 SIMULATORS = ("own", "carla")

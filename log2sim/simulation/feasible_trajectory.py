@@ -46,9 +46,6 @@ class FeasibilityLimits:
     ----------
     offset_m : float
         From the rear axle forward to the box center.
-    max_curvature_1pm : float
-    max_curvature_rate_1pmps : float
-    max_accel_mps2 : float
     max_lateral_mps2 : float
         Below the 9 m/s2 of a dry road; the rest is left to the controller.
     """
@@ -183,7 +180,6 @@ class _LeastSquares:
         Spacing of the knots.
     logged : (K, 4) float64
         Box center x, y, yaw and speed at the knots.
-    limits : FeasibilityLimits
     """
 
     h_s: float

@@ -36,7 +36,6 @@ class ControllerGains:
         At walking pace errors decay over this distance, since a car cannot move sideways.
     integral_s : float, s
     derivative_filter_s : float, s
-    damping : float
     point_s : float, s
         Time constant of point masses.
     hold_below_mps, hold_brake_mps2, hold_within_m : float
@@ -44,7 +43,6 @@ class ControllerGains:
         drives up.
     max_lateral_accel_mps2 : float
         Grip of a dry road.
-    integral_limit_mps2 : float
     integral_share : float
         Limit of the lateral integral, as a share of the curvature that steering and grip allow.
     max_along_m : float, m

@@ -1,4 +1,4 @@
-"""Groups of agents that are driven alike: placed ones, vehicles, pedestrians, and the vehicle of the user's policy.
+"""Groups of agents that are driven alike, the clock and the recording of a replay, and what the ego's policy observes.
 
 A group owns the state of its agents; the simulator that steps it is stateless. All columns are (A,) over the agents of
 the group that live in the present window of time; `live` holds their indices in the group.
@@ -6,15 +6,18 @@ the group that live in the present window of time; `live` holds their indices in
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array, cos_sin, wrap_angle
+from log2sim.simulation.corridors import SPACING_M, PathTable
 from log2sim.simulation.follower import (
     ControllerMemory,
     control_step,
@@ -23,11 +26,62 @@ from log2sim.simulation.follower import (
     start_points,
     start_vehicles,
 )
-from log2sim.simulation.policy import Controls
+from log2sim.simulation.policy import (
+    PATH_AHEAD_M,
+    ROUTE_AHEAD_S,
+    ROUTE_STEP_S,
+    Controls,
+    EgoState,
+    Observation,
+    Others,
+    PathAhead,
+    Route,
+)
 from log2sim.simulation.reference import GRID_S, Reference
 from log2sim.simulation.simulators import Simulator
 from log2sim.simulation.vehicles.model_choice import with_slip_states
 from log2sim.simulation.vehicles.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
+
+STORE_S = 0.05  # spacing of stored states, about 20 Hz
+MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10 ms
+
+
+@dataclass(frozen=True)
+class StepClock:
+    """Steps at `begin_s + n * dt_s` for n in [0, `steps`).
+
+    Attributes
+    ----------
+    begin_s : float, s
+    dt_s : float, s
+        Length of a step.
+    """
+
+    begin_s: float
+    dt_s: float
+    steps: int
+
+    @classmethod
+    def spanning(cls, begin_s: float, end_s: float, dt_s: float) -> StepClock:
+        """Create the clock whose steps cover `begin_s` to `end_s`."""
+        return cls(begin_s, dt_s, math.floor((end_s - begin_s) / dt_s + MARGIN) + 1)
+
+    @property
+    def store_every(self) -> int:
+        """States are stored at every so many steps."""
+        return max(1, round(STORE_S / self.dt_s))
+
+    def time(self, step: int) -> float:
+        """Return the time of a step in s."""
+        return self.begin_s + step * self.dt_s
+
+    def first_step(self, t_s: Array) -> NDArray[np.intp]:
+        """Return the first steps at or after times (N,)."""
+        return np.ceil((t_s - self.begin_s) / self.dt_s - MARGIN).astype(np.intp)
+
+    def last_step(self, t_s: Array) -> NDArray[np.intp]:
+        """Return the last steps at or before times (N,)."""
+        return np.floor((t_s - self.begin_s) / self.dt_s + MARGIN).astype(np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,3 +327,154 @@ def _copy_rows(window: Array, reference: Reference, row0: int) -> None:
     window[:low] = columns[0]
     window[low:high] = columns[low - begin : high - begin]
     window[high:] = columns[-1]
+
+
+RecordedTracks = dict[str, tuple[NDArray[np.intp], Array]]
+"""By agent id: the stored steps (S,) and the columns (C, S) of `Snapshot` at these steps."""
+
+COLUMNS = tuple(f.name for f in fields(Snapshot))
+
+
+class WindowRecording:
+    """Snapshots of a group at every `every`-th step of a window [begin, end), in one array (S, C, A)."""
+
+    def __init__(self, group: AgentGroup, begin: int, end: int, every: int) -> None:
+        self.group, self.live = group, group.live
+        self.steps = np.arange(-(-begin // every) * every, end, every)
+        self.rows = np.empty((len(self.steps), len(COLUMNS), len(group.live)))
+        self.count = 0
+
+    def add(self) -> None:
+        """Store the present state of the group."""
+        snapshot = self.group.snapshot()
+        for column, name in zip(self.rows[self.count], COLUMNS):
+            column[:] = getattr(snapshot, name)
+        self.count += 1
+
+    def lives(self) -> Iterable[tuple[str, NDArray[np.intp], Array]]:
+        """Yield what was stored by agent, cut to its lifetime: id, steps (S,) and columns (C, S)."""
+        group, steps = self.group, self.steps[: self.count]
+        begin = np.searchsorted(steps, group.first[self.live])
+        end = np.searchsorted(steps, group.last[self.live], side="right")
+        for slot, i in enumerate(self.live):
+            alive = slice(begin[slot], end[slot])
+            if begin[slot] < end[slot]:
+                yield group.agents[i].id, steps[alive], self.rows[alive, :, slot].T
+
+
+def merged_tracks(records: Iterable[WindowRecording]) -> RecordedTracks:
+    """Join the recordings of each agent in order of time."""
+    parts: dict[str, list[tuple[NDArray[np.intp], Array]]] = {}
+    for record in records:
+        for agent, steps, columns in record.lives():
+            parts.setdefault(agent, []).append((steps, columns))
+    return {k: (np.concatenate([s for s, _ in v]), np.concatenate([c for _, c in v], axis=1)) for k, v in parts.items()}
+
+
+ONE = np.zeros(1, dtype=np.intp)
+
+
+class PolicyObserver:
+    """Observations for the one vehicle that a policy drives, among all groups and static agents."""
+
+    def __init__(
+        self, ego: PolicyVehicle, groups: Sequence[AgentGroup], statics: Sequence[Agent], sight_m: float
+    ) -> None:
+        self.ego, self.sight_m = ego, sight_m
+        self._trajectory = ego.references[0].trajectory
+        self._path_table = PathTable([self._trajectory])
+        self._groups = [g for g in groups if g is not ego]
+        self._statics = _static_poses(statics)
+        lives = [(-np.inf, np.inf) if a.is_permanent else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
+        self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
+        self._agents = [_identities(g.agents, [r.trajectory for r in g.references]) for g in self._groups]
+        self._static_agents = _identities(statics, [Trajectory.through(a.waypoints, 0.0) for a in statics])
+        self.restart()
+
+    def restart(self) -> None:
+        """Start again at the beginning of the path."""
+        self.progress_m = 0.0
+
+    def __call__(self, step: int, t_s: float, dt_s: float) -> Observation:
+        """Build the observation at a step; steps must be in order."""
+        ahead = self._ahead()
+        ego = self._state()
+        return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
+
+    def _state(self) -> EgoState:
+        """Build the ego's state, at the height of its path in the scenario at `progress_m`."""
+        agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
+        log_t_s = self._path_table.times(ONE, np.array([self.progress_m]))
+        return EgoState(
+            x_m=float(s.x_m[0]),
+            y_m=float(s.y_m[0]),
+            z_m=float(self._trajectory.heights(log_t_s)[0]),
+            yaw_rad=float(s.yaw_rad[0]),
+            speed_mps=float(s.speed_mps[0]),
+            accel_mps2=float(s.accel_mps2[0]),
+            steer_rad=float(s.steer_rad[0]),
+            length_m=agent.size_m[0],
+            width_m=agent.size_m[1],
+            height_m=agent.size_m[2],
+            wheelbase_m=float(p.wheelbase_m[0]),
+            rear_axle_offset_m=float(p.rear_axle_offset_m[0]),
+            understeer_s2pm2=float(p.understeer_s2pm2[0]),
+        )
+
+    def _route(self, t_s: float) -> Route:
+        ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._trajectory.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
+        x, y, _, yaw, speed = self._trajectory.at(ahead)
+        return Route(*(_read_only(c) for c in (ahead, x, y, yaw, speed)))
+
+    def _ahead(self) -> PathAhead:
+        table, now = self._path_table, self.ego.snapshot()
+        self.progress_m = table.progress_near(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
+        ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
+        x, y, cos, sin, at_s = table.along(ONE, self.progress_m + ahead)
+        pace = np.abs(table.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)
+        columns = (ahead, x + table.origin_m[0], y + table.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
+        return PathAhead(self.progress_m, *(_read_only(c) for c in columns))
+
+    def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
+        begin_s, end_s = self._static_lives_s.T
+        here = (begin_s <= t_s) & (t_s <= end_s)
+        poses, who, log_s = [self._statics[:, here]], [self._static_agents[here]], [np.full(here.sum(), t_s)]
+        for group, agents in zip(self._groups, self._agents):
+            if len(group.live):
+                present = (group.first[group.live] <= step) & (step <= group.last[group.live])
+                s = group.snapshot()
+                poses.append(np.stack([s.x_m, s.y_m, s.yaw_rad, s.speed_mps])[:, present])
+                who.append(agents[group.live[present]])
+                log_s.append(group.log_times(t_s)[present])
+        x, y, yaw, speed = np.concatenate(poses, axis=1)
+        distance = np.hypot(x - ego.x_m, y - ego.y_m)
+        near = np.argsort(distance, kind="stable")
+        near = near[distance[near] <= self.sight_m]
+        x, y, yaw, speed, seen = x[near], y[near], yaw[near], speed[near], np.concatenate(who)[near]
+        z = np.array(
+            [trajectory.heights(t) for trajectory, t in zip(seen["trajectory"], np.concatenate(log_s)[near])],
+            dtype=np.float64,
+        )
+        size = (seen[k] for k in ("length_m", "width_m", "height_m"))
+        columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
+        return Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))
+
+
+def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray[Any]:
+    """Return id, category, size and trajectory in the scenario of agents as records (A,)."""
+    rows = [(a.id, a.category, *a.size_m, trajectory) for a, trajectory in zip(agents, trajectories)]
+    sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
+    return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("trajectory", object)])
+
+
+def _static_poses(agents: Sequence[Agent]) -> Array:
+    """Return x, y, yaw and speed (4, A) of static agents."""
+    first = [(a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.yaw_rad[0], 0.0) for a in agents]
+    return np.array(first, dtype=np.float64).reshape(-1, 4).T
+
+
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the array protected against writing, strings as such and not as objects."""
+    out = values.astype(str) if values.dtype == object else np.ascontiguousarray(values)
+    out.setflags(write=False)
+    return out

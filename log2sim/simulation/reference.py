@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Trajectory
-from log2sim.datatypes.trajectory import hermite
+from log2sim.datatypes.agent import hermite
 from log2sim.geometry import Array
 from log2sim.simulation.feasible_trajectory import (
     KNOT_S,
@@ -49,7 +49,6 @@ class Reference:
     ----------
     trajectory : Trajectory
         The box centers in the scenario.
-    first_row : int
     columns : (K, C) float64
         `VEHICLE_COLUMNS`, `POINT_COLUMNS`, or x, y, yaw, speed.
     exact : callable

@@ -11,14 +11,19 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent
 from log2sim.simulation.follower import control_step
-from log2sim.simulation.groups import AgentGroup, PolicyVehicle
-from log2sim.simulation.observer import PolicyObserver
+from log2sim.simulation.groups import (
+    AgentGroup,
+    PolicyObserver,
+    PolicyVehicle,
+    RecordedTracks,
+    StepClock,
+    WindowRecording,
+    merged_tracks,
+)
 from log2sim.simulation.policy import SIGHT_M, Controls, Observation, Policy, query_policy
-from log2sim.simulation.reactive.traffic import Traffic
-from log2sim.simulation.recording import RecordedTracks, WindowRecording, merged_tracks
+from log2sim.simulation.reactive import Traffic
 from log2sim.simulation.reference import GRID_S
 from log2sim.simulation.simulators import ExternalSimulator
-from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.model_choice import ModelChoice
 
 WINDOW_S = 10.0  # reference tables are at hand for the agents that live within this time

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from log2sim import registry
 from log2sim.datatypes import Agent
 from log2sim.errors import PluginError
+from log2sim.files import plugins
 from log2sim.simulation.vehicles.vehicle import (
     PointControls,
     PointState,
@@ -99,8 +99,8 @@ def load_step(model: str) -> VehicleStep:
     PluginError
         When one of another package cannot be used.
     """
-    step: VehicleStep = registry.load("vehicle_model", model)
-    return step if registry.is_built_in("vehicle_model", model) else _checked(step, model)
+    step: VehicleStep = plugins.load("vehicle_model", model)
+    return step if plugins.is_built_in("vehicle_model", model) else _checked(step, model)
 
 
 def _checked(step: VehicleStep, model: str) -> VehicleStep:
@@ -109,14 +109,14 @@ def _checked(step: VehicleStep, model: str) -> VehicleStep:
     def checked(
         state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
     ) -> VehicleState:
-        with registry.blaming("vehicle_model", model):
+        with plugins.blaming("vehicle_model", model):
             after = step(state, controls, parameters, dt_s)
-        registry.require_type("vehicle_model", model, after, VehicleState)
+        plugins.require_type("vehicle_model", model, after, VehicleState)
         for key in ("x_m", "y_m", "yaw_rad", "speed_mps"):
             column = np.asarray(getattr(after, key))
             if column.shape != state.x_m.shape or not np.isfinite(column).all():
                 raise PluginError(
-                    f"{registry.say_plugin('vehicle_model', model)}: {key} is {column!s:.80}, expected {len(state.x_m)} finite "
+                    f"{plugins.say_plugin('vehicle_model', model)}: {key} is {column!s:.80}, expected {len(state.x_m)} finite "
                     "numbers, one for each vehicle"
                 )
         return after

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from log2sim.synth.scene import Scene, load_scene
-from log2sim.synth.write import synthesize, write_synthetic
+from log2sim.synth.synthesis import synthesize, write_synthetic
 
 __all__ = ["Scene", "load_scene", "synthesize", "write_synthetic"]

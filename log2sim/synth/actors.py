@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry import NS_PER_S, Array, Mount, rotation_from_rpy, transform, wrap_angle
-from log2sim.synth import people, vehicles
+from log2sim.synth import shapes
 from log2sim.synth.motion import PathStates, TimedPath
+from log2sim.synth.paint import Appearance
 from log2sim.synth.scene import AgentSpec, Ego, Scene
 from log2sim.synth.shapes import Mesh
-from log2sim.synth.surfaces import Appearance
 
 EGO_COLOR = (198, 200, 204)  # as sensors at the roadside see it
 
@@ -48,8 +48,6 @@ class Actor:
 
     Attributes
     ----------
-    spec : AgentSpec
-    appearance : Appearance
     path : TimedPath or None
         None for a parked one.
     parked : (float, float, float) or None
@@ -84,18 +82,18 @@ class Actor:
         """Return the shape at a time, agent frame."""
         size, category = self.spec.box_m, self.spec.category
         if category == "car":
-            return vehicles.car(size, self.spec.shape)
+            return shapes.car(size, self.spec.shape)
         if category == "truck":
-            return vehicles.truck(size)
+            return shapes.truck(size)
         if category == "bus":
-            return vehicles.bus(size)
+            return shapes.bus(size)
         state = self.at(t_s)
         if category == "cyclist":
-            turn = state.distance_m[0] / people.PEDAL_M + self.appearance.seed / 7
-            return people.cyclist(size, int(np.floor(turn * people.PHASES)) % people.PHASES)
-        turn = state.distance_m[0] / (people.STRIDE_M * size[2] / 1.75) + self.appearance.seed / 7
-        phase = int(np.floor(turn * people.PHASES)) % people.PHASES
-        return people.pedestrian(size, phase, self.path is None)
+            turn = state.distance_m[0] / shapes.PEDAL_M + self.appearance.seed / 7
+            return shapes.cyclist(size, int(np.floor(turn * shapes.PHASES)) % shapes.PHASES)
+        turn = state.distance_m[0] / (shapes.STRIDE_M * size[2] / 1.75) + self.appearance.seed / 7
+        phase = int(np.floor(turn * shapes.PHASES)) % shapes.PHASES
+        return shapes.pedestrian(size, phase, self.path is None)
 
 
 def actors_of(scene: Scene) -> tuple[Actor, ...]:
@@ -159,8 +157,6 @@ class MovingScene:
 
     Attributes
     ----------
-    scene : Scene
-    ego : EgoMotion or None
     actors : tuple of Actor
         Without the ego.
     ego_body : Actor or None

@@ -1,23 +1,113 @@
-"""The static parts of a scene: the ground and facades."""
+"""The static parts of a scene: ground, terrain and facades."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, box_corners_bev
-from log2sim.synth.grain import grain
-from log2sim.synth.ground import Ground
-from log2sim.synth.light import light_of
-from log2sim.synth.markings import GroundPlan
+from log2sim.synth.ground import GROUND_M_PER_PX, LEVELS, MEADOW, TILE_PX, Ground, GroundPlan, grain
+from log2sim.synth.light import FAR_M, MIN_FALL, Image, Light, RenderCamera, Texture, light_of, linear
 from log2sim.synth.polytope_caster import Terrain
-from log2sim.synth.scene import Scene
-from log2sim.synth.scene_places import Building
+from log2sim.synth.scene import Building, Scene
+
+NEWTON_STEPS = 3
+MAX_ERROR_M = 0.05  # of the terrain's height where a ray meets it
+MAX_MOSAIC_TILES = 24  # along a side: 113 MB at most
+REACH_M = 250.0  # beyond which the ground is as level as it is under the camera
+Flags = NDArray[np.bool_]
+
+
+def draw_terrain(
+    view: RenderCamera, ground: Ground, terrain: Terrain, light: Light, color: Image, depth: Image
+) -> None:
+    """Draw the ground below the horizon."""
+    by_column, by_row = view.rays()
+    fall = -(by_row[:, None, 2] + by_column[None, :, 2])
+    rows = np.flatnonzero((fall > MIN_FALL).any(1))
+    if len(rows) == 0:
+        return
+    band = slice(int(rows[0]), int(rows[-1]) + 1)
+    dx = by_row[band, None, 0] + by_column[None, :, 0]
+    dy = by_row[band, None, 1] + by_column[None, :, 1]
+    eye = view.map_T_cam[:3, 3].astype(np.float32)
+    under = terrain.height(eye[:1], eye[1:2]) + terrain.relief(eye[:1], eye[1:2])
+    level = np.maximum(eye[2] - under[0], np.float32(0.1)) / np.maximum(fall[band], np.float32(1e-6))
+    level = np.minimum(level, np.float32(FAR_M))
+    away, met = _distances(terrain, eye, (dx, dy, -fall[band]), np.minimum(level, np.float32(REACH_M)))
+    away = np.where(met, away, level)
+    seen = met | (fall[band] > MIN_FALL)
+    x, y = eye[0] + away * dx, eye[1] + away * dy
+    lit = linear(_sampled(ground, view, x, y, away, seen), light.on_ground())
+    color[band][seen], depth[band][seen] = lit[seen], away[seen]
+
+
+def _distances(
+    terrain: Terrain, eye: NDArray[np.float32], ray: tuple[Image, Image, Image], start: Image
+) -> tuple[Image, Flags]:
+    """Depth (H, W) at which rays meet the terrain by Newton's method, and whether they do."""
+    dx, dy, dz = (np.ravel(r) for r in ray)
+    t = start.ravel().copy()
+    for _ in range(NEWTON_STEPS):
+        x, y = eye[0] + t * dx, eye[1] + t * dy
+        sx, sy = terrain.slope(x, y)
+        slope = dz - sx * dx - sy * dy
+        error = eye[2] + t * dz - terrain.height(x, y)
+        t -= error / np.minimum(slope, np.float32(-1e-3))
+        np.clip(t, 0.1, 2 * REACH_M, out=t)
+    x, y = eye[0] + t * dx, eye[1] + t * dy
+    met = np.abs(eye[2] + t * dz - terrain.height(x, y)) < MAX_ERROR_M
+    sx, sy = terrain.slope(x, y)
+    t += terrain.relief(x, y) / np.minimum(dz - sx * dx - sy * dy, np.float32(-0.02))
+    return t.reshape(start.shape), met.reshape(start.shape) & (t.reshape(start.shape) < REACH_M)
+
+
+def _sampled(ground: Ground, view: RenderCamera, x: Image, y: Image, away: Image, seen: Flags) -> Texture:
+    """Colors (H, W, 3) of positions, for each row from the level of tiles whose resolution fits."""
+    middle = np.median(away, axis=1)
+    slanted = np.sqrt(np.maximum(middle / max(float(view.map_T_cam[2, 3]), 0.5), 1.0))
+    footprint = middle / view.K[0, 0] * slanted
+    level = np.clip(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0)), 0, LEVELS - 1).astype(int)
+    out = np.empty((*x.shape, 3), np.uint8)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [len(level)]])
+    for first, last in pairwise(edges):
+        part = slice(int(first), int(last))
+        out[part] = sampled_ground(ground, int(level[first]), x[part], y[part], seen[part])
+    return out
+
+
+def sampled_ground(ground: Ground, level: int, x: Image, y: Image, seen: Flags) -> Texture:
+    """Colors (H, W, 3) of positions (H, W) from tiles of a level, or of a coarser one where they would be too many."""
+    if not seen.any():
+        return np.zeros((*x.shape, 3), np.uint8)
+    # On a slope, rays of one row meet the ground near by and far away: coarser tiles, so that all of them fit into memory.
+    extent = max(float(np.ptp(x[seen])), float(np.ptp(y[seen])))
+    while level < LEVELS - 1 and extent > MAX_MOSAIC_TILES * TILE_PX * GROUND_M_PER_PX * 2**level:
+        level += 1
+    step = np.float32(GROUND_M_PER_PX * 2**level)
+    side = step * np.float32(TILE_PX)
+    i, j = (np.floor(v[seen] / side).astype(np.int64) for v in (x, y))
+    low = (int(i.min()), int(j.min()))
+    shape = (int(j.max()) - low[1] + 1, int(i.max()) - low[0] + 1)
+    touched = np.zeros(shape, bool)
+    touched[j - low[1], i - low[0]] = True
+    mosaic = np.empty((shape[0] * TILE_PX, shape[1] * TILE_PX, 3), np.uint8)
+    mosaic[:] = MEADOW
+    for row, column in zip(*np.nonzero(touched)):
+        tile = ground.tile(level, low[0] + int(column), low[1] + int(row))
+        mosaic[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX] = tile
+    u, v = (
+        (x - np.float32(low[0]) * side) / step - np.float32(0.5),
+        (y - np.float32(low[1]) * side) / step - np.float32(0.5),
+    )
+    return np.asarray(cv2.remap(mosaic, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
 
 FACADE_M_PER_PX = 0.04
 FACADE_LEVELS = 6
@@ -37,8 +127,6 @@ class Wall:
         Unit direction from there along the foot.
     outward : (2,) float64
         Unit normal.
-    length_m : float
-    height_m : float
     color : (int, int, int)
         RGB.
     seed : tuple of int
@@ -128,3 +216,156 @@ def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     while len(levels) < FACADE_LEVELS and min(levels[-1].shape[:2]) >= 8:
         levels.append(np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8))
     return tuple(levels)
+
+
+SUBPIXEL_BITS = 4  # of the coordinates of polygons
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A wall that looks at the camera, in the image.
+
+    Attributes
+    ----------
+    gap_m : float
+        Distance of the camera from its plane.
+    polygon : (P, 2) int32
+        In 1 / 2**SUBPIXEL_BITS px.
+    rows, columns : slice
+        The rectangle around it.
+    """
+
+    wall: Wall
+    gap_m: float
+    polygon: NDArray[np.int32]
+    rows: slice
+    columns: slice
+
+    @property
+    def region(self) -> tuple[slice, slice]:
+        """Rows and columns."""
+        return self.rows, self.columns
+
+    def mask(self, polygon: NDArray[np.int32], line: int) -> Texture:
+        """Draw a polygon on a mask of the region, from 0 to 255."""
+        out = np.zeros((self.rows.stop - self.rows.start, self.columns.stop - self.columns.start), np.uint8)
+        corner = np.array([self.columns.start, self.rows.start], np.int32) << SUBPIXEL_BITS
+        cv2.fillConvexPoly(out, polygon - corner, 255, line, SUBPIXEL_BITS)
+        return out
+
+    def depth(self, view: RenderCamera) -> Image:
+        """Depth of the wall's plane in the region."""
+        by_column, by_row = view.rays()
+        outward = (self.wall.outward / -self.gap_m).astype(np.float32)
+        nearness = (by_row[self.rows, :2] @ outward)[:, None] + (by_column[self.columns, :2] @ outward)[None, :]
+        ahead = nearness > 1e-9
+        return np.divide(np.float32(1), nearness, out=np.full(nearness.shape, np.inf, np.float32), where=ahead)
+
+
+def draw_buildings(
+    view: RenderCamera, buildings: tuple[tuple[Wall, ...], ...], light: Light, color: Image, depth: Image
+) -> None:
+    """Draw facades where they are nearer than the depth (H, W) so far, far ones first."""
+    eye = view.map_T_cam[:2, 3]
+    far_first = sorted(buildings, key=lambda walls: -float(np.min([np.linalg.norm(w.foot_m - eye) for w in walls])))
+    for walls in far_first:
+        seen = [s for wall in walls if (s := _look_at(view, wall)) is not None]
+        if not seen:
+            continue
+        region = (_around([s.rows for s in seen]), _around([s.columns for s in seen]))
+        shape = (region[0].stop - region[0].start, region[1].stop - region[1].start)
+        paint, share, away = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), depth[region].copy()
+        for part in seen:
+            inner = tuple(slice(s.start - whole.start, s.stop - whole.start) for s, whole in zip(part.region, region))
+            z = part.depth(view)
+            covered = part.mask(part.polygon, cv2.LINE_AA) * np.float32(1 / 255)
+            covered *= z < depth[part.region]
+            paint[inner] += linear(_texture(view, part), light.on_wall(part.wall.outward)) * covered[..., None]
+            share[inner] += covered
+            away[inner] = np.where(covered >= 0.5, z, away[inner])
+        # Where two walls of a building meet, their shares sum to one or more, so that nothing behind shines through.
+        paint /= np.maximum(share, 1.0)[..., None]
+        color[region] *= (1 - np.minimum(share, 1.0))[..., None]
+        color[region] += paint
+        depth[region] = away
+
+
+def hide_behind_buildings(view: RenderCamera, buildings: tuple[tuple[Wall, ...], ...], depth: Image) -> None:
+    """Bring the depth (H, W) forward to the facades."""
+    for walls in buildings:
+        for wall in walls:
+            seen = _look_at(view, wall)
+            if seen is not None:
+                z = np.where(seen.mask(seen.polygon, cv2.LINE_8) > 0, seen.depth(view), np.inf)
+                np.minimum(depth[seen.region], z, out=depth[seen.region])
+
+
+def _around(slices: list[slice]) -> slice:
+    return slice(min(s.start for s in slices), max(s.stop for s in slices))
+
+
+def _look_at(view: RenderCamera, wall: Wall) -> _Seen | None:
+    gap = float(np.dot(view.map_T_cam[:2, 3] - wall.foot_m, wall.outward))
+    if gap <= 0:
+        return None
+    polygon = view.polygon(_corners(wall, 0.0, wall.length_m))
+    if len(polygon) == 0:
+        return None
+    size = [view.width_px, view.height_px]
+    low = np.clip((polygon.min(0) >> SUBPIXEL_BITS) - 1, 0, size)
+    high = np.clip((polygon.max(0) >> SUBPIXEL_BITS) + 3, 0, size)
+    if np.any(high <= low):
+        return None
+    return _Seen(wall, gap, polygon, slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
+
+
+def _corners(wall: Wall, start_m: float, end_m: float) -> Array:
+    a, b = wall.foot_m + wall.along * start_m, wall.foot_m + wall.along * end_m
+    return np.array([[*a, 0], [*b, 0], [*b, wall.height_m], [*a, wall.height_m]])
+
+
+def _texture(view: RenderCamera, seen: _Seen) -> Texture:
+    """Warp the facade into the region, in pieces along the wall whose resolution fits their distance."""
+    wall = seen.wall
+    size = (seen.columns.stop - seen.columns.start, seen.rows.stop - seen.rows.start)
+    out = np.zeros((size[1], size[0], 3), np.uint8)
+    eye = view.map_T_cam[:3, 3]
+    shift = np.array([[1, 0, -seen.columns.start], [0, 1, -seen.rows.start], [0, 0, 1.0]])
+    image_H_wall = shift @ view.image_H_plane(
+        np.array([*wall.foot_m, 0.0]) - eye, np.array([*wall.along, 0.0]), np.array([0, 0, 1.0])
+    )
+    pieces = _pieces(view, seen)
+    for start, end, level in pieces:
+        polygon = view.polygon(_corners(wall, start, end))
+        if len(polygon) == 0:
+            continue
+        step = FACADE_M_PER_PX * 2**level
+        wall_H_texture = np.array([[step, 0, step / 2], [0, step, step / 2], [0, 0, 1]])
+        warped = cv2.warpPerspective(
+            wall.texture[level],
+            image_H_wall @ wall_H_texture,
+            size,
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        if len(pieces) == 1:
+            return np.asarray(warped, np.uint8)
+        # Two pixels wider, for the softened outline of the wall.
+        mask = cv2.dilate(seen.mask(polygon, cv2.LINE_8), np.ones((5, 5), np.uint8))
+        cv2.copyTo(warped, mask, out)
+    return out
+
+
+def _pieces(view: RenderCamera, seen: _Seen) -> list[tuple[float, float, int]]:
+    """Begin and end of pieces along a wall in m, far ones first, and the level of the texture for each."""
+    wall, gap, focal = seen.wall, max(seen.gap_m, 0.1), view.K[0, 0]
+    foot = float(np.dot(view.map_T_cam[:2, 3] - wall.foot_m, wall.along))  # where the camera is nearest
+    # A pixel covers distance / focal across and distance / gap as much along the wall; the mean decides, rather sharp.
+    limits = FACADE_M_PER_PX * 2.0 ** (np.arange(len(wall.texture) - 1) + 1)
+    reach = np.sqrt(np.maximum((limits * focal * np.sqrt(gap)) ** (4 / 3) - gap**2, 0.0))
+    edges = np.unique(np.clip([0.0, wall.length_m, *(foot + reach), *(foot - reach)], 0.0, wall.length_m))
+    pieces = []
+    for start, end in pairwise(edges):
+        if end - start > 1e-6:
+            pieces.append((float(start), float(end), int(np.sum(reach <= abs((start + end) / 2 - foot)))))
+    return sorted(pieces, key=lambda piece: -piece[2])

@@ -1,15 +1,21 @@
-"""Light of the sun and the sky on surfaces, and what shiny ones mirror. Directions are in the map frame, colors BGR."""
+"""Light of the sun, the sky and lamps on surfaces, a camera at one time, and the sky and the ground in its picture."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.geometry import Array, Camera, apply, inverse
+from log2sim.synth.ground import GROUND_M_PER_PX, LEVELS, TILE_PX, Ground
+from log2sim.synth.paint import Paint
 from log2sim.synth.returns import Weather
-from log2sim.synth.scene import Environment
-from log2sim.synth.surfaces import Paint
+from log2sim.synth.scene import Environment, Road
 
 Color = tuple[float, float, float]
 
@@ -35,7 +41,6 @@ class Light:
         Brightness of headlights, rear lights and street lights, relative to what surfaces emit by day.
     wetness : float
         From 0 for a dry road to 1 for a wet one.
-    rain_mm_h : float
     noise : float
         Of the camera, relative to daylight.
     exposure : float
@@ -207,3 +212,331 @@ def _power_60(x: NDArray[np.float32]) -> NDArray[np.float32]:
     x16 = x8 * x8
     power: NDArray[np.float32] = x16 * x16 * x16 * x8 * x4
     return power
+
+
+CAMERA_NEAR_M = 0.2  # of the near plane
+
+
+@dataclass(frozen=True, eq=False)
+class RenderCamera:
+    """A camera at one time.
+
+    Attributes
+    ----------
+    K : (3, 3) float64, px
+    map_T_cam : (4, 4) float64
+    """
+
+    K: Array
+    width_px: int
+    height_px: int
+    map_T_cam: Array
+
+    @classmethod
+    def of(cls, camera: Camera, map_T_cam: Array) -> RenderCamera:
+        """Take a camera without its distortion."""
+        return cls(camera.K, camera.width_px, camera.height_px, map_T_cam)
+
+    def enlarged(self, scale: int) -> RenderCamera:
+        """Divide each pixel into several; whole numbers are pixel centers, before and after."""
+        K = self.K * scale
+        K[:2, 2] += (scale - 1) / 2
+        K[2, 2] = 1.0
+        return RenderCamera(K, self.width_px * scale, self.height_px * scale, self.map_T_cam)
+
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Rays with depth 1 in the map, as sums of a part by column (W, 3) and a part by row (H, 3)."""
+        u = (np.arange(self.width_px) - self.K[0, 2]) / self.K[0, 0]
+        v = (np.arange(self.height_px) - self.K[1, 2]) / self.K[1, 1]
+        R = self.map_T_cam[:3, :3]
+        return np.outer(u, R[:, 0]).astype(np.float32), (np.outer(v, R[:, 1]) + R[:, 2]).astype(np.float32)
+
+    def rise(self) -> NDArray[np.float32]:
+        """Height gained by rays of depth 1: (H, W), or (H, 1) where all of a row rise alike."""
+        by_column, by_row = self.rays()
+        if np.ptp(by_column[:, 2]) < 1e-6:
+            by_column = by_column[:1]
+        up: NDArray[np.float32] = by_row[:, None, 2] + by_column[None, :, 2]
+        return up
+
+    def taller(self, factor: int) -> RenderCamera:
+        """Divide each row into several."""
+        K = self.K.copy()
+        K[1] *= factor
+        K[1, 2] += (factor - 1) / 2
+        return RenderCamera(K, self.width_px, self.height_px * factor, self.map_T_cam)
+
+    def directions(self, u: NDArray[Any], v: NDArray[Any]) -> Array:
+        """Rays (N, 3) of depth 1 in the map through points of the image."""
+        rays = np.column_stack([(u - self.K[0, 2]) / self.K[0, 0], (v - self.K[1, 2]) / self.K[1, 1], np.ones(len(u))])
+        return np.asarray(rays @ self.map_T_cam[:3, :3].T)
+
+    def ground_depth(self, u: NDArray[Any], v: NDArray[Any], far_m: float) -> Array:
+        """Depth (N,) at which rays through points of the image meet z = 0, at most `far_m`."""
+        fall = np.maximum(-self.directions(u, v)[:, 2], 1e-9)
+        return np.asarray(np.minimum(self.map_T_cam[2, 3] / fall, far_m))
+
+    def image_H_plane(self, origin: Array, first: Array, second: Array) -> Array:
+        """Homography (3, 3) from coordinates along two directions (3,) in the map, from `origin` (3,) relative to the camera."""
+        return np.asarray(self.K @ self.map_T_cam[:3, :3].T @ np.column_stack([first, second, origin]))
+
+    def polygon(self, points_map: Array) -> NDArray[np.int32]:
+        """Project a convex polygon (P, 3), clipped at the near plane, to sixteenths of a pixel (Q, 2); may be empty."""
+        p = apply(inverse(self.map_T_cam), points_map)
+        out = []
+        for a, b in zip(p, np.roll(p, -1, axis=0)):
+            if a[2] >= CAMERA_NEAR_M:
+                out.append(a)
+            if (a[2] >= CAMERA_NEAR_M) != (b[2] >= CAMERA_NEAR_M):
+                out.append(a + (b - a) * (CAMERA_NEAR_M - a[2]) / (b[2] - a[2]))
+        if len(out) < 3:
+            return np.zeros((0, 2), np.int32)
+        q = np.array(out)
+        uv = q[:, :2] / q[:, 2:] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
+        return np.asarray(np.rint(np.clip(uv, -1e5, 1e5) * 16).astype(np.int32))
+
+
+FAR_M = 2000.0
+ROWS_PER_PX = 2  # rows of the ground that are averaged for a pixel, because it is seen at a grazing angle
+MIN_FALL = 1e-3  # of a ray of depth 1 that meets the ground
+GAMMA = 2.2
+_LINEAR = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
+
+Image = NDArray[np.float32]
+Texture = NDArray[np.uint8]
+
+
+def linear(image: Texture, light: NDArray[np.float32]) -> Image:
+    """Light from surfaces of sRGB colors (H, W, 3) in light of a color (3,)."""
+    out: Image = cv2.LUT(image, _LINEAR)  # type: ignore[assignment]
+    out *= light
+    return out
+
+
+def draw_sky(view: RenderCamera, light: Light) -> tuple[Image, Image]:
+    """Draw the sky: the image (H, W, 3) and its depth (H, W) in m."""
+    up = view.rise()
+    rise = np.clip(up / np.sqrt(1 + up * up) * 1.8, 0, 1)[..., None]
+    horizon, zenith = np.array(light.horizon, np.float32), np.array(light.zenith, np.float32)
+    color = np.empty((view.height_px, view.width_px, 3), np.float32)
+    color[:] = horizon + (zenith - horizon) * rise
+    return color, np.full(color.shape[:2], FAR_M, np.float32)
+
+
+def draw_ground(view: RenderCamera, ground: Ground, light: Light, color: Image, depth: Image) -> None:
+    """Draw the ground z = 0 below the horizon."""
+    fall = -view.rise()
+    rows = np.flatnonzero((fall > MIN_FALL).any(1))
+    height = float(view.map_T_cam[2, 3])
+    if len(rows) == 0 or height <= 0:
+        return
+    band = slice(int(rows[0]), int(rows[-1]) + 1)
+    below = fall[band] > MIN_FALL
+    away = np.divide(np.float32(height), fall[band], out=np.full(below.shape, FAR_M, np.float32), where=below)
+    lit = linear(_ground_image(view, ground, band), light.on_ground())
+    away, below = (np.broadcast_to(x, lit.shape[:2]) for x in (np.minimum(away, FAR_M), below))
+    if below.all():
+        color[band], depth[band] = lit, away
+    else:
+        color[band][below], depth[band][below] = lit[below], away[below]
+
+
+def _ground_image(view: RenderCamera, ground: Ground, band: slice) -> Texture:
+    """Warp the tiles of the ground into rows of the image, for each row from the level whose resolution fits."""
+    fine = view.taller(ROWS_PER_PX)
+    top = band.start * ROWS_PER_PX
+    middle = fine.ground_depth(np.full(fine.height_px, fine.width_px / 2), np.arange(fine.height_px), FAR_M)
+    slanted = np.sqrt(np.maximum(middle / (ROWS_PER_PX * fine.map_T_cam[2, 3]), 1.0))
+    footprint = middle / fine.K[0, 0] * slanted
+    level = np.clip(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0)), 0, LEVELS - 1).astype(int)
+    level = level[top : band.stop * ROWS_PER_PX]
+    out = np.empty((len(level), fine.width_px, 3), np.uint8)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [len(level)]])
+    for first, last in pairwise(edges):
+        out[first:last] = _warped(fine, ground, int(level[first]), slice(int(top + first), int(top + last)))
+    size = (fine.width_px, band.stop - band.start)
+    return np.asarray(cv2.resize(out, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _warped(fine: RenderCamera, ground: Ground, level: int, rows: slice) -> Texture:
+    """Warp the tiles of one level into some rows."""
+    step = GROUND_M_PER_PX * 2**level
+    eye = fine.map_T_cam[:2, 3]
+    corner_u = np.array([0, fine.width_px - 1, fine.width_px - 1, 0]) + np.array([-1, 1, 1, -1])
+    corner_v = np.array([rows.start, rows.start, rows.stop, rows.stop]) + np.array([-1, -1, 1, 1])
+    away = fine.ground_depth(corner_u, corner_v, FAR_M)[:, None]
+    seen = (eye + fine.directions(corner_u, corner_v)[:, :2] * away) / (step * TILE_PX)
+    low = np.floor(seen.min(0) - 0.02).astype(int)
+    shape = np.floor(seen.max(0) + 0.02).astype(int) - low + 1  # columns and rows of tiles
+    mosaic = np.zeros((shape[1] * TILE_PX, shape[0] * TILE_PX, 3), np.uint8)
+    for j, i in zip(*np.nonzero(_touched(seen - low, shape))):
+        tile = ground.tile(level, int(low[0] + i), int(low[1] + j))
+        mosaic[j * TILE_PX : (j + 1) * TILE_PX, i * TILE_PX : (i + 1) * TILE_PX] = tile
+    corner = low * TILE_PX * step + step / 2 - eye  # of the mosaic's first pixel, relative to the camera
+    ground_H_mosaic = np.array([[step, 0, corner[0]], [0, step, corner[1]], [0, 0, 1]])
+    shift = np.array([[1, 0, 0], [0, 1, -rows.start], [0, 0, 1.0]])
+    homography = shift @ fine.image_H_plane(np.array([0, 0, -fine.map_T_cam[2, 3]]), *np.eye(3)[:2]) @ ground_H_mosaic
+    size = (fine.width_px, rows.stop - rows.start)
+    warped = cv2.warpPerspective(mosaic, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(warped, np.uint8)
+
+
+def _touched(corners: Array, shape: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of a grid of unit squares, `shape` (2,) columns and rows, a convex polygon (P, 2) touches: (rows, columns)."""
+    fineness = 8
+    columns, rows = (int(n) * fineness for n in shape)
+    mask = np.zeros((rows, columns), np.uint8)
+    hull = cv2.convexHull(np.rint((corners * fineness - 0.5) * 16).astype(np.int32))
+    cv2.fillConvexPoly(mask, hull, 1, cv2.LINE_8, 4)
+    wider = np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
+    return np.asarray(wider.reshape(rows // fineness, fineness, columns // fineness, fineness).any(axis=(1, 3)))
+
+
+HEADLIGHT_COLOR: Color = (0.95, 0.95, 0.90)  # LED, 5000 K
+STREET_COLOR: Color = (0.42, 0.72, 1.0)  # 2700 K
+HEADLIGHT_POWER, HEADLIGHT_REACH_M = 1.1, 14.0
+STREET_POWER, STREET_REACH_M = 0.9, 7.0
+BEAM_HALF_WIDTH = 0.36  # tangent
+CUTOFF_RISE, CUTOFF_SOFTNESS, ABOVE_CUTOFF = -0.01, 0.02, 0.12  # tangents of a low beam, and what is left above it
+STREET_SPACING_M, STREET_HEIGHT_M = 30.0, 7.0
+MAX_LAMPS, MAX_LAMP_DISTANCE_M = 14, 90.0
+COARSENESS = 4  # of the grid on which the light of lamps on the static scene is computed
+GLARE = 0.5
+GROUND_BAND_M = 0.2  # what is lower counts as ground, which lamps light at a grazing angle
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A lamp at one time.
+
+    Attributes
+    ----------
+    position_m : (3,) float64, m
+    forward : (2,) float64 or None
+        Direction of a headlight; None for a street light, which shines downwards.
+    """
+
+    position_m: Array
+    forward: Array | None = None
+
+
+def headlights(map_T_vehicle: Array, front_m: float, width_m: float) -> tuple[Lamp, ...]:
+    """Lamps of a vehicle whose front is so far ahead of the origin of a pose on the ground."""
+    R, origin = map_T_vehicle[:3, :3], map_T_vehicle[:3, 3]
+    sides = (R @ np.array([front_m, side * 0.36 * width_m, 0.65]) for side in (-1, 1))
+    return tuple(Lamp(origin + offset, R[:2, 0] / np.linalg.norm(R[:2, 0])) for offset in sides)
+
+
+def street_lights(roads: Sequence[Road], around_m: Array) -> tuple[Lamp, ...]:
+    """Lamps that hang over roads near a point (2,)."""
+    lamps: list[Lamp] = []
+    for road in roads:
+        line = np.array(road.line)
+        for a, b in pairwise(line):
+            length = float(np.linalg.norm(b - a))
+            middle = float(np.dot(around_m - a, b - a)) / max(length, 1e-9)
+            first = max(
+                np.ceil((middle - MAX_LAMP_DISTANCE_M) / STREET_SPACING_M) * STREET_SPACING_M, STREET_SPACING_M / 2
+            )
+            along = np.arange(first, min(length, middle + MAX_LAMP_DISTANCE_M), STREET_SPACING_M)
+            lamps += [Lamp(np.append(a + (b - a) * s / length, STREET_HEIGHT_M)) for s in along]
+    return tuple(lamps)
+
+
+def nearest_lamps(view: RenderCamera, lamps: Sequence[Lamp]) -> tuple[Lamp, ...]:
+    """Choose those that may light what a camera sees."""
+    eye, axis = view.map_T_cam[:3, 3], view.map_T_cam[:3, 2]
+    distance = {k: float(np.linalg.norm(lamp.position_m - eye)) for k, lamp in enumerate(lamps)}
+    ahead = {k: float((lamp.position_m - eye) @ axis) for k, lamp in enumerate(lamps)}
+    near = [k for k in distance if distance[k] < MAX_LAMP_DISTANCE_M and ahead[k] > -2 * STREET_REACH_M]
+    return tuple(lamps[k] for k in sorted(near, key=lambda k: distance[k])[:MAX_LAMPS])
+
+
+def lamplight(lamps: Sequence[Lamp], exposure: float, points: Image, normals: Image | None) -> Image:
+    """Light (N, 3) on points (N, 3) in the map with normals (N, 3); None for surfaces that face all lamps."""
+    out = np.zeros((len(points), 3), np.float32)
+    for lamp in lamps:
+        offset = points - lamp.position_m.astype(np.float32)
+        square = np.einsum("ni,ni->n", offset, offset)
+        reach = STREET_REACH_M if lamp.forward is None else HEADLIGHT_REACH_M
+        power = STREET_POWER if lamp.forward is None else HEADLIGHT_POWER
+        strength = np.float32(power * exposure) / (1 + square * np.float32(reach**-2))
+        strength *= _downward(offset, square) if lamp.forward is None else _beam(offset, lamp.forward)
+        if normals is not None:
+            toward = -np.einsum("ni,ni->n", offset, normals) / np.sqrt(np.maximum(square, np.float32(1e-6)))
+            strength *= np.clip(np.float32(0.15) + np.float32(0.85) * toward, 0, 1)
+        for channel, value in enumerate(STREET_COLOR if lamp.forward is None else HEADLIGHT_COLOR):
+            out[:, channel] += strength * np.float32(value)
+    return out
+
+
+def _downward(offset: Image, square: Image) -> Image:
+    return np.asarray(np.clip(-offset[:, 2] / np.sqrt(np.maximum(square, np.float32(1e-6))) + 0.1, 0, 1), np.float32)
+
+
+def _beam(offset: Image, forward: Array) -> Image:
+    """Share of a low beam in a direction: wide to the sides, cut off above the horizon."""
+    fx, fy = forward.astype(np.float32)
+    along = offset[:, 0] * fx + offset[:, 1] * fy
+    aside = offset[:, 1] * fx - offset[:, 0] * fy
+    ahead = np.maximum(along, np.float32(0.3))
+    wide = np.exp(-((aside / ahead / np.float32(BEAM_HALF_WIDTH)) ** 2))
+    rise = np.clip((CUTOFF_RISE - offset[:, 2] / ahead) / CUTOFF_SOFTNESS, -10, 10)
+    low = ABOVE_CUTOFF + (1 - ABOVE_CUTOFF) / (1 + np.exp(-rise))
+    return np.where(along > 0.3, wide * low, 0).astype(np.float32)
+
+
+def light_scenery(view: RenderCamera, lamps: Sequence[Lamp], light: Light, color: Image, depth: Image) -> None:
+    """Add the light of lamps to a picture (H, W, 3) of the static scene, which the sky alone has lit so far."""
+    if not lamps:
+        return
+    v = np.arange(COARSENESS // 2, view.height_px, COARSENESS)
+    u = np.arange(COARSENESS // 2, view.width_px, COARSENESS)
+    grid_u, grid_v = (x.ravel() for x in np.meshgrid(u, v))
+    away = depth[grid_v, grid_u]
+    points = view.directions(grid_u, grid_v) * away[:, None] + view.map_T_cam[:3, 3]
+    added = lamplight(lamps, light.exposure, points.astype(np.float32), None)
+    added[away >= FAR_M] = 0
+    dry = np.add(light.sky_color, np.multiply(light.sun_color, light.sun[2])).astype(np.float32)
+    factor = 1 + added / np.maximum(dry, np.float32(1e-4))
+    size = (view.width_px, view.height_px)
+    color *= np.where(
+        (depth < FAR_M)[..., None],
+        cv2.resize(factor.reshape(len(v), len(u), 3), size, interpolation=cv2.INTER_LINEAR),
+        1,
+    )
+
+
+def glare(view: RenderCamera, lamps: Sequence[Lamp], light: Light, color: Image, depth: Image) -> None:
+    """Draw the lamps themselves and let what is too bright shine over its surroundings, in place."""
+    if light.lamps <= 0:
+        return
+    bright = np.zeros_like(color)
+    for lamp in lamps:
+        p = apply(inverse(view.map_T_cam), lamp.position_m[None])[0]
+        if p[2] < 1.0:
+            continue
+        u, v = p[0] / p[2] * view.K[0, 0] + view.K[0, 2], p[1] / p[2] * view.K[1, 1] + view.K[1, 2]
+        if not (0 <= u < view.width_px and 0 <= v < view.height_px) or depth[int(v), int(u)] < p[2] - 1.0:
+            continue
+        if lamp.forward is None:
+            tint = tuple(0.6 * light.lamps * c for c in STREET_COLOR)
+            radius = max(1, round(0.18 * view.K[0, 0] / p[2]))
+        else:
+            toward = float(np.dot(lamp.forward, (view.map_T_cam[:2, 3] - lamp.position_m[:2]) / p[2]))
+            if toward < 0.2:
+                continue
+            tint = tuple(light.lamps * toward**2 * c for c in HEADLIGHT_COLOR)
+            radius = max(1, round(0.09 * view.K[0, 0] / p[2]))
+        passed = float(np.exp(-light.extinction_per_m * p[2]))
+        cv2.circle(bright, (round(u), round(v)), radius, tuple(passed * c for c in tint), -1, cv2.LINE_AA)
+    np.maximum(color, bright, out=color)
+    small = cv2.resize(np.maximum(color - 0.9, 0), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    if small.max() <= 0:
+        return
+    # Fog scatters light around a lamp more widely than a lens does.
+    wide = 3.0 + 200 * light.extinction_per_m
+    halo = 0.6 * cv2.GaussianBlur(small, (0, 0), 1.5) + 0.4 * cv2.GaussianBlur(small, (0, 0), wide)
+    color += GLARE * cv2.resize(
+        halo.astype(np.float32), (view.width_px, view.height_px), interpolation=cv2.INTER_LINEAR
+    )

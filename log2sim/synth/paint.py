@@ -1,16 +1,120 @@
-"""Colors of road users: procedural textures by position on the body.
+"""Colors of road users, and how strongly surfaces send a LiDAR's light back.
 
 Colors are linear BGR in [0, 1].
+
+Colors are linear BGR in [0, 1].
+
+Glass beads in paint send light back to where it comes from, so at 905 nm markings return two to four times as much as
+asphalt; on flat lines a film of water ends that (Burghardt et al., Visibility of flat line and structured road markings for
+machine vision, Case Studies in Construction Materials 18, 2023).
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.synth.surfaces import Appearance, Paint, Patch, linear_bgr
-from log2sim.synth.vehicles import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line
+from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground, Surface
+from log2sim.synth.shapes import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Appearance of an actor; colors are sRGB from 0 to 255.
+
+    Attributes
+    ----------
+    size_m : (float, float, float)
+        Length, width, height.
+    color : (int, int, int)
+    kind : str
+        Body of a car.
+    second_color : (int, int, int)
+    skin : (int, int, int)
+    hair : (int, int, int)
+    seed : int
+        Varies the folds of clothes.
+    """
+
+    category: str
+    size_m: tuple[float, float, float]
+    color: tuple[int, int, int]
+    kind: str = ""
+    second_color: tuple[int, int, int] = (45, 50, 66)
+    skin: tuple[int, int, int] = (196, 150, 122)
+    hair: tuple[int, int, int] = (52, 38, 28)
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """Optical properties of P surface points, colors in linear BGR.
+
+    Attributes
+    ----------
+    albedo : (P, 3) float32
+    gloss : (P,) float32
+        Share of the surroundings that is mirrored.
+    glow : (P, 3) float32
+        Emitted light.
+    """
+
+    albedo: NDArray[np.float32]
+    gloss: NDArray[np.float32]
+    glow: NDArray[np.float32]
+
+
+def linear_bgr(rgb: tuple[int, int, int]) -> NDArray[np.float32]:
+    """Linear BGR of an sRGB color."""
+    return ((np.array(rgb[::-1], dtype=np.float32) / 255) ** np.float32(2.2)).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Points of one material on an actor, to be painted.
+
+    Attributes
+    ----------
+    out : Paint
+        Of all points of the actor.
+    rows : (Q,) int64
+        Rows of this patch in `out`.
+    p : (Q, 3) float64, m
+        Points in the agent frame.
+    z : (Q,) float64, m
+        Heights above the ground.
+    n : (Q, 3) float64
+        Normals.
+    """
+
+    appearance: Appearance
+    out: Paint
+    rows: Index
+    p: Array
+    z: Array
+    n: Array
+    part: Material
+
+    def set(self, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
+        """Paint the points of a mask (Q,)."""
+        self._put(self.rows[mask], albedo, gloss, glow)
+
+    def fill(self, albedo: Any, gloss: float = 0.0) -> None:
+        """Paint all points."""
+        self._put(self.rows, albedo, gloss, 0.0)
+
+    def _put(self, index: Index, albedo: Any, gloss: float, glow: float) -> None:
+        self.out.albedo[index] = albedo
+        self.out.gloss[index] = gloss
+        self.out.glow[index] = glow * np.asarray(albedo, np.float32)
+
 
 GLASS = (0.055, 0.05, 0.045)
 RUBBER = (0.028, 0.027, 0.026)
@@ -231,3 +335,76 @@ _PAINTERS = {
     Material.CAR_BODY: _car, Material.WHEEL: _wheel, Material.CAB: _cab, Material.CARGO: _cargo, Material.BUS_BODY: _bus,
     Material.SHIRT: _cloth, Material.TROUSERS: _cloth,
 }  # fmt: skip
+
+
+FULL_SCALE = 255.0  # intensities are whole numbers up to it, as most LiDARs have them
+REFLECTANCE: Surface = {"meadow": 0.4, "sidewalk": 0.28, "curb": 0.32, "asphalt": 0.16, "paint": 0.48}
+# Paint that is bright to the eye is bright at 905 nm, dark paint mostly dark.
+BODY_REFLECTANCE = (0.06, 0.75)
+AIR_REFLECTANCE = 0.02
+WET_SHARE, WET_BEADS = 0.5, 0.1  # of a wet road's return, and of what beads add to it
+SPECKLE = 0.15  # standard deviation of a return relative to its mean
+INCIDENCE_POWER = 0.7  # of rough surfaces, as in `log2sim.synth.returns`
+BEAM_RAD = 0.003  # divergence, as makers of spinning sensors state it
+MAX_LEVEL = 4
+
+
+class GroundReflectance:
+    """Reflectance of the painted ground where beams meet it.
+
+    Parameters
+    ----------
+    ground : Ground
+    wetness : float
+        From 0 for dry to 1 for wet ground.
+    """
+
+    def __init__(self, ground: Ground, wetness: float = 0.0) -> None:
+        self._ground = ground
+        self._tiles: dict[tuple[int, int, int], NDArray[np.uint8]] = {}
+        asphalt = REFLECTANCE["asphalt"]
+        beads = (REFLECTANCE["paint"] - asphalt) * (1 - (1 - WET_BEADS) * wetness)
+        dry = {**REFLECTANCE, "paint": asphalt + beads}
+        self._values = {name: float(value * (1 - (1 - WET_SHARE) * wetness)) for name, value in dry.items()}
+
+    def at(self, xy_m: NDArray[np.float64], spot_m: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the mean reflectance (N,) over spots of some widths (N,) around points (N, 2) in the map."""
+        out = np.empty(len(xy_m), np.float32)
+        if len(xy_m) == 0:
+            return out
+        level = np.clip(np.rint(np.log2(np.maximum(spot_m / GROUND_M_PER_PX, 1.0))), 0, MAX_LEVEL).astype(np.int64)
+        pixel = np.floor(xy_m / (GROUND_M_PER_PX * 2.0**level)[:, None]).astype(np.int64)
+        keys, group = np.unique(np.column_stack([level, pixel // TILE_PX]), axis=0, return_inverse=True)
+        order = np.argsort(group, kind="stable")
+        column, row = (pixel % TILE_PX).T
+        for key, rows in zip(keys.tolist(), np.split(order, np.flatnonzero(np.diff(group[order])) + 1)):
+            out[rows] = self._tile(*key)[row[rows], column[rows]]
+        return out / np.float32(FULL_SCALE)
+
+    def _tile(self, level: int, i: int, j: int) -> NDArray[np.uint8]:
+        where = (level, i, j)
+        if where not in self._tiles:
+            shade = self._ground.shade(*where, self._values)
+            self._tiles[where] = np.asarray(np.rint(shade * FULL_SCALE), np.uint8)
+        return self._tiles[where]
+
+
+def spot_m(range_m: NDArray[np.float64], incidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Width (N,) in m of the spot of a beam, the mean of those along and across it; `incidence` is the cosine at the surface."""
+    return np.asarray(BEAM_RAD * range_m / np.sqrt(np.maximum(incidence, 0.01)))
+
+
+def body_reflectance(color: Sequence[int]) -> float:
+    """Return the reflectance of a body of an sRGB color."""
+    red, green, blue = (int(c) for c in color)
+    low, high = BODY_REFLECTANCE
+    return float(low + (high - low) * linear_bgr((red, green, blue)).mean())
+
+
+def intensity_of(
+    reflectance: NDArray[np.float32], incidence: NDArray[np.float32], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Intensities (N,) of returns, corrected for range as sensors do, with speckle."""
+    speckle = 1 + SPECKLE * rng.standard_normal(len(reflectance), dtype=np.float32)
+    strength = reflectance * np.maximum(incidence, np.float32(0.02)) ** np.float32(INCIDENCE_POWER) * speckle
+    return np.asarray(np.clip(np.rint(strength * np.float32(FULL_SCALE)), 1, FULL_SCALE), np.float32)

@@ -13,10 +13,270 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.synth.lidar_models import LidarModel
-from log2sim.synth.polytope_hits import MIN_RANGE_M, Rays, SensorState, Solid, cast_solid, windows_of
-from log2sim.synth.polytopes import Material
-from log2sim.synth.returns import REFLECTANCE, ReturnModel, backscattered, detected, disturbed, reflected
+from log2sim.geometry import Array, rotation_from_rpy, wrap_angle
+from log2sim.synth.polytopes import Material, Polytope
+from log2sim.synth.returns import REFLECTANCE, LidarModel, ReturnModel, backscattered, detected, disturbed, reflected
+
+MIN_RANGE_M = 0.4
+WINDOW_MARGIN_RAD = 0.012
+LEAF_MEAN_PATH_M = 0.5
+# Share of rays that a wire mesh or a net lets through.
+MESH_OPENNESS = 0.65
+# Leaves face any way.
+LEAF_INCIDENCE = 0.7
+# Slower motion moves nothing by the noise of a distance within a sweep.
+MIN_DRIFT_MPS = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """An object for the caster.
+
+    Attributes
+    ----------
+    position_m : (3,) float64, m
+        Middle of its floor at time 0.
+    velocity_mps : (2,) float64, m/s
+    glass_passes : float
+        Share of rays that its windows let through.
+    """
+
+    parts: tuple[Polytope, ...]
+    position_m: Array
+    yaw_rad: float
+    velocity_mps: Array
+    glass_passes: float = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class SensorState:
+    """Where a LiDAR is during a sweep.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64
+        From the sensor to the level frame.
+    position_m : (3,) float64, m
+        At time 0, the middle of the sweep.
+    velocity_mps : (2,) float64, m/s
+    """
+
+    rotation: Array
+    position_m: Array
+    velocity_mps: Array
+
+
+@dataclass(eq=False)
+class Rays:
+    """The rays of a sweep, L lines by A firings, and what each meets first.
+
+    Attributes
+    ----------
+    azimuth, elevation : (A,), (L,) float64
+        In the sensor's frame, rad.
+    direction : (L, A, 3) float32
+        Level frame.
+    column_s : (A,) float32
+        Times of the firings relative to the middle of the sweep.
+    range_m : (L, A) float32
+        Infinite without a hit.
+    hit : (L, A) int32
+    material : (L, A) int8
+    incidence : (L, A) float32
+        Cosine between ray and normal.
+    """
+
+    azimuth: Array
+    elevation: Array
+    direction: NDArray[np.float32]
+    column_s: NDArray[np.float32]
+    range_m: NDArray[np.float32]
+    hit: NDArray[np.int32]
+    material: NDArray[np.int8]
+    incidence: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Angles in the sensor's frame that may see each of S objects; azimuths around a middle one, less than half a turn each way."""
+
+    near_m: Array
+    azimuth: Array
+    half: Array
+    elevation: Array
+    low: Array
+    high: Array
+
+
+def windows_of(solids: Sequence[Solid], sensor: SensorState) -> Windows:
+    """Find the window of every object from points on its bounding box."""
+    low = np.array([np.min([p.low for p in solid.parts], axis=0) for solid in solids]).reshape(-1, 3)
+    high = np.array([np.max([p.high for p in solid.parts], axis=0) for solid in solids]).reshape(-1, 3)
+    position = np.array([solid.position_m for solid in solids]).reshape(-1, 3)
+    rotation = rotation_from_rpy(0.0, 0.0, np.array([solid.yaw_rad for solid in solids]))
+    local = np.einsum("sji,sj->si", rotation, sensor.position_m - position)
+    near = np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0), axis=1)
+    # So dense that the greatest elevation is not missed between them.
+    steps = np.linspace(0, 1, 5)
+    u, v, w = np.meshgrid(steps, steps, [0.0, 1.0], indexing="ij")
+    grid = low[:, None] + np.column_stack([u.ravel(), v.ravel(), w.ravel()]) * (high - low)[:, None]
+    points = (grid @ rotation.transpose(0, 2, 1) + (position - sensor.position_m)[:, None]) @ sensor.rotation
+    azimuth, flat = np.arctan2(points[..., 1], points[..., 0]), np.hypot(points[..., 0], points[..., 1])
+    elevation = np.arctan2(points[..., 2], flat)
+    margin = WINDOW_MARGIN_RAD + 0.3 / np.maximum(near, 0.3) * np.linalg.norm((high - low)[:, :2], axis=1) / 16
+    middle = np.arctan2(np.sin(azimuth).mean(axis=1), np.cos(azimuth).mean(axis=1))
+    off = wrap_angle(azimuth - middle[:, None])
+    half = np.column_stack([off.min(axis=1) - margin, off.max(axis=1) + margin])
+    half[(near < 1.0) | (np.ptp(off, axis=1) > 5.5)] = -np.pi, np.pi
+    return Windows(
+        near, middle, half, np.column_stack([elevation.min(axis=1) - margin, elevation.max(axis=1) + margin]), low, high
+    )
+
+
+def _columns(windows: Windows, index: int, azimuth: Array) -> NDArray[np.intp]:
+    """Return the firings (C,) within a window, which may lie across the sweep's seam."""
+    off = (azimuth - windows.azimuth[index] + np.pi) % (2 * np.pi) - np.pi
+    return np.flatnonzero((off >= windows.half[index, 0]) & (off <= windows.half[index, 1]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Approach:
+    """Rays that meet an object's bounding box, in the object's frame: rays n, directions (3, n)."""
+
+    line: NDArray[np.intp]
+    firing: NDArray[np.intp]
+    direction: NDArray[np.float32]
+    origin: NDArray[np.float32]
+    drift: NDArray[np.float32] | None
+
+
+def cast_solid(
+    rays: Rays, solid: Solid, index: int, windows: Windows, sensor: SensorState, rng: np.random.Generator
+) -> None:
+    """Let one object stop the rays that reach it."""
+    near = _approach(rays, solid, index, windows, sensor)
+    if near is None:
+        return
+    crossings = _Crossings.of(near, solid.parts, rays.column_s)
+    enter = crossings.enter
+    for k in np.flatnonzero(np.isfinite(enter).any(axis=1)).tolist():
+        if solid.parts[k].material in (Material.LEAVES, Material.GLASS, Material.MESH):
+            enter[k] = _passed(enter[k], crossings.leave[k], solid.parts[k].material, solid, rng)
+    part = enter.argmin(axis=0)
+    t = enter[part, np.arange(len(part))]
+    first = np.flatnonzero(t < rays.range_m[near.line, near.firing])
+    if not len(first):
+        return
+    line, firing, part = near.line[first], near.firing[first], part[first]
+    rays.range_m[line, firing] = t[first]
+    rays.hit[line, firing] = index
+    rays.material[line, firing] = np.array([p.material for p in solid.parts], np.int8)[part]
+    rays.incidence[line, firing] = crossings.incidence(first, part, solid.parts)
+
+
+def _approach(rays: Rays, solid: Solid, index: int, windows: Windows, sensor: SensorState) -> _Approach | None:
+    """Choose the rays of an object's window that meet its bounding box before anything else."""
+    low, high = windows.elevation[index]
+    rows = np.flatnonzero((rays.elevation >= low) & (rays.elevation <= high))
+    cols = _columns(windows, index, rays.azimuth)
+    if not len(rows) or not len(cols):
+        return None
+    # Rays that meet something nearer than the object's nearest point need no test.
+    line, firing = np.nonzero(rays.range_m[np.ix_(rows, cols)] > windows.near_m[index])
+    if not len(line):
+        return None
+    line, firing = rows[line], cols[firing]
+    c, s = np.cos(solid.yaw_rad), np.sin(solid.yaw_rad)
+    to_object = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    direction = to_object.astype(np.float32) @ rays.direction[line, firing].T
+    direction[direction == 0] = np.float32(1e-12)
+    origin = (to_object @ (sensor.position_m - solid.position_m)).astype(np.float32)
+    moved = to_object @ np.append(sensor.velocity_mps - solid.velocity_mps, 0.0)
+    drift = moved.astype(np.float32) if np.abs(moved).max() > MIN_DRIFT_MPS else None
+    start = origin[:, None] if drift is None else origin[:, None] + drift[:, None] * rays.column_s[firing]
+    # Most rays of the window pass the bounding box; the parts need not be tested for them.
+    with np.errstate(over="ignore"):
+        ends = [(edge[index].astype(np.float32)[:, None] - start) / direction for edge in (windows.low, windows.high)]
+    first, last = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
+    met = np.flatnonzero((first <= last) & (last > 0) & (first < rays.range_m[line, firing]))
+    return _Approach(line[met], firing[met], direction[:, met], origin, drift) if len(met) else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Crossings:
+    """Where n rays cross the half-spaces of P parts with K faces in all.
+
+    Attributes
+    ----------
+    enter, leave : (P, n) float32, m
+        Infinite where a ray misses the part.
+    latest : (K, n) float32, m
+        Of the faces that a ray enters by, -inf of the others.
+    slope : (K, n) float32
+        Normals times directions.
+    start, count : (P,) int64
+        Of each part's faces.
+    """
+
+    enter: NDArray[np.float32]
+    leave: NDArray[np.float32]
+    latest: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    start: NDArray[np.int64]
+    count: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, near: _Approach, parts: Sequence[Polytope], column_s: NDArray[np.float32]) -> _Crossings:
+        """Intersect rays with all parts of an object."""
+        normals, offsets = np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
+        count = np.array([len(p.offsets) for p in parts])
+        start = np.cumsum(count) - count
+        slope = normals @ near.direction
+        gap = (offsets - normals @ near.origin)[:, None]
+        if near.drift is not None:
+            gap = gap - (normals @ near.drift)[:, None] * column_s[near.firing]
+        slope[slope == 0] = np.float32(1e-12)
+        crossing = gap / slope
+        entering = slope < 0
+        enter, leave = np.empty((2, len(parts), len(near.line)), np.float32)
+        latest = np.where(entering, crossing, np.float32(-np.inf))
+        earliest = np.where(entering, np.float32(np.inf), crossing)
+        for k, (a, n) in enumerate(zip(start.tolist(), count.tolist(), strict=True)):
+            latest[a : a + n].max(axis=0, out=enter[k])
+            earliest[a : a + n].min(axis=0, out=leave[k])
+        enter = np.where((enter < leave) & (enter > MIN_RANGE_M), enter, np.float32(np.inf))
+        return cls(enter, leave, latest, slope, start, count)
+
+    def incidence(
+        self, ray: NDArray[np.intp], part: NDArray[np.intp], parts: Sequence[Polytope]
+    ) -> NDArray[np.float32]:
+        """Return the cosine (m,) between rays and the faces by which they enter a part each."""
+        out = np.full(len(ray), np.float32(LEAF_INCIDENCE))
+        for k in np.unique(part).tolist():
+            if parts[k].material != Material.LEAVES:
+                own = part == k
+                faces = slice(self.start[k], self.start[k] + self.count[k])
+                # A ray enters by the face that it crosses last.
+                face = self.latest[faces][:, ray[own]].argmax(axis=0)
+                out[own] = -self.slope[self.start[k] + face, ray[own]]
+        return out
+
+
+def _passed(
+    enter: NDArray[np.float32], leave: NDArray[np.float32], material: Material, solid: Solid, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Let rays through what is not solid: leaves by a mean free path, windows and nets by a share."""
+    met = np.flatnonzero(np.isfinite(enter))
+    out = enter.copy()
+    if material == Material.LEAVES:
+        depth = rng.exponential(LEAF_MEAN_PATH_M, len(met)).astype(np.float32)
+        inside = depth < leave[met] - enter[met]
+        out[met] = np.where(inside, enter[met] + depth, np.float32(np.inf))
+    else:
+        share = solid.glass_passes if material == Material.GLASS else MESH_OPENNESS
+        out[met[rng.random(len(met)) < share]] = np.inf
+    return out
+
 
 GROUND, NOTHING = -1, -2
 NEWTON_STEPS = 3
@@ -77,10 +337,6 @@ def cast_polytopes(
 
     Parameters
     ----------
-    model : LidarModel
-    sensor : SensorState
-    solids : sequence of Solid
-    terrain : Terrain
     rng : Generator
         Draws reflectances, losses and noise.
     returns : ReturnModel, optional

@@ -11,12 +11,11 @@ from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
 from log2sim.synth.actors import EGO_COLOR, Actor, MovingScene
 from log2sim.synth.light import weather_of
-from log2sim.synth.reflectance import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
+from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
+from log2sim.synth.raster import first_hit
+from log2sim.synth.render import triangles_of
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
-from log2sim.synth.scene import LidarSpec, Scene
-from log2sim.synth.scene_places import Building
-from log2sim.synth.traffic_lights import triangles_of
-from log2sim.synth.triangles import first_hit
+from log2sim.synth.scene import Building, LidarSpec, Scene
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
@@ -32,7 +31,6 @@ class LabeledSweep:
 
     Attributes
     ----------
-    sweep : Sweep
     hit : (N,) int64
         Index of the actor, GROUND, BUILDING, EGO or AIR.
     """

@@ -1,4 +1,7 @@
-"""What comes back to a LiDAR: reflectances, losses, noise, mixed pixels, rain and fog.
+"""LiDARs as data, and what comes back to them.
+
+Elevations are those of the makers' manuals: Velodyne VLP-16, HDL-32E, VLP-32C, HDL-64E S2; RoboSense RS-LiDAR-16, M1; Hesai
+Pandar64, PandarGT; Ouster OS1.
 
 The power of a return goes with reflectance x incidence / range^2 x exp(-2 extinction x range), the LiDAR equation of an
 extended target; a return is lost when it falls below a threshold. Fog extinguishes 3.912 / visibility (Koschmieder, 1924),
@@ -7,14 +10,153 @@ rain 1.076 x rate^0.67 dB/km (Carbonneau & Wisely, SPIE 1998); both send returns
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from log2sim.errors import ConfigError
+from log2sim.files.documents import first_problem
+from log2sim.files.inputs import read_text
+from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
 from log2sim.synth.polytopes import Material
+
+MAX_FILE_BYTES = 65536
+MAX_RAYS = 4_000_000
+
+Angle = Annotated[float, Field(ge=-90, le=90)]
+
+
+class LidarModel(BaseModel):
+    """A LiDAR whose rays form a grid of lines by azimuths; it turns clockwise from the left end of its field of view.
+
+    Attributes
+    ----------
+    elevation_deg : tuple of float
+        Of each line, deg.
+    azimuth_deg : (float, float)
+        Right and left end of the field of view, deg.
+    azimuth_step_deg : float
+        Angle between two firings, deg.
+    range_m : float
+        Largest measured distance, m.
+    noise_m : float
+        Standard deviation of a distance, m.
+    rate_hz : float
+        Sweeps per second, 1/s.
+    height_m : float
+        Usual height above the ground, m.
+    pitch_deg : float
+        Usual pitch, positive downward, deg.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str = "custom"
+    elevation_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=512)]
+    azimuth_deg: tuple[Annotated[float, Field(ge=-180, le=180)], Annotated[float, Field(ge=-180, le=180)]] = (
+        -180.0,
+        180.0,
+    )
+    azimuth_step_deg: Annotated[float, Field(ge=0.02, le=10)] = 0.2
+    range_m: Annotated[float, Field(ge=1, le=500)] = 100.0
+    noise_m: Annotated[float, Field(ge=0, le=1)] = 0.02
+    rate_hz: Annotated[float, Field(ge=0.1, le=100)] = 10.0
+    height_m: Annotated[float, Field(ge=0.1, le=50)] = 1.8
+    pitch_deg: Angle = 0.0
+
+    def azimuths_rad(self) -> Array:
+        """Azimuths (A,) of the firings in their order, from the left (high) to the right (low), rad."""
+        low, high = self.azimuth_deg
+        count = max(1, round((high - low) / self.azimuth_step_deg))
+        return np.asarray(np.deg2rad(high - (np.arange(count) + 0.5) * (high - low) / count))
+
+    def elevations_rad(self) -> Array:
+        """Elevations (L,) of the lines, rad."""
+        return np.asarray(np.deg2rad(np.array(self.elevation_deg)))
+
+
+def _even(low: float, high: float, lines: int) -> tuple[float, ...]:
+    return tuple(np.linspace(low, high, lines).round(4).tolist())
+
+
+_HDL64 = (*np.round(2 - np.arange(32) / 3, 3).tolist(), *np.round(-8.83 - np.arange(32) / 2, 3).tolist())
+_PANDAR64 = (
+    15.0, 11.0, 8.0, 5.0, 3.0, 2.0, *np.round(2 - np.arange(1, 49) / 6, 3).tolist(),
+    -7.0, -8.0, -9.0, -10.0, -11.0, -12.0, -13.0, -14.0, -19.0, -25.0,
+)  # fmt: skip
+_VLP32C = (
+    -25.0, -15.639, -11.31, -8.843, -7.254, -6.148, -5.333, -4.667, -4.0, -3.667, -3.333, -3.0, -2.667, -2.333, -2.0, -1.667,
+    -1.333, -1.0, -0.667, -0.333, 0.0, 0.333, 0.667, 1.0, 1.333, 1.667, 2.333, 3.333, 4.667, 7.0, 10.333, 15.0,
+)  # fmt: skip
+
+LIDAR_MODELS = {
+    model.name: model
+    for model in (
+        LidarModel(name="vlp16", elevation_deg=_even(-15, 15, 16), noise_m=0.03, range_m=100),
+        LidarModel(
+            name="rslidar16-roadside", elevation_deg=_even(-15, 15, 16), range_m=150, height_m=3.6, pitch_deg=31.25
+        ),
+        LidarModel(name="rslidar16", elevation_deg=_even(-15, 15, 16), range_m=150),
+        LidarModel(name="hdl32e", elevation_deg=_even(-30.67, 10.67, 32), range_m=80),
+        LidarModel(name="vlp32c", elevation_deg=_VLP32C, noise_m=0.03, range_m=150),
+        LidarModel(name="hdl64e", elevation_deg=_HDL64, azimuth_step_deg=0.17, height_m=1.73),
+        LidarModel(name="pandar64", elevation_deg=_PANDAR64, range_m=150),
+        LidarModel(name="os1-64", elevation_deg=_even(-22.5, 22.5, 64), azimuth_step_deg=0.3516, noise_m=0.015),
+        LidarModel(name="os1-128", elevation_deg=_even(-22.5, 22.5, 128), azimuth_step_deg=0.3516, noise_m=0.015),
+        LidarModel(
+            name="rslidar-m1",
+            elevation_deg=_even(-12.5, 12.5, 125),
+            azimuth_deg=(-60.0, 60.0),
+            range_m=150,
+            noise_m=0.025,
+        ),
+        LidarModel(
+            name="pandargt",
+            elevation_deg=_even(-10, 10, 150),
+            azimuth_deg=(-30.0, 30.0),
+            azimuth_step_deg=0.1,
+            range_m=200,
+        ),
+    )
+}
+"""Sensors by name: spinning ones of 16, 32, 64 and 128 lines, solid-state ones with a field of view of 120 and 60 degrees."""
+
+
+def lidar_model(name_or_path: str) -> LidarModel:
+    """Return a LiDAR of the table, or read one from a TOML file with the attributes of `LidarModel` as keys.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown name, an unreadable file, an unknown key or an impossible value.
+    """
+    if name_or_path in LIDAR_MODELS:
+        return LIDAR_MODELS[name_or_path]
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        known = list(LIDAR_MODELS)
+        raise ConfigError(
+            f"no LiDAR '{name_or_path}'{nearest(name_or_path, known)}; known: {', '.join(known)}, or a .toml file"
+        )
+    text = read_text(path, MAX_FILE_BYTES, ConfigError)
+    try:
+        model = LidarModel.model_validate({"name": path.stem, **tomllib.loads(text)})
+    except ValidationError as problem:
+        raise ConfigError(f"{path}: {first_problem(problem, LidarModel)}") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as problem:
+        raise ConfigError(f"{path}: not valid TOML: {problem}") from None
+    if model.azimuth_deg[0] >= model.azimuth_deg[1]:
+        raise ConfigError(f"{path}: azimuth_deg {list(model.azimuth_deg)}: expected the right end before the left end")
+    if len(model.elevation_deg) * len(model.azimuths_rad()) > MAX_RAYS:
+        raise ConfigError(f"{path}: more than {MAX_RAYS} rays a sweep")
+    return model
+
 
 # Least and greatest reflectance at 905 nm and normal incidence, drawn for each object; dark paint and tires send little.
 REFLECTANCE: dict[Material, tuple[float, float]] = {
@@ -81,7 +223,6 @@ class ReturnModel:
         Share of returns that are lost whatever they hit.
     mixed : float
         Share of returns that lie between two surfaces.
-    weather : Weather
     """
 
     noise_m: float = 0.02
@@ -101,7 +242,6 @@ def reflected(
     reflectance : (N,) float32
     incidence : (N,) float32
         Cosine of the angle between ray and normal.
-    weather : Weather
     """
     lost = np.exp(np.float32(-2 * weather.extinction_per_m) * range_m)
     nearness = np.maximum(range_m / np.float32(REFERENCE_RANGE_M), np.float32(0.05))

@@ -1,4 +1,4 @@
-"""Triangle meshes and the primitives that road users are composed of.
+"""Triangle meshes of road users: vehicles, pedestrians and cyclists.
 
 A mesh lives in the agent frame: x forward, y left, z up, origin at the center of its box.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -193,3 +195,320 @@ def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int, *, c
         for t in np.arange(7) * np.pi / 3
     ]
     return loft(np.array(rings), part, caps=False)
+
+
+class Material(IntEnum):
+    """Material of a face; `paint` assigns its colors."""
+
+    CAR_BODY = 0
+    WHEEL = 1
+    CAB = 2
+    CARGO = 3
+    CHASSIS = 4
+    BUS_BODY = 5
+    SKIN = 6
+    SHIRT = 7
+    TROUSERS = 8
+    SHOE = 9
+    HAIR = 10
+    FRAME = 11
+    TIRE = 12
+    MIRROR = 13
+    BARK = 14
+    LEAVES = 15
+
+
+# Side view of a sedan and a hatchback: position along the length and height of the top as fractions, rear to front.
+SEDAN = ((-0.5, 0.5), (-0.494, 0.62), (-0.47, 0.685), (-0.36, 0.72), (-0.335, 0.735), (-0.17, 0.955), (-0.08, 1.0), (0.03, 0.985),
+         (0.08, 0.95), (0.225, 0.685), (0.25, 0.665), (0.40, 0.60), (0.46, 0.55), (0.488, 0.47), (0.5, 0.38))  # fmt: skip
+HATCH = ((-0.5, 0.42), (-0.495, 0.6), (-0.485, 0.68), (-0.42, 0.92), (-0.39, 0.965), (-0.2, 1.0), (-0.02, 0.985), (0.05, 0.95),
+         (0.215, 0.69), (0.25, 0.665), (0.40, 0.61), (0.46, 0.56), (0.488, 0.47), (0.5, 0.38))  # fmt: skip
+WHEEL_AT = 0.3  # axles lie this fraction of the length off the middle
+WHEEL_RADIUS_M = 0.33
+BELT = 0.64  # height of the window line as a fraction
+
+
+def roof_line(kind: str) -> Array:
+    """Side view (P, 2) of a car: fraction of the length, fraction of the height."""
+    return np.array(SEDAN if kind == "sedan" else HATCH)
+
+
+@lru_cache(maxsize=64)
+def car(size_m: tuple[float, float, float], kind: str) -> Mesh:
+    """Shape a car: one skin from nose to tail and four wheels."""
+    length, width, height = size_m
+    line = roof_line(kind)
+    u = np.unique(np.concatenate([line[:, 0], np.linspace(-0.47, 0.47, 26)]))
+    top = np.interp(u, line[:, 0], line[:, 1])
+    rings = np.array([_car_section(ui, ti) for ui, ti in zip(u, top)]) * [length, width, height]
+    skin = loft(rings, Material.CAR_BODY)
+    floor = block(
+        [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Material.CHASSIS
+    )
+    wheels = [
+        disc_wheel(
+            [s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M], WHEEL_RADIUS_M, 0.22, Material.WHEEL
+        )
+        for s in (-1, 1)
+        for side in (-1, 1)
+    ]
+    mirrors = [block(*_mirror(length, width, height, side), Material.MIRROR, bevel_m=0.03) for side in (-1, 1)]
+    return merged([skin, floor, *wheels, *mirrors]).fitted(size_m)
+
+
+def _mirror(length: float, width: float, height: float, side: int) -> tuple[list[float], list[float]]:
+    inner, outer = side * width * 0.44, side * width * 0.5
+    return (
+        [0.165 * length, min(inner, outer), 0.63 * height],
+        [0.165 * length + 0.12, max(inner, outer), 0.63 * height + 0.13],
+    )
+
+
+def _car_section(u: float, top: float) -> Array:
+    """Ring (K, 3) at fraction `u` of the length, in fractions of length, width and height."""
+    end = abs(2 * u)
+    half = 0.5 * (1 - 0.16 * end**5 - 0.05 * end**12)
+    low = 0.16 + 0.05 * max(0.0, end - 0.8) * 5
+    shoulder = min(BELT, top - 0.035)
+    roof_half = half * (0.93 - 0.62 * max(0.0, top - shoulder - 0.03))
+    side = [
+        (0.0, low),
+        (0.8 * half, low),
+        (0.95 * half, low + 0.06),
+        (0.99 * half, min(0.36, shoulder - 0.06)),
+        (half, min(0.5, shoulder - 0.04)),
+        (0.985 * half, shoulder - 0.02),
+        (0.95 * half, shoulder),
+        (0.93 * half - 0.33 * (0.93 * half - roof_half), shoulder + (top - shoulder) * 0.33),
+        (0.93 * half - 0.66 * (0.93 * half - roof_half), shoulder + (top - shoulder) * 0.66),
+        (roof_half, top - (top - shoulder) * 0.12),
+        (roof_half - 0.035, top - (top - shoulder) * 0.03),
+        (0.5 * roof_half, top),
+        (0.0, top + 0.004),
+    ]
+    # Seen from the front the ring runs counter-clockwise: up the left side (+y), down the right.
+    left = side[:-1]
+    right = [(-y, z) for y, z in side[:0:-1]]
+    return np.array([(u, y, z) for y, z in left + right])
+
+
+@lru_cache(maxsize=32)
+def truck(size_m: tuple[float, float, float]) -> Mesh:
+    """Shape a box truck: cab in front, cargo box behind, three axles."""
+    length, width, height = size_m
+    cab = min(2.1, 0.32 * length)
+    front, rear = length / 2, -length / 2
+    half = width / 2
+    parts = [
+        _cab(front - cab, front, 0.92 * half, 0.34, 0.8 * height),
+        block([rear, -half, 0.36 * height], [front - cab - 0.15, half, height], Material.CARGO, bevel_m=0.05),
+        block([rear + 0.1, -0.3 * width, 0.5], [front - 0.4, 0.3 * width, 0.36 * height + 0.02], Material.CHASSIS),
+    ]
+    radius = 0.48
+    axles = (front - 0.95, rear + 1.1) if length < 8 else (front - 0.95, rear + 2.4, rear + 1.2)
+    parts += [
+        disc_wheel([x, side * (half - 0.17), radius], radius, 0.3, Material.WHEEL) for x in axles for side in (-1, 1)
+    ]
+    return merged(parts).fitted(size_m)
+
+
+def _cab(rear: float, front: float, half: float, low: float, high: float) -> Mesh:
+    x = np.array([rear, rear + 0.08, front - 0.45, front - 0.2, front - 0.06, front])
+    top = np.array([high - 0.06, high, high, high - 0.08, 0.62 * high, 0.5 * high])
+    squeeze = np.array([0.98, 1.0, 1.0, 0.99, 0.98, 0.96])
+    rings = []
+    for xi, ti, wi in zip(x, top, squeeze):
+        h = half * wi
+        left = [
+            (0.0, low),
+            (0.96 * h, low),
+            (h, low + 0.08),
+            (h, ti - 0.12),
+            (0.97 * h, ti - 0.04),
+            (0.88 * h, ti),
+            (0.0, ti),
+        ]
+        right = [(-y, z) for y, z in left[-2:0:-1]]
+        rings.append([(xi, y, z) for y, z in left + right])
+    return loft(np.array(rings), Material.CAB)
+
+
+@lru_cache(maxsize=32)
+def bus(size_m: tuple[float, float, float]) -> Mesh:
+    """Shape a city bus: a long box with rounded edges and two axles."""
+    length, width, height = size_m
+    half = width / 2
+    x = np.array([-0.5, -0.492, -0.48, 0.46, 0.485, 0.5]) * length
+    squeeze = np.array([0.93, 0.985, 1.0, 1.0, 0.985, 0.93])
+    top = np.array([0.95, 0.985, 1.0, 1.0, 0.985, 0.94]) * height
+    rings = []
+    for xi, wi, ti in zip(x, squeeze, top):
+        h = half * wi
+        left = [(0.0, 0.28), (0.97 * h, 0.28), (h, 0.4), (h, ti - 0.3), (0.97 * h, ti - 0.1), (0.88 * h, ti), (0.0, ti)]
+        right = [(-y, z) for y, z in left[-2:0:-1]]
+        rings.append([(xi, y, z) for y, z in left + right])
+    radius = 0.48
+    wheels = [
+        disc_wheel([s * length, side * (half - 0.165), radius], radius, 0.3, Material.WHEEL)
+        for s in (-0.26, 0.27)
+        for side in (-1, 1)
+    ]
+    return merged([loft(np.array(rings), Material.BUS_BODY), *wheels]).fitted(size_m)
+
+
+# ruff: noqa: RUF005  (`+` adds to points here, it does not join lists)
+
+
+STRIDE_M = 1.5  # two steps of a walking adult
+PEDAL_M = 5.2  # distance that a bicycle covers per turn of the pedals
+PHASES = 24
+# Height as a fraction from hips to neck, half the width and half the depth in m.
+TORSO = (
+    (0.0, 0.13, 0.10),
+    (0.08, 0.165, 0.115),
+    (0.3, 0.15, 0.10),
+    (0.55, 0.175, 0.115),
+    (0.78, 0.195, 0.115),
+    (0.9, 0.185, 0.10),
+    (0.965, 0.13, 0.08),
+    (1.0, 0.06, 0.06),
+)
+
+
+@lru_cache(maxsize=512)
+def pedestrian(size_m: tuple[float, float, float], phase: int, standing: bool) -> Mesh:
+    """Shape a person on foot at step `phase` of `PHASES`; the box holds the whole gait, whose ends legs reach twice a stride."""
+    low, high = _gait_extent(standing)
+    return _step(phase, standing).fitted(size_m, low, high)
+
+
+@lru_cache(maxsize=2 * PHASES)
+def _step(phase: int, standing: bool) -> Mesh:
+    return _grounded(_walker(2 * np.pi * phase / PHASES, standing))
+
+
+@lru_cache(maxsize=2)
+def _gait_extent(standing: bool) -> tuple[Array, Array]:
+    poses = [_step(k, standing).vertices_m for k in range(PHASES)]
+    return np.min([p.min(0) for p in poses], axis=0), np.max([p.max(0) for p in poses], axis=0)
+
+
+def _grounded(mesh: Mesh) -> Mesh:
+    return Mesh(mesh.vertices_m - [0, 0, mesh.vertices_m[:, 2].min()], mesh.normals, mesh.faces, mesh.part)
+
+
+def _walker(phase: float, standing: bool) -> Mesh:
+    swing = 0.0 if standing else 1.0
+    hip_z, shoulder_z = 0.93, 1.43
+    parts: list[Mesh] = []
+    for side, shift in ((1, 0.0), (-1, np.pi)):
+        s = np.sin(phase + shift) * swing
+        lift = max(0.0, np.cos(phase + shift)) * swing
+        thigh = 0.42 * s + 0.25 * lift
+        shin = thigh - 0.10 - 0.75 * lift - 0.18 * max(0.0, -s)
+        hip = np.array([0.0, side * 0.095, hip_z])
+        knee = hip + 0.44 * np.array([np.sin(thigh), 0, -np.cos(thigh)])
+        ankle = knee + 0.42 * np.array([np.sin(shin), 0, -np.cos(shin)])
+        toe = ankle + 0.19 * np.array([np.cos(shin + 0.05), 0.0, np.sin(shin + 0.05) - 0.12])
+        parts.append(
+            limb(
+                [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
+                [0.095, 0.085, 0.062, 0.058, 0.045],
+                Material.TROUSERS,
+            )
+        )
+        parts.append(limb([ankle + [-0.04, 0, -0.03], toe], [0.05, 0.04], Material.SHOE))
+        arm = -0.45 * s
+        shoulder = np.array([0.0, side * 0.195, shoulder_z])
+        elbow = shoulder + 0.29 * np.array([np.sin(arm - 0.06), side * 0.13, -np.cos(arm)])
+        wrist = elbow + 0.25 * np.array([np.sin(arm + 0.32), -side * 0.02, -np.cos(arm + 0.32)])
+        parts.append(
+            limb([shoulder, (shoulder + elbow) / 2, elbow, wrist], [0.062, 0.055, 0.047, 0.038], Material.SHIRT)
+        )
+        parts.append(ellipsoid(wrist + [0.015, 0, -0.05], [0.035, 0.025, 0.06], Material.SKIN, count=8))
+    parts.append(_torso(0.02, 0.86, shoulder_z + 0.08))
+    parts += _head(np.array([0.03, 0.0, 1.68]))
+    return merged(parts)
+
+
+def _torso(lean: float, low: float, high: float) -> Mesh:
+    """Hips to neck as one skin of oval rings; `lean` is the forward shift a meter of height."""
+    angle = np.arange(16) * 2 * np.pi / 16
+    rings = []
+    for f, half_width, half_depth in TORSO:
+        z = low + f * (high - low)
+        ring = [half_depth * np.cos(angle) + lean * (z - low), half_width * np.sin(angle), np.full(16, z)]
+        rings.append(np.stack(ring, 1))
+    return loft(np.array(rings), Material.SHIRT)
+
+
+def _head(center: Array) -> list[Mesh]:
+    return [
+        limb([center + [-0.03, 0, -0.2], center + [-0.01, 0, -0.08]], [0.055, 0.055], Material.SKIN),
+        ellipsoid(center, [0.098, 0.077, 0.12], Material.SKIN),
+        ellipsoid(center + [-0.022, 0, 0.025], [0.098, 0.083, 0.112], Material.HAIR),
+    ]
+
+
+@lru_cache(maxsize=256)
+def cyclist(size_m: tuple[float, float, float], phase: int) -> Mesh:
+    """Shape a bicycle with its rider at `phase` of `PHASES` of a turn of the pedals."""
+    return _rider(phase).fitted(size_m)
+
+
+@lru_cache(maxsize=PHASES)
+def _rider(step: int) -> Mesh:
+    phase = 2 * np.pi * step / PHASES
+    radius = 0.34
+    rear, front = np.array([-0.53, 0.0, radius]), np.array([0.53, 0.0, radius])
+    crank, seat, head = np.array([-0.08, 0.0, 0.28]), np.array([-0.26, 0.0, 0.92]), np.array([0.38, 0.0, 0.88])
+    parts = [hoop(c, radius, 0.026, Material.TIRE) for c in (rear, front)]
+    for hub in (rear, front):
+        for k in range(8):
+            a = k * np.pi / 8 + phase
+            rim = 0.31 * np.array([np.cos(a), 0, np.sin(a)])
+            parts.append(limb([hub - rim, hub + rim], [0.005, 0.005], Material.MIRROR, count=4))
+        parts.append(limb([hub + [0, -0.04, 0], hub + [0, 0.04, 0]], [0.025, 0.025], Material.TIRE, count=6))
+    tubes = ((seat, crank), (crank, head), (seat + [0.02, 0, -0.08], head), (crank, rear), (seat + [0.03, 0, -0.12], rear),
+             (head + [0.0, 0, 0.1], front))  # fmt: skip
+    parts += [limb([a, b], [0.024, 0.024], Material.FRAME, count=8) for a, b in tubes]
+    bar = head + [0.02, 0, 0.13]
+    parts.append(limb([bar + [0, -0.27, 0], bar + [0, 0.27, 0]], [0.016, 0.016], Material.TIRE, count=6))
+    parts.append(limb([seat + [-0.13, 0, 0.03], seat + [0.12, 0, 0.03]], [0.06, 0.03], Material.TIRE, count=8))
+    hip_z = 1.0
+    for side, shift in ((1, 0.0), (-1, np.pi)):
+        pedal = crank + [0.17 * np.cos(phase + shift), side * 0.11, -0.17 * np.sin(phase + shift)]
+        parts.append(
+            limb([crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]], [0.014, 0.014], Material.MIRROR, count=6)
+        )
+        hip, ankle = np.array([-0.22, side * 0.09, hip_z]), pedal + [-0.06, 0, 0.1]
+        knee = _knee(hip, ankle, 0.44, 0.43)
+        parts.append(
+            limb(
+                [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
+                [0.10, 0.09, 0.065, 0.06, 0.045],
+                Material.TROUSERS,
+            )
+        )
+        parts.append(limb([ankle + [-0.03, 0, -0.04], pedal + [0.1, 0, 0.03]], [0.048, 0.038], Material.SHOE))
+        shoulder = np.array([0.13, side * 0.19, 1.45])
+        hand = bar + [0.01, side * 0.23, 0.03]
+        elbow = (shoulder + hand) / 2 + [-0.05, side * 0.05, -0.06]
+        parts.append(limb([shoulder, elbow, hand], [0.062, 0.05, 0.04], Material.SHIRT))
+        parts.append(ellipsoid(hand, [0.05, 0.045, 0.035], Material.SKIN, count=8))
+    parts.append(_torso(0.62, 0.95, 1.52))
+    torso = parts[-1]
+    parts[-1] = Mesh(torso.vertices_m - [0.22, 0, 0], torso.normals, torso.faces, torso.part)
+    parts += _head(np.array([0.25, 0.0, 1.68]))
+    return merged(parts)
+
+
+def _knee(hip: Array, ankle: Array, thigh_m: float, shin_m: float) -> Array:
+    """Position of a knee that bends forward between hip and ankle."""
+    reach = ankle - hip
+    distance = min(float(np.linalg.norm(reach)), 0.999 * (thigh_m + shin_m))
+    along = (thigh_m**2 - shin_m**2 + distance**2) / (2 * distance)
+    off = np.sqrt(max(thigh_m**2 - along**2, 0.0))
+    axis = reach / np.linalg.norm(reach)
+    forward = np.array([-axis[2], 0.0, axis[0]])
+    return np.asarray(hip + axis * along + off * forward / np.linalg.norm(forward))

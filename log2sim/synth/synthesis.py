@@ -1,4 +1,9 @@
-"""Synthesis of a log and its exact truth from a scene."""
+"""Synthesis of a log and its exact truth from a scene, and its writing.
+
+scene = load_scene("samples/crossing.toml")
+log, truth = synthesize(scene, seed=1)          # records are rendered and cast when they are read
+write_synthetic(scene, "samples/crossing", seed=1)
+"""
 
 from __future__ import annotations
 
@@ -6,33 +11,40 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.color_names import name_of
 from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario, Stream, Waypoints
+from log2sim.datatypes.color_names import name_of
 from log2sim.errors import ConfigError
+from log2sim.files.documents import check_folder
+from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import raycast
 from log2sim.synth.actors import Actor, ActorStates, EgoMotion, MovingScene
-from log2sim.synth.cameras import camera_of, frame_stamps
-from log2sim.synth.labels import (
+from log2sim.synth.render import camera_of, frame_stamps
+from log2sim.synth.scene import LidarSpec, Scene, load_scene
+from log2sim.synth.truth import (
     FrameVisibility,
     LidarVisibility,
     labels_2d,
     labels_3d,
+    map_features_of,
+    seen_ground,
     visibility_by_camera,
     visible_at,
 )
-from log2sim.synth.map_truth import map_features_of
-from log2sim.synth.scene import LidarSpec, Scene
-from log2sim.synth.seen_ground import seen_ground
 
 if TYPE_CHECKING:
-    from log2sim.synth.lamps import Lamp
-    from log2sim.synth.reflectance import GroundReflectance
+    from log2sim.datatypes import Log, Scenario
+    from log2sim.synth.light import Lamp
+    from log2sim.synth.paint import GroundReflectance
+
+__all__ = ["Scene", "load_scene", "synthesize", "write_synthetic"]
+
 
 Caster = Callable[[str, int], raycast.LabeledSweep]
 
@@ -104,9 +116,7 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
     scene, light = moving.scene, light_of(moving.scene.environment)
 
     def read(camera: Camera, index: int, t_ns: NDArray[np.int64], i: int) -> NDArray[np.uint8]:
-        from log2sim.synth.bodies import Body
-        from log2sim.synth.render import SceneInstant, render
-        from log2sim.synth.traffic_lights import bodies_at
+        from log2sim.synth.render import Body, SceneInstant, bodies_at, render
 
         map_T_cam = moving.map_T_mount(camera.mount, t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, index, i])
@@ -129,7 +139,7 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
 
 def lamps_on(moving: MovingScene, map_T_cam: Array, t_ns: int) -> tuple[Lamp, ...]:
     """List the headlights of all that drives and the street lights around a camera."""
-    from log2sim.synth.lamps import headlights, street_lights
+    from log2sim.synth.light import headlights, street_lights
 
     lamps = list(street_lights(moving.scene.road, map_T_cam[:2, 3]))
     driving = (*moving.actors, *([] if moving.ego_body is None else [moving.ego_body]))
@@ -154,10 +164,9 @@ def _backdrop(scene: Scene, seed: int) -> Any:
 
 @lru_cache(maxsize=2)
 def _ground_reflectance(scene: Scene, seed: int) -> GroundReflectance:
-    from log2sim.synth.ground import Ground
+    from log2sim.synth.ground import Ground, GroundPlan
     from log2sim.synth.light import light_of
-    from log2sim.synth.markings import GroundPlan
-    from log2sim.synth.reflectance import GroundReflectance
+    from log2sim.synth.paint import GroundReflectance
 
     return GroundReflectance(Ground(GroundPlan.of(scene), seed), light_of(scene.environment).wetness)
 
@@ -206,7 +215,7 @@ def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> P
 
 
 def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, seed: int) -> Scenario:
-    from log2sim.synth.traffic_lights import signals_of
+    from log2sim.synth.render import signals_of
 
     scene = moving.scene
     agents = [] if moving.ego_body is None else [_ego_agent(moving.ego_body, t_s)]
@@ -266,3 +275,53 @@ def _waypoints(t_s: Array, states: ActorStates, visible: NDArray[np.bool_] | Non
 
 def _digest(scene: Scene, seed: int) -> str:
     return hashlib.sha256(f"{scene!r} {seed}".encode()).hexdigest()
+
+
+TRUTH_FILE = "truth.json"
+MANIFEST = "log.json"
+
+
+def write_synthetic(
+    scene: Scene,
+    out: Path | str,
+    *,
+    seed: int = 0,
+    overwrite: bool = False,
+    jpeg_quality: int = 85,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a scene's log as a native log folder with its truth as `truth.json` in it, whole or not at all.
+
+    Parameters
+    ----------
+    out
+        The folder; one that is there already is replaced only with `overwrite`, and only if it is a log.
+    jpeg_quality
+        1 to 100.
+    progress
+        Called as `progress(done, total)` after each record.
+
+    Raises
+    ------
+    ConfigError
+        When the folder may not be replaced or cannot be written.
+    """
+    from log2sim.logs.native.writer import write_log
+
+    target = Path(out)
+    _refuse(target, overwrite)
+    check_folder(target, overwrite=overwrite)
+    log, truth = synthesize(scene, seed=seed)
+    poses: Literal["gnss", "poses"] = scene.ego.poses if scene.ego is not None else "poses"
+    with replaced_folder(target, overwrite=overwrite) as folder:
+        write_log(log, folder, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
+        truth.save(folder / TRUTH_FILE)
+
+
+def _refuse(target: Path, overwrite: bool) -> None:
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if not overwrite:
+        raise ConfigError(f"{target}: exists already; choose another name or pass --overwrite")
+    if not (target / MANIFEST).is_file():
+        raise ConfigError(f"{target}: exists and is no log folder, so it is not replaced; choose another name")

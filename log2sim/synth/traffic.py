@@ -1,4 +1,4 @@
-"""Random traffic scenes around a LiDAR: roads, road users and clutter, cast in a tenth of a second.
+"""Random traffic scenes around a LiDAR: roads, road users and clutter, cast into clouds.
 
 A scene is drawn from a seed alone. Roads run at any angle, bend, cross each other and rise; traffic keeps right or left; cars
 park along, across and at an angle; people, riders and what is no road user stand beside the road.
@@ -7,17 +7,18 @@ park along, across and at an angle; people, riders and what is no road user stan
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, wrap_angle
-from log2sim.synth.lidar_models import LidarModel
-from log2sim.synth.polytope_caster import Returns, cast_polytopes
-from log2sim.synth.polytope_hits import SensorState, Solid
+from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform, wrap_angle
+from log2sim.synth import traffic_shapes as clutter
+from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Polytope
-from log2sim.synth.returns import ReturnModel
+from log2sim.synth.returns import LIDAR_MODELS, LidarModel, ReturnModel, Weather, lidar_model
+from log2sim.synth.scene import Environment
+from log2sim.synth.traffic_shapes import ROAD_USERS, own_car
 
 Mount = Literal["vehicle", "roadside"]
 
@@ -32,13 +33,10 @@ class Road:
         Point of the line at s = 0.
     yaw_rad : float
         Direction of the line there.
-    curvature_per_m : float
     half_width_m : float
         Half of the carriageway, m.
     lanes : int
         In all.
-    keeps_right : bool
-    one_way : bool
     """
 
     origin_m: Array
@@ -81,7 +79,6 @@ class Surface:
         Of x, y, x^2, x y, y^2.
     waves : (K, 4) float64
         Amplitude in m, wave numbers along x and y in rad/m, phase.
-    roads : tuple of Road
     kerb_m : float
         Height of the ground beside the roads.
     """
@@ -127,10 +124,8 @@ class TrafficObject:
         One of the road users' categories, "" for clutter.
     position_m : (3,) float64, m
         Middle of its floor, level frame under the sensor.
-    yaw_rad : float
     size_m : (float, float, float)
         Length, width, height, m.
-    parts : tuple of Polytope
     speed_mps : float
         Along the heading.
     turn_radps : float
@@ -165,12 +160,6 @@ class TrafficScene:
     ----------
     mount : str
         vehicle or roadside.
-    roads : tuple of Road
-    surface : Surface
-    objects : tuple of TrafficObject
-    lidar : LidarModel
-    sensor : SensorState
-    returns : ReturnModel
     second : (LidarModel, SensorState) or None
         Another LiDAR that sees the scene too.
     """
@@ -229,7 +218,6 @@ class LabeledCloud:
         x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's points.
     points : (M,) int64
         Number of points on each.
-    scene : TrafficScene
     """
 
     xyz_m: NDArray[np.float32]
@@ -253,3 +241,464 @@ def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud
         boxes[row] = *position[:2], position[2] + item.size_m[2] / 2, *item.size_m, yaw
     category = np.array([scene.objects[k].category for k in users], dtype="<U16")
     return LabeledCloud(cloud.xyz_m, cloud.hit, category, boxes, count[users], scene)
+
+
+REACH_M = 60.0
+WALKING_MPS, RIDING_MPS = 1.4, 5.0
+# Shares of what drives on a lane.
+LANE_SHARES = {"car": 0.78, "truck": 0.09, "bus": 0.04, "motorcycle": 0.04, "cyclist": 0.05}
+
+
+@dataclass(eq=False)
+class _Layout:
+    """Objects so far, with circles that cover what is taken."""
+
+    surface: Surface
+    roads: tuple[Road, ...]
+    rng: np.random.Generator
+    objects: list[TrafficObject] = field(default_factory=list)
+    circles: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def is_free(self, circles: Array, margin: float = 0.0) -> bool:
+        """Decide whether circles (K, 3: x, y, radius) meet none that is taken."""
+        dx, dy = (circles[:, None, axis] - self.circles[:, axis] for axis in range(2))
+        reach = circles[:, None, 2] + self.circles[:, 2] + margin
+        return not bool(((dx * dx + dy * dy <= reach * reach) & (reach > 0)).any())
+
+    def take(self, circles: Array) -> None:
+        """Mark circles (K, 3) as taken."""
+        self.circles = np.concatenate([self.circles, circles])
+
+    def on_road(self, xy: Array) -> bool:
+        """Decide whether a position is on a carriageway."""
+        x, y = xy[:1].astype(np.float32), xy[1:].astype(np.float32)
+        return any(abs(float(road.offset(x, y)[0])) < road.half_width_m for road in self.roads)
+
+    def add_user(
+        self, category: str, xy: Array, yaw: float, *, speed: float = 0.0, turn: float = 0.0, margin: float = 0.4
+    ) -> bool:
+        """Add a road user where its place is free."""
+        size, parts = ROAD_USERS[category](self.rng)
+        circles = _covering(xy, yaw, size)
+        if not self.is_free(circles, margin):
+            return False
+        self.take(circles)
+        self.objects.append(
+            TrafficObject(category, np.append(xy, self.surface.elevation(xy)), yaw, size, parts, speed, turn)
+        )
+        return True
+
+    def add_thing(self, kind: str, xy: Array, yaw: float, parts: tuple[Polytope, ...], radius: float = 0.0) -> bool:
+        """Add clutter; with a radius only where its place is free."""
+        circle = np.array([[*xy, radius]])
+        if radius and not self.is_free(circle):
+            return False
+        if radius:
+            self.take(circle)
+        low, high = np.min([p.low for p in parts], axis=0), np.max([p.high for p in parts], axis=0)
+        size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
+        self.objects.append(TrafficObject("", np.append(xy, self.surface.elevation(xy)), yaw, size, parts, kind=kind))
+        return True
+
+
+def _covering(xy: Array, yaw: float, size: tuple[float, float, float]) -> Array:
+    """Cover a box by circles (K, 3) along its length."""
+    length, width, _ = size
+    if length <= 1.5 * width:
+        return np.array([[*xy, max(length, width) / 2]])
+    along = np.linspace(-(length - width) / 2, (length - width) / 2, max(2, int(length / max(width, 0.8)) + 1))
+    direction = np.array([np.cos(yaw), np.sin(yaw)])
+    return np.column_stack([xy + along[:, None] * direction, np.full(len(along), width / 2)])
+
+
+def draw_layout(
+    mount: Mount, roads: tuple[Road, ...], surface: Surface, rng: np.random.Generator
+) -> list[TrafficObject]:
+    """Draw the objects of a scene."""
+    out = _Layout(surface, roads, rng)
+    # The place of the sensor's own car, or of its pole.
+    out.take(np.array([[0.0, 0.0, 0.5 if mount == "roadside" else 2.4]]))
+    for road in roads:
+        _traffic(out, road)
+    _parked(out, roads[0])
+    if rng.random() < 0.3:
+        _car_park(out, roads[0])
+    for road in roads[: 1 + (rng.random() < 0.5)]:
+        _people(out, road)
+        _roadside(out, road)
+        _fronts(out, road)
+    return out.objects
+
+
+def _traffic(out: _Layout, road: Road) -> None:
+    """Fill the lanes: free flow, or a queue that stands."""
+    rng = out.rng
+    density, queue = rng.uniform(0.1, 0.85), rng.random() < 0.25
+    kinds, shares = list(LANE_SHARES), np.array(list(LANE_SHARES.values()))
+    for lane in range(road.lanes):
+        d = -road.half_width_m + (lane + 0.5) * 2 * road.half_width_m / road.lanes
+        # To the right of the line one drives along it where traffic keeps right.
+        along = road.one_way or (d < 0) == road.keeps_right
+        speed = 0.0 if queue else float(rng.uniform(2, 18))
+        s = -REACH_M + rng.uniform(0, 15)
+        while s < REACH_M:
+            if rng.random() < density:
+                xy, direction = road.at(s, d + rng.normal(0, 0.25))
+                yaw = direction + (0.0 if along else np.pi) + rng.normal(0, 0.04)
+                turn = speed * road.curvature_per_m * (1 if along else -1)
+                if rng.random() < 0.07:
+                    yaw += rng.uniform(-0.7, 0.7)
+                category = str(rng.choice(kinds, p=shares / shares.sum()))
+                standing = rng.random() < 0.15
+                out.add_user(category, xy, yaw, speed=0.0 if standing else speed, turn=0.0 if standing else turn)
+            s += rng.uniform(5.5, 8) if queue else rng.uniform(6, 20)
+
+
+def _parked(out: _Layout, road: Road) -> None:
+    """Park rows along, across or at an angle beside the carriageway."""
+    rng = out.rng
+    for side in (-1, 1):
+        if rng.random() > 0.45:
+            continue
+        angle = float(rng.choice([0.0, 0.0, np.pi / 2, np.pi / 3, np.pi / 4]))
+        d = road.half_width_m + (rng.uniform(0.85, 1.3) if angle == 0 else rng.uniform(2.3, 3.2))
+        fill, s = rng.uniform(0.3, 0.95), -REACH_M * rng.uniform(0.3, 1.0)
+        end = REACH_M * rng.uniform(0.3, 1.0)
+        while s < end:
+            if rng.random() < fill:
+                category = str(rng.choice(["car", "truck", "motorcycle"], p=[0.94, 0.035, 0.025]))
+                xy, direction = road.at(s, side * d)
+                yaw = direction + side * angle + (np.pi if rng.random() < 0.5 else 0.0) + rng.normal(0, 0.03)
+                out.add_user(category, xy, yaw, margin=0.1)
+            s += (rng.uniform(5.6, 7) if angle == 0 else rng.uniform(2.6, 3.4)) / max(0.7, np.cos(0.0))
+
+
+def _car_park(out: _Layout, road: Road) -> None:
+    """Fill a car park of several rows beside the road."""
+    rng = out.rng
+    side, start = rng.choice([-1, 1]), rng.uniform(-35, 15)
+    rows, places, fill = rng.integers(1, 4), rng.integers(4, 12), rng.uniform(0.3, 1.0)
+    angle = float(rng.choice([np.pi / 2, np.pi / 2, 0.0]))
+    pitch, aisle = (2.7, 8.0) if angle else (5.8, 6.0)
+    for row in range(rows):
+        for place in range(places):
+            if rng.random() < fill:
+                xy, direction = road.at(start + place * pitch, side * (road.half_width_m + 6 + row * aisle))
+                if out.on_road(xy):
+                    continue
+                yaw = direction + angle + np.pi * rng.integers(2) + rng.normal(0, 0.04)
+                out.add_user("car" if rng.random() < 0.96 else "truck", xy, yaw, margin=0.1)
+
+
+def _people(out: _Layout, road: Road) -> None:
+    """Put people and riders on the sidewalks, at the kerb and on crossings, alone and in groups."""
+    rng, half = out.rng, road.half_width_m
+    for _ in range(rng.poisson(4)):
+        side = rng.choice([-1, 1])
+        xy, direction = road.at(rng.uniform(-35, 35), side * (half + rng.uniform(-1.5, 5)))
+        across = rng.random() < 0.3
+        yaw = direction + (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(0, 0.3)
+        out.add_user("pedestrian", xy, yaw, speed=WALKING_MPS * float(rng.random() < 0.6), margin=0.05)
+    for _ in range(rng.choice(3, p=[0.55, 0.3, 0.15])):
+        middle, direction = road.at(rng.uniform(-30, 30), rng.choice([-1, 1]) * (half + rng.uniform(-3, 4)))
+        for _ in range(rng.integers(2, 6)):
+            out.add_user("pedestrian", middle + rng.normal(0, 1.0, 2), rng.uniform(-np.pi, np.pi), margin=0.02)
+        if rng.random() < 0.3:
+            out.add_user("other", middle + rng.normal(0, 1.5, 2), direction, margin=0.05)
+    for _ in range(rng.poisson(2.5)):
+        xy, direction = road.at(rng.uniform(-35, 35), rng.choice([-1, 1]) * (half + rng.uniform(-1.8, 2.5)))
+        yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
+        out.add_user(
+            str(rng.choice(["cyclist", "motorcycle"], p=[0.7, 0.3])),
+            xy,
+            yaw,
+            speed=RIDING_MPS * float(rng.random() < 0.8),
+        )
+    if rng.random() < 0.3:
+        xy, direction = road.at(rng.uniform(-25, 25), rng.choice([-1, 1]) * (half + rng.uniform(0.5, 4)))
+        step = np.array([np.cos(direction), np.sin(direction)]) * rng.uniform(0.6, 1.1)
+        kind = str(rng.choice(["bicycle", "motorcycle"]))
+        for k in range(rng.integers(2, 8)):
+            out.add_user(kind, xy + k * step, direction + np.pi / 2 + rng.normal(0, 0.1), margin=-0.3)
+
+
+def _roadside(out: _Layout, road: Road) -> None:
+    """Scatter small clutter beside the road, some kinds in rows."""
+    rng, half = out.rng, road.half_width_m
+    kinds, shares = list(clutter.SMALL), np.array([v[0] for v in clutter.SMALL.values()])
+    for side in (-1, 1):
+        if rng.random() < 0.6:
+            kind = str(rng.choice(["tree", "pole", "bush"]))
+            _, radius, draw = clutter.SMALL[kind]
+            step, d = rng.uniform(4, 15), half + rng.uniform(0.4, 3)
+            for s in np.arange(-45 + rng.uniform(0, 6), 45, step):
+                xy, direction = road.at(s + rng.normal(0, 0.5), side * d)
+                if not out.on_road(xy):
+                    out.add_thing(kind, xy, direction, draw(rng), radius)
+    for _ in range(rng.poisson(rng.choice([16, 26, 45]))):
+        kind = str(rng.choice(kinds, p=shares / shares.sum()))
+        _, radius, draw = clutter.SMALL[kind]
+        d = rng.choice([-1, 1]) * (half + abs(rng.normal(0, 6)) + 0.3)
+        xy, direction = road.at(rng.uniform(-42, 42), d)
+        if not out.on_road(xy) or kind == "cone":
+            yaw = direction + (rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi))
+            out.add_thing(kind, xy, yaw, draw(rng), radius)
+
+
+def _fronts(out: _Layout, road: Road) -> None:
+    """Line the road with houses, fences, hedges and open ground in pieces."""
+    rng = out.rng
+    for side in (-1, 1):
+        edge = road.half_width_m + rng.uniform(2.5, 12)
+        style, s = rng.random(), -55.0
+        while s < 55:
+            length = rng.uniform(4, 14)
+            xy, direction = road.at(s + length / 2, side * edge)
+            yaw = direction + (0.0 if side > 0 else np.pi)
+            clear = out.is_free(_covering(xy, direction, (length, 2.0, 1.0)), 0.3)
+            if clear and not out.on_road(xy):
+                if style < 0.5 and rng.random() < 0.85:
+                    out.add_thing("building", xy, yaw, clutter.building(length, rng))
+                elif style < 0.85 and rng.random() < 0.75:
+                    out.add_thing("fence", xy, yaw, clutter.fence(length, rng))
+            s += length + (rng.uniform(1, 9) if rng.random() < 0.4 else 0.0)
+
+
+VEHICLE_LIDARS = ("hdl64e", "pandar64", "os1-64", "os1-128", "vlp32c", "hdl32e", "rslidar-m1")
+VEHICLE_LIDAR_SHARES = (0.28, 0.3, 0.12, 0.08, 0.1, 0.09, 0.03)
+
+
+def draw_scene(
+    mount: Mount, rng: np.random.Generator, *, lidar: LidarModel | None = None, weather: Weather | None = None
+) -> TrafficScene:
+    """Draw a random scene.
+
+    Parameters
+    ----------
+    mount : str
+        "vehicle": the LiDAR is on a car's roof on the road; "roadside": on a pole beside it, tilted down to the road.
+    rng : Generator
+    lidar : LidarModel, optional
+        By default one of the common sensors, with elevations and density that vary as between units.
+    weather : Weather, optional
+        By default clear, in one scene of ten rain or fog.
+    """
+    roads, sensor_forward = _draw_roads(mount, rng)
+    surface = _draw_surface(roads, rng)
+    model = lidar or _draw_lidar(mount, rng)
+    objects = draw_layout(mount, roads, surface, rng)
+    sensor = _draw_sensor(mount, model, surface, sensor_forward, rng)
+    if mount == "vehicle" and rng.random() < 0.7:
+        parts = own_car(float(sensor.position_m[2]), rng)
+        speed = float(np.hypot(*sensor.velocity_mps))
+        objects.append(TrafficObject("", np.zeros(3), sensor_forward, (4.4, 1.8, 1.5), parts, speed, kind="own car"))
+    weather = weather or _draw_weather(rng)
+    returns = ReturnModel(
+        noise_m=model.noise_m if lidar else float(rng.uniform(0.008, 0.03)),
+        dropout=float(rng.uniform(0.0, 0.12)),
+        mixed=float(rng.uniform(0, 0.006)),
+        weather=weather,
+    )
+    second = (
+        _draw_second(sensor, sensor_forward, rng) if mount == "vehicle" and not lidar and rng.random() < 0.2 else None
+    )
+    return TrafficScene(mount, roads, surface, tuple(objects), model, sensor, returns, second)
+
+
+def _draw_roads(mount: Mount, rng: np.random.Generator) -> tuple[tuple[Road, ...], float]:
+    """Draw the main road, which passes the sensor, and those that cross it."""
+    half = float(rng.uniform(2.6, 5) if rng.random() < 0.6 else rng.uniform(5, 11))
+    yaw = float(rng.uniform(-np.pi, np.pi))
+    keeps_right = bool(rng.random() < 0.7)
+    curvature = float(rng.choice([0.0, rng.normal(0, 0.004), rng.normal(0, 0.012)], p=[0.5, 0.3, 0.2]))
+    lanes = max(1, round(2 * half / 3.3))
+    side = rng.choice([-1, 1])
+    if mount == "roadside":
+        offset = side * (half + rng.uniform(0.4, 3.0))
+        forward = float(rng.normal(0, 0.35))
+    else:
+        offset, forward = float(rng.uniform(-half + 1.2, half - 1.2)), 0.0
+    # The origin is `offset` to the left of the line, so the line passes on its other side.
+    normal = np.array([-np.sin(yaw), np.cos(yaw)])
+    main = Road(-offset * normal, yaw, curvature, half, lanes, keeps_right, bool(rng.random() < 0.15))
+    if mount == "roadside":
+        # The sensor looks across the road, more or less.
+        towards = np.arctan2(*(-offset * normal)[::-1])
+        forward += float(towards) + float(rng.choice([0.0, rng.uniform(-1.2, 1.2)]))
+    elif rng.random() < 0.9:
+        forward = yaw + (0.0 if (offset < 0) == keeps_right else np.pi)
+    roads = [main]
+    for _ in range(rng.choice(3, p=[0.5, 0.38, 0.12])):
+        at, _ = main.at(float(rng.uniform(-40, 40)), 0.0)
+        cross_half = float(rng.uniform(2.5, 7))
+        cross_yaw = yaw + float(rng.choice([-1, 1])) * float(rng.normal(np.pi / 2, 0.2))
+        roads.append(Road(at, cross_yaw, 0.0, cross_half, max(1, round(2 * cross_half / 3.3)), keeps_right))
+    return tuple(roads), forward
+
+
+def _draw_surface(roads: tuple[Road, ...], rng: np.random.Generator) -> Surface:
+    steep = rng.random() < 0.4
+    tilt = rng.normal(0, 0.03 if steep else 0.008, 2)
+    bend = rng.normal(0, 4e-4 if steep else 5e-5, 3)
+    waves = np.column_stack(
+        [rng.uniform(0, 0.025, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.uniform(0, 2 * np.pi, 3)]
+    )
+    kerb = float(rng.choice([0.0, rng.uniform(0.02, 0.2), rng.normal(0, 0.2)], p=[0.3, 0.6, 0.1]))
+    return Surface(np.append(tilt, bend), waves, roads, kerb)
+
+
+def _draw_lidar(mount: Mount, rng: np.random.Generator) -> LidarModel:
+    if mount == "roadside":
+        model = LIDAR_MODELS["rslidar16-roadside"]
+        if rng.random() < 0.25:
+            lines = int(rng.choice([32, 40, 64]))
+            model = model.model_copy(update={"elevation_deg": tuple(np.linspace(-20, 12, lines).tolist())})
+        return model.model_copy(update={"range_m": float(rng.choice([80.0, 120.0, 150.0]))})
+    model = LIDAR_MODELS[str(rng.choice(VEHICLE_LIDARS, p=VEHICLE_LIDAR_SHARES))]
+    elevation = np.array(model.elevation_deg) + rng.normal(0, 0.15)
+    if rng.random() < 0.08:
+        elevation = np.delete(elevation, rng.choice(len(elevation), len(elevation) // 3, replace=False))
+    step = model.azimuth_step_deg * float(rng.choice([1.0, 1.2, 1.5], p=[0.6, 0.25, 0.15]))
+    return model.model_copy(update={"elevation_deg": tuple(elevation.tolist()), "azimuth_step_deg": step})
+
+
+def _draw_sensor(
+    mount: Mount, model: LidarModel, surface: Surface, forward: float, rng: np.random.Generator
+) -> SensorState:
+    if mount == "roadside":
+        height, pitch = model.height_m + rng.normal(0, 0.1), np.deg2rad(model.pitch_deg + rng.normal(0, 0.6))
+        roll, velocity = np.deg2rad(rng.normal(0, 0.6)), np.zeros(2)
+    else:
+        height = float(rng.uniform(1.55, 2.3))
+        sx, sy = surface.slope(np.zeros(1, np.float32), np.zeros(1, np.float32))
+        uphill = float(sx[0] * np.cos(forward) + sy[0] * np.sin(forward))
+        leftward = float(-sx[0] * np.sin(forward) + sy[0] * np.cos(forward))
+        # The car stands on the slope, so its sensor leans with it.
+        pitch, roll = (
+            -np.arctan(uphill) + np.deg2rad(rng.normal(0, 0.5)),
+            np.arctan(leftward) + np.deg2rad(rng.normal(0, 0.5)),
+        )
+        speed = float(rng.choice([0.0, rng.uniform(0, 16), rng.uniform(16, 32)], p=[0.3, 0.55, 0.15]))
+        velocity = speed * np.array([np.cos(forward), np.sin(forward)])
+    rotation = rotation_from_rpy(roll, pitch, forward)
+    return SensorState(rotation, np.array([0.0, 0.0, height]), velocity)
+
+
+def _draw_second(sensor: SensorState, forward: float, rng: np.random.Generator) -> tuple[LidarModel, SensorState]:
+    """Draw a second LiDAR: a solid-state one that looks forward, or one of a few lines at a corner."""
+    if rng.random() < 0.6:
+        model, yaw = LIDAR_MODELS[str(rng.choice(["pandargt", "rslidar-m1"]))], forward
+    else:
+        model, yaw = LIDAR_MODELS["vlp16"], float(rng.uniform(-np.pi, np.pi))
+    offset = np.array([rng.uniform(-1.0, 0.6), rng.uniform(-0.8, 0.8), rng.uniform(-0.4, 0.1)])
+    place = sensor.position_m + rotation_from_rpy(0.0, 0.0, forward) @ offset
+    pitch = np.deg2rad(rng.normal(0, 1.0))
+    return model, SensorState(rotation_from_rpy(0.0, pitch, yaw), place, sensor.velocity_mps)
+
+
+def _draw_weather(rng: np.random.Generator) -> Weather:
+    kind = rng.random()
+    if kind < 0.05:
+        return Weather("fog", visibility_m=float(rng.uniform(60, 400)))
+    if kind < 0.1:
+        return Weather("rain", rain_mm_h=float(rng.uniform(2, 30)))
+    return Weather()
+
+
+# KITTI's camera 2, which sits 0.27 m ahead of the LiDAR and 0.08 m lower (Geiger et al., IJRR 2013).
+KITTI_SIZE_PX, KITTI_FOCAL_PX, KITTI_CENTER_PX = (1242, 375), 721.5377, (609.5593, 172.854)
+KITTI_OFFSET_M = (0.27, 0.0, -0.08)
+# At the roadside: a wide view of the road below.
+ROADSIDE_SIZE_PX, ROADSIDE_FOCAL_PX = (960, 600), 600.0
+ROADSIDE_PITCH_DEG, ROADSIDE_OFFSET_M = 17.0, (0.0, 0.0, 0.5)
+DEFAULT_LIDAR: dict[str, str] = {"vehicle": "hdl64e", "roadside": "rslidar16-roadside"}
+LIGHT_SHARES = {"noon": 0.4, "overcast": 0.25, "dusk": 0.15, "night": 0.2}
+WEATHER_SHARES = {"clear": 0.7, "rain": 0.15, "fog": 0.15}
+VISIBILITY_M, RAIN_MM_H = (50.0, 300.0), (2.0, 40.0)  # between which they are drawn
+FORWARD_R_CAM = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Camera and LiDAR at one time.
+
+    Attributes
+    ----------
+    map_T_cam : (4, 4) float64
+    map_T_lidar : (4, 4) float64
+    map_T_level : (4, 4) float64
+        A frame at the camera with x right, y down along gravity and z forward: the camera's own where it looks level.
+    lidar_height_m : float
+        Above the ground below it.
+    """
+
+    camera: Camera
+    map_T_cam: Array
+    map_T_lidar: Array
+    map_T_level: Array
+    lidar_height_m: float
+
+
+def camera_for(mount: Mount) -> tuple[int, int, Array]:
+    """Width, height and intrinsics (3, 3) of the camera at a mount."""
+    if mount == "vehicle":
+        (width, height), focal, (cx, cy) = KITTI_SIZE_PX, KITTI_FOCAL_PX, KITTI_CENTER_PX
+    else:
+        (width, height), focal = ROADSIDE_SIZE_PX, ROADSIDE_FOCAL_PX
+        cx, cy = (width - 1) / 2, (height - 1) / 2
+    return width, height, np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
+
+
+def rig_of(scene: TrafficScene) -> Rig:
+    """Place the camera of a scene at time 0: it looks where the LiDAR does, level on a vehicle, down at the roadside."""
+    R, position = scene.sensor.rotation, scene.sensor.position_m
+    yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+    offset = KITTI_OFFSET_M if scene.mount == "vehicle" else ROADSIDE_OFFSET_M
+    pitch = 0.0 if scene.mount == "vehicle" else np.deg2rad(ROADSIDE_PITCH_DEG)
+    eye = position + rotation_from_rpy(0.0, 0.0, yaw) @ np.array(offset)
+    level = transform(rotation_from_rpy(0.0, 0.0, yaw) @ FORWARD_R_CAM, eye)
+    map_T_cam = transform(rotation_from_rpy(0.0, pitch, yaw) @ FORWARD_R_CAM, eye)
+    width, height, K = camera_for(scene.mount)
+    camera = Camera("camera", width, height, K, "map", map_T_cam)
+    return Rig(camera, map_T_cam, transform(R, position), level, float(position[2] - scene.surface.elevation(position)))
+
+
+def mount_T_cam_of(mount: Mount, rig: Rig) -> Array:
+    """Pose of the camera relative to the LiDAR, for a rig that moves as one piece."""
+    if mount == "roadside":
+        return np.asarray(inverse(rig.map_T_lidar) @ rig.map_T_cam)
+    return transform(FORWARD_R_CAM, np.array(KITTI_OFFSET_M))
+
+
+def sensor_named(name: str | None, mount: Mount) -> LidarModel | None:
+    """Return the LiDAR of a name or TOML file; by default the usual one of the mount, for "random" None.
+
+    Raises
+    ------
+    ConfigError
+        For a name that is not known or a file that cannot be read.
+    """
+    if name == "random":
+        return None
+    return LIDAR_MODELS[DEFAULT_LIDAR[mount]] if name is None else lidar_model(name)
+
+
+def draw_environment(rng: np.random.Generator, light: str | None, weather: str | None) -> Environment:
+    """Draw light and weather; what is given stays, and does not change what else is drawn."""
+    lights, weathers = list(LIGHT_SHARES), list(WEATHER_SHARES)
+    drawn_light = str(rng.choice(lights, p=list(LIGHT_SHARES.values())))
+    drawn_weather = str(rng.choice(weathers, p=list(WEATHER_SHARES.values())))
+    visibility, rain = rng.uniform(*VISIBILITY_M), rng.uniform(*RAIN_MM_H)
+    return Environment.model_validate(
+        {
+            "light": light or drawn_light,
+            "weather": weather or drawn_weather,
+            "visibility_m": round(float(visibility), 1),
+            "rain_mm_h": round(float(rain), 1),
+        }
+    )
+
+
+def known(field: str) -> tuple[str, ...]:
+    """Values that a field of the environment may have."""
+    return tuple(str(v) for v in get_args(Environment.model_fields[field].annotation))

@@ -1,27 +1,187 @@
-"""Pictures of random traffic: the same polytopes that the LiDAR meets, on the same terrain."""
+"""Pictures of random traffic."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, rotation_from_rpy, transform
 from log2sim.synth.backdrop import Wall
-from log2sim.synth.bodies import Body
-from log2sim.synth.ground import Ground
-from log2sim.synth.lamps import Lamp, headlights
-from log2sim.synth.light import Light
-from log2sim.synth.markings import GroundPlan
-from log2sim.synth.polytope_caster import Terrain
-from log2sim.synth.polytope_mesh import meshes_of
-from log2sim.synth.polytopes import Material
-from log2sim.synth.render import SceneInstant
-from log2sim.synth.scene_places import Road as PaintedRoad
+from log2sim.synth.ground import Ground, GroundPlan
+from log2sim.synth.light import Lamp, Light, headlights
+from log2sim.synth.paint import Paint, linear_bgr
+from log2sim.synth.polytope_caster import MESH_OPENNESS, Terrain
+from log2sim.synth.polytopes import Material, meshes_of
+from log2sim.synth.render import Body, Painter, SceneInstant, Values
+from log2sim.synth.scene import Road as PaintedRoad
 from log2sim.synth.shapes import Mesh
 from log2sim.synth.traffic import Road, TrafficObject, TrafficScene
-from log2sim.synth.traffic_colors import VEHICLES, Look, look_of
+
+Rgb = tuple[int, int, int]
+
+# Colors of cars in traffic by share (Germany, newly registered, 2023, rounded).
+CAR_COLORS: tuple[tuple[Rgb, float], ...] = (
+    ((90, 94, 98), 0.2), ((28, 29, 31), 0.25), ((232, 233, 232), 0.22), ((168, 172, 176), 0.1), ((40, 66, 120), 0.1),
+    ((160, 28, 30), 0.06), ((60, 84, 62), 0.03), ((200, 150, 40), 0.02), ((120, 96, 70), 0.02),
+)  # fmt: skip
+LOAD_COLORS: tuple[Rgb, ...] = ((226, 226, 222), (60, 92, 150), (170, 40, 36), (216, 180, 60), (120, 124, 128))
+CLOTHES: tuple[Rgb, ...] = (
+    (40, 42, 50), (52, 66, 104), (150, 40, 44), (70, 96, 70), (196, 190, 180), (110, 84, 60), (208, 140, 50), (90, 92, 96),
+)  # fmt: skip
+WALLS: tuple[Rgb, ...] = (
+    (196, 182, 158),
+    (176, 158, 146),
+    (186, 186, 180),
+    (188, 168, 140),
+    (150, 120, 100),
+    (208, 204, 196),
+)
+FIXED: dict[Material, Rgb] = {
+    Material.GROUND: (120, 112, 96),
+    Material.GLASS: (62, 68, 74),
+    Material.DARK: (38, 38, 40),
+    Material.METAL: (150, 154, 158),
+    Material.MESH: (120, 126, 122),
+    Material.WOOD: (104, 82, 62),
+}
+GLOSS = {Material.GLASS: 0.34, Material.PAINT: 0.14, Material.METAL: 0.12}
+SKINS: tuple[Rgb, ...] = ((206, 162, 136), (170, 122, 92), (96, 66, 48))
+HAIRS: tuple[Rgb, ...] = ((40, 32, 26), (88, 62, 38), (150, 120, 80), (120, 118, 116))
+# Share of samples through which one sees what is behind.
+OPENNESS = {Material.MESH: MESH_OPENNESS}
+FLOOR_M, BAY_M = 3.1, 2.7
+LAMP_WHITE, LAMP_RED, PLATE = (0.72, 0.76, 0.76), (0.02, 0.02, 0.42), (0.6, 0.6, 0.6)
+VEHICLES = ("car", "truck", "bus")
+PEOPLE = ("pedestrian", "cyclist", "motorcycle")
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Appearance of an object, by part.
+
+    Attributes
+    ----------
+    size_m : (float, float, float)
+    material : (K,) int64
+    color : (K, 3) float32
+    gloss : (K,) float32
+    trousers, skin, hair : (3,) float32
+    """
+
+    category: str
+    kind: str
+    size_m: tuple[float, float, float]
+    material: NDArray[np.int64]
+    color: NDArray[np.float32]
+    gloss: NDArray[np.float32]
+    trousers: NDArray[np.float32]
+    skin: NDArray[np.float32]
+    hair: NDArray[np.float32]
+
+    def painter(self) -> Painter:
+        """Return the function that colors points of it."""
+        return partial(_paint, self)
+
+    def passes(self) -> NDArray[np.float32] | None:
+        """Share of samples (K,) that each part lets through, None for a solid one."""
+        open_parts = np.array([OPENNESS.get(Material(m), 0.0) for m in self.material], np.float32)
+        return open_parts if open_parts.any() else None
+
+
+def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
+    """Draw the colors of an object."""
+    body = _choice(rng, [c for c, _ in CAR_COLORS], [s for _, s in CAR_COLORS])
+    if item.category in ("truck", "bus"):
+        body = LOAD_COLORS[rng.integers(len(LOAD_COLORS))]
+    cloth, trousers, wall = (pool[rng.integers(len(pool))] for pool in (CLOTHES, CLOTHES[:4], WALLS))
+    green = rng.uniform(0.75, 1.15) * np.array([0.035, 0.12, 0.055], np.float32)
+    drawn = {Material.PAINT: body, Material.CLOTH: cloth, Material.WALL: wall, **FIXED}
+    material = np.array([int(p.material) for p in item.parts])
+    color = np.array([green if m == Material.LEAVES else linear_bgr(drawn[Material(m)]) for m in material], np.float32)
+    gloss = np.array([GLOSS.get(Material(m), 0.0) for m in material], np.float32)
+    skin, hair = SKINS[rng.integers(len(SKINS))], HAIRS[rng.integers(len(HAIRS))]
+    return Look(
+        item.category,
+        item.kind,
+        item.size_m,
+        material,
+        color,
+        gloss,
+        linear_bgr(trousers),
+        linear_bgr(skin),
+        linear_bgr(hair),
+    )
+
+
+def _choice(rng: np.random.Generator, pool: list[Rgb], shares: list[float]) -> Rgb:
+    return pool[rng.choice(len(pool), p=np.array(shares) / np.sum(shares))]
+
+
+def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values) -> Paint:
+    out = Paint(look.color[part], look.gloss[part], np.zeros((len(part), 3), np.float32))
+    z = points[:, 2] + np.float32(look.size_m[2] / 2)
+    material = look.material[part]
+    if look.category in VEHICLES:
+        _vehicle(look, out, material, points, z, normals)
+    elif look.category in PEOPLE:
+        _person(look, out, material, z, normals)
+    elif look.kind == "building":
+        _front(out, material, points, z, normals)
+    leaves = material == Material.LEAVES
+    if leaves.any():
+        out.albedo[leaves] *= _mottled(points[leaves])[:, None]
+    return out
+
+
+def _vehicle(look: Look, out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
+    """Paint lamps, plates and the sills of windows."""
+    length, width, height = look.size_m
+    low = min(1.1, 0.62 * height)
+    x, y = points[:, 0], np.abs(points[:, 1])
+    end = material == Material.PAINT
+    lamp = end & (y > 0.28 * width) & (z > 0.62 * low) & (z < 0.86 * low)
+    for mask, color, glow in (
+        (lamp & (normals[:, 0] > 0.5) & (x > 0.42 * length), LAMP_WHITE, 0.25),
+        (lamp & (normals[:, 0] < -0.5) & (x < -0.42 * length), LAMP_RED, 0.25),
+        (end & (np.abs(normals[:, 0]) > 0.5) & (y < 0.26) & (np.abs(z - 0.5 * low) < 0.06), PLATE, 0.0),
+    ):
+        out.albedo[mask] = color
+        out.glow[mask] = glow * np.asarray(color, np.float32)
+
+
+def _person(look: Look, out: Paint, material: NDArray[np.int64], z: Values, normals: Values) -> None:
+    """Paint trousers, hands' height, face and hair by their heights."""
+    cloth = material == Material.CLOTH
+    share = z / np.float32(look.size_m[2])
+    out.albedo[cloth & (share < 0.5)] = look.trousers
+    head = cloth & (share > 0.855)
+    out.albedo[head] = look.hair
+    out.albedo[head & (normals[:, 0] > 0.2) & (share < 0.965)] = look.skin
+    out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
+
+
+def _front(out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
+    """Paint floors of windows on a house."""
+    wall = (material == Material.WALL) & (np.abs(normals[:, 2]) < 0.5)
+    along = np.where(np.abs(normals[:, 1]) > 0.5, points[:, 0], points[:, 1])
+    bay, floor = np.mod(along, BAY_M), np.mod(z - 0.9, FLOOR_M)
+    pane = wall & (z > 3.2) & (bay > 0.8) & (bay < 1.95) & (floor > 0.3) & (floor < 1.8)
+    frame = wall & (z > 3.2) & (bay > 0.7) & (bay < 2.05) & (floor > 0.2) & (floor < 1.9) & ~pane
+    out.albedo[frame] = np.minimum(out.albedo[frame] * 1.3, 0.8)
+    out.albedo[pane] = (0.1, 0.085, 0.075)
+    out.gloss[pane] = 0.25
+    out.albedo[wall & (z < 0.7)] *= np.float32(0.7)
+
+
+def _mottled(points: Values) -> Values:
+    """Light and dark patches (P,) of leaves."""
+    patches = np.sin(7.1 * points[:, 0] + 3.3 * points[:, 2]) * np.sin(6.3 * points[:, 1] - 4.7 * points[:, 2])
+    fine = np.sin(23.0 * points[:, 0] + 17.0 * points[:, 1]) * np.sin(29.0 * points[:, 2] - 13.0 * points[:, 1])
+    return np.asarray(1.0 + 0.28 * patches + 0.3 * fine, np.float32)
+
 
 ROAD_REACH_M, MAX_SAGITTA_M = 240.0, 0.02
 SIDEWALK_M = 2.5
@@ -36,8 +196,6 @@ class TrafficBackdrop:
 
     Attributes
     ----------
-    ground : Ground
-    terrain : Terrain
     buildings, shadows : tuple
         None; houses are bodies.
     """

@@ -1,14 +1,542 @@
-"""How to draw a random road user of a category."""
+"""Random vehicles, people and clutter made of convex polytopes.
+
+Cars: from microcars (2.7 m) to pick-ups (6.1 m) and delivery vans (6.5 m); widths without mirrors. Trucks and buses up to
+Directive 96/53/EC.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.synth.polytopes import Shape
-from log2sim.synth.traffic_people import bicycle, cyclist, motorcycle, pedestrian, stroller
-from log2sim.synth.traffic_vehicles import bus, car, truck
+from log2sim.synth.polytopes import Material, Polytope, Shape, box, column, ellipsoid, prism, tube, wheel
+
+
+@dataclass(frozen=True)
+class _Body:
+    """Proportions of a kind of car: sizes as mean and standard deviation in m, the rest as shares."""
+
+    length: tuple[float, float]
+    width: tuple[float, float]
+    height: tuple[float, float]
+    windscreen: tuple[float, float]
+    rear: float
+    rear_rake_m: float
+    taper: float
+
+
+# Share of the half length from the middle forward to the foot of the windscreen, and backward to the end of the roof.
+_CARS = {
+    "small": _Body((3.5, 0.2), (1.64, 0.05), (1.5, 0.06), (0.5, 0.68), 0.95, 0.3, 0.2),
+    "hatch": _Body((4.15, 0.2), (1.77, 0.05), (1.47, 0.05), (0.4, 0.55), 0.95, 0.4, 0.22),
+    "sedan": _Body((4.75, 0.22), (1.84, 0.05), (1.45, 0.04), (0.33, 0.48), 0.72, 0.65, 0.24),
+    "wagon": _Body((4.75, 0.18), (1.83, 0.04), (1.49, 0.05), (0.35, 0.5), 0.95, 0.45, 0.22),
+    "suv": _Body((4.6, 0.25), (1.88, 0.06), (1.7, 0.08), (0.35, 0.5), 0.96, 0.25, 0.18),
+    "large suv": _Body((5.05, 0.2), (1.99, 0.05), (1.84, 0.07), (0.38, 0.52), 0.97, 0.15, 0.14),
+    "van": _Body((4.9, 0.25), (1.92, 0.06), (1.95, 0.1), (0.6, 0.78), 0.98, 0.1, 0.1),
+    "pickup": _Body((5.6, 0.25), (1.95, 0.06), (1.85, 0.07), (0.38, 0.5), 0.05, 0.15, 0.15),
+}
+_CAR_SHARES = {
+    "small": 0.11, "hatch": 0.2, "sedan": 0.22, "wagon": 0.1, "suv": 0.17, "large suv": 0.08, "van": 0.05, "pickup": 0.07,
+}  # fmt: skip
+
+
+def car(rng: np.random.Generator) -> Shape:
+    """Draw a car: a body, a cabin of glass under a solid roof, seats, wheels; nearly one in ten is a delivery van."""
+    kinds = [*_CAR_SHARES, "delivery"]
+    shares = np.array([*_CAR_SHARES.values(), 0.08])
+    kind = kinds[rng.choice(len(kinds), p=shares / shares.sum())]
+    return _delivery_van(rng) if kind == "delivery" else _car(kind, rng)
+
+
+def _car(kind: str, rng: np.random.Generator) -> Shape:
+    body = _CARS[kind]
+    length, width, height = (rng.normal(*body.length), rng.normal(*body.width), rng.normal(*body.height))
+    half, sill = length / 2, rng.uniform(0.15, 0.3)
+    belt = height * rng.uniform(0.56, 0.64)
+    hood = belt - rng.uniform(0.02, 0.15) * (1 if kind not in ("van",) else 0.3)
+    nose = rng.uniform(0.12, 0.35)
+    lower = prism(
+        [
+            (-half + 0.05, sill), (half - 0.12, sill), (half, sill + 0.2), (half, hood - 0.25), (half - nose, hood - 0.06),
+            (half * 0.4, belt), (-half + 0.1, belt), (-half, belt - 0.15), (-half, sill + 0.2),
+        ],
+        width, Material.PAINT, taper=0.02,
+    )  # fmt: skip
+    front, back = half * rng.uniform(*body.windscreen), half * body.rear
+    rake = (height - belt) * rng.uniform(0.9, 1.7) * (0.6 if kind == "van" else 1.0)
+    taper, roof = body.taper, height - 0.09
+    cabin = [
+        prism([(-back, belt - 0.02), (front, belt - 0.02), (front - rake, height - 0.02), (-back + body.rear_rake_m, height - 0.02)],
+              width * 0.97, Material.GLASS, taper=taper),
+        prism([(-back + 0.85 * body.rear_rake_m, roof), (front - 0.88 * rake, roof), (front - rake, height), (-back + body.rear_rake_m, height)],
+              width * 0.97 - 2 * taper * (roof - belt), Material.PAINT, taper=taper),
+    ]  # fmt: skip
+    seats = box(
+        (-back * 0.5, -width * 0.38, belt - 0.1), (front - rake * 0.9, width * 0.38, belt + 0.22), Material.CLOTH
+    )
+    pillar = min(back - body.rear_rake_m, half * 0.15)
+    pillars = prism(
+        [(-pillar - 0.06, belt), (-pillar + 0.06, belt), (-pillar + 0.06, height - 0.03), (-pillar - 0.06, height - 0.03)],
+        width * 0.97, Material.PAINT, taper=taper,
+    )  # fmt: skip
+    parts = [
+        lower,
+        *cabin,
+        seats,
+        pillars,
+        *_wheels(half * 0.62, width, rng.uniform(0.29, 0.36)),
+        _underbody(half, width, sill),
+    ]
+    if kind in ("van", "wagon", "large suv", "suv") and rng.random() < 0.35:
+        parts.append(box((-back, -width * 0.36, belt), (-back + 0.25, width * 0.36, height - 0.1), Material.DARK))
+    if kind == "pickup":
+        parts[0] = prism(
+            [(-half * 0.05, sill), (half - 0.12, sill), (half, sill + 0.2), (half, hood - 0.2), (half - nose, hood), (half * 0.4, belt), (-half * 0.05, belt)],
+            width, Material.PAINT, taper=0.02,
+        )  # fmt: skip
+        parts += _bed(half, width, sill, belt, full=rng.random() < 0.25)
+    return (length, width, height), tuple(parts)
+
+
+def _bed(half: float, width: float, sill: float, belt: float, *, full: bool) -> list[Polytope]:
+    """Make the open bed of a pick-up."""
+    low, high, w = sill + 0.1, belt - 0.08, width / 2
+    walls = [
+        box((-half, -w, low), (-half * 0.05, -w + 0.1, high), Material.PAINT),
+        box((-half, w - 0.1, low), (-half * 0.05, w, high), Material.PAINT),
+        box((-half, -w, low), (-half + 0.08, w, high), Material.PAINT),
+        box((-half, -w, low), (-half * 0.05, w, low + 0.25), Material.DARK),
+    ]
+    return (
+        [*walls, box((-half + 0.1, -w + 0.1, low), (-half * 0.2, w - 0.1, high + 0.2), Material.CLOTH)]
+        if full
+        else walls
+    )
+
+
+def _wheels(x: float, width: float, radius: float) -> list[Polytope]:
+    return [wheel(radius, 0.22, sx * x, sy * (width / 2 - 0.13)) for sx in (1, -1) for sy in (1, -1)]
+
+
+def _underbody(half: float, width: float, sill: float) -> Polytope:
+    return box((-half * 0.7, -width * 0.38, 0.14), (half * 0.7, width * 0.38, sill + 0.02), Material.DARK)
+
+
+def _delivery_van(rng: np.random.Generator) -> Shape:
+    length, width, height = rng.uniform(5.0, 6.5), rng.uniform(1.95, 2.1), rng.uniform(2.2, 2.8)
+    half, hood = length / 2, rng.uniform(1.1, 1.3)
+    foot = half - rng.uniform(0.6, 1.0)
+    top = foot - (height - hood) * rng.uniform(0.4, 0.6)
+    body = prism(
+        [(-half, 0.35), (half - 0.1, 0.3), (half, 0.5), (half, hood - 0.2), (foot, hood), (-half, hood)],
+        width, Material.PAINT,
+    )  # fmt: skip
+    upper = prism(
+        [(-half, hood), (foot - 0.9, hood), (top - 0.5, height), (-half + 0.05, height)],
+        width * 0.99,
+        Material.PAINT,
+        taper=0.04,
+    )
+    screen = prism(
+        [(foot - 1.0, hood), (foot, hood), (top, height), (top - 0.6, height)], width * 0.97, Material.GLASS, taper=0.06
+    )
+    seats = box((foot - 1.2, -width * 0.4, hood - 0.1), (foot - 0.7, width * 0.4, hood + 0.45), Material.CLOTH)
+    return (length, width, height), (body, upper, screen, seats, *_wheels(half * 0.6, width, 0.34))
+
+
+def truck(rng: np.random.Generator) -> Shape:
+    """Draw a truck: box, flatbed, tipper, tanker or a tractor with its trailer."""
+    if rng.random() < 0.35:
+        return _semitrailer(rng)
+    length, width, height = rng.uniform(5.5, 11.0), rng.uniform(2.1, 2.55), rng.uniform(2.3, 3.9)
+    cab, floor = rng.uniform(1.5, 2.2), rng.uniform(0.7, 1.1)
+    parts = _cab(length / 2, cab, width * rng.uniform(0.88, 0.98), min(height * rng.uniform(0.75, 1.0), 3.3), rng)
+    parts += _load(-length / 2, length / 2 - cab - 0.15, width, floor, height, rng)
+    parts += [box((-length * 0.48, -width * 0.25, 0.45), (length * 0.45, width * 0.25, floor + 0.02), Material.DARK)]
+    axles = (length * 0.36, -length * 0.28, *((-length * 0.4,) if length > 8 else ()))
+    parts += [wheel(0.48, 0.3, x, s * (width / 2 - 0.2)) for x in axles for s in (1, -1)]
+    return (length, width, float(max(p.high[2] for p in parts))), tuple(parts)
+
+
+def _cab(front: float, cab: float, width: float, height: float, rng: np.random.Generator) -> list[Polytope]:
+    """Make the cab of a truck that ends at `front`; some have a hood."""
+    parts, screen = [], height * 0.5
+    if rng.random() < 0.3:
+        hood = min(1.3, cab * 0.5)
+        parts.append(box((front - hood, -width * 0.42, 0.5), (front, width * 0.42, 1.45), Material.PAINT))
+        front, cab = front - hood, cab - hood * 0.3
+    parts.append(box((front - cab, -width / 2, 0.4), (front, width / 2, screen), Material.PAINT))
+    parts.append(
+        prism([(front - cab, screen), (front, screen), (front - 0.15, height - 0.12), (front - cab, height - 0.12)],
+              width * 0.98, Material.GLASS, taper=0.03)
+    )  # fmt: skip
+    parts.append(box((front - cab, -width * 0.48, screen), (front - cab + 0.5, width * 0.48, height), Material.PAINT))
+    parts.append(box((front - cab, -width * 0.48, height - 0.15), (front - 0.2, width * 0.48, height), Material.PAINT))
+    return parts
+
+
+def _load(
+    back: float, front: float, width: float, floor: float, height: float, rng: np.random.Generator
+) -> list[Polytope]:
+    """Make what a truck or trailer carries between two x."""
+    w, kind = width / 2, rng.random()
+    if kind < 0.6:
+        return [box((back, -w, floor), (front, w, height), Material.PAINT)]
+    bed = [box((back, -w, floor), (front, w, floor + 0.2), Material.METAL)]
+    if kind < 0.75:
+        wall = rng.uniform(0.4, 1.4)
+        return [
+            *bed,
+            box((back, -w, floor), (front, -w + 0.08, floor + wall), Material.METAL),
+            box((back, w - 0.08, floor), (front, w, floor + wall), Material.METAL),
+            box((back, -w, floor), (back + 0.08, w, floor + wall), Material.METAL),
+            box((front - 0.08, -w, floor), (front, w, floor + wall + 0.3), Material.METAL),
+        ]
+    if kind < 0.87:
+        return [
+            *bed,
+            tube(min(w, (height - floor) / 2), (back, front), floor + min(w, (height - floor) / 2), Material.METAL),
+        ]
+    load = rng.uniform(0.5, 1.0)
+    cargo = box(
+        (back + 0.3, -w * 0.9, floor + 0.2),
+        (back + (front - back) * load, w * 0.9, floor + rng.uniform(0.6, 1.8)),
+        Material.WOOD,
+    )
+    return [*bed, cargo, box((front - 0.08, -w, floor), (front, w, floor + 1.2), Material.METAL)]
+
+
+def _semitrailer(rng: np.random.Generator) -> Shape:
+    length, width, height = rng.uniform(12.0, 20.0), rng.uniform(2.45, 2.6), rng.uniform(3.2, 4.0)
+    half, cab, floor = length / 2, rng.uniform(1.9, 2.4), rng.uniform(1.0, 1.25)
+    parts = _cab(half, cab, width * 0.97, rng.uniform(2.8, 3.6), rng)
+    parts += _load(-half, half - cab - rng.uniform(0.5, 1.2), width, floor, height, rng)
+    parts.append(box((-half + 1, -width * 0.2, 0.6), (half - 0.5, width * 0.2, floor + 0.02), Material.DARK))
+    axles = (half - 1.3, half - 4.2, -half + 1.4, -half + 2.7, -half + 4.0)
+    parts += [wheel(0.5, 0.32, x, s * (width / 2 - 0.2)) for x in axles for s in (1, -1)]
+    return (length, width, float(max(p.high[2] for p in parts))), tuple(parts)
+
+
+def bus(rng: np.random.Generator) -> Shape:
+    """Draw a bus or coach."""
+    length, width, height = (
+        rng.choice([rng.uniform(6.5, 9), rng.uniform(10.5, 13), 18.0], p=[0.2, 0.65, 0.15]),
+        rng.uniform(2.3, 2.6),
+        rng.uniform(2.8, 3.5),
+    )
+    half, w, belt = length / 2, width / 2, rng.uniform(1.0, 1.4)
+    parts = [
+        box((-half, -w, 0.3), (half, w, belt), Material.PAINT),
+        prism([(-half, belt), (half, belt), (half - 0.15, height - 0.3), (-half + 0.05, height - 0.3)], width * 0.99, Material.GLASS, taper=0.01),
+        box((-half + 0.05, -w * 0.98, height - 0.32), (half - 0.15, w * 0.98, height), Material.PAINT),
+        box((-half + 0.05, -w * 0.97, belt), (-half + 0.4, w * 0.97, height - 0.3), Material.PAINT),
+        box((-half + 0.6, -w * 0.8, belt - 0.2), (half - 1.5, w * 0.8, belt + 0.35), Material.CLOTH),
+    ]  # fmt: skip
+    parts += [
+        box((x - 0.08, -w * 0.99, belt), (x + 0.08, w * 0.99, height - 0.3), Material.PAINT)
+        for x in np.arange(-half + 1.8, half - 1, 3.0)
+    ]
+    parts += [wheel(0.48, 0.3, x, s * (w - 0.18)) for x in (half * 0.6, -half * 0.55) for s in (1, -1)]
+    return (length, width, height), tuple(parts)
+
+
+def _torso(rng: np.random.Generator, height: float, *, base: float, lean: float, x: float = 0.0) -> list[Polytope]:
+    """Make trunk, head and arms of somebody whose hips are at `base`; `lean` tilts the trunk forward by as much in m."""
+    girth, depth = height * rng.uniform(0.11, 0.145), height * rng.uniform(0.065, 0.09)
+    trunk = 0.3 * height
+    top = base + trunk
+    parts = [
+        prism([(x - depth, base), (x + depth, base), (x + depth + lean, top), (x - depth + lean, top)], 2 * girth, Material.CLOTH, taper=-0.02),
+        ellipsoid((0.085, 0.075, 0.115), (x + lean * 1.15 + 0.02, 0, top + 0.155 * height * 0.75), Material.CLOTH),
+    ]  # fmt: skip
+    for side in (1, -1):
+        swing = rng.normal(0, 0.08) + lean * 0.5
+        parts.append(
+            ellipsoid(
+                (0.055 + abs(swing) * 0.6, 0.05, trunk * 0.52),
+                (x + swing, side * (girth + 0.04), top - trunk * 0.48),
+                Material.CLOTH,
+            )
+        )
+    return parts
+
+
+def pedestrian(rng: np.random.Generator) -> Shape:
+    """Draw a person who stands, walks or sits, some with a bag."""
+    height = float(np.clip(rng.normal(1.7, 0.1), 1.45, 2.0)) if rng.random() < 0.85 else rng.uniform(1.0, 1.45)
+    stride = rng.choice([0.0, 1.0], p=[0.4, 0.6]) * rng.uniform(0.08, 0.22) * height
+    hips = 0.5 * height
+    parts = _torso(rng, height, base=hips, lean=rng.uniform(0, 0.1))
+    for side in (1, -1):
+        x = side * stride
+        ankle, hip = ((0.07, 0.1), 0.09) if stride < 0.05 else ((0.08, 0.12), 0.1)
+        profile = [(x - ankle[0], 0.0), (x + ankle[1], 0.0), (hip, hips + 0.03), (-hip, hips + 0.03)]
+        parts.append(prism(profile, 0.15, Material.CLOTH))
+    if rng.random() < 0.25:
+        parts.append(box((-0.32, -0.16, hips + 0.05), (-0.1, 0.16, hips + 0.27 * height), Material.CLOTH))
+    length = float(np.clip(max(p.high[0] for p in parts) - min(p.low[0] for p in parts), 0.35, 1.1))
+    width = float(max(p.high[1] for p in parts) - min(p.low[1] for p in parts))
+    return (length, width, height), tuple(parts)
+
+
+def _two_wheels(reach: float, radius: float, width: float) -> list[Polytope]:
+    return [wheel(radius, width, s * reach, 0.0) for s in (1, -1)]
+
+
+def cyclist(rng: np.random.Generator) -> Shape:
+    """Draw a bicycle with its rider."""
+    height = rng.normal(1.72, 0.1)
+    length, radius = rng.uniform(1.6, 1.9), rng.uniform(0.31, 0.36)
+    reach = length / 2 - radius
+    seat = rng.uniform(0.85, 1.0)
+    lean = rng.uniform(0.1, 0.4)
+    parts = _two_wheels(reach, radius, 0.05)
+    parts += [
+        box((-reach * 0.5, -0.03, 0.45), (reach * 0.8, 0.03, 0.6), Material.METAL),
+        box((reach * 0.6, -0.28, seat + 0.05), (reach * 0.75, 0.28, seat + 0.14), Material.METAL),
+        prism([(-0.15, 0.3), (0.2, 0.3), (0.15, seat), (-0.3, seat)], 0.36, Material.CLOTH),
+        *_torso(rng, height, base=seat, lean=lean, x=-0.2),
+    ]
+    if rng.random() < 0.2:
+        parts.append(box((-reach - 0.25, -0.22, radius * 1.5), (-reach + 0.25, 0.22, radius * 2.4), Material.CLOTH))
+    return (length, 0.65, float(max(p.high[2] for p in parts))), tuple(parts)
+
+
+def motorcycle(rng: np.random.Generator) -> Shape:
+    """Draw a motorcycle or scooter, mostly with a rider."""
+    length, radius = rng.uniform(1.75, 2.3), rng.uniform(0.26, 0.33)
+    reach, seat = length / 2 - radius, rng.uniform(0.7, 0.85)
+    parts = _two_wheels(reach, radius, 0.14)
+    parts += [
+        box((-reach, -0.15, 0.3), (reach * 0.6, 0.15, seat - 0.05), Material.DARK),
+        box((-reach * 0.9, -0.14, seat - 0.1), (0.1, 0.14, seat), Material.CLOTH),
+        box((0.1, -0.16, seat - 0.15), (reach * 0.6, 0.16, seat + 0.15), Material.PAINT),
+        box((reach * 0.6, -0.35, seat + 0.2), (reach * 0.72, 0.35, seat + 0.3), Material.METAL),
+    ]
+    if rng.random() < 0.4:
+        parts.append(
+            prism(
+                [
+                    (reach * 0.5, seat),
+                    (reach * 0.9, seat - 0.1),
+                    (reach * 0.65, seat + 0.5),
+                    (reach * 0.55, seat + 0.5),
+                ],
+                0.35,
+                Material.GLASS,
+            )
+        )
+    if rng.random() < 0.65:
+        parts += _torso(rng, rng.normal(1.74, 0.08), base=seat, lean=rng.uniform(0.0, 0.3), x=-0.25)
+        parts.append(box((-0.3, -0.3, 0.35), (0.15, 0.3, seat + 0.08), Material.CLOTH))
+    return (length, 0.75, float(max(p.high[2] for p in parts))), tuple(parts)
+
+
+def bicycle(rng: np.random.Generator) -> Shape:
+    """Draw a bicycle without a rider."""
+    length, radius = rng.uniform(1.6, 1.85), rng.uniform(0.31, 0.36)
+    reach = length / 2 - radius
+    parts = _two_wheels(reach, radius, 0.05)
+    parts += [
+        box((-reach * 0.5, -0.03, 0.45), (reach * 0.8, 0.03, 0.6), Material.METAL),
+        box((-0.35, -0.08, 0.85), (-0.1, 0.08, 0.93), Material.DARK),
+        box((reach * 0.6, -0.28, 0.95), (reach * 0.75, 0.28, 1.03), Material.METAL),
+    ]
+    return (length, 0.6, 1.05), tuple(parts)
+
+
+def stroller(rng: np.random.Generator) -> Shape:
+    """Draw a stroller or a shopping cart."""
+    height = rng.uniform(0.95, 1.1)
+    parts = (
+        box((-0.35, -0.25, 0.45), (0.35, 0.25, 0.75), Material.CLOTH),
+        box((-0.35, -0.25, 0.7), (0.0, 0.25, height), Material.CLOTH),
+        *(wheel(0.12, 0.05, sx * 0.32, sy * 0.24) for sx in (1, -1) for sy in (1, -1)),
+    )
+    return (0.9, 0.55, height), parts
+
+
+Parts = tuple[Polytope, ...]
+
+
+def tree(rng: np.random.Generator) -> Parts:
+    """Draw a tree: a trunk and a crown of several volumes of leaves; some have low branches."""
+    radius, crown = rng.uniform(0.08, 0.35), rng.uniform(1.0, 2.8)
+    low = rng.uniform(0.8, 3.5)
+    parts = [column(radius, (0.0, low + crown), Material.WOOD)]
+    for _ in range(rng.integers(1, 4)):
+        r = crown * rng.uniform(0.6, 1.0)
+        parts.append(
+            ellipsoid((r, r, r * rng.uniform(0.7, 1.3)), (*rng.normal(0, 0.3 * crown, 2), low + crown), Material.LEAVES)
+        )
+    return tuple(parts)
+
+
+def bush(rng: np.random.Generator) -> Parts:
+    """Draw a bush of one to three volumes of leaves."""
+    r, h = rng.uniform(0.25, 1.6), rng.uniform(0.4, 2.2)
+    return tuple(
+        ellipsoid(
+            (r * rng.uniform(0.6, 1), r * rng.uniform(0.6, 1), h / 2),
+            (*rng.normal(0, 0.4 * r, 2), h * 0.4),
+            Material.LEAVES,
+        )
+        for _ in range(rng.integers(1, 4))
+    )
+
+
+def grass(rng: np.random.Generator) -> Parts:
+    """Draw a tuft of tall grass."""
+    r, h = rng.uniform(0.4, 2.0), rng.uniform(0.1, 0.45)
+    return (ellipsoid((r, r * rng.uniform(0.5, 1), h), (0, 0, 0), Material.LEAVES),)
+
+
+def pole(rng: np.random.Generator) -> Parts:
+    """Draw a post: a bollard, a lamp or a sign with its plate, at heights of people and above."""
+    kind = rng.random()
+    if kind < 0.25:
+        return (column(rng.uniform(0.05, 0.18), (0, rng.uniform(0.5, 1.3)), Material.METAL),)
+    height, radius = rng.uniform(1.6, 8.0), rng.uniform(0.03, 0.16)
+    parts = [column(radius, (0, height), Material.METAL)]
+    if kind < 0.6:
+        plate, z = rng.uniform(0.25, 0.6), rng.uniform(1.2, max(1.3, min(height, 3.0)))
+        parts.append(box((-0.03, -plate / 2, z), (0.03, plate / 2, z + plate), Material.METAL))
+    elif kind < 0.8:
+        parts.append(box((-0.2, -0.2, 0), (0.2, 0.2, rng.uniform(0.5, 1.4)), Material.METAL))
+    if height > 5 and rng.random() < 0.5:
+        parts.append(box((0, -0.1, height - 0.2), (rng.uniform(0.8, 2.5), 0.1, height), Material.METAL))
+    return tuple(parts)
+
+
+def bin_(rng: np.random.Generator) -> Parts:
+    """Draw a bin, a crate, a cabinet or a small container."""
+    length, w, h = rng.uniform(0.3, 1.5), rng.uniform(0.3, 1.1), rng.uniform(0.5, 1.8)
+    parts = [box((-length / 2, -w / 2, 0.05), (length / 2, w / 2, h), Material.PAINT)]
+    if rng.random() < 0.4:
+        parts.append(box((-length / 2, -w / 2, h), (length * 0.1, w / 2, h + 0.12), Material.DARK))
+    return tuple(parts)
+
+
+def container(rng: np.random.Generator) -> Parts:
+    """Draw something as large as a vehicle that is none: a container, a stall, a hut, a heap."""
+    length, w, h = rng.uniform(2.0, 7.0), rng.uniform(1.4, 3.0), rng.uniform(1.0, 3.2)
+    if rng.random() < 0.25:
+        return (ellipsoid((length / 2, w / 2, h / 2), (0, 0, 0.1), Material.GROUND),)
+    parts = [box((-length / 2, -w / 2, 0), (length / 2, w / 2, h), Material.WALL)]
+    if rng.random() < 0.4:
+        parts.append(
+            box((-length / 2 - 0.4, -w / 2 - 0.4, h), (length / 2 + 0.4, w / 2 + 0.4, h + 0.15), Material.WALL)
+        )
+    return tuple(parts)
+
+
+def bench(rng: np.random.Generator) -> Parts:
+    """Draw a bench, a table or a bicycle rack."""
+    length = rng.uniform(1.2, 2.2)
+    parts = [box((-length / 2, -0.25, 0.4), (length / 2, 0.25, 0.48), Material.WOOD)]
+    parts += [box((x - 0.04, -0.2, 0), (x + 0.04, 0.2, 0.45), Material.METAL) for x in (-length * 0.4, length * 0.4)]
+    if rng.random() < 0.6:
+        parts.append(box((-length / 2, 0.2, 0.5), (length / 2, 0.27, 0.95), Material.WOOD))
+    return tuple(parts)
+
+
+def shelter(rng: np.random.Generator) -> Parts:
+    """Draw a bus shelter: glass walls under a roof."""
+    length, d, h = rng.uniform(2.5, 5.0), rng.uniform(1.2, 1.8), rng.uniform(2.2, 2.6)
+    return (
+        box((-length / 2, d / 2 - 0.05, 0.1), (length / 2, d / 2, h), Material.GLASS),
+        box((-length / 2, -d / 2, 0.1), (-length / 2 + 0.05, d / 2, h), Material.GLASS),
+        box((-length / 2, -d / 2, h), (length / 2, d / 2, h + 0.12), Material.METAL),
+        *(column(0.05, (0, h), Material.METAL, at=(x, y)) for x in (-length / 2, length / 2) for y in (-d / 2, d / 2)),
+    )
+
+
+def cone(rng: np.random.Generator) -> Parts:
+    """Draw a traffic cone or a barrier board."""
+    if rng.random() < 0.5:
+        return (column(0.14, (0, rng.uniform(0.4, 0.8)), Material.PAINT),)
+    w = rng.uniform(0.8, 2.0)
+    feet = tuple(box((-0.2, y - 0.04, 0), (0.2, y + 0.04, 0.9), Material.METAL) for y in (-w * 0.4, w * 0.4))
+    return (box((-0.03, -w / 2, 0.6), (0.03, w / 2, 0.95), Material.METAL), *feet)
+
+
+def fence(length: float, rng: np.random.Generator) -> Parts:
+    """Draw a piece of fence, wall, hedge or guard rail along x."""
+    kind, half = rng.random(), length / 2
+    height = rng.uniform(0.7, 2.2)
+    if kind < 0.3:
+        t = rng.uniform(0.3, 0.8)
+        return (
+            box((-half, -t, 0.05), (half, t, height), Material.LEAVES),
+            box((-half, -t * 0.4, 0.2), (half, t * 0.4, height * 0.8), Material.LEAVES),
+        )
+    if kind < 0.5:
+        return (box((-half, -rng.uniform(0.08, 0.25), 0), (half, 0.1, height * 0.8), Material.WALL),)
+    if kind < 0.65:
+        return (
+            box((-half, -0.04, 0.5), (half, 0.04, 0.8), Material.METAL),
+            *(
+                box((x - 0.05, -0.08, 0), (x + 0.05, 0.0, 0.75), Material.METAL)
+                for x in np.arange(-half + 0.5, half, 2.0)
+            ),
+        )
+    posts = tuple(column(0.04, (0, height), Material.METAL, at=(x, 0.0)) for x in np.arange(-half, half + 0.1, 2.5))
+    return (box((-half, -0.02, 0.1), (half, 0.02, height), Material.MESH), *posts)
+
+
+def building(length: float, rng: np.random.Generator) -> Parts:
+    """Draw a house front along x that faces -y, with windows, a bay or an entrance."""
+    half, height, depth = length / 2, rng.uniform(3.5, 16.0), 6.0
+    parts = [box((-half, 0, 0), (half, depth, height), Material.WALL)]
+    if rng.random() < 0.5:
+        x = rng.uniform(-half * 0.6, half * 0.6)
+        parts.append(box((x - 0.8, -rng.uniform(0.2, 1.2), 0), (x + 0.8, 0.1, rng.uniform(1.0, 3.2)), Material.WALL))
+    parts += [
+        box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), Material.GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)
+    ][:2]
+    if rng.random() < 0.3:
+        parts.append(box((-half, -1.5, 2.8), (half, 0.1, 3.0), Material.WALL))
+    return tuple(parts)
+
+
+def own_car(height: float, rng: np.random.Generator) -> Parts:
+    """Draw what a LiDAR at a height sees of the car under it: roof, hood and trunk, which hide the ground close by."""
+    roof = height - rng.uniform(0.1, 0.4)
+    hood = roof - rng.uniform(0.4, 0.7)
+    back = rng.uniform(-1.6, -0.8)
+    return (
+        box((back, -0.65, 0.3), (rng.uniform(0.3, 0.9), 0.65, roof), Material.PAINT),
+        box((back - 0.8, -0.9, 0.2), (rng.uniform(1.8, 2.6), 0.9, hood), Material.PAINT),
+    )
+
+
+def stand(rng: np.random.Generator) -> Parts:
+    """Draw something slim of a person's height that is none: a meter, a pump, a pillar, a wrapped tree, a hydrant."""
+    height, width = rng.uniform(0.7, 2.2), rng.uniform(0.15, 0.5)
+    parts = [box((-width / 2, -width * 0.35, 0), (width / 2, width * 0.35, height), Material.METAL)]
+    if rng.random() < 0.4:
+        top = rng.uniform(0.2, 0.5)
+        parts.append(box((-top / 2, -top / 2, height), (top / 2, top / 2, height + top), Material.METAL))
+    return tuple(parts)
+
+
+SMALL: dict[str, tuple[float, float, Callable[[np.random.Generator], Parts]]] = {
+    "tree": (0.18, 0.4, tree),
+    "bush": (0.2, 0.9, bush),
+    "grass": (0.14, 0.3, grass),
+    "pole": (0.2, 0.2, pole),
+    "stand": (0.08, 0.3, stand),
+    "bin": (0.1, 0.8, bin_),
+    "container": (0.05, 3.5, container),
+    "bench": (0.05, 1.0, bench),
+    "shelter": (0.02, 2.5, shelter),
+    "cone": (0.04, 0.5, cone),
+}
+"""By kind: share, radius in m that is to be free around it, and how to draw it."""
+
 
 ROAD_USERS: dict[str, Callable[[np.random.Generator], Shape]] = {
     "car": car,

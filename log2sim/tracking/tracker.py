@@ -1,18 +1,58 @@
-"""Tracking in the map frame: forward assignment, stitching over occlusions, one category a track."""
+"""Tracking in the map frame: forward assignment, stitching, one category a track, and tracks of vehicle and road joined.
+
+Each end tracks on its own clock and with its own gaps. Before tracks are compared, a measurement is moved to the time of the
+other by the velocity of its own track, as "time compensation late fusion" does with detections (Yu et al., "DAIR-V2X", CVPR
+2022, section 5).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Measurements, Track
-from log2sim.geometry import period_of
-from log2sim.tracking.category import decide_category, gets_on_fast, voted_category
-from log2sim.tracking.forward import track_forward
-from log2sim.tracking.stitch import stitch
+from log2sim.config import TrackConfig
+from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
+from log2sim.geometry import NS_PER_S, Array, period_of
+from log2sim.tracking.forward import CHI2_2DOF_99, measurement_noise, track_forward
+from log2sim.tracking.stitch import decide_category, gets_on_fast, stitch, voted_category
+
+SWEEPS = ""
+"""Represents the LiDARs among the cameras, as in the column `camera` of measurements."""
+
+
+def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]]) -> list[Track]:
+    """Return tracks that know at which ticks none of the sensors that measured them recorded, and how often pictures were searched.
+
+    Parameters
+    ----------
+    recorded : mapping of str to (T,) bool
+        Whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
+    """
+    return [
+        replace(track, unrecorded=_unrecorded(track, recorded), searched=_searched(track, recorded)) for track in tracks
+    ]
+
+
+def _searched(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> float:
+    """Return at which share of its ticks any camera that measured a track was searched; 1 without a camera."""
+    cameras = {str(camera) for camera in track.measurements.camera} - {SWEEPS}
+    seen = [recorded[name] for name in cameras if name in recorded]
+    return float(np.any(seen, axis=0)[track.tick].mean()) if seen else 1.0
+
+
+def _unrecorded(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
+    m = track.measurements
+    sensors = {str(camera) for camera in m.camera} - {SWEEPS}
+    if np.isfinite(m.box_yaw_rad).any():
+        sensors.add(SWEEPS)
+    seen = [recorded[name] for name in sensors if name in recorded]
+    if not seen:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(~np.any(seen, axis=0))
 
 
 def track(
@@ -61,3 +101,175 @@ def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
     if len(t_ns) < 3:
         return 1
     return max(2, min(round(min_life_s / period_of(t_ns)), len(t_ns) // 2))
+
+
+# Velocities are those of lines through the measurements within this time of each.
+VELOCITY_WINDOW_S = 0.5
+# Standard deviation of where the road's sensors are after registration, m.
+POSE_SIGMA_M = 0.1
+# Tracks of one object may both be seen at so many of the ticks at which another track of it is, by a mistake of either tracker.
+MAX_SHARED_TICKS = 1
+RELATED = ({"pedestrian", "two_wheeler"},)
+
+
+def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
+    """Track the measurements of each end on their own and merge the tracks.
+
+    Parameters
+    ----------
+    ends : sequence of sequences of T Measurements
+        Of each end, by tick; those of a single one are tracked and no more.
+    t_ns : (T,) int64
+    config : TrackConfig
+        As for `track`; what both ends have of an object counts as its life.
+    """
+    birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
+    if len(ends) == 1:
+        return track(ends[0], t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=min_life_s)
+    tracks: list[Track] = []
+    for measurements in ends:
+        found = track(measurements, t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=0.0)
+        tracks = merge_tracks(tracks, found) if tracks else found
+    required = min_hits(t_ns, min_life_s)
+    kept = [t for t in stitch(tracks, t_ns, max_gap_s=max_gap_s) if len(t) >= required]
+    kept = [replace(t, category=decide_category(t.measurements)) for t in kept]
+    return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+
+
+def merge_tracks(a: Sequence[Track], b: Sequence[Track]) -> list[Track]:
+    """Merge the tracks of two ends that are the same objects; the others stay as they are.
+
+    Pairs are taken in the order of how well they agree. Several tracks of one end may belong to one of the other, which followed
+    the object through a gap.
+    """
+    velocity_a, velocity_b = ([velocities(t) for t in tracks] for tracks in (a, b))
+    costs = {
+        (i, j): cost
+        for i, one in enumerate(a)
+        for j, other in enumerate(b)
+        if (cost := compare(one, other, velocity_a[i], velocity_b[j])) is not None
+    }
+    owner = {("a", i): i for i in range(len(a))} | {("b", j): len(a) + j for j in range(len(b))}
+    members = {number: [key] for key, number in owner.items()}
+    tracks = {("a", i): t for i, t in enumerate(a)} | {("b", j): t for j, t in enumerate(b)}
+    for i, j in sorted(costs, key=lambda pair: costs[pair]):
+        one, other = owner["a", i], owner["b", j]
+        if one != other and _can_join(members[one], members[other], tracks):
+            for key in members.pop(other):
+                owner[key] = one
+                members[one].append(key)
+    velocity = {("a", i): v for i, v in enumerate(velocity_a)} | {("b", j): v for j, v in enumerate(velocity_b)}
+    return [_merge([tracks[k] for k in keys], [velocity[k] for k in keys]) for keys in members.values()]
+
+
+def _can_join(
+    one: Sequence[tuple[str, int]], other: Sequence[tuple[str, int]], tracks: dict[tuple[str, int], Track]
+) -> bool:
+    """Return whether no end sees two of the tracks at the same ticks."""
+    for end in "ab":
+        mine, theirs = ([tracks[k].tick for k in keys if k[0] == end] for keys in (one, other))
+        if mine and theirs and len(np.intersect1d(np.concatenate(mine), np.concatenate(theirs))) > MAX_SHARED_TICKS:
+            return False
+    return True
+
+
+def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) -> float | None:
+    """Return the median squared Mahalanobis distance of two tracks at their common ticks, less for many; None if they differ.
+
+    Parameters
+    ----------
+    velocity, velocity_other : (n, 2), (m, 2) float64
+        Velocities of the tracks at their measurements, m/s.
+    """
+    groups = {GROUP_OF[one.category], GROUP_OF[other.category]}
+    if len(groups) > 1 and groups not in RELATED:
+        return None
+    if one.tick[0] > other.tick[-1] or other.tick[0] > one.tick[-1]:
+        return None
+    _, i, j = np.intersect1d(one.tick, other.tick, assume_unique=True, return_indices=True)
+    if not len(i):
+        return None
+    m, n = one.measurements.take(i), other.measurements.take(j)
+    group = np.full(len(i), GROUP_OF[one.category])
+    late_s = ((m.t_ns - n.t_ns) / NS_PER_S)[:, None]
+    away = n.center_m[:, :2] + late_s * velocity_other[j] - m.center_m[:, :2]
+    c = measurement_noise(m.covariance + n.covariance, group) + POSE_SIGMA_M**2 * np.eye(2)
+    squared = np.einsum("ni,ni->n", away, np.linalg.solve(c, away[..., None])[..., 0])
+    middle = float(np.median(squared))
+    # They go together: an object that only passes the other is as near for a moment.
+    parted = away + np.median(late_s) * (velocity[i] - velocity_other[j])
+    if middle > CHI2_2DOF_99 or float(np.median(np.hypot(*parted.T))) > _reach(m, n):
+        return None
+    return middle - float(np.log(len(i)))
+
+
+def _reach(m: Measurements, n: Measurements) -> float:
+    """Return how far apart the centers of one object can be, m: half of both boxes, or what the errors allow without boxes."""
+    lengths = np.concatenate([m.box_size_m[:, 0], n.box_size_m[:, 0]])
+    return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else np.inf
+
+
+def velocities(track_: Track) -> Array:
+    """Return the velocities (n, 2), m/s, of a track at its measurements: the slopes of lines through those around each."""
+    t_s = (track_.measurements.t_ns - track_.measurements.t_ns[0]) / NS_PER_S
+    xy, out = track_.measurements.center_m[:, :2], np.zeros((len(t_s), 2))
+    first, last = (np.searchsorted(t_s, t_s + s * VELOCITY_WINDOW_S, side=d) for s, d in ((-1, "left"), (1, "right")))  # type: ignore[call-overload]
+    for k, (begin, end) in enumerate(zip(first.tolist(), last.tolist())):
+        t = t_s[begin:end] - t_s[begin:end].mean()
+        if t @ t > 0:
+            out[k] = t @ xy[begin:end] / (t @ t)
+    return out
+
+
+def _merge(tracks: Sequence[Track], velocity: Sequence[Array]) -> Track:
+    """Merge tracks of one object; at ticks where several have a measurement, these become one."""
+    if len(tracks) == 1:
+        return tracks[0]
+    rows, moving = Measurements.join([t.measurements for t in tracks]), np.concatenate(velocity)
+    tick = np.concatenate([t.tick for t in tracks])
+    # At a tick the one with most points comes first.
+    order = np.lexsort((-rows.points, tick))
+    tick, rows, moving = tick[order], rows.take(order), moving[order]
+    first = np.flatnonzero(np.diff(tick, prepend=tick[:1] - 1))
+    second = first + 1
+    pair = np.flatnonzero((second < len(tick)) & (tick[np.minimum(second, len(tick) - 1)] == tick[first]))
+    merged = merge_rows(rows.take(first[pair]), rows.take(second[pair]), moving[second[pair]])
+    out = rows.take(first)
+    columns: dict[str, Any] = {}
+    for name in ("center_m", "covariance", "score", "points", "seen_by"):
+        columns[name] = getattr(out, name).copy()
+        columns[name][pair] = getattr(merged, name)
+    others = list(out.others or (None,) * len(out))
+    for k, view in zip(pair.tolist(), merged.others):
+        others[k] = view
+    out = replace(out, **columns, others=tuple(others))
+    return Track(tracks[0].category, tick[first], out)
+
+
+def merge_rows(a: Measurements, b: Measurements, velocity_b: Array) -> Measurements:
+    """Merge measurements (P,) of two ends row by row, moved to the times of the first: centers by inverse covariance.
+
+    Scores are independent evidence. What else was seen is that of the first, beside which the view of the second is kept.
+    """
+    late_s = ((a.t_ns - b.t_ns) / NS_PER_S)[:, None]
+    moved = b.center_m[:, :2] + late_s * velocity_b
+    ca, cb = a.covariance, b.covariance
+    gain = ca @ np.linalg.inv(ca + cb)
+    xy = a.center_m[:, :2] + (gain @ (moved - a.center_m[:, :2])[..., None])[..., 0]
+    return replace(
+        a,
+        center_m=np.column_stack([xy, a.center_m[:, 2]]),
+        covariance=ca - gain @ ca,
+        score=1 - (1 - a.score) * (1 - b.score),
+        points=a.points + b.points,
+        seen_by=a.seen_by | b.seen_by,
+        others=tuple(_other_view(b, k, -float(late_s[k, 0])) for k in range(len(b))),
+    )
+
+
+def _other_view(m: Measurements, k: int, late_s: float) -> OtherView | None:
+    """Return what measurement `k` shows, as the second view of one that is so much earlier; None without points."""
+    if not len(m.cluster[k]):
+        return None
+    t_s = m.cluster[k][:, 3:4] if m.cluster[k].shape[1] > 3 else np.zeros((len(m.cluster[k]), 1))
+    return OtherView(m.sensor_m[k], m.ends_visible[k], np.column_stack([m.cluster[k][:, :3], t_s + late_s]))

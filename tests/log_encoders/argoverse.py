@@ -10,7 +10,7 @@ import pytest
 
 from log2sim.datatypes import Log
 from log2sim.geometry import Array, apply, inverse, quaternion_from_rotation, transform
-from log2sim.logs.argoverse.labels import scan_time_ns
+from log2sim.logs.argoverse import scan_time_ns
 from log_encoders.world import labels_at
 
 CAMERA, LIDAR = "front", "top"

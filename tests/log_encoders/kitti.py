@@ -21,7 +21,7 @@ from log2sim.geometry import (
     rotation_from_rpy,
     transform,
 )
-from log2sim.logs.kitti.drive import EARTH_RADIUS_M, EGO_T_IMU
+from log2sim.logs.kitti.labels import EARTH_RADIUS_M, EGO_T_IMU
 from log_encoders.world import labels_at
 
 CAMERA, LIDAR = "front", "top"

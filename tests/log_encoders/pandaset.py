@@ -10,9 +10,8 @@ import pytest
 
 from log2sim.datatypes import Log
 from log2sim.geometry import Array, apply, inverse, quaternion_from_rotation
-from log2sim.logs.pandaset.labels import PERIOD_NS
-from log2sim.logs.pandaset.reader import POSE_T_EGO
-from log2sim.logs.spinning import compute_scan_offset_ns
+from log2sim.logs.pandaset.reader import PERIOD_NS, POSE_T_EGO
+from log2sim.logs.stamps import compute_scan_offset_ns
 from log_encoders.world import labels_at
 
 CAMERA, LIDAR = "front", "top"

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from log2sim.datatypes import Log
 from log2sim.geometry import Array, Camera, inverse, quaternion_from_rotation
-from log2sim.logs.geodesy import geodetic_from_map
+from log2sim.logs.stamps import geodetic_from_map
 
 # From the stamp in the header to the recorder, by kind of message: messages are not recorded in the order of their stamps.
 IMAGE_DELAY_NS, OTHER_DELAY_NS = 60_000_000, 5_000_000

@@ -11,7 +11,7 @@ from cooperation_worlds.draw_blind_area import SPEED_MPS
 from cooperation_worlds.runs import Found, agents_near
 from cooperation_worlds.world import World
 from log2sim.geometry import rectangles_overlap
-from log2sim.simulation.warnings.warn import warn
+from log2sim.simulation.warnings import warn
 
 STEP_S, MATCH_M = 0.05, 1.0
 # An object counts as known from its third observation on, as the warnings of a replay take it (`simulation.warnings.known`).

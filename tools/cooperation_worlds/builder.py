@@ -10,11 +10,10 @@ import numpy as np
 
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, Array, Parts, World, rigid
 from log2sim.geometry import wrap_angle
-from log2sim.synth.polytope_hits import Solid
+from log2sim.synth.polytope_caster import Solid
 from log2sim.synth.polytopes import Shape
 from log2sim.synth.scene import Scene
-from log2sim.synth.traffic_clutter import SMALL
-from log2sim.synth.traffic_shapes import ROAD_USERS
+from log2sim.synth.traffic_shapes import ROAD_USERS, SMALL
 
 # The sensors of the paper: at 2 m with a range of 20 m on the vehicle, at 3 m with 40 m at the road.
 VEHICLE_HEIGHT_M, VEHICLE_RANGE_M = 2.0, 20.0

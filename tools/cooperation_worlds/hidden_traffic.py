@@ -14,18 +14,14 @@ from cooperation_worlds.builder import ROAD_LINES
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, Array, Parts
 from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion, match
-from log2sim.evaluation.detection.precision import average_precision
+from log2sim.evaluation.detection.evaluation import average_precision
+from log2sim.evaluation.detection.protocols import Criterion, match
 from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
-from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel
-from log2sim.synth.polytope_caster import Returns, cast_polytopes
-from log2sim.synth.polytope_hits import SensorState, Solid
-from log2sim.synth.returns import Weather
-from log2sim.synth.traffic import TrafficScene
-from log2sim.synth.traffic_log import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS
-from log2sim.synth.traffic_motion import TrafficRun, run_of
-from log2sim.synth.traffic_random import draw_scene
-from log2sim.synth.traffic_vehicles import car
+from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
+from log2sim.synth.returns import LIDAR_MODELS, LidarModel, Weather
+from log2sim.synth.traffic import TrafficScene, draw_scene
+from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS, TrafficRun, run_of
+from log2sim.synth.traffic_shapes import car
 
 VEHICLE_MODELS = ("hdl64e", "pandar64", "os1-64", "vlp32c")
 SWEEPS, PERIOD_S = 3, 0.1

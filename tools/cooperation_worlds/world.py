@@ -15,14 +15,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, Scenario, Stream, Sweep
 from log2sim.geometry import NS_PER_S
 from log2sim.synth.actors import Actor, MovingScene
-from log2sim.synth.lidar_models import LidarModel
-from log2sim.synth.polytope_caster import Returns, cast_polytopes
-from log2sim.synth.polytope_hits import SensorState, Solid
+from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Material, Polytope, box
 from log2sim.synth.raycast import mount_T_lidar, sweep_stamps
-from log2sim.synth.returns import ReturnModel
-from log2sim.synth.scene import LidarSpec, Scene
-from log2sim.synth.scene_places import Building
+from log2sim.synth.returns import LidarModel, ReturnModel
+from log2sim.synth.scene import Building, LidarSpec, Scene
 from log2sim.synth.synthesis import synthesize
 from log2sim.synth.traffic import Surface
 

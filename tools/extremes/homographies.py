@@ -6,11 +6,9 @@ import numpy as np
 
 from extremes.table import Outcome, case
 from log2sim.geometry import Array, Camera, apply_homography, inverse, transform
-from log2sim.perception.homography.camera_fit import fit_camera
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
+from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography, fit_camera, place_obstacle
 from log2sim.perception.homography.fit import HomographyFit
-from log2sim.perception.homography.placement import place_obstacle
 
 METHODS = ("time-aware", "min-frame", "per-frame")
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 30.0) for y in (-0.3 * x, 0.0, 0.3 * x)])

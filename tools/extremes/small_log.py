@@ -17,7 +17,7 @@ from log2sim import Config, Scenario, open_log, reconstruct
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, LogError
 from log2sim.logs.native.writer import write_log
-from log2sim.pipeline import Result, first_pass, second_pass, start
+from log2sim.pipeline import Result, infer_scenario, observe_log, start
 from log2sim.plan import Decision, Stage
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
@@ -79,7 +79,7 @@ def result_of(change: Callable[[Path], object], *, decode_images: bool = False) 
         run = start(open_log(folder), LABELS)
         if decode_images:
             run = replace(run, plan=run.plan.variant(Decision(Stage.IMAGE_DECODING, True, "images are asked for")))
-        return second_pass(run, first_pass(run))
+        return infer_scenario(replace(run, plan=run.plan.only_agents()), observe_log(run))
 
 
 @lru_cache

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
-from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
-from log2sim.synth.traffic import Mount, labeled_cloud
-from log2sim.synth.traffic_random import draw_scene
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, estimate_ground
+from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Boxes3D
-from log2sim.perception.detect3d.grid import grid_window, rasterize
-from log2sim.perception.detect3d.level_boxes import MapCells, categories_of, category_logits, headings
-from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
-from log2sim.perception.detect3d.network import Network
-from log2sim.perception.detect3d.votes import bandwidths_m, cluster, foreground
+from log2sim.perception.detect3d.boxes import (
+    MapCells,
+    bandwidths_m,
+    categories_of,
+    category_logits,
+    cluster,
+    foreground,
+    headings,
+)
+from log2sim.perception.detect3d.network import Network, grid_window, level_points, rasterize, viewpoints_xy
 from log2sim.perception.lidar.cloud import Cloud
 
 # Points on the ground around an object belong to its cells, too.

@@ -13,14 +13,19 @@ import torch
 from lidar_training.clouds import Example
 from lidar_training.network import IN_CHANNELS, BevNetwork
 from lidar_training.targets import GROUPS
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion, match
-from log2sim.perception.detect3d.grid import grid_window, rasterize
-from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
-from log2sim.perception.detect3d.network import METADATA_KEY, load_network
-from log2sim.perception.detect3d.network_detector import NetworkDetector, open_network
+from log2sim.evaluation.detection.protocols import Criterion, match
+from log2sim.perception.detect3d.detectors import NetworkDetector, open_network
+from log2sim.perception.detect3d.network import (
+    METADATA_KEY,
+    grid_window,
+    level_points,
+    load_network,
+    rasterize,
+    viewpoints_xy,
+)
 
 CATEGORIES = {
     "vehicle": ["car", "truck", "bus"],

@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 
 from lidar_training.clouds import Example
 from lidar_training.samples import CATEGORIES, KEPT_RANGE_M, Sample
-from log2sim.config_sections import LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array, Camera, apply, inverse, nearest_index, project
 from log2sim.perception.detect3d.detectors import create_lidar_detector
-from log2sim.perception.detect3d.grid import MAX_HEIGHT_M, MIN_HEIGHT_M
-from log2sim.perception.lidar.cloud import Cloud, cloud_origin
-from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin
 
 MAX_RANGE_M = 60.0
 # The ground under a box is the mean of that under so many points nearest to it.

@@ -11,9 +11,8 @@ from lidar_training.export import RIGHT, group_of
 from lidar_training.targets import GROUPS
 from log2sim.datatypes import Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.calibration import calibration
-from log2sim.evaluation.detection.matching import Matches, match
-from log2sim.evaluation.detection.precision import operating_point, precision_recall
+from log2sim.evaluation.detection.evaluation import calibration, operating_point, precision_recall
+from log2sim.evaluation.detection.protocols import Matches, match
 from log2sim.perception.detect3d.detectors import LidarDetector
 
 SCORE = 0.5

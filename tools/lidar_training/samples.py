@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.perception.detect3d.grid import MAX_HEIGHT_M, MIN_HEIGHT_M, rasterize
-from log2sim.perception.lidar.ground import estimate_ground
-from log2sim.synth.traffic import Mount, labeled_cloud
-from log2sim.synth.traffic_random import draw_scene
+from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M, rasterize
+from log2sim.perception.lidar.cloud import estimate_ground
+from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
 
 STEP_M = 0.005  # of stored coordinates
 KEPT_RANGE_M = 55.0

@@ -13,9 +13,8 @@ from lidar_training.export import group_of
 from lidar_training.real_logs import LogSweep
 from lidar_training.targets import GROUPS
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion, match
-from log2sim.evaluation.detection.precision import average_precision, operating_point
-from log2sim.evaluation.detection.protocols import MIN_POINTS
+from log2sim.evaluation.detection.evaluation import average_precision, operating_point
+from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion, match
 from log2sim.perception.detect3d.detectors import LidarDetector
 
 # Two-wheelers and people are hit by a handful of points beyond.

@@ -18,11 +18,10 @@ from lidar_training.two_stream import BEV_CHANNELS, IMAGE_CHANNELS, TwoStream
 from lidar_training.two_stream_inputs import CLASSES, IMAGE_PX, SHAPE, decode, inputs_of
 from log2sim.datatypes import GROUP_OF
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion
-from log2sim.evaluation.detection.precision import average_precision
-from log2sim.evaluation.detection.protocols import MIN_POINTS
+from log2sim.evaluation.detection.evaluation import average_precision
+from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion
+from log2sim.perception.detect3d.boxes import Rectangles, suppress
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.detect3d.suppression import Rectangles, suppress
 
 INPUTS = ("bev", "image", "bev_boxes", "image_boxes")
 MIN_SCORE = 0.05

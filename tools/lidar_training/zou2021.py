@@ -38,7 +38,7 @@ NO_CENTER_LOGIT = -9.0
 
 
 class PaperGrid(nn.Module):
-    """The paper's 8 channels from the 12 of `log2sim.perception.detect3d.grid`."""
+    """The paper's 8 channels from the 12 of `log2sim.perception.detect3d.network`."""
 
     def forward(self, grid: Tensor, middle_m: Tensor | None = None) -> Tensor:
         """Map grids (B, 12, H, W) to (B, 8, H, W).

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.logs.waymo.crc32c import masked_crc32c
+from log2sim.logs.waymo.tfrecord import masked_crc32c
 from mutation.damage import Damage, Mutation, Place, pick
 
 EXTREMES: dict[str, tuple[Any, ...]] = {

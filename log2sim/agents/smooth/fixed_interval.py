@@ -1,31 +1,330 @@
-"""Fixed-interval smoothing of planar positions: outliers, noise and jerk densities estimated, then one banded solve."""
+"""Fixed-interval smoothing of planar positions: outliers, noise and jerk densities estimated, standstill recognized.
+
+All unknowns (place, velocity, accelerations, errors that repeat) are Gaussian and integrated out, so that hypotheses with more
+of them are compared fairly (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 28). Positions that
+fit no such motion are outliers at a fixed cost.
+
+A test in the position domain, of the kind that inertial navigation calls zero-velocity detector (Skog, Handel, Nilsson and
+Rantakokko, IEEE Trans. Biomed. Eng. 57, 2010): drift and scatter of a span are compared with what its noise allows.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.smooth.heading import course_is_known, unwrap, yaw_of_motion, yaw_sigma
-from log2sim.agents.smooth.jerk_density import STRONG_PRIOR, WEAK_PRIOR, DensityEstimator, min_density
-from log2sim.agents.smooth.likelihood import (
+from log2sim.agents.candidate import spans_of
+from log2sim.agents.smooth.motion_model import MotionModel, Smoothed, course_is_known, unwrap, yaw_of_motion, yaw_sigma
+from log2sim.agents.smooth.quadratic import (
+    STRONG_PRIOR,
+    WEAK_PRIOR,
+    DensityEstimator,
     MeasurementModel,
+    Minimum,
+    MotionPrior,
+    NoisyPositions,
+    Quadratic,
     geman_mcclure_weights,
     inlier_probability,
+    min_density,
+    minimize,
+    nearest_index,
     propagate,
     transition,
+    weighted_sum,
     zero_motion,
 )
-from log2sim.agents.smooth.motion_model import MotionModel, Smoothed
-from log2sim.agents.smooth.motion_prior import MotionPrior, NoisyPositions, nearest_index
-from log2sim.agents.smooth.quadratic import Minimum, Quadratic, minimize, weighted_sum
-from log2sim.agents.smooth.rolling_back import MAX_HOLDING_ROUNDS, backward_runs, held_at, max_misfit
-from log2sim.agents.smooth.zero_velocity import zero_velocity_sigma
 from log2sim.geometry import Array
+from log2sim.tracking.forward import CHI2_2DOF_99
 
 __all__ = ["smooth_interval"]
+
+
+# A place is known before to some car lengths: the gates of the tracker reach as far.
+PLACE_SIGMA_M = 5.0
+# Errors of a center repeat while the view stays the same, for some half a second of passing traffic; the rest of the variance
+# changes from tick to tick.
+VIEW_S, REPEATED_SHARE = 0.5, 0.9
+# One position in twenty shows something else, anywhere within a gate of 3 m.
+OUTLIER_LOG = float(np.log(0.05 / (np.pi * 3.0**2)))
+# Outliers are removed in so many rounds at most, each those that are worse than as many on either side: since errors repeat, an
+# outlier makes its neighbors unlikely too.
+MAX_ROUNDS, NEIGHBORS = 12, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Positions of a track.
+
+    Attributes
+    ----------
+    t_s : (n,) float64, s
+        In rising order.
+    xy_m : (n, 2) float64, m
+    variance : (n,) float64, m2
+        Of a position in each direction, changing views included.
+    """
+
+    t_s: Array
+    xy_m: Array
+    variance: Array
+
+    def __len__(self) -> int:
+        """Return the number of positions."""
+        return len(self.t_s)
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Positions:
+        """Return some of the rows."""
+        return Positions(self.t_s[rows], self.xy_m[rows], self.variance[rows])
+
+
+@dataclass(frozen=True)
+class MotionPriorSigmas:
+    """How far an object is expected to move.
+
+    Attributes
+    ----------
+    speed_mps : float
+        Standard deviation of each component of the velocity; 0 for one that stands.
+    acceleration_mps2 : float
+        Standard deviation of its change in 1 s.
+    """
+
+    speed_mps: float = 0.0
+    acceleration_mps2: float = 0.0
+
+
+STANDING = MotionPriorSigmas()
+
+
+@dataclass(frozen=True, eq=False)
+class MarginalLikelihood:
+    """How well a hypothesis explains positions.
+
+    Attributes
+    ----------
+    log : float
+        Logarithm of the marginal likelihood, outliers included.
+    inlier : (n,) bool
+    """
+
+    log: float
+    inlier: NDArray[np.bool_]
+
+
+def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> MarginalLikelihood:
+    """Compute the marginal likelihood of one object that moves as expected, or stands.
+
+    Notes
+    -----
+    The velocity is a Wiener process about the middle of the track. O(n^3).
+    """
+    inlier = np.ones(len(positions), dtype=bool)
+    best = MarginalLikelihood(-np.inf, inlier)
+    for _ in range(MAX_ROUNDS):
+        log, each = _likelihoods(positions.take(inlier), motion)
+        log += OUTLIER_LOG * int((~inlier).sum())
+        if log > best.log:
+            best = MarginalLikelihood(log, inlier)
+        padded = np.full(len(each) + 2 * NEIGHBORS, np.inf)
+        padded[NEIGHBORS : NEIGHBORS + len(each)] = each
+        lowest = reduce(np.minimum, [padded[k : k + len(each)] for k in range(2 * NEIGHBORS + 1)])
+        worst = np.flatnonzero((each < OUTLIER_LOG) & (each == lowest))
+        if len(worst) == 0 or inlier.sum() <= 2:
+            break
+        inlier = inlier.copy()
+        inlier[np.flatnonzero(inlier)[worst]] = False
+    return best
+
+
+def _likelihoods(p: Positions, motion: MotionPriorSigmas) -> tuple[float, Array]:
+    """Return the log-likelihood of all positions, and that of each given all others (n,)."""
+    s = p.t_s - (p.t_s[0] + p.t_s[-1]) / 2
+    middle = np.median(p.xy_m, axis=0) if motion.speed_mps == 0 else p.xy_m[np.argmin(np.abs(s))]
+    z = p.xy_m - middle
+    k = noise_of(p) + PLACE_SIGMA_M**2 + motion.speed_mps**2 * np.outer(s, s)
+    if motion.acceleration_mps2:
+        near = np.minimum(np.abs(s)[:, None], np.abs(s)[None, :]) * (np.sign(s)[:, None] == np.sign(s)[None, :])
+        far = np.maximum(np.abs(s)[:, None], np.abs(s)[None, :])
+        k += motion.acceleration_mps2**2 * near**2 * (far / 2 - near / 6)
+    inverse = np.linalg.inv(k)
+    weighted, variance = inverse @ z, 1.0 / np.diag(inverse)
+    log = -0.5 * float(np.vdot(z, weighted)) - float(np.linalg.slogdet(k)[1]) - len(p) * float(np.log(2 * np.pi))
+    each = -np.log(2 * np.pi * variance) - 0.5 * variance * (weighted**2).sum(axis=1)
+    return log, each
+
+
+def noise_of(p: Positions) -> Array:
+    """Return the covariance (n, n), m2, of the errors: a part that repeats while the view stays the same, and one that does not."""
+    sigma = np.sqrt(p.variance)
+    repeated = np.exp(-np.abs(p.t_s[:, None] - p.t_s[None, :]) / VIEW_S)
+    return np.outer(sigma, sigma) * (REPEATED_SHARE * repeated + (1 - REPEATED_SHARE) * np.eye(len(p)))
+
+
+# A longer way backward is one.
+MAX_ROLL_M = 2.0
+# Standard deviation of the velocity of what is held, and rounds in which its neighbors may have to be held too.
+HELD_SIGMA_MPS, MAX_HOLDING_ROUNDS = 0.02, 4
+
+
+def backward_runs(state: Array, known: NDArray[np.bool_], heading_rad: float | None) -> list[NDArray[np.intp]]:
+    """Return the knots of each short way backward of a vehicle.
+
+    Parameters
+    ----------
+    state : (K, 3, 2) float64
+    known : (K,) bool
+        Where the course is known.
+    heading_rad : float, optional
+        Heading where the motion does not give one.
+    """
+    velocity = state[:, 1]
+    if heading_rad is None and not known.any():
+        return []
+    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=heading_rad, known=known)
+    forward = velocity[:, 0] * np.cos(yaw) + velocity[:, 1] * np.sin(yaw)
+    runs = spans_of(forward < -2 * HELD_SIGMA_MPS)
+    return [run for run in runs if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() < MAX_ROLL_M]
+
+
+def max_misfit(observed: NoisyPositions) -> float:
+    """Return by how much the squared residuals in sigmas may grow where a vehicle is held.
+
+    A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile. Errors that repeat for
+    `VIEW_S` count once.
+    """
+    if not observed.correlated or len(observed.t_s) < 2:
+        return CHI2_2DOF_99
+    return CHI2_2DOF_99 * max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s))))
+
+
+def held_at(state: Array, rows: NDArray[np.intp]) -> Quadratic:
+    """Pseudo-measurements of zero velocity at some knots of a state (K, 3, 2)."""
+    information = np.zeros((len(state), 2, 2))
+    information[rows] = np.eye(2) / HELD_SIGMA_MPS**2
+    return zero_motion(state, information, np.zeros_like(information))
+
+
+# Candidates are spans in which the smoothed speed stays below this, plus as many of its standard deviations.
+CANDIDATE_MPS, CANDIDATE_SIGMAS = 0.4, 2.0
+MIN_SPAN_S, MIN_OBSERVATIONS = 0.8, 4
+# A drift is motion when it is this significant and faster than the outline of a standing object seems to move.
+DRIFT_SIGMAS, MIN_DRIFT_MPS = 3.0, 0.05
+SCATTER_SIGMAS = 3.0
+MIN_WEIGHT = 0.25
+# Standard deviation of the velocity at a standstill, and near the edges of a span, where it decays within the time that follows.
+STANDSTILL_SIGMA_MPS = 0.005
+EDGE_MPS, EDGE_S = 1.0, 0.4
+# The first and the last quarter of a span are off its middle when it is this significant and this far.
+END_SIGMAS, MIN_END_STEP_M = 2.5, 0.03
+# An end is moving when a straight line at constant speed, this long, explains this share of its scatter.
+MIN_EXPLAINED_SHARE, MIN_LINE_M, MIN_LINE_OBSERVATIONS = 0.85, 0.1, 4
+
+
+def zero_velocity_sigma(
+    knots_s: Array, measurement: MeasurementModel, weight: Array, state: Array, covariance: Array
+) -> Array:
+    """Detect standstill: standard deviation (K,) of the velocity in m/s around zero, infinite where the object moves.
+
+    Parameters
+    ----------
+    knots_s : (K,) float64, s
+    weight : (n,) float64
+        Weights of the observations.
+    state : (K, 3, 2) float64
+        Smoothed state without this constraint.
+    covariance : (K, 6, 6) float64
+    """
+    speed = np.hypot(*state[:, 1].T)
+    sigma = np.sqrt(np.trace(covariance[:, 2:4, 2:4], axis1=1, axis2=2) / 2)
+    slow = speed < CANDIDATE_MPS + CANDIDATE_SIGMAS * sigma
+    out = np.full(len(knots_s), np.inf)
+    if not slow.any():
+        return out
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
+    for first, last in zip(edges[::2], edges[1::2] - 1):
+        inside = np.flatnonzero((measurement.knot >= first) & (measurement.knot <= last) & (weight > MIN_WEIGHT))
+        span = _trim_to_standstill(measurement, inside, speed[measurement.knot])
+        if len(span):
+            # A candidate that reaches the track's end stands until then.
+            begin = first if first == 0 and span[0] == inside[0] else measurement.knot[span[0]]
+            end = last if last == len(knots_s) - 1 and span[-1] == inside[-1] else measurement.knot[span[-1]]
+            since = np.inf if begin == 0 else knots_s[begin : end + 1] - knots_s[begin]
+            until = np.inf if end == len(knots_s) - 1 else knots_s[end] - knots_s[begin : end + 1]
+            out[begin : end + 1] = STANDSTILL_SIGMA_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
+    return out
+
+
+def _trim_to_standstill(measurement: MeasurementModel, rows: NDArray[np.intp], speed: Array) -> NDArray[np.intp]:
+    """Cut off the end that differs more until the remaining rows (m,) stand; none are left where they never do."""
+    t, xy = measurement.observed.t_s, measurement.observed.xy
+    information = 2.0 / np.trace(measurement.observed.r, axis1=1, axis2=2)
+    begin, end = (rows[0], rows[-1]) if len(rows) else (0, 0)
+    while len(rows) >= MIN_OBSERVATIONS and t[rows[-1]] - t[rows[0]] >= MIN_SPAN_S:
+        first, last = _end_discrepancies(t[rows], xy[rows], information[rows])
+        if max(first, last) < 1.0:
+            # Where one end was cut off, the observations next to it are in doubt; one is enough where it covers the edge.
+            step_s = (t[rows[-1]] - t[rows[0]]) / (len(rows) - 1)
+            margin = max(len(rows) // 10, 1 if step_s > EDGE_S else 2)
+            return rows[margin * (rows[0] > begin) : len(rows) - margin * (rows[-1] < end)]
+        cut = max(len(rows) // 10, 1)
+        if first == last:
+            first, last = speed[rows[0]], speed[rows[-1]]
+        rows = rows[cut:] if first > last else rows[:-cut]
+    return rows[:0]
+
+
+def _end_discrepancies(t: Array, xy: Array, information: Array) -> tuple[float, float]:
+    """Distance of the first and the last quarter of positions from the middle half, relative to what noise allows.
+
+    Both are the same where the positions drift or scatter too far as a whole.
+    """
+    weight = information / information.sum()
+    time = t - weight @ t
+    from_mean = xy - weight @ xy
+    known = float(information @ time**2)
+    drift = (information * time) @ from_mean / known
+    scatter = float(information @ ((from_mean - time[:, None] * drift) ** 2).sum(axis=1))
+    freedom = 2 * len(t) - 4
+    # Where the positions scatter less than their covariances say, smaller steps are significant.
+    noise_scale = min(1.0, np.sqrt(scatter / freedom))
+    whole = max(
+        scatter / (freedom + SCATTER_SIGMAS * np.sqrt(2 * freedom)),
+        float(np.hypot(*drift)) / max(DRIFT_SIGMAS * noise_scale / np.sqrt(known), MIN_DRIFT_MPS),
+    )
+    if whole >= 1.0:
+        return whole, whole
+    quarter = max(len(t) // 4, 1 if len(t) < 6 else 2)
+    parts = slice(quarter), slice(quarter, -quarter), slice(-quarter, None)
+    sums = [float(information[part].sum()) for part in parts]
+    means = [information[part] @ xy[part] / s for part, s in zip(parts, sums)]
+    first, last = (
+        max(
+            float(np.hypot(*(means[k] - means[1])))
+            / max(END_SIGMAS * noise_scale * np.sqrt(1 / sums[1] + 1 / sums[k]), MIN_END_STEP_M),
+            _line_length(t[parts[k]], xy[parts[k]]) / MIN_LINE_M,
+        )
+        for k in (0, 2)
+    )
+    return first, last
+
+
+def _line_length(t: Array, xy: Array) -> float:
+    """Length in m of the straight line that positions follow at constant speed, 0 where they do not.
+
+    Detects driving off even where the positions are far better than their covariances say.
+    """
+    if len(t) < MIN_LINE_OBSERVATIONS:
+        return 0.0
+    time, from_mean = t - t.mean(), xy - xy.mean(axis=0)
+    slope = time @ from_mean / (time @ time)
+    explained = float((slope @ slope) * (time @ time))
+    on_line = explained > MIN_EXPLAINED_SHARE * float((from_mean**2).sum())
+    return float(np.hypot(*slope) * (t[-1] - t[0])) if on_line else 0.0
+
 
 # Jerk density in m2/s5 that follows every maneuver while outliers are searched.
 PERMISSIVE_JERK_DENSITY = 4.0
@@ -63,8 +362,6 @@ class _Problem:
 
     Attributes
     ----------
-    prior : MotionPrior
-    measurement : MeasurementModel
     state : (K, 3, 2) float64
         Reference of the forms.
     weight : (n,) float64
@@ -115,10 +412,8 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
 
     Parameters
     ----------
-    observed : NoisyPositions
     asked_s : (T,) float64, s
         Times of the result.
-    motion : MotionModel
 
     Notes
     -----

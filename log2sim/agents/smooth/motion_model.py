@@ -1,12 +1,295 @@
-"""What is known of how an object moves, and what smoothing its positions gives."""
+"""What is known of how an object moves: limits of road vehicles, headings from motion, and what smoothing gives."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from log2sim.agents.smooth.feasibility import MAX_CURVATURE_1PM
-from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
-from log2sim.geometry import Array
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Doubt
+from log2sim.geometry import Array, wrap_angle
+
+# Beyond these a vehicle's motion is infeasible for Waymax (Gulino et al., 2023).
+MAX_ACCELERATION_MPS2 = 10.4
+MAX_CURVATURE_1PM = 0.3
+# Tires on dry asphalt hold about 0.9 g laterally.
+MAX_LATERAL_MPS2 = 8.8
+# Brakes need some 0.2 s to build up their full deceleration.
+MAX_JERK_MPS3 = 50.0
+# A limit counts as broken where the motion is beyond it by as many of its own standard deviations.
+SIGNIFICANT_SIGMAS = 2.0
+
+PHRASES = {
+    "acceleration": "accelerates at {:.0f} m/s2",
+    "lateral_acceleration": "accelerates sideways at {:.0f} m/s2",
+    "curvature": "turns on a circle of {:.1f} m",
+    "jerk": "jerks at {:.0f} m/s3",
+}
+
+
+@dataclass(frozen=True)
+class BrokenLimit:
+    """A limit that a motion breaks.
+
+    Attributes
+    ----------
+    name : str
+        A key of `PHRASES`.
+    worst : float
+        Farthest beyond the limit, in its unit.
+    worst_s : float, s
+        When.
+    start_s, end_s : float, s
+        First and last time at which it is broken.
+    """
+
+    name: str
+    worst: float
+    worst_s: float
+    start_s: float
+    end_s: float
+
+
+def broken_limits(
+    t_s: Array,
+    acceleration_mps2: Array,
+    yaw_rad: Array,
+    curvature_1pm: Array,
+    sigma: Mapping[str, Array] | None = None,
+) -> tuple[BrokenLimit, ...]:
+    """Find the limits that a motion breaks anywhere.
+
+    Parameters
+    ----------
+    t_s : (T,) float64, s
+    acceleration_mps2 : (T, 2) float64, m/s2
+    yaw_rad : (T,) float64, rad
+    curvature_1pm : (T,) float64, 1/m
+    sigma : mapping of str to (T,) float64, optional
+        Standard deviations of the limited quantities by the names of the limits; 0 where none is given.
+    """
+    lateral = acceleration_mps2[:, 1] * np.cos(yaw_rad) - acceleration_mps2[:, 0] * np.sin(yaw_rad)
+    jerk = np.hypot(*np.diff(acceleration_mps2, axis=0).T) / np.diff(t_s)
+    limited = {
+        "acceleration": (np.hypot(*acceleration_mps2.T), MAX_ACCELERATION_MPS2),
+        "lateral_acceleration": (np.abs(lateral), MAX_LATERAL_MPS2),
+        "curvature": (np.abs(curvature_1pm), MAX_CURVATURE_1PM),
+        "jerk": (jerk, MAX_JERK_MPS3),
+    }
+    found = []
+    for name, (values, limit) in limited.items():
+        margin = SIGNIFICANT_SIGMAS * (sigma or {}).get(name, np.zeros(len(values)))
+        broken = np.flatnonzero(values - margin > limit)
+        if len(broken):
+            worst = int(broken[np.argmax(values[broken])])
+            # A difference of two waypoints holds for both of them.
+            last = int(broken[-1]) + len(t_s) - len(values)
+            times = (float(t_s[k]) for k in (worst, int(broken[0]), last))
+            found.append(BrokenLimit(name, float(values[worst]), *times))
+    return tuple(found)
+
+
+def limit_doubts(broken: Iterable[BrokenLimit]) -> tuple[Doubt, ...]:
+    """Make doubts of the limits that a motion breaks."""
+    doubts = []
+    for limit in broken:
+        value = 1.0 / limit.worst if limit.name == "curvature" else limit.worst
+        reason = f"{PHRASES[limit.name].format(value)} at {limit.worst_s:.1f} s"
+        doubts.append(Doubt(limit.name, reason, limit.start_s, limit.end_s))
+    return tuple(doubts)
+
+
+# Below these speeds of vehicles and pedestrians the direction of a smoothed velocity is noise.
+MIN_MOVING_MPS = 1.0
+MIN_WALKING_MPS = 0.4
+# A course is known where the speed is this many of its own standard deviations, that is to some ten degrees; by whether
+# the object is holonomic. One that may turn on the spot has no heading to hold, so less will do.
+MIN_COURSE_SIGMAS = {False: 5.0, True: 2.5}
+MIN_COURSE_MPS = {False: 0.5, True: 0.3}
+# What is covered at a lower speed is noise of a standing object.
+MIN_PROGRESS_MPS = 0.2
+# Without a known course, the displacement from end to end gives one if it is longer.
+MIN_DISPLACEMENT_M = 1.0
+# Standard deviation of the curvature of a way on which no course is known: a turn at a crossing has a radius of some 15 m.
+WAY_CURVATURE_1PM = 0.06
+# Of a heading of which nothing is known: uniform over half a turn.
+UNKNOWN_YAW_RAD = float(np.pi / np.sqrt(12.0))
+
+
+def course_is_known(
+    xy_m: Array,
+    velocity_mps: Array,
+    covariance: Array,
+    *,
+    holonomic: bool = False,
+    correlated: bool = False,
+    max_curvature_1pm: float = MAX_CURVATURE_1PM,
+) -> NDArray[np.bool_]:
+    """Where (T,) the direction of the velocity gives the heading.
+
+    Parameters
+    ----------
+    xy_m : (T, 2) float64, m
+    velocity_mps : (T, 2) float64, m/s
+    covariance : (T, 2, 2) float64, m2/s2
+        Of the velocity.
+    correlated : bool
+        Whether the errors of the positions repeat. The covariances are too small then, so the speed alone decides.
+    max_curvature_1pm : float, 1/m
+        Of a path that is not holonomic. Courses that a vehicle could not turn between are not both known, see
+        `_turns_feasible`.
+    """
+    speed = np.hypot(*velocity_mps.T)
+    if correlated:
+        known = np.asarray(speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS))
+    else:
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+        known = np.asarray(speed > np.maximum(MIN_COURSE_SIGMAS[holonomic] * sigma, MIN_COURSE_MPS[holonomic]))
+    rows = np.flatnonzero(known)
+    if holonomic or len(rows) < 2 or np.isinf(max_curvature_1pm):
+        return known
+    course = np.arctan2(velocity_mps[rows, 1], velocity_mps[rows, 0])
+    sigma = np.sqrt(_course_variance(velocity_mps[rows], covariance[rows]))
+    known[rows] = _turns_feasible(_distance_covered(xy_m, speed)[rows], course, sigma, max_curvature_1pm)
+    return known
+
+
+def _turns_feasible(
+    distance_m: Array, course_rad: Array, sigma_rad: Array, max_curvature_1pm: float
+) -> NDArray[np.bool_]:
+    """Select courses (n,), (n,) bool, of which no two differ by more than a vehicle can turn on the way between them.
+
+    A smoothed velocity swings round where an object comes to rest or is seen for the first time. A course counts if it
+    differs from the surer ones that count by no more than the distance driven times the largest curvature, plus the
+    standard deviation of the difference. Forward and backward are the same.
+    """
+    counts = np.ones(len(course_rad), dtype=bool)
+    turned = np.abs(wrap_angle(2 * np.diff(course_rad))) / 2
+    if np.all(turned <= max_curvature_1pm * np.diff(distance_m)):  # then it holds between any two
+        return counts
+    counts[:] = False
+    # Within this distance any turn is feasible.
+    reach_m = np.pi / 2 / max_curvature_1pm
+    first = np.searchsorted(distance_m, distance_m - reach_m)
+    last = np.searchsorted(distance_m, distance_m + reach_m, side="right")
+    for k in np.argsort(sigma_rad, kind="stable").tolist():
+        near = slice(first[k], last[k])
+        turned = np.abs(wrap_angle(2 * (course_rad[near] - course_rad[k]))) / 2
+        feasible = max_curvature_1pm * np.abs(distance_m[near] - distance_m[k]) + np.hypot(
+            sigma_rad[near], sigma_rad[k]
+        )
+        counts[k] = np.all((turned <= feasible) | ~counts[near])
+    return counts
+
+
+def _course_variance(velocity_mps: Array, covariance: Array) -> Array:
+    """Return the variance (n,) in rad2 of the directions of velocities (n, 2) with covariances (n, 2, 2)."""
+    across = np.stack([-velocity_mps[:, 1], velocity_mps[:, 0]], axis=-1)
+    squared = (velocity_mps**2).sum(axis=1)
+    return np.asarray(np.einsum("ka,kab,kb->k", across, covariance, across) / squared**2)
+
+
+def yaw_of_motion(
+    xy_m: Array,
+    velocity_mps: Array,
+    *,
+    hint_rad: float | None = None,
+    holonomic: bool = False,
+    known: NDArray[np.bool_] | None = None,
+) -> Array:
+    """Heading (T,) in rad of a trajectory.
+
+    Between two moving parts the heading changes with the distance covered, so a standing object does not turn.
+
+    Parameters
+    ----------
+    xy_m : (T, 2) float64, m
+    velocity_mps : (T, 2) float64, m/s
+    hint_rad : float, optional
+        Heading before the first motion; it also decides between driving forward and reversing. Without motion and hint the
+        heading is 0.
+    holonomic : bool
+        True for pedestrians, who turn round instead of moving backward.
+    known : (T,) bool, optional
+        Where the course is known; by default where it is fast enough.
+    """
+    speed = np.hypot(*velocity_mps.T)
+    moving = speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS) if known is None else known
+    if not moving.any():
+        displacement = xy_m[-1] - xy_m[0]
+        far = np.hypot(*displacement) > MIN_DISPLACEMENT_M
+        overall = float(np.arctan2(displacement[1], displacement[0])) if far else 0.0
+        return np.full(len(xy_m), overall if hint_rad is None else hint_rad)
+    course = np.arctan2(velocity_mps[:, 1], velocity_mps[:, 0])
+    distance = _distance_covered(xy_m, speed)
+    angles = unwrap(course[moving] if holonomic else _heading_of_course(course[moving], hint_rad))
+    return wrap_angle(np.interp(distance, distance[moving], angles))
+
+
+def yaw_sigma(
+    xy_m: Array,
+    velocity_mps: Array,
+    covariance: Array,
+    known: NDArray[np.bool_],
+    *,
+    hint_sigma_rad: float = UNKNOWN_YAW_RAD,
+) -> Array:
+    """Return the standard deviation (T,) in rad of `yaw_of_motion`, given where the course is `known` (T,).
+
+    There it is that of the direction of the velocity; elsewhere it grows with the distance from the nearest known course.
+
+    Parameters
+    ----------
+    xy_m : (T, 2) float64, m
+    velocity_mps : (T, 2) float64, m/s
+    covariance : (T, 2, 2) float64, m2/s2
+        Of the velocity.
+    known : (T,) bool
+    hint_sigma_rad : float
+        Of the heading that is taken without any known course.
+    """
+    rows = np.flatnonzero(known)
+    if len(rows) == 0:
+        return np.full(len(xy_m), min(hint_sigma_rad, UNKNOWN_YAW_RAD))
+    speed = np.hypot(*velocity_mps.T)
+    variance = _course_variance(velocity_mps[rows], covariance[rows])
+    distance = _distance_covered(xy_m, speed)
+    after = np.clip(np.searchsorted(rows, np.arange(len(xy_m))), 0, len(rows) - 1)
+    nearest = [
+        variance[k] + (WAY_CURVATURE_1PM * (distance - distance[rows[k]])) ** 2
+        for k in (after, np.maximum(after - 1, 0))
+    ]
+    return np.asarray(np.minimum(np.sqrt(np.minimum(*nearest)), UNKNOWN_YAW_RAD))
+
+
+def speed_sigma(yaw_rad: Array, covariance: Array) -> Array:
+    """Return the standard deviation (T,) in m/s of the speed along headings (T,), from covariances (T, 2, 2) of the velocity."""
+    along = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+    return np.asarray(np.sqrt(np.einsum("ta,tab,tb->t", along, covariance, along)))
+
+
+def _distance_covered(xy_m: Array, speed_mps: Array) -> Array:
+    """Distance (T,) in m along a trajectory, less what is noise of a standing object."""
+    advancing = speed_mps > MIN_PROGRESS_MPS
+    step = np.hypot(*np.diff(xy_m, axis=0).T) * (advancing[1:] | advancing[:-1])
+    return np.concatenate([[0.0], np.cumsum(step)])
+
+
+def unwrap(angles: Array) -> Array:
+    """Angles (n,) without jumps by full turns between neighbors."""
+    return np.concatenate([angles[:1], angles[0] + np.cumsum(wrap_angle(np.diff(angles)))])
+
+
+def _heading_of_course(course: Array, hint_rad: float | None) -> Array:
+    """Turn courses (n,) into headings: a jump by more than a right angle is a change of gear, not a turn on the spot."""
+    first = course[0]
+    if hint_rad is not None and abs(float(wrap_angle(first - hint_rad))) > np.pi / 2:
+        first = first + np.pi
+    jumps = np.abs(wrap_angle(np.diff(course))) > np.pi / 2
+    backward = np.concatenate([[0], np.cumsum(jumps)]) % 2
+    return wrap_angle(course + (first - course[0]) + np.pi * backward)
 
 
 @dataclass(frozen=True)

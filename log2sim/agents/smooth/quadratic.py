@@ -1,12 +1,17 @@
-"""Quadratic forms over a chain of states, their sum and its minimum by a banded Cholesky factorization in linear time."""
+"""The motion prior and the measurements of a chain of states as quadratic forms, their minimum, and densities by likelihood.
+
+It is the continuous Wiener process acceleration model of Bar-Shalom, Li and Kirubarajan, Estimation with Applications to
+Tracking and Navigation (2001), section 6.2.3, for uneven steps.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 
@@ -50,7 +55,6 @@ class Minimum:
         At the minimum.
     log_determinant : float
         log(det A).
-    form : Quadratic
     """
 
     step: Array
@@ -165,3 +169,394 @@ def _dense_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
     dense[k[1:], :, k[:-1]] = np.swapaxes(off, 1, 2)
     inverse = np.linalg.inv(dense.reshape(count * size, -1)).reshape(dense.shape).astype(np.float64, copy=False)
     return inverse[k, :, k], inverse[k[:-1], :, k[1:]]
+
+
+# Minimum distance of two knots; in between the acceleration is taken as constant, which at 100 m/s3 of jerk costs 0.02 mm.
+# The information that ties two knots grows with the fifth power of the inverse step: 1 ms apart they would leave no digits
+# for the data.
+KNOT_STEP_S = 0.02
+# Standard deviations of the vague prior of the first state.
+VELOCITY_PRIOR_MPS = 40.0
+ACCELERATION_PRIOR_MPS2 = 4.0
+
+# Covariance of position, velocity, acceleration after unit time of white jerk of unit density, and its inverse.
+_UNIT_Q = np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
+_UNIT_INFORMATION = np.linalg.inv(_UNIT_Q)
+
+
+@dataclass(frozen=True, eq=False)
+class NoisyPositions:
+    """Measured positions with their noise.
+
+    Attributes
+    ----------
+    t_s : (n,) float64, s
+    xy : (n, 2) float64, m
+    r : (n, 2, 2) float64, m2
+        Covariance of each position.
+    unknown_scale : bool
+        Whether `r` is known up to a common factor only.
+    correlated : bool
+        Whether errors repeat from tick to tick and have heavier tails than Gaussian ones, as those of measured boxes.
+    """
+
+    t_s: Array
+    xy: Array
+    r: Array
+    unknown_scale: bool = False
+    correlated: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrior:
+    """Knots and the motion between them, at a jerk density of 1 m2/s5.
+
+    Attributes
+    ----------
+    knots_s : (K,) float64, s
+    step : (K-1, 3, 3) float64
+        Transition of position, velocity and acceleration to the next knot.
+    inverse : (K-1, 3, 3) float64
+        Information about the process noise of each step.
+    inverse_before : (K-1, 3, 3) float64
+        The same, propagated to the earlier knot.
+    cross : (K-1, 3, 3) float64
+        Blocks above the diagonal of the squared jerk.
+    diagonal : (K, 3, 3) float64
+        Blocks on the diagonal of the squared jerk.
+    """
+
+    knots_s: Array
+    step: Array
+    inverse: Array
+    inverse_before: Array
+    cross: Array
+    diagonal: Array
+
+    @classmethod
+    def over(cls, t_s: Array, step_s: float = KNOT_STEP_S) -> MotionPrior:
+        """Build the prior with knots out of the times (n,), none nearer to another than `step_s`."""
+        knots = place_knots(t_s, step_s)
+        dt = np.diff(knots)
+        # Inverted in units of the step: steps from milliseconds to seconds are equally well conditioned.
+        scale = np.stack([dt**-2.5, dt**-1.5, dt**-0.5], axis=-1)
+        step = np.zeros((len(dt), 3, 3))
+        step[:, [0, 1, 2], [0, 1, 2]] = 1.0
+        step[:, 0, 1], step[:, 1, 2], step[:, 0, 2] = dt, dt, dt**2 / 2
+        inverse = _UNIT_INFORMATION * scale[:, :, None] * scale[:, None, :]
+        cross = -np.swapaxes(step, 1, 2) @ inverse
+        diagonal = np.zeros((len(knots), 3, 3))
+        before = -cross @ step
+        diagonal[:-1] = before
+        diagonal[1:] += inverse
+        return cls(knots, step, inverse, before, cross, diagonal)
+
+    def __len__(self) -> int:
+        """Return the number of knots."""
+        return len(self.knots_s)
+
+    def jerk(self, state: Array) -> Quadratic:
+        """Squared jerk over the three unknowns that both axes share, about a state (K, 3, 2)."""
+        return Quadratic.of(self.diagonal, self.cross, *self._gradient(state[1:] - self.step @ state[:-1]))
+
+    def jerk_by_direction(self, state: Array, direction: Array) -> tuple[Quadratic, Quadratic]:
+        """Squared jerk along and across unit directions (K-1, 2) of the steps, over all six unknowns of a knot."""
+        outer = direction[:, :, None] * direction[:, None, :]
+        noise = state[1:] - self.step @ state[:-1]
+        along = noise @ outer
+        # Each step has a direction of its own, so a knot's block takes two of them.
+        diagonal = np.zeros((len(self), 6, 6))
+        diagonal[:-1] = kronecker(self.inverse_before, outer)
+        diagonal[1:] += kronecker(self.inverse, outer)
+        cross = kronecker(self.cross, outer)
+        longitudinal = self._form(along, diagonal, cross)
+        np.negative(diagonal, out=diagonal)
+        np.negative(cross, out=cross)
+        for axis in range(2):  # across is all that is not along
+            diagonal[:, axis::2, axis::2] += self.diagonal
+            cross[:, axis::2, axis::2] += self.cross
+        return longitudinal, self._form(noise - along, diagonal, cross)
+
+    def _form(self, noise: Array, diagonal: Array, cross: Array) -> Quadratic:
+        gradient, value = self._gradient(noise)
+        return Quadratic.of(diagonal, cross, gradient.reshape(-1, 6, 1), value)
+
+    def _gradient(self, noise: Array) -> tuple[Array, float]:
+        """Negative half gradient (K, 3, 2) of the squared jerk for process noise (K-1, 3, 2), and its value."""
+        weighted = self.inverse @ noise
+        gradient = np.zeros((len(self), 3, 2))
+        gradient[:-1] = np.swapaxes(self.step, 1, 2) @ weighted
+        gradient[1:] -= weighted
+        return gradient, float(np.vdot(noise, weighted))
+
+
+def kronecker(blocks: Array, weights: Array) -> Array:
+    """Kronecker products (n, 6, 6) of blocks (n, 3, 3) of one axis and weights (n, 2, 2) of each pair of axes."""
+    product = np.empty((len(blocks), 6, 6))
+    for first in range(2):
+        for second in range(2):
+            np.multiply(blocks, weights[:, first, second, None, None], out=product[:, first::2, second::2])
+    return product
+
+
+def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
+    """Select knots (K,) from times (n,), from the first on, none nearer to the one before than `step_s`."""
+    times = np.unique(t_s)
+    if np.all(np.diff(times) >= step_s):
+        return times
+    knots: list[float] = []
+    for t in times.tolist():
+        if not knots or t - knots[-1] >= step_s:
+            knots.append(t)
+    return np.array(knots)
+
+
+def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
+    """Index of the knot nearest to each time."""
+    if len(knots) == 1:
+        return np.zeros(len(t), dtype=np.intp)
+    i = np.clip(np.searchsorted(knots, t), 1, len(knots) - 1)
+    return np.where(np.abs(knots[i - 1] - t) <= np.abs(knots[i] - t), i - 1, i)
+
+
+# Information about position, velocity and acceleration of the first knot.
+INITIAL_INFORMATION = np.array([0.0, VELOCITY_PRIOR_MPS**-2, ACCELERATION_PRIOR_MPS2**-2])
+# Prior share of outliers and the ratio of their standard deviation to that of inliers.
+OUTLIER_SHARE, OUTLIER_WIDTH = 0.02, 10.0
+# Scale of the Geman-McClure weights: an observation at this many sigmas counts a quarter.
+GEMAN_MCCLURE_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementModel:
+    """Which state each observation measures, and how.
+
+    All forms contain the vague prior of the first knot, with which a single observation, or two of them, have a solution.
+
+    Attributes
+    ----------
+    knot : (n,) int
+        Index of the knot that each observation measures.
+    design : (n, 3) float64
+        Row that takes the knot's position, velocity and acceleration to the observed position.
+    group_start : (G,) int
+        Rows at which the observations of another knot begin.
+    """
+
+    observed: NoisyPositions
+    knot: NDArray[np.intp]
+    design: Array
+    group_start: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, observed: NoisyPositions, prior: MotionPrior) -> MeasurementModel:
+        """Tie each observation to the nearest knot of a motion prior."""
+        knot = nearest_index(prior.knots_s, observed.t_s)
+        start = np.concatenate([[0], np.flatnonzero(knot[1:] > knot[:-1]) + 1])
+        return cls(observed, knot, position_row(observed.t_s - prior.knots_s[knot]), start)
+
+    def residual(self, state: Array) -> Array:
+        """Observed minus predicted positions (n, 2) for a state (K, 3, 2)."""
+        return np.asarray(self.observed.xy - np.einsum("ni,nia->na", self.design, state[self.knot]))
+
+    def independent_axes(self, state: Array, information: Array) -> Quadratic:
+        """Squared residuals with scalar information (n,), over the three unknowns that both axes share."""
+        residual = self.residual(state)
+        rows = self.design * information[:, None]
+        diagonal = self._sum_by_knot(rows[:, :, None] * self.design[:, None, :], len(state))
+        gradient = self._sum_by_knot(rows[:, :, None] * residual[:, None, :], len(state))
+        diagonal[0] += np.diag(INITIAL_INFORMATION)
+        gradient[0] -= INITIAL_INFORMATION[:, None] * state[0]
+        value = float(information @ (residual**2).sum(axis=1) + INITIAL_INFORMATION @ (state[0] ** 2).sum(axis=1))
+        return Quadratic.of(diagonal, None, gradient, value)
+
+    def coupled_axes(self, state: Array, information: Array) -> Quadratic:
+        """Squared residuals with information (n, 2, 2), over all six unknowns of a knot."""
+        residual = self.residual(state)
+        weighted = np.einsum("nab,nb->na", information, residual)
+        h = self.design
+        diagonal = self._sum_by_knot(kronecker(h[:, :, None] * h[:, None, :], information), len(state))
+        gradient = self._sum_by_knot((h[:, :, None] * weighted[:, None, :]).reshape(-1, 6, 1), len(state))
+        initial = np.repeat(INITIAL_INFORMATION, 2)
+        diagonal[0] += np.diag(initial)
+        gradient[0, :, 0] -= initial * state[0].ravel()
+        value = float(np.vdot(weighted, residual) + initial @ state[0].ravel() ** 2)
+        return Quadratic.of(diagonal, None, gradient, value)
+
+    def _sum_by_knot(self, values: Array, count: int) -> Array:
+        """Sum values (n, ...) of the observations of each knot to (K, ...)."""
+        sums = np.zeros((count, *values.shape[1:]))
+        unique = len(self.group_start) == len(self.knot)
+        sums[self.knot[self.group_start]] = values if unique else np.add.reduceat(values, self.group_start, axis=0)
+        return sums
+
+
+def position_row(offset_s: Array) -> Array:
+    """Rows (n, 3) that take position, velocity and acceleration to the position after an offset (n,)."""
+    return np.stack([np.ones_like(offset_s), offset_s, offset_s**2 / 2], axis=-1)
+
+
+def transition(offset_s: Array) -> Array:
+    """Transition matrices (n, 3, 3) over offsets (n,) at constant acceleration."""
+    step = np.zeros((len(offset_s), 3, 3))
+    step[:, 0] = position_row(offset_s)
+    step[:, 1, 1:] = step[:, 0, :2]
+    step[:, 2, 2] = 1.0
+    return step
+
+
+def propagate(prior: MotionPrior, state: Array, t_s: Array) -> Array:
+    """Propagate the state (K, 3, 2) from the nearest knot to each time (T,): (T, 3, 2)."""
+    knot = nearest_index(prior.knots_s, t_s)
+    return transition(t_s - prior.knots_s[knot]) @ state[knot]
+
+
+def zero_motion(state: Array, velocity_information: Array, acceleration_information: Array) -> Quadratic:
+    """Pseudo-measurements of zero velocity and zero acceleration, with information (K, 2, 2) about each."""
+    count = len(state)
+    diagonal, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6, 1))
+    diagonal[:, 2:4, 2:4], diagonal[:, 4:, 4:] = velocity_information, acceleration_information
+    v = np.einsum("kab,kb->ka", velocity_information, state[:, 1])
+    a = np.einsum("kab,kb->ka", acceleration_information, state[:, 2])
+    gradient[:, 2:4, 0], gradient[:, 4:, 0] = -v, -a
+    return Quadratic.of(diagonal, None, gradient, float(np.vdot(v, state[:, 1]) + np.vdot(a, state[:, 2])))
+
+
+def geman_mcclure_weights(squared: Array) -> Array:
+    """Robust weights (n,) of squared residuals in sigmas, while the outliers are not yet known.
+
+    Notes
+    -----
+    Geman and McClure, Statistical methods for tomographic image reconstruction (1987).
+    """
+    return np.asarray(1.0 / (1.0 + squared / GEMAN_MCCLURE_SIGMAS**2) ** 2)
+
+
+def inlier_probability(squared: Array) -> Array:
+    """Probability (n,) of being an inlier, from squared residuals in sigmas, relative to that of a residual of zero.
+
+    Notes
+    -----
+    Mixture of two Gaussians, that of the outliers `OUTLIER_WIDTH` times as wide (expectation step of Dempster, Laird and
+    Rubin, 1977, section 4.3). Inliers keep nearly all their weight, unlike with `geman_mcclure_weights`.
+    """
+    odds = OUTLIER_SHARE / (1.0 - OUTLIER_SHARE) / OUTLIER_WIDTH**2
+    exponent = np.minimum(squared, 200.0) / 2.0 * (1.0 - OUTLIER_WIDTH**-2)
+    return np.asarray((1.0 + odds) / (1.0 + odds * np.exp(exponent)))
+
+
+@dataclass(frozen=True)
+class LogNormalPrior:
+    """Prior of a jerk density: median in m2/s5 and standard deviation of its logarithm."""
+
+    median: float
+    log_sigma: float
+
+    def penalty(self, log_density: float) -> float:
+        """Twice the negative log density, up to a constant."""
+        return ((log_density - float(np.log(self.median))) / self.log_sigma) ** 2
+
+
+# The weak prior is outweighed by some seconds of data. The strong one is for errors that repeat from tick to tick, which
+# look like maneuvers.
+WEAK_PRIOR, STRONG_PRIOR = LogNormalPrior(1.5, 2.5), LogNormalPrior(3.0, 0.7)
+# Information that ties two knots beyond this leaves no digits of float64 for the data.
+MAX_INFORMATION = 1e13
+MIN_DENSITY, MAX_DENSITY = 1e-4, 1e4  # m2/s5
+# Half widths of the search in the logarithm, round by round.
+SEARCH_WIDTHS = (2.0, 0.8)
+
+
+@dataclass(frozen=True)
+class DensityEstimator:
+    """Maximizes the marginal likelihood of jerk densities.
+
+    Attributes
+    ----------
+    unknown_scale : bool
+        Whether the variance of the noise is known up to a factor only.
+    rounds : int
+        Rounds of the search for one density, each narrower; 1 where a finer search follows.
+    """
+
+    prior: LogNormalPrior = WEAK_PRIOR
+    unknown_scale: bool = False
+    rounds: int = 2
+
+    def isotropic(
+        self, motion: MotionPrior, state: Array, likelihood: Quadratic, weight_sum: float
+    ) -> tuple[float, float]:
+        """Estimate one jerk density in m2/s5 for both axes and the factor on the noise's variance.
+
+        Parameters
+        ----------
+        state : (K, 3, 2) float64
+            Reference state of the forms.
+        likelihood : Quadratic
+            Squared residuals over 3 unknowns a knot and 2 columns, about `state`.
+        weight_sum : float
+            Sum of the observations' weights.
+        """
+        jerk = motion.jerk(state)
+        steps = len(motion) - 1
+        # The six unknowns of the initial state are as good as free.
+        freedom = max(2.0 * weight_sum - 6.0, 1.0)
+
+        def objective(log_density: Array) -> float:
+            u = float(log_density[0])
+            least = minimize(weighted_sum([(1.0, likelihood), (np.exp(-u), jerk)]))
+            noise = freedom * np.log(least.value) if self.unknown_scale else least.value
+            return float(noise + 2.0 * least.log_determinant + 6.0 * steps * u + self.prior.penalty(u))
+
+        lowest = min_density(motion)
+        start = np.array([np.log(max(self.prior.median, lowest))])
+        u = _coordinate_descent(objective, start, SEARCH_WIDTHS[: self.rounds], lowest)
+        ratio = float(np.exp(u[0]))
+        if not self.unknown_scale:
+            return ratio, 1.0
+        factor = minimize(weighted_sum([(1.0, likelihood), (1 / ratio, jerk)])).value / freedom
+        return ratio * factor, factor
+
+    def by_direction(
+        self, motion: MotionPrior, jerk: tuple[Quadratic, Quadratic], likelihood: Quadratic, start: float
+    ) -> tuple[float, float]:
+        """Estimate jerk densities in m2/s5 along and across the path.
+
+        Drivers brake and steer at different times: the straight path of a braking car and the constant speed of one that
+        changes lanes are each smoothed as strongly as the data allow.
+        """
+        steps = len(motion) - 1
+
+        def objective(logs: Array) -> float:
+            least = minimize(
+                weighted_sum([(1.0, likelihood), (np.exp(-logs[0]), jerk[0]), (np.exp(-logs[1]), jerk[1])])
+            )
+            misfit = least.value + least.log_determinant + 3.0 * steps * logs.sum()
+            return float(misfit + self.prior.penalty(logs[0]) + self.prior.penalty(logs[1]))
+
+        logs = _coordinate_descent(objective, np.full(2, np.log(start)), SEARCH_WIDTHS, min_density(motion))
+        return float(np.exp(logs[0])), float(np.exp(logs[1]))
+
+
+def min_density(motion: MotionPrior) -> float:
+    """Smallest density in m2/s5 with which the normal equations are solvable in float64."""
+    stiffest = float(motion.inverse[:, 0, 0].max()) if len(motion) > 1 else 0.0
+    return max(stiffest / MAX_INFORMATION, MIN_DENSITY)
+
+
+def _coordinate_descent(
+    objective: Callable[[Array], float], start: Array, widths: tuple[float, ...], lowest: float
+) -> Array:
+    """Step to the vertex of a parabola through three points on each axis, all from one center, once for every width."""
+    at, low, high = start.copy(), np.log(lowest), np.log(MAX_DENSITY)
+    for width in widths:
+        here, move = objective(at), np.zeros_like(at)
+        for axis in range(len(at)):
+            side = np.zeros_like(at)
+            side[axis] = width
+            above, below = objective(at + side), objective(at - side)
+            slope, curvature = (above - below) / (2 * width), (above + below - 2 * here) / width**2
+            reach = 2 * width
+            move[axis] = -np.sign(slope) * reach if curvature * reach <= abs(slope) else -slope / curvature
+        at = np.clip(at + move, low, high)
+    return at

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.agents.smooth.feasibility import BrokenLimit, broken_limits
 from log2sim.agents.smooth.fixed_interval import smooth_interval
-from log2sim.agents.smooth.heading import speed_sigma
-from log2sim.agents.smooth.motion_model import MotionModel, Smoothed
-from log2sim.agents.smooth.motion_prior import NoisyPositions
+from log2sim.agents.smooth.motion_model import BrokenLimit, MotionModel, Smoothed, broken_limits, speed_sigma
+from log2sim.agents.smooth.quadratic import NoisyPositions
 from log2sim.geometry import Array, wrap_angle
 
 __all__ = ["MotionModel", "SmoothedTrack", "smooth_track"]

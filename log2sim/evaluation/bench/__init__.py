@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from log2sim.evaluation.bench.benchmark import Benchmark, bench
-from log2sim.evaluation.bench.panels import Panel
+from log2sim.evaluation.bench.benchmark import Benchmark, Panel, bench
 from log2sim.evaluation.bench.scores import Scope
 
 __all__ = ["Benchmark", "Panel", "Scope", "bench"]

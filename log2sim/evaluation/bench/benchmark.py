@@ -1,20 +1,191 @@
-"""Error against run time of the pipeline over methods and settings, on one log and with shared work."""
+"""Error against run time of the pipeline over methods and settings, as panels, figure, document and table."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from textwrap import wrap
 from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
-from log2sim.errors import MissingExtra
-from log2sim.evaluation.bench.ends import ends_settings, make_context_of_ends, whole_points
-from log2sim.evaluation.bench.panels import Panel, make_ends_panel, make_panels
-from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context
-from log2sim.evaluation.bench.scores import EVERYTHING, Scope
-from log2sim.evaluation.bench.settings import default_settings, make_grid
+from log2sim.errors import MissingExtra, ScenarioError
+from log2sim.evaluation.bench.runs import STAGE as ENDS_STAGE
+from log2sim.evaluation.bench.runs import (
+    BenchContext,
+    BenchRun,
+    Progress,
+    ends_settings,
+    homography_points,
+    make_context,
+    make_context_of_ends,
+    run_all,
+    whole_points,
+)
+from log2sim.evaluation.bench.scores import EVERYTHING, Scope, Score
+from log2sim.evaluation.bench.settings import (
+    COVERAGE,
+    Point,
+    Recommendation,
+    default_settings,
+    error_interval,
+    front_mask,
+    make_grid,
+    recommend,
+    short,
+)
+from log2sim.files.documents import check, replaced
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.version import __version__
+from log2sim.visualization.plot.style import CROWD_COLOR, FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, halo, printable
 
 __all__ = ["Benchmark", "Panel", "Scope", "bench"]
+
+
+OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
+
+WITHOUT_TRUTH = "the log has no labels: these figures say how steady a setting is, not how right"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """The settings of a stage.
+
+    Attributes
+    ----------
+    error, label, unit : str
+        Key of the figure that is the error, its description and its unit.
+    on_front : tuple of bool
+        Which points are Pareto-optimal.
+    """
+
+    stage: str
+    error: str
+    label: str
+    unit: str
+    points: tuple[Point, ...]
+    on_front: tuple[bool, ...]
+    recommendation: Recommendation
+
+
+# Key, description and unit of a stage's error with truth, and without.
+ERRORS = {
+    "detect": (
+        ("error_m", "position error, missed and false objects counted", "m"),
+        ("gap_share", "part of the objects' ticks without a detection", ""),
+    ),
+    "measure": (
+        ("error_m", "error of measured centers, cut at 2 m", "m"),
+        ("smoothing_residual_m", "measurements' distance from the smoothed path", "m"),
+    ),
+    "homography": (
+        ("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),
+        ("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),
+    ),
+    "smooth": (
+        ("state_error_m", "error of the position one second ahead", "m"),
+        ("jitter_m", "jitter of waypoints", "m"),
+    ),
+    "whole run": (
+        ("error_m", "position error, missed and false objects counted", "m"),
+        ("jitter_m", "jitter of waypoints", "m"),
+    ),
+    ENDS_STAGE: (
+        ("error_m", "vehicle, road, and both by LiDAR: position error, missed and false objects counted", "m"),
+        ("jitter_m", "vehicle, road, and both by LiDAR: jitter of waypoints", "m"),
+    ),
+}
+
+
+def make_panels(context: BenchContext, report: Progress, default: Sequence[Point] = ()) -> list[Panel]:
+    """Run all settings and make one panel for each stage and one for whole runs, with those of the default beside them."""
+    runs, observations = run_all(context, report)
+    whole_ms = context.ms_per_tick(runs[0].seconds)
+    known = context.truth is not None
+    by_stage = {stage: [runs[0], *(r for r in runs[1:] if r.setting.stage == stage)] for stage in OWN_STAGES}
+    homographies = homography_points(context, observations, report)
+    whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
+    points = {
+        "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
+        "measure": [_measure_point(context, r) for r in by_stage["measure"]],
+        "homography": homographies,
+        "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
+        "whole run": _with_placed_shares(whole, homographies),
+    }
+    return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
+
+
+def make_ends_panel(points: Sequence[Point], truth: Scenario | None) -> Panel:
+    """Make the panel of vehicle, road, and both; the present setting comes first."""
+    return _panel(ENDS_STAGE, points, points[0].ms_per_tick, truth is not None)
+
+
+def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) -> Panel:
+    error, label, unit = ERRORS[stage][0 if known else 1]
+    recommendation = recommend(points, unit, whole_ms)
+    if not known and stage != "homography":
+        recommendation = Recommendation(None, recommendation.present, WITHOUT_TRUTH)
+    return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_mask(points)), recommendation)
+
+
+def _name(context: BenchContext, stage: str, run: BenchRun) -> str:
+    """Name a run within a stage; the present run belongs to every stage."""
+    return run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
+
+
+def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
+    ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
+    return _scored_point(_name(context, stage, run), run.setting.present, ms, run.score, _error(context, stage))
+
+
+def _scored_point(name: str, present: bool, ms: float, score: Score, error: str) -> Point:
+    return Point(name, present, ms, score.figures.get(error), score.figures, score.by_object.get(error, {}))
+
+
+def _measure_point(context: BenchContext, run: BenchRun) -> Point:
+    point = _point(context, "measure", run)
+    if context.truth is None:
+        return point
+    return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
+
+
+def _with_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
+    """Add to whole runs the share of the obstacles that their homographies place."""
+    if not homographies:
+        return list(whole)
+    shares = {f"homography: {p.setting}": p.figures["placed_share"] for p in homographies}
+    present = next(p for p in homographies if p.present).figures["placed_share"]
+    return [replace(p, figures={**p.figures, "placed_share": shares.get(p.setting, present)}) for p in whole]
+
+
+def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> Point:
+    """Make the point of a run; where it is `compared` with the others, that of the present settings is marked."""
+    present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
+    name = present if run.setting.present else run.setting.key
+    stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
+    point = _scored_point(
+        name,
+        run.setting.present and compared,
+        context.ms_per_tick(run.seconds),
+        run.score,
+        _error(context, "whole run"),
+    )
+    return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
+
+
+def _error(context: BenchContext, stage: str) -> str:
+    return ERRORS[stage][0 if context.truth is not None else 1][0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,3 +300,377 @@ def _notes(context: BenchContext, panels: list[Panel]) -> list[str]:
     if all(p.stage != "homography" for p in panels):
         notes.append("too few obstacles with LiDAR points within 60 m to judge homographies by")
     return notes
+
+
+SIZE_PT, LETTER_PT, LINE_PT, POINT_PT = 6.8, 3.9, 9.0, 6.0
+# Points nearer to each other than this share one block of labels.
+MAX_SHARED_LABEL_PT = 7.0
+# Labels farther from their point than this get a leader line.
+MIN_LEADER_PT = 11.5
+# Candidates for a block of labels by preference: side, horizontal gap and vertical offset from its point, in points.
+CANDIDATES = tuple(
+    (side, gap, rise)
+    for rise in (0, 9, -9, 16, -16, 24, -24, 34, -34, 46, -46, 60, -60, 76, -76)
+    for side, gap in ((1, 10), (-1, 10), (0, 0))
+    if side or abs(rise) > 9
+)
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, right, top in display pixels."""
+
+
+def place_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
+    """Label points (K, 2) with their settings, clear of a line with corners `line` (n, 2)."""
+    pt = float(ax.figure.dpi) / 72
+    at = ax.transData.transform(xy)
+    present = next(p for p in points if p.present) if any(p.present for p in points) else points[0]
+    # Covering a point costs three times as much as covering a label.
+    taken = 3 * [_around(u, v, POINT_PT * pt) for u, v in at] + _along(ax.transData.transform(line), pt)
+    frame = ax.get_window_extent()
+    inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
+    for members in sorted(_together(at, MAX_SHARED_LABEL_PT * pt), key=lambda m: -float(at[m[0], 1])):
+        members = sorted(members, key=lambda k: not points[k].present)
+        names = [printable(_label(points[k], present), 42) for k in members]
+        box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
+        taken.append(box)
+        _lead(ax, at[members].mean(axis=0), box, pt)
+        for k, (member, name) in enumerate(zip(members, names)):
+            x, y = ax.transData.inverted().transform((box[0], box[3] - (k + 0.5) * LINE_PT * pt))
+            ax.text(
+                x, y, name, fontsize=SIZE_PT, family=FONT, color=INK, va="center_baseline", ha="left", parse_math=False,
+                weight="bold" if points[member].present else "normal", path_effects=halo(1.8), zorder=5,
+            )  # fmt: skip
+
+
+def short_name(setting: str) -> str:
+    """Drop the stage from a setting whose name identifies its stage."""
+    stage, _, name = setting.partition(": ")
+    return setting if name in ("", "on", "off") or stage == "smooth" else name
+
+
+def _label(point: Point, present: Point) -> str:
+    """Name a point, with the share of objects that it finds or places where the present setting does so with more."""
+    name = short_name(point.setting)
+    if point.covers_as_many_as(present):
+        return name
+    key, share = min(point.coverage.items(), key=lambda item: item[1])
+    return f"{name} ({share:.0%} {COVERAGE[key]})"
+
+
+def _together(at: Array, reach: float) -> list[list[int]]:
+    """Group the indices of points within `reach` of the first of each group."""
+    groups: list[list[int]] = []
+    for k, place in enumerate(at):
+        group = next((g for g in groups if np.hypot(*(at[g[0]] - place)) < reach), None)
+        if group is None:
+            groups.append([k])
+        else:
+            group.append(k)
+    return groups
+
+
+def _best_box(at: Array, names: Sequence[str], taken: Sequence[Box], inside: Box, pt: float) -> Box:
+    width, height = max(map(len, names)) * LETTER_PT * pt, len(names) * LINE_PT * pt
+    boxes, costs = [], []
+    for k, (side, gap, rise) in enumerate(CANDIDATES):
+        u = at[0] + side * gap * pt - (0.0, width / 2, width)[(1, 0, -1).index(side)]
+        v = at[1] + (rise + np.sign(rise) * (len(names) - 1) * LINE_PT / 2) * pt
+        box = (float(u), float(v - height / 2), float(u + width), float(v + height / 2))
+        boxes.append(box)
+        costs.append(sum(_shared(box, other) for other in taken) + 9 * (width * height - _shared(box, inside)) + k)
+    return boxes[int(np.argmin(costs))]
+
+
+def _lead(ax: Axes, at: Array, box: Box, pt: float) -> None:
+    """Draw a leader line from labels to their point when they are far from it."""
+    end = np.clip(at, box[:2], box[2:])
+    if np.hypot(*(end - at)) > MIN_LEADER_PT * pt:
+        line = ax.transData.inverted().transform(np.stack([at, end]))
+        ax.plot(*line.T, color=CROWD_COLOR, lw=0.6, zorder=1.5)
+
+
+def _around(u: float, v: float, reach: float) -> Box:
+    return (u - reach, v - reach, u + reach, v + reach)
+
+
+def _along(corners: Array, pt: float) -> list[Box]:
+    """Cover a line of horizontal and vertical segments with boxes."""
+    low, high = np.minimum(corners[:-1], corners[1:]) - pt, np.maximum(corners[:-1], corners[1:]) + pt
+    return [(float(a), float(b), float(c), float(d)) for (a, b), (c, d) in zip(low, high)]
+
+
+def _shared(a: Box, b: Box) -> float:
+    """Compute the area that two boxes share, px^2."""
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
+
+
+COLUMNS = 3
+CELL_IN = (4.3, 3.6)
+MARGIN_IN = {"left": 0.62, "right": 0.2, "top": 0.62, "bottom": 0.56}
+HEAD_IN = 0.62
+FRONT, CHOSEN = PALETTE[0], PALETTE[4]
+
+
+def write_picture(result: Benchmark, path: Path, *, dpi: int = 150) -> None:
+    """Write all panels into a PNG, atomically."""
+    figure = draw(result)
+    with replaced(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+
+
+def draw(result: Benchmark) -> Figure:
+    """Draw all panels; the last cell explains the marks and gives the recommendations."""
+    rows = -(-(len(result.panels) + 1) // COLUMNS)
+    width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
+    figure = Figure(figsize=(width, height), facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    _title(figure, result)
+    for k, panel in enumerate(result.panels):
+        _draw_panel(figure.add_axes(_cell(k, rows, width, height)), panel)
+    _draw_recommendations(figure.add_axes(_cell(len(result.panels), rows, width, height)), result)
+    return figure
+
+
+def _cell(k: int, rows: int, width: float, height: float) -> tuple[float, float, float, float]:
+    """Compute left, bottom, width, height of the axes of cell `k` as fractions of the figure."""
+    column, row = k % COLUMNS, k // COLUMNS
+    x = column * CELL_IN[0] + MARGIN_IN["left"]
+    y = (rows - 1 - row) * CELL_IN[1] + MARGIN_IN["bottom"]
+    w = CELL_IN[0] - MARGIN_IN["left"] - MARGIN_IN["right"]
+    h = CELL_IN[1] - MARGIN_IN["bottom"] - MARGIN_IN["top"]
+    return x / width, y / height, w / width, h / height
+
+
+def _title(figure: Figure, result: Benchmark) -> None:
+    context = result.context
+    height = figure.get_figheight()
+    against = f"truth: {context.truth.name}" if context.truth is not None else "no truth"
+    cameras, lidars = len(context.plan.cameras), len(context.log.lidars)
+    counts = [(len(context.schedule), "tick"), (cameras, "camera") if cameras else (lidars, "LiDAR")]
+    parts = [f"{n} {what}{'s' * (n != 1)}" for n, what in counts]
+    if context.truth is not None and context.scope.max_range_m is not None:
+        parts.append(f"within {context.scope.max_range_m:g} m")
+    if context.truth is not None and context.scope.categories is not None:
+        parts.append(", ".join(context.scope.categories))
+    text = " · ".join([*parts, against, "one stage's setting changed at a time"])
+    style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
+    x = MARGIN_IN["left"] / figure.get_figwidth()
+    title = printable(f"{context.log.name}: error against run time", 90)
+    figure.text(x, 1 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
+    figure.text(x, 1 - 0.6 / height, printable(text, 150), fontsize=8, color=MUTED, **style)
+
+
+def _draw_panel(ax: Axes, panel: Panel) -> None:
+    shown = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
+    _style(ax)
+    style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
+    ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
+    label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
+    ax.text(0, 1.035, printable(label, 90), fontsize=6.8, color=MUTED, **style)
+    hidden = [p.setting for p in panel.points if p.error is None]
+    if hidden:
+        ax.text(0.02, 0.025, printable(f"no error known: {', '.join(hidden)}"), fontsize=6.8, color=MUTED, **style)
+    if not shown:
+        ax.set(xticks=[], yticks=[])
+        return
+    points = [p for p, _ in shown]
+    x = np.array([p.ms_per_tick for p in points])
+    y = np.array([p.error for p in points], dtype=np.float64)
+    present = next((p for p in points if p.present), None)
+    spread = None if present is None else error_interval(present.by_object)
+    if present is not None and spread is not None:
+        ax.vlines(present.ms_per_tick, *spread, color=CROWD_COLOR, lw=1.0, alpha=0.6, zorder=1.8)
+    _limits(ax, x, np.append(y, spread or ()))
+    front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
+    ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
+    for point, on_front in shown:
+        _mark(ax, point, on_front=on_front, chosen=point.setting == panel.recommendation.supported)
+    corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
+    place_labels(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
+
+
+def _mark(ax: Axes, point: Point, *, on_front: bool, chosen: bool) -> None:
+    x, y = np.array([point.ms_per_tick]), np.array([point.error], dtype=np.float64)
+    if chosen:
+        ax.plot(x, y, "o", ms=13, mfc="none", mec=CHOSEN, mew=1.6, zorder=3)
+    face, edge = (FRONT, PAPER) if on_front else (PAPER, CROWD_COLOR)
+    ax.plot(
+        x, y, "D" if point.present else "o", ms=6.5 if point.present else 5.5, mfc=face, mec=edge, mew=1.1, zorder=4
+    )
+
+
+def _style(ax: Axes) -> None:
+    ax.set_facecolor("#FBFCFD")
+    ax.set_axisbelow(True)
+    ax.grid(True, color=GRID, lw=0.7)
+    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
+    ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=MUTED, family=FONT)
+    for spine in ax.spines.values():
+        spine.set(color=FRAME, linewidth=0.8)
+
+
+def _limits(ax: Axes, x: Array, y: Array) -> None:
+    """Set a logarithmic time axis at least a factor of three wide, and room for labels on the error axis."""
+    low, high = np.log10(max(x.min(), 1e-3)), np.log10(max(x.max(), 1e-3))
+    wide = max((high - low) * 1.5, np.log10(3.0))
+    start, end = 10 ** ((low + high - wide) / 2), 10 ** ((low + high + wide) / 2)
+    ax.set_xscale("log")
+    ax.set_xlim(start, end)
+    digits = (1, 2, 5) if end > 6 * start else (1, 1.5, 2, 3, 4, 5, 6, 8)
+    steps = [m * 10.0**k for k in range(-4, 7) for m in digits]
+    ax.xaxis.set_major_locator(FixedLocator([s for s in steps if start <= s <= end]))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    room = max(float(np.ptp(y)) * 0.22, float(y.max()) * 0.1, 1e-6)
+    ax.set_ylim(max(float(y.min()) - room, -0.4 * room), float(y.max()) + room)
+
+
+def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
+    """Draw the legend and the recommendations."""
+    ax.set_axis_off()
+    ax.set(xlim=(0, 1), ylim=(0, 1))
+    mark: dict[str, Any] = {"ls": "none", "mew": 1.1}
+    handles = [
+        (Line2D([], [], marker="D", ms=6.5, mfc=FRONT, mec=PAPER, **mark), "present setting, on the front"),
+        (Line2D([], [], marker="D", ms=6.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "present setting, behind it"),
+        (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
+        (Line2D([], [], marker="o", ms=5.5, mfc=FRONT, mec=PAPER, **mark), "on the Pareto front"),
+        (Line2D([], [], marker="o", ms=5.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "behind it"),
+        (Line2D([], [], color=CROWD_COLOR, lw=1.0, alpha=0.6), "5 to 95 % of resamples"),
+    ]
+    ax.legend(
+        [h for h, _ in handles], [t for _, t in handles], loc="upper left", bbox_to_anchor=(-0.03, 1.14), frameon=False,
+        ncols=2, prop={"family": FONT, "size": 7.0}, labelcolor=INK, handletextpad=0.5, columnspacing=1.2, labelspacing=0.7,
+    )  # fmt: skip
+    y = 0.86
+    for panel in result.panels:
+        for k, line in enumerate(wrap(printable(panel.recommendation.reason, 240), 50)):
+            head = panel.stage if k == 0 else ""
+            ax.text(0, y, head, fontsize=7.2, family=FONT, color=INK, weight="bold", va="top", parse_math=False)
+            ax.text(0.23, y, line, fontsize=7.2, family=FONT, color=INK, va="top", parse_math=False)
+            y -= 0.058
+        y -= 0.03
+    for note in result.notes:
+        for line in wrap(printable(f"Note: {note}", 240), 70):
+            ax.text(0, y, line, fontsize=6.6, family=FONT, color=MUTED, va="top", parse_math=False)
+            y -= 0.05
+
+
+VERSION = 1
+# Figures of the table next to the error, in panels that have them.
+TABLE_COLUMNS = (
+    ("recall", "recall", 3),
+    ("precision", "precis.", 3),
+    ("position_rmse_m", "pos rmse m", 2),
+    ("placed_share", "placed", 3),
+    ("median_m", "median m", 2),
+    ("near_error_m", "<25 m", 2),
+    ("far_error_m", ">25 m", 2),
+    ("center_error_m", "center m", 2),
+    ("seam_m", "seam m", 3),
+    ("seam_aligned_m", "aligned m", 3),
+    ("jitter_m", "jitter m", 4),
+)
+
+
+def document(result: Benchmark) -> dict[str, Any]:
+    """Return the document of `schemas/bench-1.json`."""
+    context, config = result.context, result.context.grid.present.config
+    t = context.schedule.t_ns
+    out = {
+        "bench_version": VERSION,
+        "log": {"name": context.log.name, "format": context.log.format, "digest": context.log.digest},
+        "log2sim_version": __version__,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "ticks": len(t),
+        "duration_s": int(t[-1] - t[0]) / NS_PER_S,
+        "cameras": list(context.plan.cameras),
+        "truth": context.truth.name if context.truth is not None else None,
+        "max_range_m": context.scope.max_range_m,
+        "categories": None if context.scope.categories is None else list(context.scope.categories),
+        "config": config.to_dict(),
+        "notes": list(result.notes),
+        "panels": [_panel_document(p) for p in result.panels],
+    }
+    check(out, "bench-1", ScenarioError)
+    return out
+
+
+def _panel_document(panel: Panel) -> dict[str, Any]:
+    recommendation = panel.recommendation
+    return {
+        "stage": panel.stage,
+        "error": {"figure": panel.error, "label": panel.label, "unit": panel.unit},
+        "points": [
+            {
+                "setting": p.setting,
+                "present": p.present,
+                "on_front": on_front,
+                "ms_per_tick": round(p.ms_per_tick, 4),
+                "error": _finite(p.error),
+                "error_interval": _interval(p),
+                "figures": _finite(p.figures),
+            }
+            for p, on_front in zip(panel.points, panel.on_front, strict=True)
+        ],
+        "supports": {
+            "setting": recommendation.supported,
+            "present": recommendation.present,
+            "agrees": None if recommendation.supported is None else recommendation.agrees,
+            "reason": recommendation.reason,
+        },
+    }
+
+
+def _interval(point: Point) -> list[float] | None:
+    found = error_interval(point.by_object) if point.error is not None else None
+    return None if found is None else [round(value, 6) for value in found]
+
+
+def _finite(value: Any) -> Any:
+    """Round nested figures to six decimals; None for a number that is not finite."""
+    if isinstance(value, Mapping):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value
+
+
+def format_table(result: Benchmark) -> str:
+    """Format one block for each stage, then the recommendations."""
+    lines = [
+        "* present setting   + on the Pareto front: no setting is as accurate in less time",
+        "5-95 %: error over resamples of the objects, '-' with fewer than five of them",
+        "",
+    ]
+    for panel in result.panels:
+        lines += [f"{panel.stage}: {panel.label}", *_rows(panel), ""]
+    lines += ["What the figures support:"]
+    lines += [f"  {p.stage:<11} {p.recommendation.reason}" for p in result.panels]
+    return "\n".join([*lines, *(f"note: {n}" for n in result.notes)])
+
+
+def _rows(panel: Panel) -> list[str]:
+    columns = [c for c in TABLE_COLUMNS if any(p.figures.get(c[0]) is not None for p in panel.points)]
+    head = ["", "", "ms a tick", f"error {panel.unit}".strip(), "5-95 %", *(title for _, title, _ in columns)]
+    cells = [head] + [
+        [
+            f"  {'*' if p.present else ' '}{'+' if on_front else ' '}",
+            p.setting,
+            short(p.ms_per_tick),
+            short(p.error),
+            "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
+            *(_table_cell(p.figures.get(key), digits) for key, _, digits in columns),
+        ]
+        for p, on_front in _by_time(panel)
+    ]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
+    return ["  ".join(c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(r, widths))) for r in cells]
+
+
+def _by_time(panel: Panel) -> list[tuple[Point, bool]]:
+    return sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)
+
+
+def _table_cell(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

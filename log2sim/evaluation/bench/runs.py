@@ -1,39 +1,184 @@
-"""Runs of the pipeline with one stage's setting changed at a time, on shared detections and measurements."""
+"""Runs of the pipeline with one stage's setting changed at a time, on shared detections."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Scenario
-from log2sim.errors import NothingToReconstruct
-from log2sim.evaluation.bench.localization import (
+from log2sim.config import Config
+from log2sim.datatypes import ENDS, ROAD, Detections, Frame, Log, Scenario, end_of
+from log2sim.errors import LogError, NothingToReconstruct, RecordError
+from log2sim.evaluation.bench.scores import (
+    EVERYTHING,
     Holdout,
+    Scope,
+    Score,
+    check_scope,
     lidar_positions,
     score_homographies,
     score_measurements,
+    score_scenario,
     split_holdout,
     true_positions,
 )
-from log2sim.evaluation.bench.pareto import Point
-from log2sim.evaluation.bench.scores import EVERYTHING, Scope, Score, check_scope, score_scenario
-from log2sim.evaluation.bench.seams import SeamBench
-from log2sim.evaluation.bench.settings import Grid, Setting
-from log2sim.evaluation.bench.shared_detections import RecordedDetections, detect_once
+from log2sim.evaluation.bench.settings import Grid, Point, Setting
+from log2sim.files.stages import StageClock
 from log2sim.geometry import period_of
+from log2sim.perception.cooperative import detector_by_mounting
+from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.first_pass import Observations, observe
+from log2sim.perception.frames import RecordReader
 from log2sim.perception.fusion import fuse
-from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
-from log2sim.perception.sync import Schedule
-from log2sim.pipeline import Run, schedule_of, second_pass
-from log2sim.plan import LABELS, Decision, HomographyScope, Plan, Stage, make_plan
-from log2sim.run_detectors import Detectors, create_image_detector
-from log2sim.sensors import select_sensors
-from log2sim.stage_clock import StageClock
+from log2sim.perception.homography_stage import CameraHomography, fit_homographies
+from log2sim.perception.run_detectors import Detectors, create_image_detector
+from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
+from log2sim.perception.sync import Schedule, schedule_of
+from log2sim.pipeline import Run, infer_scenario, observe_log, start
+from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, Stage, make_plan, select_sensors
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDetections:
+    """A `Detector` that returns recorded detections; none for a frame that was not recorded.
+
+    Attributes
+    ----------
+    found : dict of (str, int) to Detections
+        By camera and stamp.
+    spent_s : list of float, s
+        Time of the recorded detector for each frame.
+    """
+
+    name: str
+    default_min_score: float
+    found: dict[tuple[str, int], Detections] = field(default_factory=dict)
+    spent_s: list[float] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> float:
+        """Return the time of the recorded detector for all frames, s."""
+        return sum(self.spent_s)
+
+    def record(self, detector: Detector, frame: Frame) -> None:
+        """Run a detector on one frame and record the result and its time."""
+        begin = time.perf_counter()
+        boxes = detector.detect(frame)
+        self.spent_s.append(time.perf_counter() - begin)
+        self.found[frame.camera.name, frame.t_ns] = boxes
+
+    def detect(self, frame: Frame) -> Detections:
+        """Return the recorded boxes of one frame."""
+        return self.found.get((frame.camera.name, frame.t_ns), Detections.empty())
+
+
+def detect_once(
+    log: Log,
+    schedule: Schedule,
+    detectors: Mapping[str, Detector],
+    *,
+    decode: bool,
+    progress: Callable[[int, int], None],
+) -> tuple[dict[str, RecordedDetections], float]:
+    """Run every detector on every frame of a schedule once.
+
+    Detectors take turns on each frame, so that a change of the machine's speed affects all of them.
+
+    Returns
+    -------
+    dict, float
+        Recorded detections by the same names, and the seconds of decoding.
+
+    Raises
+    ------
+    LogError
+        When no frame of a camera can be read.
+    """
+    recorded = {key: RecordedDetections(d.name, d.default_min_score) for key, d in detectors.items()}
+    records, decoding_s = RecordReader(log), 0.0
+    for tick in range(len(schedule)):
+        for camera, index in schedule.frames.items():
+            if index[tick] < 0:
+                continue
+            begin = time.perf_counter()
+            image = records.get(camera, int(index[tick])) if decode else None
+            decoding_s += time.perf_counter() - begin
+            if decode and image is None:
+                continue
+            frame = Frame(log.cameras[camera], int(log.streams[camera].t_ns[index[tick]]), partial(_decoded, image))
+            for key, detector in detectors.items():
+                recorded[key].record(detector, frame)
+        progress(tick + 1, len(schedule))
+    records.require_some()
+    return recorded, decoding_s
+
+
+def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    if image is None:
+        raise RecordError(
+            "a detector needs the image, but no image was decoded because all detectors were expected to need none"
+        )
+    return image
+
+
+@dataclass(frozen=True, eq=False)
+class SeamBench:
+    """Pictures to align mounts by, and registered seams of other ticks to measure homographies by.
+
+    Attributes
+    ----------
+    survey : SeamSurvey
+        Which pixels of two cameras show one point of the road 15 m away, registered once for all homographies.
+    reading_s : float, s
+        Time of reading the pictures to align by.
+    """
+
+    aligning: SeamPictures
+    measuring: SeamPictures
+    survey: SeamSurvey
+    reading_s: float
+
+    @classmethod
+    def of(
+        cls, log: Log, schedule: Schedule, observed: Observations, homographies: Mapping[str, CameraHomography]
+    ) -> SeamBench:
+        """Read the pictures of a log with several cameras, and register them by homographies of cameras fitted together."""
+        reader, several = RecordReader(log), any(h.rig is not None for h in homographies.values())
+        begin = time.perf_counter()
+        aligning = SeamPictures.read(log, schedule, observed, reader, ticks_of(schedule) if several else [])
+        reading_s = time.perf_counter() - begin
+        ticks = ticks_of(schedule, 2 * TICKS, held_out=True) if several else []
+        measuring = SeamPictures.read(log, schedule, observed, reader, ticks)
+        aligned, _ = align_seams(aligning, homographies)
+        return cls(aligning, measuring, measuring.survey(aligned), reading_s)
+
+    def figures(self, homographies: Mapping[str, CameraHomography]) -> dict[str, Any]:
+        """Compute the median misalignment, m, 15 m from the cameras, as fitted and with mounts aligned; None where none is seen."""
+        if len(homographies) < 2 or not self.survey.places:
+            return {}
+        out: dict[str, Any] = {
+            "seam_m": self._median_m(homographies),
+            "seams": len(self.survey.seams),
+            "seam_places": self.survey.places,
+            "seam_places_covered": self.survey.covered,
+        }
+        if all(h.rig is None for h in homographies.values()):
+            return out
+        begin = time.perf_counter()
+        aligned, _ = align_seams(self.aligning, homographies)
+        spent_s = time.perf_counter() - begin + self.reading_s
+        return out | {"seam_aligned_m": self._median_m(aligned), "aligning_s": spent_s}
+
+    def _median_m(self, homographies: Mapping[str, CameraHomography]) -> float | None:
+        found = self.measuring.misalignments_m(self.survey.seams, homographies)
+        known = found[~np.isnan(found)]
+        return float(np.median(known)) if len(known) else None
+
 
 REPEATS = 3
 """Repetitions of short stages, taking turns; the least time counts, since other processes only add to it."""
@@ -54,11 +199,6 @@ class BenchContext:
     ----------
     log : Log
         Narrowed to the cameras and sensors of the plan.
-    plan : Plan
-    schedule : Schedule
-    truth : Scenario or None
-    scope : Scope
-    grid : Grid
     found : dict of str to RecordedDetections
         Detections by setting of the detector.
     shared_s : dict of str to float, s
@@ -90,7 +230,6 @@ class BenchRun:
 
     Attributes
     ----------
-    setting : Setting
     score : Score
         Of the scenario.
     measurement_score : Score
@@ -118,20 +257,20 @@ def make_context(
     config, clock = grid.present.config, StageClock()
     sensors = select_sensors(log, config)
     with clock.stage("sync"):
-        schedule = schedule_of(log, config, sensors)
+        schedule = schedule_of(sensors.restrict(log), sensors.cameras, config)
     log = sensors.restrict(log)
     detectors = {s.name: create_image_detector(log, s.config) for s in grid.detect}
     decode = any(s.config.detect.name != LABELS for s in grid.detect)
     found, decoding_s = detect_once(
         log, schedule, detectors, decode=decode, progress=lambda done, total: report("detect", done, total)
     )
-    plan = make_plan(log, config, sensors, schedule.t_ns)
+    plan = make_plan(log, config, sensors, schedule.t_ns).only_agents()
     # Detections are looked up, so that no image is decoded and no frame skipped.
     plan = replace(plan.variant(Decision(Stage.IMAGE_DECODING, False, "detections are shared")), detector_stride=1)
     return BenchContext(log, plan, schedule, truth, scope, grid, found, {**clock.seconds, "decode": decoding_s})
 
 
-def first_pass(
+def timed_first_pass(
     context: BenchContext, detect: Setting, measure: Setting, report: Progress
 ) -> tuple[Observations, dict[str, float]]:
     """Measure what a detector found; returns the observations and the seconds of all stages so far."""
@@ -184,7 +323,7 @@ def _concluded(context: BenchContext, setting: Setting, observations: Observatio
     detectors = Detectors(context.found[context.grid.present.name], None)
     try:
         run = Run(context.log, setting.config, context.plan, context.schedule, detectors, clock, lambda *_: None)
-        result = second_pass(run, observations)
+        result = infer_scenario(run, observations)
     except NothingToReconstruct:
         return Score({"agents": 0})
     return score_scenario(result.scenario, context.truth, context.tick_s, context.scope)
@@ -194,7 +333,9 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
     """Run every setting, the present one first; returns the runs and the observations of the present one."""
     grid = context.grid
     warm_up(context)
-    passes = [[first_pass(context, grid.present, s, report) for s in grid.measure] for _ in range(MEASURE_REPEATS)]
+    passes = [
+        [timed_first_pass(context, grid.present, s, report) for s in grid.measure] for _ in range(MEASURE_REPEATS)
+    ]
     observations = [one for one, _ in passes[-1]]
     stages_s = [{k: min(each[n][1][k] for each in passes) for k in passes[0][n][1]} for n in range(len(observations))]
     runs = run_settings(
@@ -203,7 +344,7 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
     for n, setting in enumerate(grid.measure[1:], 1):
         runs += run_settings(context, [setting], (observations[n], stages_s[n]), report)
     for setting in grid.detect[1:]:
-        runs += run_settings(context, [setting], first_pass(context, setting, grid.measure[0], report), report)
+        runs += run_settings(context, [setting], timed_first_pass(context, setting, grid.measure[0], report), report)
     return _share_clouds(runs), observations[0]
 
 
@@ -224,7 +365,9 @@ def warm_up(context: BenchContext) -> None:
         residuals_s={name: r[:1] for name, r in s.residuals_s.items()},
     )
     short = replace(context, schedule=first)
-    observations, _ = first_pass(short, context.grid.present, context.grid.measure[0], lambda what, done, total: None)
+    observations, _ = timed_first_pass(
+        short, context.grid.present, context.grid.measure[0], lambda what, done, total: None
+    )
     _concluded(short, context.grid.present, observations, StageClock())
 
 
@@ -273,8 +416,8 @@ def homography_points(context: BenchContext, observations: Observations, report:
 def fit(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, CameraHomography]:
     """Fit the homographies of all cameras by one method."""
     plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
-    options, rng = estimation_options(setting.config.topdown), np.random.default_rng(setting.config.seed)
-    return fit_homographies(context.log, holdout.observations, plan, options, rng=rng)
+    rng = np.random.default_rng(setting.config.seed)
+    return fit_homographies(context.log, holdout.observations, plan, setting.config.topdown, rng=rng)
 
 
 def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
@@ -287,3 +430,85 @@ def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
         "cameras": len(grounds),
         "cameras_by_calibration": sum(bool(g.refusal) for g in grounds.values()),
     }
+
+
+STAGE = "ends"
+DETECTOR = "lidar:vehicle"
+"""Searches sweeps where the settings name no detector for them."""
+
+
+def has_both_ends(log: Log) -> bool:
+    """Return whether a log has LiDARs of the vehicle and of the road."""
+    return {end_of(lidar) for lidar in log.lidars.values()} >= set(ENDS)
+
+
+def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: Scope) -> BenchContext:
+    """Synchronize a log without cameras, of which the ends alone are compared.
+
+    Raises
+    ------
+    LogError
+        For a log without LiDARs at both ends.
+    """
+    if not ends:
+        raise LogError(
+            f"{log.name}: the log has no camera, and bench compares methods for images; use detect and evaluate"
+        )
+    check_scope(truth, scope)
+    config = ends[0].config
+    sensors = select_sensors(log, config)
+    schedule = schedule_of(sensors.restrict(log), sensors.cameras, config)
+    plan = make_plan(log, config, sensors, schedule.t_ns).only_agents()
+    grid = Grid(detect=tuple(ends[:1]), measure=(), homography=(), hypotheses=(), smooth=())
+    return BenchContext(sensors.restrict(log), plan, schedule, truth, scope, grid, {}, {})
+
+
+def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:
+    """List the levels of fusion and the ends alone, the present one first; none for a log without LiDARs at both ends.
+
+    LiDAR sweeps alone are searched, so that the LiDARs of the ends are what is compared.
+    """
+    if not has_both_ends(log):
+        return ()
+    name = config.detect.in_sweeps or DETECTOR
+    present = config.cooperation.ends if config.cooperation.ends != "both" else config.cooperation.fusion
+    ways: dict[str, dict[str, Any]] = {f"{end} alone": {"ends": end} for end in ENDS}
+    ways |= {f"both, {level}": {"ends": "both", "fusion": str(level)} for level in FusionLevel}
+    out = []
+    for title, change in ways.items():
+        detector = detector_by_mounting(log, name) if change["ends"] == ROAD else name
+        changed = config.changed(cameras=[], detect={"name": detector}, cooperation=change)
+        chosen = change.get("fusion", change["ends"])
+        out.append(Setting(STAGE, title, changed, chosen == present))
+    return tuple(sorted(out, key=lambda setting: not setting.present))
+
+
+def whole_points(
+    log: Log,
+    settings: Sequence[Setting],
+    truth: Scenario | None,
+    scope: Scope,
+    report: Callable[[str, int, int], None],
+) -> list[Point]:
+    """Run every setting once, as `reconstruct` does, and score its scenario.
+
+    The time is that of everything after synchronization: poses, calibration and registration are the same for all.
+    """
+    out = []
+    for k, setting in enumerate(settings):
+        run = start(log, setting.config, cache=False)
+        begin = time.perf_counter()
+        try:
+            result = infer_scenario(replace(run, plan=run.plan.only_agents()), observe_log(run))
+            score = score_scenario(result.scenario, truth, period_of(run.schedule.t_ns), scope)
+        except NothingToReconstruct:
+            score = Score({"agents": 0})
+        ms = (time.perf_counter() - begin) * 1e3 / len(run.schedule)
+        stages = {stage: s * 1e3 / len(run.schedule) for stage, s in run.clock.seconds.items()}
+        error = "error_m" if truth is not None else "jitter_m"
+        figures = {**score.figures, "stages_ms_per_tick": stages}
+        out.append(
+            Point(setting.name, setting.present, ms, score.figures.get(error), figures, score.by_object.get(error, {}))
+        )
+        report(setting.stage, k + 1, len(settings))
+    return out

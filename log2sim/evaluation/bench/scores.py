@@ -1,17 +1,25 @@
-"""Scores of a reconstructed scenario: figures against the truth, and figures that need none."""
+"""Scores of a reconstructed scenario, and localization errors of its measurements."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import GROUP_OF, Agent, Log, Measurements, Scenario
 from log2sim.errors import ConfigError
-from log2sim.evaluation.bench.bootstrap import ErrorSums, error_of
+from log2sim.evaluation.bench.settings import ErrorSums, error_of
+from log2sim.evaluation.metrics.comparison import StateTable, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
+from log2sim.perception.first_pass import Observations, base_pose
+from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
+from log2sim.perception.homography.estimate import MAX_RANGE_M
+from log2sim.perception.homography_stage import CameraHomography, place_by_homography
+from log2sim.perception.sync import Schedule
 
 CUTOFF_M = 2.0
 """Cutoff distance of GOSPA, m; the metrics match objects up to it."""
@@ -55,7 +63,6 @@ class Score:
 
     Attributes
     ----------
-    figures : dict
     by_object : mapping of str to ErrorSums
         Contributions of single objects, for figures that are errors.
     """
@@ -164,3 +171,261 @@ def _smoothing_residual(scenario: Scenario) -> float | None:
     known = [a.quality.get("smoothing_residual_rms_m") for a in scenario.others]
     values = [v for v in known if v is not None]
     return float(np.median(values)) if values else None
+
+
+MIN_IOU = 0.5
+NEAR_M = 25.0
+HOLDOUT_FRACTION = 0.25
+"""Fraction of the measured obstacles that homographies are not fitted to and are scored by."""
+
+MIN_POINTS = 20
+MAX_SAME_FOOT_PX = 0.01
+BLOCK_S = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPositions:
+    """Known positions of the objects of one tick's measurements.
+
+    Attributes
+    ----------
+    xy : (M, 2) float64, m
+        Map frame; NaN where unknown.
+    object_id : (M,) int64
+        Which object each measurement is of, -1 where unknown.
+    """
+
+    xy: Array
+    object_id: NDArray[np.int64]
+
+
+def true_positions(
+    log: Log,
+    schedule: Schedule,
+    observations: Observations,
+    truth: Scenario,
+    *,
+    when: Literal["measured", "imaged"] = "measured",
+) -> list[KnownPositions]:
+    """Find, for each tick, the true centers of the objects that its measurements are of.
+
+    Parameters
+    ----------
+    when : {"measured", "imaged"}
+        At the times of the measurements, or at the stamps of the images.
+
+    Notes
+    -----
+    Measurements are matched with objects by IoU of their boxes in the image, independently of the measured position.
+    """
+    shift_m = np.array(truth.map.offset_m) - np.array(log.map.offset_m)
+    out = [KnownPositions(np.full((len(m), 2), np.nan), np.full(len(m), -1)) for m in observations.measurements]
+    for camera, index in schedule.frames.items():
+        ticks = np.flatnonzero(index >= 0)
+        stamps = log.streams[camera].t_ns[index[ticks]]
+        table = truth_states(truth.others, (stamps - truth.t0_ns) / NS_PER_S, shift_m, None)
+        map_T_cam, known = log.map_T_sensor(camera, stamps)
+        for k in np.flatnonzero(known):
+            m = observations.measurements[ticks[k]]
+            rows = np.flatnonzero(m.camera == camera)
+            if len(rows) and len(table.ids):
+                boxes = _boxes_in_image(log, camera, table, int(k), inverse(map_T_cam[k]))
+                pairs = _matched_agents(m.take(rows), table, boxes)
+                later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
+                out[ticks[k]].xy[rows] = _true_xy(table, int(k), pairs, later_s)
+                out[ticks[k]].object_id[rows] = pairs
+    return out
+
+
+def lidar_positions(observations: Observations, tick_s: float) -> list[KnownPositions]:
+    """Take LiDAR positions of each tick's measurements as known; those within `BLOCK_S` count as one object."""
+    return [
+        KnownPositions(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
+        for tick, m in enumerate(observations.measurements)
+    ]
+
+
+def _boxes_in_image(log: Log, camera: str, table: StateTable, k: int, cam_T_map: Array) -> Array:
+    """Project the truth agents that count at a frame: boxes (A, 4), px, NaN for the others."""
+    boxes = np.full((len(table.ids), 4), np.nan)
+    rows = np.flatnonzero(table.present[:, k] & table.visible[:, k])
+    center = np.column_stack([table.xy_m[rows, k], table.z_m[rows, k]])
+    projected = project_boxes(center, table.size_m[rows], table.yaw_rad[rows, k], log.cameras[camera], cam_T_map)
+    boxes[rows] = projected.box_px
+    return boxes
+
+
+def _matched_agents(m: Measurements, table: StateTable, boxes: Array) -> NDArray[np.intp]:
+    """Find the truth agent (M,) of each measured box, -1 for none: mutually best IoU within a group of categories."""
+    group = np.array([GROUP_OF[str(c)] for c in m.category])
+    overlap = np.nan_to_num(box_iou(m.box_px, boxes))
+    overlap = np.where(group[:, None] == table.group, overlap, 0.0)
+    best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
+    rows = np.arange(len(m))
+    return np.where((overlap[rows, best] >= MIN_IOU) & (back[best] == rows), best, -1)
+
+
+def _true_xy(table: StateTable, k: int, pairs: NDArray[np.intp], later_s: Array) -> Array:
+    """Extrapolate true centers (M, 2) by `later_s` (M,), a few hundredths of a second, from frame `k`."""
+    speed, yaw = table.speed_mps[pairs, k], table.yaw_rad[pairs, k]
+    xy = table.xy_m[pairs, k] + (speed * later_s)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    return np.where((pairs >= 0)[:, None], xy, np.nan)
+
+
+def score_measurements(observations: Observations, known: Sequence[KnownPositions]) -> Score:
+    """Score measured centers by their distance from the true ones, capped at `CUTOFF_M`; a missing position counts as that."""
+    measured = np.concatenate([m.center_m[:, :2] for m in observations.measurements])
+    true, object_id = np.concatenate([k.xy for k in known]), np.concatenate([k.object_id for k in known])
+    known_rows = np.isfinite(true[:, 0])
+    return _score_of_distances(np.hypot(*(measured - true)[known_rows].T), object_id[known_rows])
+
+
+def _score_of_distances(distance: Array, object_id: NDArray[np.int64]) -> Score:
+    """Compute the score of distances (K,), m, NaN for missing positions, of objects (K,)."""
+    cut = np.where(distance < CUTOFF_M, distance, CUTOFF_M)
+    squares, count = np.bincount(object_id, cut**2), np.bincount(object_id)
+    parts = {str(k): (float(squares[k]), float(count[k])) for k in np.flatnonzero(count)}
+    placed = np.isfinite(distance)
+    figures = {
+        "objects": len(distance),
+        "placed_share": float(placed.mean()) if len(distance) else None,
+        "error_m": error_of(parts),
+        "median_m": float(np.median(distance[placed])) if placed.any() else None,
+        "farther_than_2_m_share": float(np.mean(cut >= CUTOFF_M)) if len(distance) else None,
+    }
+    return Score(figures, {"error_m": parts})
+
+
+@dataclass(frozen=True, eq=False)
+class Holdout:
+    """Measured obstacles that homographies are not fitted to, by camera, one entry for each tick.
+
+    Attributes
+    ----------
+    observations : Observations
+        What is left to fit to.
+    obstacles : dict of str to list of Measurements
+        The held-out obstacles without their LiDAR positions.
+    known : dict of str to list of KnownPositions
+        Of their centers.
+    feet : dict of str to list of Correspondences
+        Their foot points by LiDAR.
+    """
+
+    observations: Observations
+    obstacles: dict[str, list[Measurements]]
+    known: dict[str, list[KnownPositions]]
+    feet: dict[str, list[Correspondences]]
+
+    def __len__(self) -> int:
+        """Return the number of held-out obstacles."""
+        return sum(len(m) for rows in self.obstacles.values() for m in rows)
+
+
+def split_holdout(
+    log: Log, schedule: Schedule, observations: Observations, known: Sequence[KnownPositions], rng: np.random.Generator
+) -> Holdout:
+    """Hold out a random part of the measured obstacles within 60 m, with their known positions at the images' stamps."""
+    obstacles: dict[str, list[Measurements]] = {camera: [] for camera in observations.feet}
+    places: dict[str, list[KnownPositions]] = {camera: [] for camera in observations.feet}
+    holdout: dict[str, list[Correspondences]] = {camera: [] for camera in observations.feet}
+    for tick, m in enumerate(observations.measurements):
+        xy, object_id = known[tick].xy, known[tick].object_id
+        near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= MAX_RANGE_M
+        good = (m.source == "lidar") & ~m.truncated & (m.points >= MIN_POINTS) & near & np.isfinite(xy[:, 0])
+        good &= np.array([len(c) > 0 for c in m.cluster], dtype=bool)
+        good &= rng.random(len(m)) < HOLDOUT_FRACTION
+        for camera in obstacles:
+            rows = np.flatnonzero(good & (m.camera == camera))
+            stamp = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
+            ego_T_map = inverse(base_pose(log, stamp))
+            holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
+            obstacles[camera].append(_without_position(m.take(rows), stamp))
+            places[camera].append(KnownPositions(xy[rows], object_id[rows]))
+    feet = {
+        camera: [_without_feet(log.cameras[camera], parts, obstacles[camera])]
+        for camera, parts in observations.feet.items()
+    }
+    return Holdout(replace(observations, feet=feet), obstacles, places, holdout)
+
+
+def _without_position(m: Measurements, stamp: int) -> Measurements:
+    """Reset the rows to detections in the image of that stamp, without LiDAR evidence."""
+    return replace(
+        m,
+        t_ns=np.full(len(m), stamp),
+        source=np.full(len(m), "", dtype="<U16"),
+        center_m=np.full((len(m), 3), np.nan),
+        covariance=np.full((len(m), 2, 2), np.nan),
+        cluster=tuple(np.zeros((0, 3)) for _ in range(len(m))),
+    )
+
+
+def _without_feet(
+    camera: Camera, parts: Sequence[Correspondences], obstacles: Sequence[Measurements]
+) -> Correspondences:
+    """Drop the correspondences of held-out obstacles."""
+    feet = Correspondences.join(parts)
+    tick = np.concatenate([np.full(len(m), k) for k, m in enumerate(obstacles)])
+    box = np.concatenate([m.box_px for m in obstacles])
+    if not len(box) or not len(feet.uv):
+        return feet
+    uv = undistorted_pixels(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
+    same = (feet.tick[:, None] == tick) & (np.abs(feet.uv[:, None] - uv).max(axis=2) < MAX_SAME_FOOT_PX)
+    kept = ~same.any(axis=1)
+    return replace(feet, **{name: column[kept] for name, column in vars(feet).items() if column is not None})
+
+
+def score_homographies(log: Log, holdout: Holdout, grounds: Mapping[str, CameraHomography]) -> Score:
+    """Score homographies by the distance of held-out foot points from their LiDAR positions.
+
+    Distances are capped at `CUTOFF_M`, which missing positions count as. `near_error_m` and `far_error_m` are of obstacles
+    within and beyond `NEAR_M`. `center_error_m` and `center_median_m` are of box centers, which also depend on the assumed
+    depth of an object.
+    """
+    feet, centers, range_m, object_id = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    for camera in (c for c in holdout.obstacles if c in grounds):
+        for tick, (m, known) in enumerate(zip(holdout.obstacles[camera], holdout.known[camera], strict=True)):
+            feet.append(_foot_distances(holdout.feet[camera][tick], at_tick(grounds[camera], tick)))
+            centers.append(np.hypot(*(_places(log, tick, m, grounds[camera]) - known.xy).T))
+            range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
+            object_id.append(known.object_id)
+    d, near, w = np.concatenate(feet), np.concatenate(range_m) < NEAR_M, np.concatenate(object_id)
+    score, center = _score_of_distances(d, w), _score_of_distances(np.concatenate(centers), w).figures
+    figures = {
+        f"{name}_error_m": _score_of_distances(d[rows], w[rows]).figures["error_m"]
+        for name, rows in (("near", near), ("far", ~near))
+    }
+    figures |= {f"center_{key}": center[key] for key in ("error_m", "median_m")}
+    return Score(score.figures | figures, score.by_object)
+
+
+def _foot_distances(feet: Correspondences, ground: CameraHomography) -> Array:
+    """Compute the distances (N,), m, of foot points placed by a homography from their positions; NaN above its horizon."""
+    if not len(feet.uv):
+        return np.zeros(0)
+    return np.asarray(np.hypot(*(apply_homography(ground.fit.ground_H_image, feet.uv)[0] - feet.xy_ego).T))
+
+
+def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> Array:
+    """Locate the rows of a tick by the homography: positions (M, 2), m, map frame."""
+    if not len(m):
+        return np.zeros((0, 2))
+    observations = Observations(measurements=[m], obstacles=[None])
+    found = place_by_homography(log, observations, {ground.camera.name: at_tick(ground, tick)})[0]
+    return _in_order(m, found)
+
+
+def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
+    """Select a camera's homography of one tick; refused when the tick has none."""
+    own = ground.fit.at_tick(tick)
+    h = np.full((3, 3), np.nan) if own is None else own
+    return replace(ground, fit=replace(ground.fit, ground_H_image=h, per_tick=None, ok=own is not None))
+
+
+def _in_order(requested: Measurements, found: Measurements) -> Array:
+    """Order found centers (M, 2) as requested, matching rows by their boxes; NaN for missing ones."""
+    xy = np.full((len(requested), 2), np.nan)
+    for box, center in zip(found.box_px, found.center_m):
+        xy[np.all(requested.box_px == box, axis=1)] = center[:2]
+    return xy

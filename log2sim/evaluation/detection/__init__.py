@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion, Matches, match
-from log2sim.evaluation.detection.precision import PrecisionRecall, average_precision, operating_point, precision_recall
+from log2sim.evaluation.detection.evaluation import (
+    PrecisionRecall,
+    average_precision,
+    operating_point,
+    precision_recall,
+)
+from log2sim.evaluation.detection.protocols import Criterion, Matches, match
 
 __all__ = [
     "Criterion",

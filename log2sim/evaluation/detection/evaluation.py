@@ -1,8 +1,8 @@
-"""Evaluate a boxes file against the labels of a log by one protocol."""
+"""A boxes file against the labels of a log: average precision, precision and recall, calibration of scores."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,15 +11,489 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
-from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.boxes_file import DetectedBoxes
-from log2sim.evaluation.detection.class_figures import ClassBoxes, class_figures, overall
-from log2sim.evaluation.detection.image_views import ImageViews, image_views
-from log2sim.evaluation.detection.protocols import MIN_POINTS, PROTOCOLS, ObjectClass, Protocol
-from log2sim.evaluation.detection.truth import SweepTruth, truth_of_sweeps
-from log2sim.evaluation.metrics.label_coverage import MIN_REGION_SHARE
-from log2sim.geometry import Array
-from log2sim.registry import nearest
+from log2sim.evaluation.detection.boxes import DetectedBoxes, SceneBoxes
+from log2sim.evaluation.detection.protocols import (
+    DIFFICULTIES,
+    MIN_POINTS,
+    PROTOCOLS,
+    Criterion,
+    Matches,
+    ObjectClass,
+    Pairs,
+    Protocol,
+    assign,
+    candidate_pairs,
+    match,
+)
+from log2sim.evaluation.detection.truth import ImageViews, SweepTruth, image_views, truth_of_sweeps
+from log2sim.evaluation.metrics.comparison import MIN_REGION_SHARE
+from log2sim.evaluation.metrics.correctness import reliability
+from log2sim.evaluation.metrics.table import columns_text, percent, verdict_text
+from log2sim.files.plugins import nearest
+from log2sim.geometry import Array, wrap_angle
+
+ROUNDING = 1e-9
+SAMPLES = 40
+"""Steps of recall of KITTI's published program."""
+NUSCENES_FLOOR = 0.1
+"""nuScenes leaves out what lies below this precision and this recall."""
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionRecall:
+    """Precision and recall at each distinct score, greatest first.
+
+    Attributes
+    ----------
+    score : (K,) float64
+        Boxes of this score and above are reported.
+    precision, recall : (K,) float64
+    truths : int
+        Number of counted true boxes.
+    """
+
+    score: Array
+    precision: Array
+    recall: Array
+    truths: int
+
+    def best_precision(self, recall: Array) -> Array:
+        """Return the greatest precision at or beyond recalls (R,), 0 where none is reached."""
+        at_least = np.maximum.accumulate(self.precision[::-1])[::-1]
+        k = np.searchsorted(self.recall, recall - ROUNDING)
+        return np.where(k < len(at_least), np.append(at_least, 0.0)[k], 0.0)
+
+    def average(self, recall_points: int = 40) -> float | None:
+        """Average the best precision over recalls; None without true boxes.
+
+        Parameters
+        ----------
+        recall_points : {40, 11}
+            40: recalls 1/40 to 1, KITTI's rule since 2019, which drops the first of 41 points (Simonelli et al., ICCV 2019);
+            11: recalls 0 to 1 (PASCAL VOC; Everingham et al., IJCV 2010), KITTI's rule before.
+        """
+        if recall_points not in (40, 11):
+            raise ValueError(f"recall_points is {recall_points}, expected 40 or 11")
+        at = np.arange(1, 41) / 40 if recall_points == 40 else np.arange(11) / 10
+        return float(self.best_precision(at).mean()) if self.truths else None
+
+    def nuscenes_average(self) -> float | None:
+        """Average as nuScenes does (Caesar et al., CVPR 2020, section 3.1); None without true boxes.
+
+        Notes
+        -----
+        Over recalls 0.11 to 1 in steps of 0.01, of the precision above 0.1, scaled to 1. The precision is the best one at or
+        beyond each recall; nuScenes interpolates between neighbors instead.
+        """
+        if not self.truths:
+            return None
+        above = np.maximum(self.best_precision(np.arange(11, 101) / 100) - NUSCENES_FLOOR, 0)
+        return min(float(above.mean() / (1 - NUSCENES_FLOOR)), 1.0)
+
+    def sampled_average(self, recall_points: int = 40) -> float | None:
+        """Average as KITTI's published program does; None without true boxes.
+
+        Notes
+        -----
+        The program looks at no more than 41 of the scores of right boxes, those at which the recall is nearest to 0, 1/40 and
+        so on; points that are not reached count 0, and the last right box counts as one more point, which adds up to 1/40. With
+        fewer than 40 true boxes even a perfect detector gets less than 1: take `average` for small sets, and this figure to
+        compare with published ones.
+        """
+        if not self.truths:
+            return None
+        right = np.round(self.recall * self.truths).astype(np.int64)
+        of_curve = np.repeat(np.arange(len(self.score)), np.diff(right, prepend=0))
+        sampled, reached, aim = np.zeros(SAMPLES + 1), 0, 0.0
+        for n, k in enumerate(of_curve.tolist(), start=1):
+            here, following = n / self.truths, (n + 1) / self.truths
+            if n < len(of_curve) and following - aim < aim - here:
+                continue
+            sampled[reached] = self.precision[k]
+            reached += 1
+            aim += 1 / SAMPLES  # summed as there, since rounding decides where two scores are equally near
+        best = np.maximum.accumulate(sampled[::-1])[::-1]
+        return float(best[1:].mean() if recall_points == 40 else best[::4].mean())
+
+
+def precision_recall(found: SceneBoxes, matches: Matches) -> PrecisionRecall:
+    """Compute the curve of matched boxes; boxes of equal score come together."""
+    rows = np.flatnonzero(matches.right | matches.false)
+    rows = rows[np.argsort(-found.score[rows], kind="stable")]
+    score = found.score[rows]
+    last = np.flatnonzero(np.append(score[1:] != score[:-1], len(score) > 0))
+    right = np.cumsum(matches.right[rows])[last]
+    recall = right / matches.truths if matches.truths else np.zeros(len(last))
+    return PrecisionRecall(score[last], right / (last + 1), recall, matches.truths)
+
+
+def average_precision(
+    found: SceneBoxes, truth: SceneBoxes, criterion: Criterion, recall_points: int = 40
+) -> float | None:
+    """Compute the average precision of the boxes of one class; None without counted true boxes.
+
+    Parameters
+    ----------
+    recall_points : {40, 11}
+        As in `PrecisionRecall.average`.
+    """
+    return precision_recall(found, match(found, truth, criterion)).average(recall_points)
+
+
+def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> dict[str, Any]:
+    """Count what is right when only boxes of at least a score are reported.
+
+    Returns
+    -------
+    dict
+        "true_positives", "false_positives", "false_negatives", and "precision", "recall", "f1" and
+        "precision_times_recall", which are None where nothing was reported or nothing was there to be found. Some authors
+        call the last one mean average precision, which it is not: it is one point of the curve.
+    """
+    reported = found.score >= min_score
+    right, false = (int(np.count_nonzero(rows & reported)) for rows in (matches.right, matches.false))
+    return rates(right, false, matches.truths - right)
+
+
+def rates(right: int, false: int, missed: int) -> dict[str, Any]:
+    """Compute the figures of `operating_point` from its counts."""
+    precision = right / (right + false) if right + false else None
+    recall = right / (right + missed) if right + missed else None
+    both = precision is not None and recall is not None
+    return {
+        "true_positives": right,
+        "false_positives": false,
+        "false_negatives": missed,
+        "precision": precision,
+        "recall": recall,
+        "f1": 2 * right / (2 * right + false + missed) if both else None,
+        "precision_times_recall": precision * recall if precision is not None and recall is not None else None,
+    }
+
+
+def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
+    """Compare scores with the share of right boxes.
+
+    Returns
+    -------
+    dict
+        "boxes", "expected_calibration_error" (None without boxes), and "bins" of equal width from 0 to 1 with "low", "high",
+        "boxes", "mean_score" and "precision" (None in empty bins).
+
+    Notes
+    -----
+    See `reliability`. Ignored boxes are left out.
+    """
+    judged = matches.right | matches.false
+    table = reliability(found.score[judged], matches.right[judged])
+    bins = [
+        {
+            "low": b["low"],
+            "high": b["high"],
+            "boxes": b["count"],
+            "mean_score": b["mean_confidence"],
+            "precision": b["right"],
+        }
+        for b in table["bins"]
+    ]
+    return {
+        "boxes": table["count"],
+        "expected_calibration_error": table["expected_calibration_error"],
+        "bins": bins,
+    }
+
+
+Mask = NDArray[np.bool_]
+RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
+POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))
+"""The last one joins the two before."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClassBoxes:
+    """Found and true boxes of one class.
+
+    Attributes
+    ----------
+    found, truth : SceneBoxes
+        M found and L true boxes; true ones are ignored where they never count.
+    far : (M,) bool
+        Found boxes out of range, which are not false where they match nothing.
+    unlabeled : (M,) bool
+        Those where nothing was labeled, likewise.
+    found_views, truth_views : ImageViews or None
+        In the reference camera, for KITTI's difficulties.
+    occlusion : (L,) int64 or None
+        As the log states it.
+    """
+
+    found: SceneBoxes
+    truth: SceneBoxes
+    far: Mask
+    unlabeled: Mask
+    found_views: ImageViews | None = None
+    truth_views: ImageViews | None = None
+    occlusion: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Objects:
+    """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored.
+
+    Attributes
+    ----------
+    elsewhere : (M,) bool
+        Found boxes that are not false where they match nothing, since they are out of range or of other objects.
+    """
+
+    name: str
+    boxes: ClassBoxes
+    found: SceneBoxes
+    truth: SceneBoxes
+    elsewhere: Mask
+
+    def matches(self, pairs: Pairs, criterion: Criterion) -> Matches:
+        """Match them; boxes where nothing was labeled are not false."""
+        found = assign(self.found, self.truth, pairs, criterion)
+        return found.excusing(self.elsewhere).excusing(self.boxes.unlabeled)
+
+
+def class_figures(boxes: ClassBoxes, of_class: ObjectClass, min_score: float) -> dict[str, Any]:
+    """Compute all figures of a class.
+
+    Parameters
+    ----------
+    of_class : ObjectClass
+        The first of its criteria is that of the tables by range and by points.
+    min_score : float
+        Score from which boxes are reported, for precision and recall.
+    """
+    pairs = {c: candidate_pairs(boxes.found, boxes.truth, c) for c in of_class.criteria}
+    everything, main = all_objects(boxes), of_class.criteria[0]
+
+    def rows(some: Iterator[Objects], *criteria: Criterion) -> list[dict[str, Any]]:
+        return [figures(o, pairs[c], c, min_score) for o in some for c in criteria]
+
+    matches = everything.matches(pairs[main], main)
+    return {
+        "categories": list(of_class.categories),
+        "ignored_kinds": list(of_class.ignored_kinds),
+        "figures": rows(iter((everything, *difficulties(boxes))), *of_class.criteria),
+        "by_range": rows(by_range(boxes), main),
+        "by_points": None if boxes.truth.points is None else rows(by_points(boxes), main),
+        "calibration": {"match": match_entry(main), **calibration(everything.found, matches)},
+    }
+
+
+def all_objects(boxes: ClassBoxes) -> Objects:
+    """Select all objects with enough points."""
+    few = np.zeros(len(boxes.truth), dtype=bool) if boxes.truth.points is None else boxes.truth.points < MIN_POINTS
+    return Objects("all", boxes, boxes.found, boxes.truth.ignoring(few), boxes.far)
+
+
+def difficulties(boxes: ClassBoxes) -> Iterator[Objects]:
+    """Select the objects of each of KITTI's difficulties, whatever their number of points; none without views."""
+    if boxes.found_views is None or boxes.truth_views is None or boxes.occlusion is None:
+        return
+    for level in DIFFICULTIES:
+        truth = boxes.truth.ignoring(level.ignores_truth(boxes.truth_views, boxes.occlusion))
+        found = boxes.found.ignoring(level.ignores_found(boxes.found_views))
+        yield Objects(level.name, boxes, found, truth, boxes.far)
+
+
+def by_range(boxes: ClassBoxes) -> Iterator[Objects]:
+    """Select the objects of each range; a found box that matches nothing is false in its own range."""
+    everything = all_objects(boxes)
+    for low, high in RANGES_M:
+        beyond, elsewhere = (((b.range_m < low) | (b.range_m >= high)) for b in (boxes.truth, boxes.found))
+        yield Objects(
+            f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g}+ m",
+            boxes,
+            boxes.found,
+            everything.truth.ignoring(beyond),
+            boxes.far | elsewhere,
+        )
+
+
+def by_points(boxes: ClassBoxes) -> Iterator[Objects]:
+    """Select the objects of each number of points; a found box that matches nothing is false where its own points are.
+
+    Found boxes whose points were not counted are false everywhere.
+    """
+    assert boxes.truth.points is not None
+    for low, high in POINTS:
+        outside = (boxes.truth.points < low) | (boxes.truth.points > high)
+        own = boxes.found.points
+        elsewhere = np.zeros(len(boxes.found), dtype=bool) if own is None else (own < low) | (own > high)
+        yield Objects(
+            f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points",
+            boxes,
+            boxes.found,
+            boxes.truth.ignoring(outside),
+            boxes.far | elsewhere,
+        )
+
+
+def figures(objects: Objects, pairs: Pairs, criterion: Criterion, min_score: float) -> dict[str, Any]:
+    """Compute average precision, the figures at a score, and how many headings are off by more than 90 degrees."""
+    matches = objects.matches(pairs, criterion)
+    curve = precision_recall(objects.found, matches)
+    in_images = objects.boxes.found_views is not None
+    return {
+        "objects": objects.name,
+        "match": match_entry(criterion),
+        "truths": matches.truths,
+        "ap_r40": curve.average(40),
+        "ap_r11": curve.average(11),
+        "ap_nuscenes": curve.nuscenes_average() if criterion.measure == "center_m" else None,
+        **(published(objects, pairs, criterion) if in_images else {}),
+        **operating_point(objects.found, matches, min_score),
+        "heading_over_90_deg": headings(objects, matches, min_score),
+    }
+
+
+def published(objects: Objects, pairs: Pairs, criterion: Criterion) -> dict[str, Any]:
+    """Compute average precision as KITTI's published program does: sampled, and false in regions without labels too.
+
+    Notes
+    -----
+    The program compares the 3D boxes of these regions, which do not exist, so that its figures for 3D boxes lack the rule.
+    """
+    found = assign(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
+    curve = precision_recall(objects.found, found)
+    return {"ap_r40_published": curve.sampled_average(40), "ap_r11_published": curve.sampled_average(11)}
+
+
+def headings(objects: Objects, matches: Matches, min_score: float) -> float | None:
+    """Compute the share of right boxes at a score whose heading is off by more than 90 degrees; None without any."""
+    rows = np.flatnonzero(matches.right & (objects.found.score >= min_score))
+    off = wrap_angle(objects.found.box[rows, 6] - objects.truth.box[matches.truth[rows], 6])
+    wrong = np.abs(off) > np.pi / 2
+    return float(wrong.mean()) if len(rows) else None
+
+
+def match_entry(criterion: Criterion) -> dict[str, Any]:
+    """Return a criterion as a document."""
+    return {"measure": criterion.measure, "limit": criterion.limit}
+
+
+def overall(classes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Add up the counts of classes, each by its own first match, for all objects and for each range and number of points.
+
+    Categories whose group is among the classes count once.
+    """
+    members = {name: set(figures["categories"]) for name, figures in classes.items()}
+    whole = [
+        figures for name, figures in classes.items() if not any(members[name] < other for other in members.values())
+    ]
+    counts: dict[str, list[int]] = {}
+    for figures in whole:
+        for row in (figures["figures"][0], *figures["by_range"], *(figures["by_points"] or [])):
+            sums = counts.setdefault(row["objects"], [0, 0, 0])
+            for k, key in enumerate(("true_positives", "false_positives", "false_negatives")):
+                sums[k] += row[key]
+    return [{"objects": name, "truths": c[0] + c[2], **rates(*c)} for name, c in counts.items()]
+
+
+AVERAGES = {
+    "kitti": (("ap_r40", "AP R40"), ("ap_r11", "AP R11"), ("ap_r40_published", "publ. R40")),
+    "dair": (("ap_r40", "AP R40"), ("ap_r11", "AP R11")),
+    "center": (("ap_nuscenes", "AP nuSc"), ("ap_r40", "AP R40")),
+}
+AT_SCORE = (
+    ("precision", "precis."),
+    ("recall", "recall"),
+    ("f1", "F1"),
+    ("precision_times_recall", "P x R"),
+    ("heading_over_90_deg", "> 90 deg"),
+)
+
+
+def format_verdict(result: Mapping[str, Any]) -> str:
+    """Say for each class how many boxes were found, how many of the found are right, and the average precision."""
+    key, title = AVERAGES[result["protocol"]][0]
+    lines, shown = [], list[Any]()
+    for name, figures in result["classes"].items():
+        row = next((row for row in _rows(figures) if row["objects"] == "all"), None)
+        if row is None or figures in shown:
+            continue
+        shown.append(figures)
+        limit = Criterion(**row["match"])
+        if not row["truths"]:
+            lines.append((name, f"none labeled, {row['false_positives']} found ({limit})"))
+            continue
+        text = f"{percent(row['recall'])} of {row['truths']} found, {percent(row['precision'])} of the found right"
+        average = "" if row[key] is None else f", {title} {row[key]:.3f}"
+        turned = row["heading_over_90_deg"]
+        backwards = f", {percent(turned)} backwards" if turned else ""
+        lines.append((name, f"{text}{average}{backwards} ({limit})"))
+    return verdict_text([*lines, ("scope", _scope(result))])
+
+
+def format_table(result: Mapping[str, Any]) -> str:
+    """Format a result of `evaluate_boxes`; '-' for None.
+
+    Left out are classes without a true and a found box, categories that are all of their group, rows without true boxes,
+    and the looser limits of difficulties; the document has them.
+    """
+    columns = (*AVERAGES[result["protocol"]], *AT_SCORE)
+    cells = [["class", "objects", "match", "truths", *(title for _, title in columns)]]
+    shown: dict[str, list[Mapping[str, Any]]] = {}
+    for name, figures in result["classes"].items():
+        rows = _rows(figures)
+        if rows and rows not in shown.values():
+            shown[name] = rows
+    for name, rows in shown.items():
+        for row in rows:
+            values = [_cell(row[key]) for key, _ in columns]
+            cells.append([name, row["objects"], str(Criterion(**row["match"])), str(row["truths"]), *values])
+    if len(shown) > 1:
+        for row in result["overall"]:
+            if row["truths"]:
+                values = [_cell(row.get(key)) for key, _ in columns]
+                cells.append(["all classes", row["objects"], "each its first", str(row["truths"]), *values])
+    lines = columns_text(cells, heads=3)
+    scores = [_score_note(name, result["classes"][name]["calibration"]) for name in shown]
+    return "\n".join([*lines, *filter(None, scores)])
+
+
+def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Select the rows of a class."""
+    limit = figures["calibration"]["match"]["limit"]
+    everything = [row for row in figures["figures"] if row["objects"] == "all"]
+    parts = [row for row in figures["figures"] if row["objects"] != "all" and row["match"]["limit"] == limit]
+    parts += [*figures["by_range"], *(figures["by_points"] or [])]
+    if not any(row["truths"] for row in (*everything, *parts)):
+        # Only false boxes, which one match tells as well as all.
+        return [row for row in everything[:1] if row["false_positives"]]
+    return [*everything, *(row for row in parts if row["truths"])]
+
+
+def _score_note(name: str, scores: Mapping[str, Any]) -> str:
+    error = scores["expected_calibration_error"]
+    if error is None:
+        return ""
+    where = f"{scores['boxes']} boxes, {Criterion(**scores['match'])}"
+    return f"{name}: expected calibration error of the scores {error:.3f} ({where})"
+
+
+def _scope(result: Mapping[str, Any]) -> str:
+    sweeps, skipped = result["sweeps"], result["sweeps_without_labels"]
+    parts = [
+        f"{sweeps} labeled sweep{'s' * (sweeps != 1)}" + (f" ({skipped} without labels left out)" if skipped else "")
+    ]
+    if result["reference_camera"] is not None:
+        parts.append(f"boxes that {result['reference_camera']} shows")
+        if not result["occlusion_known"]:
+            parts.append("difficulties without occlusion, which the labels do not state")
+    if result["max_range_m"] is not None:
+        parts.append(f"up to {result['max_range_m']:g} m")
+    return f"{'; '.join(parts)}; precision, recall and what follows at scores from {result['min_score']:g}"
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
 
 VERSION = 1
 DEFAULT_SCORE = 0.5
@@ -86,10 +560,8 @@ def evaluate_boxes(
 
     Parameters
     ----------
-    detected : DetectedBoxes
     log : Log
         With labels; its sweeps are read to count points.
-    options : Options
     progress : callable, optional
         Called with (sweeps done, all sweeps).
 

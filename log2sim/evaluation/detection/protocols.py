@@ -1,16 +1,175 @@
-"""What counts: the classes and matches of each protocol, and KITTI's difficulties."""
+"""What counts and which found box is which true one, by protocol."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES
-from log2sim.evaluation.detection.image_views import ImageViews
-from log2sim.evaluation.detection.matching import Criterion
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.truth import ImageViews
+from log2sim.geometry import Array, rectangle_iou, upright_box_iou
+
+Measure = Literal["iou_3d", "iou_bev", "center_m"]
+FLAT = [0, 1, 3, 4, 6]  # x, y, length, width, yaw
+MAX_PAIRS_AT_ONCE = 2_000_000
+"""Limits memory to some 100 MB."""
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When a found and a true box match.
+
+    Attributes
+    ----------
+    measure : {"iou_3d", "iou_bev", "center_m"}
+        IoU of the boxes, IoU of their outlines on the ground, or horizontal distance of their centers.
+    limit : float
+        IoU above which, or distance in m below which, boxes match.
+    """
+
+    measure: Measure
+    limit: float
+
+    def __post_init__(self) -> None:
+        """Check the limit."""
+        if self.measure not in ("iou_3d", "iou_bev", "center_m"):
+            raise ValueError(f"measure is '{self.measure}', expected iou_3d, iou_bev or center_m")
+        if not (self.limit > 0 if self.measure == "center_m" else 0 <= self.limit < 1):
+            expected = "above 0 m" if self.measure == "center_m" else "from 0 to below 1"
+            raise ValueError(f"limit of {self.measure} is {self.limit:g}, expected {expected}")
+
+    def __str__(self) -> str:
+        """Name the criterion, such as "IoU 3D > 0.7" or "center < 1 m"."""
+        if self.measure == "center_m":
+            return f"center < {self.limit:g} m"
+        return f"IoU {'3D' if self.measure == 'iou_3d' else 'BEV'} > {self.limit:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of found and true boxes that may match.
+
+    Attributes
+    ----------
+    found, truth : (P,) int64
+        Rows of both tables.
+    value : (P,) float64
+        IoU or distance.
+    """
+
+    found: NDArray[np.int64]
+    truth: NDArray[np.int64]
+    value: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """The true box of each found one.
+
+    Attributes
+    ----------
+    truth : (M,) int64
+        Row of the true box; -1 without.
+    value : (M,) float64
+        IoU or distance of the match, NaN without.
+    right : (M,) bool
+        Found boxes that match a counted true box.
+    false : (M,) bool
+        Found boxes that match nothing; ignored ones are neither right nor false.
+    truths : int
+        Number of counted true boxes.
+    """
+
+    truth: NDArray[np.int64]
+    value: Array
+    right: NDArray[np.bool_]
+    false: NDArray[np.bool_]
+    truths: int
+
+    def excusing(self, rows: NDArray[np.bool_]) -> Matches:
+        """Return matches in which the boxes of a mask (M,) are not false where they match nothing."""
+        return replace(self, false=self.false & ~rows)
+
+
+def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches:
+    """Match found and true boxes of all scenes one to one, best score first.
+
+    Parameters
+    ----------
+    found, truth : SceneBoxes
+        Of one class: categories are not compared.
+    """
+    return assign(found, truth, candidate_pairs(found, truth, criterion), criterion)
+
+
+def assign(found: SceneBoxes, truth: SceneBoxes, pairs: Pairs, criterion: Criterion) -> Matches:
+    """Choose among candidate pairs, which do not depend on what is ignored; see `match`.
+
+    Notes
+    -----
+    A found box takes the best true box that is free, a counted one before an ignored one. Ignored found boxes come last. So
+    the matches of the boxes above a score do not depend on those below. This is the order of PASCAL VOC and nuScenes; KITTI
+    lets true boxes choose, which gives the same counts wherever a found box can match one true box only, as above an IoU of
+    one half. Found boxes beyond the first on one true box are false, ignored true boxes included, as in KITTI.
+    """
+    i, j, value = pairs.found, pairs.truth, pairs.value
+    closeness = -value if criterion.measure == "center_m" else value
+    order = np.lexsort((j, -closeness, truth.ignored[j], i, -found.score[i], found.ignored[i]))
+    partner, of_pair = np.full(len(found), -1, dtype=np.int64), np.full(len(found), np.nan)
+    taken = np.zeros(len(truth), dtype=bool)
+    for a, b, v in zip(i[order].tolist(), j[order].tolist(), value[order].tolist(), strict=True):
+        if partner[a] < 0 and not taken[b]:
+            partner[a], of_pair[a], taken[b] = b, v, True
+    matched = partner >= 0
+    to_counted = matched.copy()
+    to_counted[matched] = ~truth.ignored[partner[matched]]
+    counted = int(np.count_nonzero(~truth.ignored))
+    return Matches(partner, of_pair, to_counted & ~found.ignored, ~matched & ~found.ignored, counted)
+
+
+def candidate_pairs(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Pairs:
+    """List the pairs of boxes of one scene that meet a criterion."""
+    rows_i, rows_j, values = [], [], []
+    for i, j in _pairs_in_scenes(found.scene, truth.scene):
+        a, b = found.box[i], truth.box[j]
+        distance = np.hypot(a[:, 0] - b[:, 0], a[:, 1] - b[:, 1])
+        if criterion.measure == "center_m":
+            near, value = distance < criterion.limit, distance
+        else:
+            reach = (np.hypot(a[:, 3], a[:, 4]) + np.hypot(b[:, 3], b[:, 4])) / 2
+            gate = distance < reach
+            i, j, a, b = i[gate], j[gate], a[gate], b[gate]
+            value = upright_box_iou(a, b) if criterion.measure == "iou_3d" else rectangle_iou(a[:, FLAT], b[:, FLAT])
+            near = value > criterion.limit
+        rows_i.append(i[near])
+        rows_j.append(j[near])
+        values.append(value[near])
+    if not values:
+        return Pairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+    return Pairs(np.concatenate(rows_i), np.concatenate(rows_j), np.concatenate(values))
+
+
+def _pairs_in_scenes(
+    scene_a: NDArray[np.int64], scene_b: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Yield all pairs of rows with one scene, in parts of about `MAX_PAIRS_AT_ONCE`."""
+    order = np.argsort(scene_b, kind="stable")
+    begin = np.searchsorted(scene_b[order], scene_a)
+    count = np.searchsorted(scene_b[order], scene_a, side="right") - begin
+    part = np.cumsum(count) // MAX_PAIRS_AT_ONCE
+    for k in np.unique(part):
+        rows = np.flatnonzero((part == k) & (count > 0))
+        if not len(rows):
+            continue
+        n = count[rows]
+        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        yield np.repeat(rows, n).astype(np.int64), order[np.repeat(begin[rows], n) + within].astype(np.int64)
+
 
 MIN_POINTS = 5
 """True boxes with fewer points are ignored, outside KITTI's difficulties: they show no extent (Waymo's level 1 asks for more
@@ -23,7 +182,6 @@ class ObjectClass:
 
     Attributes
     ----------
-    name : str
     categories : tuple of str
         Categories that make it up; they match freely among each other.
     criteria : tuple of Criterion
@@ -44,8 +202,6 @@ class Protocol:
 
     Attributes
     ----------
-    name : str
-    classes : tuple of ObjectClass
     of_camera : bool
         Whether only boxes count that the reference camera shows, by KITTI's difficulties.
     """
@@ -57,15 +213,7 @@ class Protocol:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Limits of a true box; found boxes below the height are ignored.
-
-    Attributes
-    ----------
-    name : str
-    min_height_px : float
-    max_occlusion : int
-    max_truncation : float
-    """
+    """Limits of a true box; found boxes below the height are ignored."""
 
     name: str
     min_height_px: float

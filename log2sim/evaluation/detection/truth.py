@@ -1,4 +1,4 @@
-"""True boxes of the sweeps in which a detector searched, from the labels of a log."""
+"""True boxes of sweeps from the labels of a log."""
 
 from __future__ import annotations
 
@@ -12,13 +12,198 @@ from log2sim.config import Config
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.label_tracks import MAX_LAG_NS, MAX_PERIODS, LabelTracks
-from log2sim.evaluation.detection.sweep_clouds import clouds, middle_ns, only_ticks, stamps_of
-from log2sim.geometry import NS_PER_S, Array, nearest_index, period_of
+from log2sim.evaluation.detection.detect_log import clouds, middle_ns, only_ticks, stamps_of
+from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares
+from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of, project_boxes, wrap_angle
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin
 from log2sim.pipeline import Run, start
+
+MAX_LAG_NS = 60_000_000
+"""A label holds for this time around its stamp: half a period at 10 Hz, and jitter."""
+MAX_PERIODS = 1.5
+"""Between labels of a track that are farther apart than this many periods the object was not labeled."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTracks:
+    """Labels in the order of their tracks and stamps.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+    pose : (L, 4) float64
+        Center x, y, z and yaw.
+    size_m : (rows of the log's labels, 3) float64
+        In the order of the log.
+    row : (L,) int64
+        Index in the log's labels.
+    first : (K + 1,) int64
+        Where each of K tracks begins, and L.
+    period_s : float
+        Median time between labels of a track; 0 where no track has two.
+    """
+
+    t_ns: NDArray[np.int64]
+    pose: Array
+    size_m: Array
+    row: NDArray[np.int64]
+    first: NDArray[np.int64]
+    period_s: float
+
+    @classmethod
+    def of(cls, labels: Labels) -> LabelTracks:
+        """Sort labels; of two of one object at one stamp the first is kept."""
+        _, track = np.unique(labels.track_id, return_inverse=True)
+        order = np.lexsort((labels.t_ns, track))
+        t, k = labels.t_ns[order], track[order]
+        order = order[np.r_[True, (np.diff(t) > 0) | (np.diff(k) != 0)]]
+        t, k = labels.t_ns[order], track[order]
+        steps = np.diff(t)[np.diff(k) == 0]
+        return cls(
+            t,
+            np.column_stack([labels.center_m[order], labels.yaw_rad[order]]),
+            labels.size_m,
+            order.astype(np.int64),
+            np.append(np.flatnonzero(np.diff(k, prepend=-1)), len(order)).astype(np.int64),
+            float(np.median(steps)) / NS_PER_S if len(steps) else 0.0,
+        )
+
+    def present(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """List the moments (P,), indices into `t_ns` (F,), and tracks (P,) labeled at them, in the order of moments."""
+        moments, tracks = [], []
+        for k, (begin, end) in enumerate(zip(self.first[:-1], self.first[1:], strict=True)):
+            stamps = self.t_ns[begin:end]
+            after = np.searchsorted(stamps, t_ns)
+            before_ns = t_ns - stamps[np.maximum(after - 1, 0)]
+            after_ns = stamps[np.minimum(after, len(stamps) - 1)] - t_ns
+            near = np.minimum(np.abs(before_ns), np.abs(after_ns)) <= MAX_LAG_NS
+            gap_s = (before_ns + after_ns) / NS_PER_S
+            between = (after > 0) & (after < len(stamps)) & (gap_s <= MAX_PERIODS * self.period_s)
+            found = np.flatnonzero(near | between)
+            moments.append(found)
+            tracks.append(np.full(len(found), k))
+        moment, track = np.concatenate(moments), np.concatenate(tracks)
+        order = np.argsort(moment, kind="stable")
+        return moment[order].astype(np.int64), track[order].astype(np.int64)
+
+    def at(self, track: NDArray[np.int64], t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+        """Interpolate tracks (P,) at stamps (P,).
+
+        Returns
+        -------
+        pose : (P, 4) float64
+            Center x, y, z and yaw, on the line through the labels before and after; beyond the ends, and next to a gap, on
+            the line through the two nearest ones.
+        row : (P,) int64
+            Index of the nearest label in the log's labels.
+        """
+        pose, row = np.empty((len(track), 4)), np.empty(len(track), dtype=np.int64)
+        for k in np.unique(track):
+            mine = np.flatnonzero(track == k)
+            part = slice(self.first[k], self.first[k + 1])
+            pose[mine], nearest = _along(self.t_ns[part], self.pose[part], t_ns[mine], self.period_s)
+            row[mine] = self.row[part][nearest]
+        return pose, row
+
+
+def _along(
+    stamps: NDArray[np.int64], pose: Array, t_ns: NDArray[np.int64], period_s: float
+) -> tuple[Array, NDArray[np.intp]]:
+    """Interpolate one track with stamps (K,) and poses (K, 4) at times (P,); also the index (P,) of the nearest stamp."""
+    nearest = np.abs(stamps - t_ns[:, None]).argmin(axis=1)
+    toward = np.where(t_ns >= stamps[nearest], 1, -1)
+    linked = np.append(np.diff(stamps) / NS_PER_S <= MAX_PERIODS * period_s, False)
+    partner = nearest.copy()
+    for step in (-toward, toward):  # the last one that can be had is taken
+        there = nearest + step
+        usable = (there >= 0) & (there < len(stamps)) & linked[np.minimum(nearest, there)]
+        partner = np.where(usable, there, partner)
+    span = stamps[partner] - stamps[nearest]
+    share = np.divide(t_ns - stamps[nearest], span, out=np.zeros(len(t_ns)), where=span != 0)
+    way = pose[partner] - pose[nearest]
+    way[:, 3] = wrap_angle(way[:, 3])
+    return pose[nearest] + share[:, None] * way, nearest
+
+
+@dataclass(frozen=True, eq=False)
+class ImageViews:
+    """M boxes in the images of one camera.
+
+    Attributes
+    ----------
+    shown : (M,) bool
+        Whether the image shows a part of the box.
+    height_px : (M,) float64
+        Height of the box in the image, clipped to it; 0 where it is not shown.
+    truncation : (M,) float64
+        Share of the outline outside the image; 1 where it is not shown.
+    region_share : (M,) float64
+        Greatest share of the image box in one region left without labels.
+    """
+
+    shown: NDArray[np.bool_]
+    height_px: Array
+    truncation: Array
+    region_share: Array
+
+    def take(self, rows: NDArray[np.bool_]) -> ImageViews:
+        """Take the rows of a mask."""
+        return ImageViews(self.shown[rows], self.height_px[rows], self.truncation[rows], self.region_share[rows])
+
+
+def image_views(
+    log: Log, camera: str, t_ns: NDArray[np.int64], boxes: SceneBoxes, *, truncation: bool = False
+) -> ImageViews:
+    """Project boxes into the images of a camera.
+
+    Parameters
+    ----------
+    t_ns : (F,) int64
+        Stamps of the scenes, absolute; the camera is taken where it was then.
+    boxes : SceneBoxes
+        Their scenes are indices into `t_ns`, the boxes are in the map frame.
+    truncation : bool
+        Whether to compute it, which takes a millisecond a box at the border of the image; 0 for all shown boxes otherwise.
+    """
+    count = len(boxes)
+    shown, height, share = np.zeros(count, dtype=bool), np.zeros(count), np.zeros(count)
+    outside = np.ones(count)
+    poses, known = log.map_T_sensor(camera, t_ns)
+    for scene in np.unique(boxes.scene):
+        if not known[scene]:
+            continue
+        rows = np.flatnonzero(boxes.scene == scene)
+        solid = boxes.box[rows, :3], boxes.box[rows, 3:6], boxes.box[rows, 6]
+        seen = project_boxes(*solid, log.cameras[camera], inverse(poses[scene]))
+        shown[rows] = seen.valid
+        height[rows] = np.where(seen.valid, seen.box_px[:, 3] - seen.box_px[:, 1], 0)
+        inside = image_shares(log.cameras[camera], inverse(poses[scene]), *solid) if truncation else 1.0
+        outside[rows] = np.where(seen.valid, 1 - inside, 1.0)
+        share[rows] = _region_share(seen.box_px, _regions(log, camera, int(t_ns[scene])))
+    return ImageViews(shown, height, outside, np.where(shown, share, 0))
+
+
+def _regions(log: Log, camera: str, t_ns: int) -> Array:
+    """Select the regions (R, 4) without labels of the image nearest to a stamp."""
+    regions = log.ignored_regions.get(camera)
+    if regions is None or not len(regions.t_ns):
+        return np.zeros((0, 4))
+    lag = np.abs(regions.t_ns - t_ns)
+    return regions.box_px[lag == lag.min()] if lag.min() <= MAX_STAMP_LAG_NS else np.zeros((0, 4))
+
+
+def _region_share(box_px: Array, region_px: Array) -> Array:
+    """Compute the greatest share (M,) of boxes (M, 4) that one of the regions (R, 4) covers."""
+    if not len(region_px):
+        return np.zeros(len(box_px))
+    low = np.maximum(box_px[:, None, :2], region_px[None, :, :2])
+    high = np.minimum(box_px[:, None, 2:], region_px[None, :, 2:])
+    shared = np.clip(high - low, 0, None).prod(axis=2).max(axis=1)
+    area = (box_px[:, 2:] - box_px[:, :2]).prod(axis=1)
+    return np.asarray(np.divide(shared, area, out=np.zeros_like(area), where=area > 0))
+
 
 MAX_STAMP_ERROR_NS = 1_000_000
 """Stamps of one sweep differ by rounding at most this much."""
@@ -56,7 +241,6 @@ def truth_of_sweeps(
 
     Parameters
     ----------
-    log : Log
     t_ns : (F,) int64
         Stamps of the sweeps, absolute, increasing.
     progress : callable, optional

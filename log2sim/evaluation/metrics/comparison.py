@@ -1,4 +1,4 @@
-"""Truth and reconstruction at the same ticks, matched, with what counts on either side."""
+"""Truth and reconstruction at the same ticks, in one frame, matched as CLEAR MOT does, with what counts on either side."""
 
 from __future__ import annotations
 
@@ -6,14 +6,465 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from log2sim.datatypes import IgnoreRegions
-from log2sim.evaluation.metrics.align import StateTable
-from log2sim.evaluation.metrics.clear_mot import associate, switches
-from log2sim.evaluation.metrics.label_coverage import ignored_ticks
-from log2sim.evaluation.metrics.pairs import Index, Mask, Pairs, gate_m, near_pairs
-from log2sim.evaluation.metrics.truth import MIN_POINTS
-from log2sim.geometry import Array
+from log2sim.datatypes import GROUP_OF, Agent, IgnoreRegions, LabelView, Scenario
+from log2sim.evaluation.metrics.truth import MIN_POINTS, image_samples
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index
+
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+GATE_M = 2.0
+GATE_PER_LENGTH = 0.25
+
+
+def gate_m(length_m: Array) -> Array:
+    """Compute the gate (A,), m: the largest distance of matching box centers, by the truth's length (A,), m.
+
+    Notes
+    -----
+    nuScenes matches within 2 m. The center of a partly visible bus or truck is uncertain by more, so the gate is at least a
+    quarter of the length.
+    """
+    return np.maximum(GATE_M, GATE_PER_LENGTH * np.asarray(length_m, dtype=np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs within the gate, sorted by tick.
+
+    Attributes
+    ----------
+    tick : (P,) int64
+    truth, other : (P,) int64
+        Indices of the truth agent and of the reconstructed agent.
+    distance_m : (P,) float64
+    similarity : (P,) float64
+        1 - distance / gate; 0 across groups of categories.
+    same_group : (P,) bool
+    """
+
+    tick: Index
+    truth: Index
+    other: Index
+    distance_m: Array
+    similarity: Array
+    same_group: Mask
+
+    def take(self, index: Mask | Index) -> Pairs:
+        """Return the rows at `index`."""
+        return Pairs(
+            self.tick[index],
+            self.truth[index],
+            self.other[index],
+            self.distance_m[index],
+            self.similarity[index],
+            self.same_group[index],
+        )
+
+    def bounds(self, ticks: int) -> Index:
+        """Return row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""
+        return np.searchsorted(self.tick, np.arange(ticks + 1))
+
+
+def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mask) -> Pairs:
+    """Collect the pairs within the gate.
+
+    Parameters
+    ----------
+    truth_xy, other_xy : (A, T, 2), (B, T, 2) float64, m
+        Box centers in one frame, NaN where an agent is absent.
+    gates_m : (A,) float64
+    same_group : (A, B) bool
+    """
+    found: list[tuple[Index, ...]] = []
+    distances = []
+    for t in range(truth_xy.shape[1]):
+        a, b = np.flatnonzero(np.isfinite(truth_xy[:, t, 0])), np.flatnonzero(np.isfinite(other_xy[:, t, 0]))
+        gap = truth_xy[a, None, t] - other_xy[None, b, t]
+        distance = np.hypot(gap[..., 0], gap[..., 1])
+        i, j = np.nonzero(distance <= gates_m[a, None])
+        found.append((np.full(len(i), t), a[i], b[j]))
+        distances.append(distance[i, j])
+    if not found:
+        none = np.zeros(0, dtype=np.int64)
+        return Pairs(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
+    tick, truth, other = (np.concatenate(column) for column in zip(*found))
+    distance_m = np.concatenate(distances)
+    same = same_group[truth, other]
+    similarity = np.where(same, 1 - distance_m / gates_m[truth], 0.0)
+    return Pairs(tick, truth, other, distance_m, similarity, same)
+
+
+def assign(rows: Index, cols: Index, score: Array) -> Index:
+    """Choose pairs one to one so that the sum of their scores is greatest.
+
+    Parameters
+    ----------
+    rows, cols : (P,) int64
+        The candidate pairs, each once.
+    score : (P,) float64
+        Greater than 0 for a pair that may be chosen.
+
+    Returns
+    -------
+    (K,) int64
+        Indices of the chosen candidates.
+
+    Notes
+    -----
+    Pairs whose row and column have no other candidate, nearly all in a sparse scene, are chosen without the solver.
+    """
+    usable = np.flatnonzero(score > 0)
+    if len(usable) == 0:
+        return usable
+    row_names, r = np.unique(rows[usable], return_inverse=True)
+    col_names, c = np.unique(cols[usable], return_inverse=True)
+    alone = (np.bincount(r)[r] == 1) & (np.bincount(c)[c] == 1)
+    if np.all(alone):
+        return usable
+    from scipy.optimize import linear_sum_assignment
+
+    contested = usable[~alone]
+    row_names, r = np.unique(rows[contested], return_inverse=True)
+    col_names, c = np.unique(cols[contested], return_inverse=True)
+    matrix = np.zeros((len(row_names), len(col_names)))
+    place = np.full(matrix.shape, -1, dtype=np.int64)
+    matrix[r, c], place[r, c] = score[contested], contested
+    i, j = linear_sum_assignment(matrix, maximize=True)
+    chosen = place[i, j]
+    return np.sort(np.concatenate([usable[alone], chosen[chosen >= 0]]))
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """Matches of A truth agents and B reconstructed agents at T ticks.
+
+    Attributes
+    ----------
+    match : (A, T) int64
+        Index of the reconstructed agent, -1 for none.
+    used : (B, T) bool
+        Reconstructed agents matched within their group of categories.
+    absorbed : (B, T) bool
+        Reconstructed agents without such a match that are at a labeled object of another group.
+    """
+
+    match: NDArray[np.int64]
+    used: Mask
+    absorbed: Mask
+
+
+def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association:
+    """Match agents tick by tick, keeping what was matched before while it is within the gate.
+
+    Notes
+    -----
+    Bernardin and Stiefelhagen (2008), section 2.2.1: previous matches within the gate are kept, then the remaining agents
+    are matched with the most pairs and the least total distance. A truth agent keeps its previous match over gaps. When two
+    truth agents have the same previous match, the nearer one keeps it.
+    """
+    match = np.full((truths, ticks), -1, dtype=np.int64)
+    used, absorbed = np.zeros((others, ticks), dtype=bool), np.zeros((others, ticks), dtype=bool)
+    last = np.full(truths, -1, dtype=np.int64)
+    bounds = pairs.bounds(ticks)
+    for t in range(ticks):
+        near = pairs.take(np.arange(bounds[t], bounds[t + 1]))
+        for same_group_only, choose in ((True, _kept), (True, _nearest), (False, _nearest)):
+            free = (match[near.truth, t] < 0) & ~used[near.other, t] & (near.same_group | (not same_group_only))
+            chosen = choose(near, np.flatnonzero(free), last)
+            if same_group_only:
+                match[near.truth[chosen], t] = near.other[chosen]
+                used[near.other[chosen], t] = True
+            else:
+                absorbed[near.other[chosen], t] = True
+        last = np.where(match[:, t] >= 0, match[:, t], last)
+    return Association(match, used, absorbed)
+
+
+def _kept(near: Pairs, rows: Index, last: Index) -> Index:
+    """Select the candidate `rows` that continue the last match of their truth agent; the nearest of several."""
+    rows = rows[last[near.truth[rows]] == near.other[rows]]
+    rows = rows[np.argsort(near.distance_m[rows], kind="stable")]
+    _, first = np.unique(near.other[rows], return_index=True)
+    return rows[first]
+
+
+def _nearest(near: Pairs, rows: Index, last: Index) -> Index:
+    """Select of the candidate `rows` the most pairs with the least total distance."""
+    distance = near.distance_m[rows]
+    # One more pair always outweighs any saving in distance.
+    bonus = 1.0 + distance.sum()
+    return rows[assign(near.truth[rows], near.other[rows], bonus - distance)]
+
+
+def switches(match: NDArray[np.int64], counted: Mask) -> Mask:
+    """Mark (A, T) identity switches: counted ticks with another match than at the last counted tick with one."""
+    held = np.where(counted, match, -1)
+    out = np.zeros(match.shape, dtype=bool)
+    last = np.full(len(match), -1, dtype=np.int64)
+    for t in range(match.shape[1]):
+        now = held[:, t]
+        out[:, t] = (now >= 0) & (last >= 0) & (now != last)
+        last = np.where(now >= 0, now, last)
+    return out
+
+
+def mota(truth_ticks: int, missed: int, false: int, id_switches: int) -> float | None:
+    """Compute the multiple object tracking accuracy, 1 - (misses + false + switches) / truth; None without truth."""
+    return 1 - (missed + false + id_switches) / truth_ticks if truth_ticks else None
+
+
+MAX_TRUTH_GAP_S = 0.25
+MAX_SIMPLIFIED_GAP_S = 1.05
+"""Simplified trajectories omit waypoints of straight uniform motion for up to a second."""
+
+MIN_TICK_S = 0.02
+"""Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself."""
+
+TRUTH_MARGIN_S = 0.15
+"""A truth agent is extrapolated this far beyond its first and last label, without being counted there."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateTable:
+    """States of A agents at T ticks; NaN where an agent is absent.
+
+    Attributes
+    ----------
+    category, group : (A,) str
+    size_m : (A, 3) float64, m
+    xy_m : (A, T, 2) float64, m
+        Box centers, the scenario's map frame.
+    z_m : (A, T) float64, m
+    yaw_rad : (A, T) float64
+    speed_mps : (A, T) float64, m/s
+    range_m : (A, T) float64, m
+        From the ego's center; infinite without an ego.
+    visible : (A, T) bool
+        False where the truth does not count.
+    labeled : (A, T) bool
+        False where the truth's state is interpolated over a gap of its labels or extrapolated.
+    lidar_points : (A, T) float64
+        LiDAR points in the truth's box; NaN where they were not counted.
+    """
+
+    ids: tuple[str, ...]
+    category: NDArray[np.str_]
+    group: NDArray[np.str_]
+    size_m: Array
+    xy_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    range_m: Array
+    visible: Mask
+    labeled: Mask
+    lidar_points: Array
+
+    @property
+    def present(self) -> Mask:
+        """Mark (A, T) the ticks at which each agent is present."""
+        return np.isfinite(self.xy_m[..., 0])
+
+
+def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
+    """Choose the instants (T,), seconds of the scenario, at which to compare; all within the time of the truth.
+
+    Notes
+    -----
+    These are the times of the ego's waypoints. When they are on average more than 0.25 s apart, which simplification does,
+    the waypoints of all agents are added, and when that is not enough, those of the truth, at least `MIN_TICK_S` apart.
+    """
+    shift_s = (truth.t0_ns - scenario.t0_ns) / NS_PER_S
+    ego = scenario.ego
+    ours = [a.waypoints.t_s for a in scenario.agents]
+    theirs = [a.waypoints.t_s + shift_s for a in truth.agents]
+    if not theirs:
+        return np.zeros(0)
+    first, last = min(t[0] for t in theirs), max(t[-1] for t in theirs)
+    # A scenario without agents misses every truth agent during its duration.
+    begin = min((t[0] for t in ours), default=0.0)
+    end = max((t[-1] for t in ours), default=scenario.duration_s)
+    ego_t_s = np.zeros(0) if ego is None else ego.waypoints.t_s
+    for times in ([] if ego is None else [ego_t_s], ours, ours + theirs):
+        if not times:
+            continue
+        # Agents of one tick may differ in the last digits of their stamps.
+        _, index = np.unique(np.round(np.concatenate(times), 4), return_index=True)
+        t = np.sort(np.concatenate(times)[index])
+        t = _thinned(t, ego_t_s)
+        t = t[(t >= max(first, begin) - TRUTH_MARGIN_S) & (t <= min(last, end) + TRUTH_MARGIN_S)]
+        if len(t) > 1 and (t[-1] - t[0]) / (len(t) - 1) <= MAX_TRUTH_GAP_S:
+            break
+    return t
+
+
+def _thinned(t_s: Array, wanted_s: Array) -> Array:
+    """Keep of increasing instants (T,) those wanted, and others at least `MIN_TICK_S` from these and each other."""
+    wanted = np.isin(t_s, wanted_s)
+    away = np.full(len(t_s), np.inf)
+    if wanted.any():
+        away = np.abs(t_s - t_s[wanted][nearest_index(t_s[wanted], t_s)])
+    keep, last_s = wanted.copy(), -np.inf
+    for k in np.flatnonzero(away >= MIN_TICK_S):
+        if t_s[k] - last_s >= MIN_TICK_S:
+            keep[k], last_s = True, t_s[k]
+    return t_s[keep]
+
+
+def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:
+    """Sample reconstructed agents at the ticks (T,); `ego_xy` (T, 2), m, or None."""
+    sampled = [a.at(ticks_s) for a in agents]
+    xy = _stack([np.stack([s.x_m, s.y_m], -1) for s in sampled], (len(ticks_s), 2))
+    yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
+    speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
+    z = _stack([s.z_m for s in sampled], (len(ticks_s),))
+    there, unknown = np.isfinite(yaw), np.full(yaw.shape, np.nan)
+    return _table(
+        agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=there, labeled=there, lidar_points=unknown
+    )
+
+
+def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
+    """Sample truth agents at the ticks (seconds of the truth), moved by `shift_m`.
+
+    Notes
+    -----
+    `visible` is that of the nearest waypoint. In gaps longer than 0.25 s and outside the trajectory it is False: there an
+    interpolated or extrapolated box only prevents a reconstructed agent from counting as false.
+    """
+    columns = [_sample_truth(a, ticks_s) for a in agents]
+    xy = _stack([c[0] for c in columns], (len(ticks_s), 2)) + shift_m[:2]
+    z = _stack([c[1] for c in columns], (len(ticks_s),)) + shift_m[2]
+    yaw = _stack([c[2] for c in columns], (len(ticks_s),))
+    speed = _stack([c[3] for c in columns], (len(ticks_s),))
+    visible, labeled = (_stack([c[k].astype(np.float64) for c in columns], (len(ticks_s),)) > 0 for k in (4, 5))
+    points = _stack([c[6] for c in columns], (len(ticks_s),))
+    seen = {"visible": visible & labeled, "labeled": labeled, "lidar_points": points}
+    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, **seen)
+
+
+def ego_states(
+    scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array
+) -> StateTable | None:
+    """Sample the ego as one row, the true one at the ticks at which it is known; None without an ego."""
+    ours = None if scenario.ego is None else reconstructed_states((scenario.ego,), ticks_s, None)
+    if truth.ego is None:
+        return ours
+    true = truth_states((truth.ego,), truth_ticks_s, shift_m, None)
+    if ours is None:
+        return true
+    xy_m = np.where(true.present[..., None], true.xy_m, ours.xy_m)
+    return replace(true, xy_m=xy_m, yaw_rad=np.where(true.present, true.yaw_rad, ours.yaw_rad))
+
+
+def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask, Mask, Array]:
+    w = agent.waypoints
+    s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
+    outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
+    step = s.speed_mps * outside
+    xy = np.stack([s.x_m + step * np.cos(s.yaw_rad), s.y_m + step * np.sin(s.yaw_rad)], -1)
+    present = np.abs(outside) <= TRUTH_MARGIN_S
+    nearest = nearest_index(w.t_s, t)
+    visible = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest]
+    points = np.full(len(t), np.nan) if w.lidar_points is None else w.lidar_points[nearest]
+    points = np.where(np.abs(w.t_s[nearest] - t) <= MAX_TRUTH_GAP_S, points, np.nan)
+    # Simplified, a static agent has its first and last waypoint only, and one in straight motion a few.
+    simplified = bool(agent.quality.get("waypoints_left_out"))
+    max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
+    labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
+    nan = np.where(present, 0.0, np.nan)
+    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible, labeled, points + nan
+
+
+def _table(agents: tuple[Agent, ...], ego_xy: Array | None, **columns: Any) -> StateTable:
+    """Complete the sampled columns with what is constant for each agent, and with the distance from the ego."""
+    category = np.array([a.category for a in agents], dtype="<U16")
+    if ego_xy is None:
+        range_m = np.where(np.isfinite(columns["yaw_rad"]), np.inf, np.nan)
+    else:
+        range_m = np.hypot(*np.moveaxis(columns["xy_m"] - ego_xy, -1, 0))
+    return StateTable(
+        ids=tuple(a.id for a in agents),
+        category=category,
+        group=np.array([GROUP_OF.get(c, "other") for c in category], dtype="<U16"),
+        size_m=np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3),
+        range_m=range_m,
+        **columns,
+    )
+
+
+def _stack(rows: list[Array], shape: tuple[int, ...]) -> Array:
+    return np.stack(rows) if rows else np.zeros((0, *shape))
+
+
+MIN_REGION_SHARE = 0.5
+MAX_FRAME_LAG_S = 0.15
+"""A tick is compared with the nearest labeled frame of a camera within this time."""
+
+
+def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, candidates: Mask) -> Mask:
+    """Mark (B, T) the boxes that no labeled camera shows in a labeled part of its image.
+
+    Parameters
+    ----------
+    t_s : (T,)
+        Ticks, seconds of the truth.
+    agents : StateTable
+        B agents at these ticks, the truth's map frame.
+    candidates : (B, T) bool
+        The boxes to decide on; all others are False.
+
+    Notes
+    -----
+    A camera shows a box in an ignore region when at least half of the visible outline lies in the union of the regions of
+    the nearest frame. One camera that shows it in a labeled part suffices to keep it.
+    """
+    center_m = np.concatenate([agents.xy_m, agents.z_m[..., None]], axis=-1)
+    labeled, hidden = np.zeros_like(candidates), np.zeros_like(candidates)
+    for view in ignore_regions.views:
+        frame, near, map_T_cam = _frames_at(view, t_s)
+        for k in np.flatnonzero(candidates.any(0) & near):
+            rows = np.flatnonzero(candidates[:, k])
+            regions = view.region_px[view.region_frame == frame[k]]
+            boxes = center_m[rows, k], agents.size_m[rows], agents.yaw_rad[rows, k]
+            for row, uv in zip(rows, image_samples(view.camera, inverse(map_T_cam[k]), *boxes)):
+                if len(uv):
+                    share = _inside_any(uv, regions).mean()
+                    (hidden if share >= MIN_REGION_SHARE else labeled)[row, k] = True
+    outside = candidates & ~hidden & ~labeled if ignore_regions.outside_views else np.zeros_like(candidates)
+    return (hidden & ~labeled) | outside
+
+
+def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
+    """Find the nearest frame (T,), whether it is within `MAX_FRAME_LAG_S`, and the camera poses (T, 4, 4) at instants (T,).
+
+    Notes
+    -----
+    Poses are interpolated: at 30 m/s a car moves 1.5 m in half a frame at 10 Hz.
+    """
+    if len(view.t_s) == 0:
+        return np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s), dtype=bool), np.zeros((len(t_s), 4, 4))
+    frame = nearest_index(view.t_s, t_s)
+    near = np.abs(view.t_s[frame] - t_s) <= MAX_FRAME_LAG_S
+    at_frames = view.map_T_cam
+    track = PoseTrack(_to_ns(view.t_s), at_frames)
+    poses, known = track.at(_to_ns(np.clip(t_s, view.t_s[0], view.t_s[-1])))
+    return frame, near, np.where(known[:, None, None], poses, at_frames[frame])
+
+
+def _to_ns(t_s: Array) -> Index:
+    return np.round(t_s * NS_PER_S).astype(np.int64)
+
+
+def _inside_any(uv: Array, regions: Array) -> Mask:
+    """Mark (S,) the pixels (S, 2) that lie in any of the regions (R, 4)."""
+    u, v = uv[:, None, 0], uv[:, None, 1]
+    within = (u >= regions[:, 0]) & (u <= regions[:, 2]) & (v >= regions[:, 1]) & (v <= regions[:, 3])
+    return np.asarray(within.any(axis=1))
+
 
 MIN_COUNTED_S = 1.0
 """A truth agent counts when its counted ticks make up at least this time."""
@@ -62,7 +513,6 @@ class Comparison:
     ----------
     truth, other : StateTable
         Truth and reconstruction.
-    pairs : Pairs
     match : (A, T) int64
         Index of the reconstructed agent, -1 for none.
     counted : (A, T) bool
@@ -103,10 +553,8 @@ def compare(
 
     Parameters
     ----------
-    truth, other : StateTable
     tick_s : float, s
         Interval of the ticks.
-    selection : Selection
     visibility_stated : bool
         Whether the truth states what is visible; else it follows from `MIN_POINTS` points and from pictures.
     """
@@ -160,7 +608,6 @@ def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s:
 
     Parameters
     ----------
-    c : Comparison
     regions : IgnoreRegions or None
         None where the labels are complete.
     truth_ticks_s : (T,) float64, s

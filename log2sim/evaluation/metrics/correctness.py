@@ -1,4 +1,4 @@
-"""How many reconstructed agents are wrong, in what, and whether the scenario doubts them."""
+"""How many agents are wrong, whether the scenario doubts them, and how well confidence is calibrated."""
 
 from __future__ import annotations
 
@@ -10,13 +10,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, GROUPS, MIN_TRUSTED_CONFIDENCE, Agent
-from log2sim.evaluation.metrics.align import StateTable
-from log2sim.evaluation.metrics.calibration import normalized_errors, reliability
-from log2sim.evaluation.metrics.comparison import Comparison
-from log2sim.evaluation.metrics.pairs import Mask
-from log2sim.evaluation.metrics.rules import correctness_rules
-from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, judge
+from log2sim.evaluation.metrics.comparison import Comparison, Mask, StateTable
+from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_rules, judge
 from log2sim.geometry import Array
+
+BINS = 10
+CHI2_95 = {1: 3.841, 2: 5.991}
+"""95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05."""
+
+
+def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
+    """Compare confidences (N,) in [0, 1] with what is right (N,).
+
+    Returns
+    -------
+    dict
+        "count", "expected_calibration_error" (None without any), and "bins" of equal width from 0 to 1 with "low", "high",
+        "count", "mean_confidence" and "right" (None in empty bins).
+
+    Notes
+    -----
+    Expected calibration error (Naeini, Cooper, Hauskrecht, AAAI 2015; Guo et al., ICML 2017): the mean over all of the
+    difference between the mean confidence and the share of right ones in their bin. What lies outside 0 to 1 is in the
+    outermost bins. Bins of few have an error by chance alone: sqrt(p (1 - p) / count) for a share p.
+    """
+    of_bin = np.clip((confidence * BINS).astype(np.int64), 0, BINS - 1)
+    count = np.bincount(of_bin, minlength=BINS)
+    sums, rights = (np.bincount(of_bin, weights=v, minlength=BINS) for v in (confidence, right))
+    bins = [
+        {
+            "low": k / BINS,
+            "high": (k + 1) / BINS,
+            "count": int(count[k]),
+            "mean_confidence": float(sums[k] / count[k]) if count[k] else None,
+            "right": float(rights[k] / count[k]) if count[k] else None,
+        }
+        for k in range(BINS)
+    ]
+    error = float(np.abs(sums - rights).sum() / len(right)) if len(right) else None
+    return {"count": len(right), "expected_calibration_error": error, "bins": bins}
+
+
+def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
+    """Compare errors (N, D) with their standard deviations (N,), which hold for each of the D = 1 or 2 axes.
+
+    Rows with an error of NaN are left out.
+
+    Returns
+    -------
+    dict
+        "count"; "without_sigma", those with a sigma of 0 or NaN, left out of all else; "nees", the mean of e^T P^-1 e / D
+        with P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", 0.69 = ln 2 for D = 2 and
+        0.45 for D = 1 where errors are Gaussian too; "within_95", the share inside of the 95 % circle or interval.
+
+    Notes
+    -----
+    Normalized estimation error squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
+    Navigation", 2001, section 5.4.2). A few gross errors dominate the mean, the other two describe the rest. The noise of
+    the labels is part of the errors. Errors of positions end at the gate of the matching.
+    """
+    there = np.isfinite(error).all(axis=1)
+    known, axes = there & (sigma > 0), error.shape[1]
+    squared = (error[known] ** 2).sum(axis=1) / sigma[known] ** 2
+    return {
+        "count": int(known.sum()),
+        "without_sigma": int((there & ~known).sum()),
+        "nees": float(squared.mean() / axes) if known.any() else None,
+        "median": float(np.median(squared) / axes) if known.any() else None,
+        "within_95": float((squared <= CHI2_95[axes]).mean()) if known.any() else None,
+    }
+
 
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
 MAX_WRONG_SHARE = 0.2
@@ -30,8 +93,6 @@ class JudgedAgents:
 
     Attributes
     ----------
-    states : StateTable
-    verdicts : Verdicts
     wrong : (B, T) bool
     confidence : (B,) float64
     reasons : tuple of tuple of str
@@ -62,7 +123,6 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
 
     Parameters
     ----------
-    c : Comparison
     agents : sequence of Agent
         The B reconstructed agents of the comparison.
     ticks_s : (T,) float64, s

@@ -1,49 +1,367 @@
-"""Compares a reconstructed scenario with the truth."""
+"""Compares a reconstructed scenario with the truth; HOTA."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, GROUPS, Agent, Log, Scenario
+from log2sim.datatypes import CATEGORIES, GROUPS, Agent, LabelView, Log, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.evaluation.colors import color_figures
-from log2sim.evaluation.lanes.figures import map_figures
-from log2sim.evaluation.metrics.align import (
-    StateTable,
-    ego_states,
-    evaluation_ticks_s,
-    reconstructed_states,
-    truth_states,
-)
-from log2sim.evaluation.metrics.clear_mot import mota
 from log2sim.evaluation.metrics.comparison import (
+    GATE_M,
     MIN_COUNTED_S,
     Comparison,
+    Mask,
+    Pairs,
     Selection,
+    StateTable,
+    assign,
     compare,
     coverage,
+    ego_states,
+    evaluation_ticks_s,
     matched_ticks,
+    mota,
+    reconstructed_states,
+    truth_states,
     without_ignored,
 )
 from log2sim.evaluation.metrics.correctness import correctness
-from log2sim.evaluation.metrics.hota import hota
-from log2sim.evaluation.metrics.pairs import Mask
-from log2sim.evaluation.metrics.per_agent import agent_rows, false_rows, ignored_rows, rounded_tree
-from log2sim.evaluation.metrics.placing import place_truth
-from log2sim.evaluation.metrics.rules import counting_rules, matching_rules
-from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors, summarize
 from log2sim.evaluation.metrics.truth import load_truth
-from log2sim.evaluation.signals import signal_figures
-from log2sim.geometry import NS_PER_S, Array
-from log2sim.registry import nearest
+from log2sim.evaluation.metrics.verdicts import (
+    counting_rules,
+    matching_rules,
+    median,
+    root_mean_square,
+    state_errors,
+    summarize,
+)
+from log2sim.evaluation.road import color_figures, map_figures, signal_figures
+from log2sim.export.exporters import on_map
+from log2sim.files.plugins import nearest
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    wrap_angle,
+)
 
 if TYPE_CHECKING:
     from log2sim.pipeline import Result
+
+
+ALPHAS: Array = np.arange(1, 20) / 20
+"""Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged."""
+
+
+@dataclass(frozen=True)
+class Hota:
+    """HOTA with its detection and association parts, each the mean over `ALPHAS`."""
+
+    hota: float
+    det_a: float
+    ass_a: float
+
+
+def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
+    """Score the tracking.
+
+    Parameters
+    ----------
+    pairs : Pairs
+        Candidates; those of absent agents and those with similarity 0 are left out.
+    truth_present, other_present : (A, T), (B, T) bool
+        Which agents count at which ticks.
+
+    Returns
+    -------
+    Hota or None
+        None when there is no truth.
+
+    Notes
+    -----
+    Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize the sum of similarity times the global alignment of
+    both identities. Without any reconstructed agent all figures are 0.
+    """
+    if not truth_present.any():
+        return None
+    if not other_present.any():
+        return Hota(0.0, 0.0, 0.0)
+    present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
+    pairs = pairs.take(present)
+    truth_count, other_count = truth_present.sum(1), other_present.sum(1)
+    alignment = _alignment(pairs, truth_count, other_count, truth_present.shape[1])
+    matched = _matched_pairs(pairs, alignment[pairs.truth, pairs.other] * pairs.similarity, truth_present.shape[1])
+    det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
+    total = int(truth_count.sum() + other_count.sum())
+    for k, alpha in enumerate(ALPHAS):
+        # A similarity equal to the threshold counts, despite rounding.
+        hits = matched.take(matched.similarity >= alpha - 1e-12)
+        if len(hits.tick) == 0:
+            continue
+        # TPA: how often a pair of identities matched; FNA, FPA: how often one of them was present without the other.
+        pair_code = hits.truth * len(other_present) + hits.other
+        code, tpa = np.unique(pair_code, return_counts=True)
+        i, j = np.divmod(code, len(other_present))
+        ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
+        det_a[k] = tpa.sum() / (total - tpa.sum())
+    return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
+
+
+def _alignment(pairs: Pairs, truth_count: Array, other_count: Array, ticks: int) -> Array:
+    """Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment."""
+    row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
+    np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
+    np.add.at(col_sum, (pairs.other, pairs.tick), pairs.similarity)
+    share = row_sum[pairs.truth, pairs.tick] + col_sum[pairs.other, pairs.tick] - pairs.similarity
+    potential = np.zeros((len(truth_count), len(other_count)))
+    np.add.at(potential, (pairs.truth, pairs.other), pairs.similarity / share)
+    union = truth_count[:, None] + other_count[None] - potential
+    return np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
+
+
+def _matched_pairs(pairs: Pairs, score: Array, ticks: int) -> Pairs:
+    bounds = pairs.bounds(ticks)
+    chosen = [
+        begin + assign(pairs.truth[begin:end], pairs.other[begin:end], score[begin:end])
+        for begin, end in pairwise(bounds)
+    ]
+    return pairs.take(np.concatenate(chosen))
+
+
+DIGITS = 6
+
+
+def agent_rows(c: Comparison) -> list[dict[str, Any]]:
+    """Make one row per counted truth agent: its matches and errors; size errors are signed."""
+    truth, other, counted, switched = c.truth, c.other, c.counted, c.switched
+    errors = state_errors(truth, other, c.match, counted)
+    rows, rows_of = [], np.broadcast_to(np.arange(len(truth.ids))[:, None], counted.shape)
+    for i in np.flatnonzero(counted.any(1)):
+        mine, covered = errors.take(errors.truth == i), coverage(c, rows_of == i)
+        ids, ticks = np.unique(mine.other, return_counts=True)
+        size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
+        headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
+        rows.append(
+            {
+                "id": truth.ids[i],
+                "category": str(truth.category[i]),
+                "ticks": int(counted[i].sum()),
+                "matched": len(mine.other),
+                **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
+                "matched_ids": {other.ids[j]: int(n) for j, n in zip(ids, ticks)},
+                "id_switches": int(switched[i].sum()),
+                "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
+                "position_rmse_m": root_mean_square(mine.position_m),
+                "yaw_median_deg": median(np.degrees(headed)),
+                "speed_rmse_mps": root_mean_square(mine.speed_mps),
+                "length_error_m": float(size[0]),
+                "width_error_m": float(size[1]),
+                "height_error_m": float(size[2]),
+            }
+        )
+    return rows
+
+
+def false_rows(other: StateTable, false: Mask, hit: Mask) -> list[dict[str, Any]]:
+    """Make one row per reconstructed agent that is false at some tick."""
+    return [
+        {
+            "id": other.ids[j],
+            "category": str(other.category[j]),
+            "false_ticks": int(false[j].sum()),
+            "matched_ticks": int(hit[j].sum()),
+            "ticks": int(other.present[j].sum()),
+            "mean_range_m": float(other.range_m[j, false[j]].mean()),
+        }
+        for j in np.flatnonzero(false.any(1))
+    ]
+
+
+def ignored_rows(other: StateTable, ignored: Mask) -> list[dict[str, Any]]:
+    """Make one row per reconstructed agent that is ignored at some tick."""
+    return [
+        {
+            "id": other.ids[j],
+            "category": str(other.category[j]),
+            "ignored_ticks": int(ignored[j].sum()),
+            "ticks": int(other.present[j].sum()),
+            "mean_range_m": float(other.range_m[j, ignored[j]].mean()),
+        }
+        for j in np.flatnonzero(ignored.any(1))
+    ]
+
+
+def rounded_tree(value: Any) -> Any:
+    """Round all floats of a document to six decimals; a value that is not finite becomes None."""
+    if isinstance(value, dict):
+        return {k: rounded_tree(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [rounded_tree(v) for v in value]
+    if isinstance(value, float):
+        return round(value, DIGITS) if math.isfinite(value) else None
+    return value
+
+
+Move = Callable[[Array, Array], Array]
+"""Takes states (N, 4), x, y, z in m and heading in rad, at times (N,), s of the truth, to those in the other map."""
+
+
+def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str, Any]]:
+    """Bring a truth into the map of a scenario.
+
+    Returns
+    -------
+    truth : Scenario
+        Unchanged where both maps have the same projection; `Scenario.shift_to` does the rest.
+    placement : dict
+        "method", how both maps were brought together: "same_map", "projection" or "ego_path"; "ego_apart_m", the median
+        distance of the egos in the end, None where not both are known.
+
+    Raises
+    ------
+    ConfigError
+        When positions have no coordinates in the projection of the scenario.
+
+    Notes
+    -----
+    Two projections scale alike only to some tenths of a percent, 0.1 m at 50 m. What moves with time is therefore kept as it
+    is around the true ego, and only the ego is reprojected. Where a georeference is missing and the egos are farther apart
+    than matches may be, the truth is rotated about the vertical and shifted so that front and rear of the egos coincide best
+    (least squares; Kabsch, 1976).
+    """
+    theirs, ours = truth.map, scenario.map
+    if theirs.projection and ours.projection:
+        if theirs.projection == ours.projection:
+            return truth, _placement("same_map", _ego_apart_m(truth, scenario, truth.shift_to(scenario)))
+        altitudes = theirs.altitude_m, ours.altitude_m
+        rise_m = 0.0 if altitudes[0] is None or altitudes[1] is None else altitudes[0] - altitudes[1]
+        target = on_map(theirs, ours.projection, ours.offset_m)
+
+        def reproject(states: Array, _t_s: Array) -> Array:
+            return np.asarray(target.forward(states) + np.array([0, 0, rise_m, 0]))
+
+        method = "projection"
+        far: Move = reproject
+        near: Move = far if truth.ego is None else _around(truth.ego, far)
+    else:
+        apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
+        if apart_m is None or apart_m <= GATE_M:
+            return truth, _placement("same_map", apart_m)
+        method = "ego_path"
+        near = far = _fit_egos(truth, scenario)
+    moved = _moved(truth, near, far)
+    moved = replace(moved, map=scenario.map)
+    return moved, _placement(method, _ego_apart_m(moved, scenario, np.zeros(3)))
+
+
+def describe_placement(placement: dict[str, Any]) -> str | None:
+    """Say how both maps were brought together; None where they are the same."""
+    if placement["method"] == "same_map":
+        return None
+    how = {
+        "projection": "their maps have two projections: the truth was reprojected by latitude and longitude",
+        "ego_path": "their maps are not the same, and no georeference joins them: the truth was put where the egos fit best",
+    }[placement["method"]]
+    apart_m = placement["ego_apart_m"]
+    return how if apart_m is None else f"{how}; then the boxes of the egos are {apart_m:.2f} m apart (median)"
+
+
+def _placement(method: str, ego_apart_m: float | None) -> dict[str, Any]:
+    return {"method": method, "ego_apart_m": ego_apart_m}
+
+
+def _common_egos(truth: Scenario, scenario: Scenario) -> tuple[Array, Array]:
+    """Return states (K, 4) of the true ego and of the other at the times of the latter at which both are known."""
+    if truth.ego is None or scenario.ego is None:
+        return np.zeros((0, 4)), np.zeros((0, 4))
+    t_s = scenario.ego.waypoints.t_s
+    true = truth.ego.at(t_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S)
+    ours = scenario.ego.at(t_s)
+    both = true.valid & ours.valid
+    return tuple(np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)[both] for s in (true, ours))  # type: ignore[return-value]
+
+
+def _ego_apart_m(truth: Scenario, scenario: Scenario, shift_m: Array) -> float | None:
+    true, ours = _common_egos(truth, scenario)
+    gap = true[:, :2] + shift_m[:2] - ours[:, :2]
+    return float(np.median(np.hypot(gap[:, 0], gap[:, 1]))) if len(gap) else None
+
+
+def _fit_egos(truth: Scenario, scenario: Scenario) -> Move:
+    """Return the rigid motion that puts the true ego on the other one, as well as one motion can."""
+    true, ours = _common_egos(truth, scenario)
+    half_m = truth.ego.size_m[0] / 2 if truth.ego is not None else 0.0
+    # Both ends of the ego, so that a standing one has a heading, too.
+    a, b = (
+        np.concatenate(
+            [s[:, :2] + end * np.stack([np.cos(s[:, 3]), np.sin(s[:, 3])], axis=1) for end in (-half_m, half_m)]
+        )
+        for s in (true, ours)
+    )
+    from_m, to_m = a.mean(axis=0), b.mean(axis=0)
+    p, q = a - from_m, b - to_m
+    turn = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))
+    rise_m = float(np.mean(ours[:, 2] - true[:, 2]))
+
+    def move(states: Array, _t_s: Array) -> Array:
+        pivot, goal = np.array([*from_m, 0.0]), np.array([*to_m, rise_m])
+        xyz = (states[:, :3] - pivot) @ rotation_from_rpy(0.0, 0.0, turn).T + goal
+        return np.column_stack([xyz, states[:, 3] + turn])
+
+    return move
+
+
+def _around(ego: Agent, move: Move) -> Move:
+    """Return a motion that keeps what is around the ego as it is, and moves the ego by `move`."""
+
+    def moved(states: Array, t_s: Array) -> Array:
+        s = ego.at(np.clip(t_s, ego.waypoints.t_s[0], ego.waypoints.t_s[-1]))
+        before = np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)
+        after = move(before, t_s)
+        turn = after[:, 3] - before[:, 3]
+        xyz = np.einsum("nij,nj->ni", rotation_from_rpy(0 * turn, 0 * turn, turn), states[:, :3] - before[:, :3])
+        return np.column_stack([xyz + after[:, :3], states[:, 3] + turn])
+
+    return moved
+
+
+def _moved(truth: Scenario, near: Move, far: Move) -> Scenario:
+    """Move agents and views by `near`, and what has no time by `far`."""
+
+    def agent(a: Agent) -> Agent:
+        w = a.waypoints
+        x, y, z, yaw = near(np.stack([w.x_m, w.y_m, w.z_m, w.yaw_rad], axis=1), w.t_s).T
+        return replace(a, waypoints=replace(w, x_m=x, y_m=y, z_m=z, yaw_rad=wrap_angle(yaw)))
+
+    def view(v: LabelView) -> LabelView:
+        states = near(np.column_stack([v.translation_m, np.zeros(len(v.t_s))]), v.t_s)
+        turn = rotation_from_rpy(0 * states[:, 3], 0 * states[:, 3], states[:, 3])
+        rotation = quaternion_from_rotation(turn @ rotation_from_quaternion(v.rotation_wxyz))
+        return replace(v, translation_m=states[:, :3], rotation_wxyz=rotation)
+
+    def points(xyz_m: Array) -> Array:
+        return far(np.column_stack([xyz_m, np.zeros(len(xyz_m))]), np.zeros(len(xyz_m)))[:, :3]
+
+    regions = truth.ignore_regions
+    return replace(
+        truth,
+        agents=tuple(agent(a) for a in truth.agents),
+        ignore_regions=None if regions is None else replace(regions, views=tuple(view(v) for v in regions.views)),
+        map_features=None if truth.map_features is None else truth.map_features.moved(points),
+        signals=tuple(replace(s, position_m=points(s.position_m[None])[0]) for s in truth.signals),
+        # Cells along the axes of the truth's own map.
+        provenance={key: value for key, value in truth.provenance.items() if key != "seen_ground"},
+    )
+
 
 VERSION = 1
 RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))

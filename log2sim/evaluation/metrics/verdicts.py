@@ -1,17 +1,140 @@
-"""What is wrong with each reconstructed agent at each tick: not there, or there in another state than the truth's."""
+"""What is wrong with each reconstructed agent at each tick, by the rules of a metrics file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from log2sim.evaluation.metrics.align import StateTable
-from log2sim.evaluation.metrics.comparison import Comparison
-from log2sim.evaluation.metrics.pairs import Index, Mask
-from log2sim.evaluation.metrics.state_errors import StateErrors, state_errors
-from log2sim.geometry import Array, rectangles_overlap
+from log2sim.datatypes import GROUPS, Scenario
+from log2sim.evaluation.metrics.comparison import (
+    GATE_M,
+    GATE_PER_LENGTH,
+    MAX_FRAME_LAG_S,
+    MAX_TRUTH_GAP_S,
+    MIN_HIT_POINTS,
+    MIN_REGION_SHARE,
+    Comparison,
+    Index,
+    Mask,
+    StateTable,
+)
+from log2sim.geometry import Array, rectangles_overlap, wrap_angle
+
+MIN_WALKING_MPS = 0.5
+"""The heading of a slower pedestrian does not count."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateErrors:
+    """Errors of K matched agent-ticks.
+
+    Attributes
+    ----------
+    truth, tick, other : (K,) int64
+        Indices of the truth agent, the tick and the reconstructed agent.
+    position_m : (K,) float64
+        2D distance of box centers.
+    yaw_rad : (K,) float64
+        Absolute, in [0, pi]; NaN where yaw does not count.
+    speed_mps : (K,) float64
+        Signed.
+    size_m : (K, 3) float64
+        Signed errors of length, width, height.
+    """
+
+    truth: Index
+    tick: Index
+    other: Index
+    position_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    size_m: Array
+
+    def take(self, index: Mask) -> StateErrors:
+        """Return the rows at `index`."""
+        return StateErrors(
+            self.truth[index],
+            self.tick[index],
+            self.other[index],
+            self.position_m[index],
+            self.yaw_rad[index],
+            self.speed_mps[index],
+            self.size_m[index],
+        )
+
+
+def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64], counted: Mask) -> StateErrors:
+    """Compare matched states at the counted ticks.
+
+    Notes
+    -----
+    Yaw counts for vehicles, two-wheelers and pedestrians of at least 0.5 m/s. The speed of a box turned by more than 90
+    degrees is taken along the truth's heading, so that a flipped box is an error of yaw only.
+    """
+    i, t = np.nonzero(counted & (match >= 0))
+    j = match[i, t]
+    gap = other.xy_m[j, t] - truth.xy_m[i, t]
+    yaw = np.abs(wrap_angle(other.yaw_rad[j, t] - truth.yaw_rad[i, t]))
+    sign = np.where(yaw > np.pi / 2, -1.0, 1.0)
+    walking = (truth.group[i] != "pedestrian") | (np.abs(truth.speed_mps[i, t]) >= MIN_WALKING_MPS)
+    headed = walking & (truth.group[i] != "other")
+    return StateErrors(
+        truth=i,
+        tick=t,
+        other=j,
+        position_m=np.hypot(gap[:, 0], gap[:, 1]),
+        yaw_rad=np.where(headed, yaw, np.nan),
+        speed_mps=sign * other.speed_mps[j, t] - truth.speed_mps[i, t],
+        size_m=other.size_m[j] - truth.size_m[i],
+    )
+
+
+def summarize(errors: StateErrors) -> dict[str, float | None]:
+    """Summarize all rows; a figure without rows is None.
+
+    Notes
+    -----
+    Sizes are constant per agent, so their medians run over truth agents, each with its mean over matched ticks;
+    `size_median_m` is the median of the mean absolute error over length, width and height. `ade_m` is the mean over
+    truth agents of their mean distance.
+    """
+    headed = errors.yaw_rad[np.isfinite(errors.yaw_rad)]
+    by_agent = agent_means(errors.truth, np.column_stack([np.abs(errors.size_m), errors.position_m]))
+    return {
+        "position_rmse_m": root_mean_square(errors.position_m),
+        "position_median_m": median(errors.position_m),
+        "ade_m": float(by_agent[:, 3].mean()) if len(by_agent) else None,
+        "yaw_median_deg": median(np.degrees(headed)),
+        "yaw_flipped": float(np.mean(headed > np.pi / 2)) if len(headed) else None,
+        "speed_rmse_mps": root_mean_square(errors.speed_mps),
+        "size_median_m": median(by_agent[:, :3].mean(axis=1)),
+        "length_median_m": median(by_agent[:, 0]),
+        "width_median_m": median(by_agent[:, 1]),
+        "height_median_m": median(by_agent[:, 2]),
+    }
+
+
+def agent_means(agent: Index, values: Array) -> Array:
+    """Average values (K, V) over the rows of each agent that occurs in `agent` (K,): (A', V)."""
+    names, index, count = np.unique(agent, return_inverse=True, return_counts=True)
+    total = np.zeros((len(names), values.shape[1]))
+    np.add.at(total, index, values)
+    return total / count[:, None]
+
+
+def root_mean_square(values: Array) -> float | None:
+    """Compute the root mean square of values (K,); None without any."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def median(values: Array) -> float | None:
+    """Compute the median of values (K,); None without any."""
+    return float(np.median(values)) if len(values) else None
+
 
 MAX_SPEED_ERROR_MPS = 1.0
 """Six standard deviations of a speed from labels with 5 cm of noise at 10 Hz, 0.16 m/s; see `truth.speed_along`."""
@@ -215,3 +338,69 @@ def _marked(shape: tuple[int, ...], agent: Index, tick: Index) -> Mask:
     mask = np.zeros(shape, dtype=bool)
     mask[agent, tick] = True
     return mask
+
+
+IGNORED_RULE = (
+    "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels may be incomplete there: "
+    f"every labeled camera that shows it (a frame within {MAX_FRAME_LAG_S:g} s) has at least {MIN_REGION_SHARE:g} of its "
+    "outline inside the image in regions left without labels, or no labeled camera shows any of it and only what these "
+    "cameras see was labeled, or its category was never labeled"
+)
+
+
+def matching_rules() -> dict[str, Any]:
+    """Describe how agents are matched."""
+    return {
+        "gate_m": GATE_M,
+        "gate_per_length": GATE_PER_LENGTH,
+        "groups": {name: list(members) for name, members in GROUPS.items()},
+        "rule": "one to one per tick by 2D distance of box centers within max(gate_m, gate_per_length x true length); "
+        "last match kept while within the gate, then most pairs with least total distance; "
+        "categories of one group match freely, across groups a match is neither found nor false",
+        "similarity": "HOTA: 1 - distance / gate, mean over thresholds 0.05 to 0.95",
+        "yaw": f"vehicles, two-wheelers and pedestrians of at least {MIN_WALKING_MPS:g} m/s; flipped: more than 90 degrees",
+        "speed": "signed along the heading; along the true heading where the box is flipped",
+        "size": "median over truth agents of the mean absolute error of length, width and height",
+    }
+
+
+def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
+    """Describe what is counted; `min_s` is the shortest counted time of a truth agent, s."""
+    return {
+        "min_s": min_s,
+        "max_truth_gap_s": MAX_TRUTH_GAP_S,
+        "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
+        "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
+        "visible or not, counted or not, matches it, but for the ignored ones",
+        "hit": f"within range, selected and at least {MIN_HIT_POINTS} points of all LiDARs in the box, visible or not",
+        "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth states that it is complete",
+        "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
+    }
+
+
+def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str, Any]:
+    """Describe what is wrong with an agent, and when a scenario doubts one; see `verdicts.judge`."""
+    return {
+        "judged": "ticks of a reconstructed agent at which it matches a labeled object, or matches none and the labels "
+        "are complete there; shares are of these ticks, ranges those of the reconstructed agent",
+        "invented": "no labeled object of its kind, matched or not, within the gate of the matching",
+        "duplicate": "such an object is within the gate, but another agent matches it",
+        "in_ego": "its footprint overlaps the ego's, and that of the labeled object that it matches does not; judged also "
+        "where the labels may be incomplete",
+        "wrong_speed": f"matched, and the speed along the true heading is off by more than {MAX_SPEED_ERROR_MPS:g} m/s",
+        "wrong_motion": f"matched, and stands (below {MAX_STANDING_MPS:g} m/s) while the truth moves (from "
+        f"{MIN_MOVING_MPS:g} m/s), moves while it stands, or both move (from {MAX_STANDING_MPS:g} m/s) more than 90 "
+        "degrees apart",
+        "backwards": "matched, and the heading is off by more than 90 degrees; standing pedestrians and category other "
+        "have none",
+        "wrong_size": f"matched, and the length or width is off by more than {MAX_SIZE_ERROR_SHARE:.0%} of the true one "
+        f"and by more than {MIN_SIZE_ERROR_M:g} m",
+        "wrong_class": "the matched object, or the nearest within the gate, has another category; no reason to be wrong",
+        "wrong": f"at a tick, any of {', '.join(MEASURES)}; of agents, and likewise for each measure, more than "
+        f"{max_wrong_share:.0%} of the ticks",
+        "doubted": f"the scenario doubts the agent at the tick, or gives it a confidence below {min_confidence:g}; of agents, at any tick",
+        "sigma": "nees: mean of squared position errors of matched ticks over two times the squared sigma, 1 expected; "
+        "median, 0.69 expected; within_95: share inside of the 95 % circle, 0.95 expected",
+        "sigma_yaw": "likewise of yaw, up to half turns; median, 0.45 expected",
+        "sigma_speed": "likewise of speed; median, 0.45 expected",
+    }

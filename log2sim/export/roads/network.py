@@ -1,18 +1,296 @@
-"""Roads of OpenDRIVE out of lanes: those side by side become one road, those of a junction its connecting roads."""
+"""Roads of OpenDRIVE out of lanes: those next to each other become one road."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
-from log2sim.datatypes import MapLane
-from log2sim.export.roads.road import Link, Road, connecting_road, cross_heading, road_of_lanes
-from log2sim.lanes.graph.polyline import Polyline
+from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
+from log2sim.export.roads.cutting import ALIGNED_M, cut_together, is_connection
+from log2sim.export.roads.reference_line import ReferenceLine, fit
+from log2sim.geometry import Array
+from log2sim.road.polyline import Polyline
 
-ALIGNED_M = 0.3
-"""Lanes side by side whose ends are farther apart along the road than this are roads of their own."""
+LEVEL_M = 5.0
+"""Length over which heights are averaged against their noise."""
+
+EXACT_M = 0.002
+"""How far widths between stations may be from what is written."""
+
+
+def elevation_profile(stations: Array, ground_m: Array, length_m: float) -> Array:
+    """Fit cubics (K, 5) s, a, b, c, d through heights (N,) at the ends and their means every `LEVEL_M`, without overshoot.
+
+    Before and after the stations the slope at the ends continues.
+    """
+    block = np.floor((stations - stations[0]) / LEVEL_M).astype(int)
+    _, first, counts = np.unique(block, return_index=True, return_counts=True)
+    s, z = (np.add.reduceat(v, first) / counts for v in (stations, ground_m))
+    inner = (s > stations[0] + LEVEL_M / 4) & (s < stations[-1] - LEVEL_M / 4)
+    s = np.concatenate([stations[:1], s[inner], stations[-1:]])
+    z = np.concatenate([ground_m[:1], z[inner], ground_m[-1:]])
+    grade = np.diff(z) / np.diff(s)
+    z = np.concatenate([[z[0] - grade[0] * s[0]], z, [z[-1] + grade[-1] * (length_m - s[-1])]])
+    return cubics_through(np.concatenate([[0.0], s, [length_m]]), z)
+
+
+def cubics_through(stations: Array, values: Array) -> Array:
+    """Return cubics (K, 5) s, a, b, c, d from station 0 on through values (N,) at stations (N,), without overshoot."""
+    from scipy.interpolate import PchipInterpolator
+
+    s, v = stations, np.asarray(values, dtype=np.float64)
+    if s[0] > 1e-6:
+        s, v = np.concatenate([[0.0], s]), np.concatenate([v[:1], v])
+    apart = np.concatenate([np.diff(s) > 1e-6, [True]])
+    s, v = s[apart], v[apart]
+    if np.ptp(v) < EXACT_M / 10:
+        return np.array([[0.0, v[0], 0.0, 0.0, 0.0]])
+    d, c, b, a = PchipInterpolator(s, v).c
+    return _merged_cubics(np.column_stack([s[:-1], a, b, c, d]))
+
+
+def _merged_cubics(rows: Array) -> Array:
+    """Drop cubics (K, 5) that only continue the one before, which checkers call redundant."""
+    kept = [rows[0]]
+    for row in rows[1:]:
+        s, a, b, c, d = kept[-1]
+        h = row[0] - s
+        goes_on = [a + h * (b + h * (c + h * d)), b + h * (2 * c + 3 * h * d), c + 3 * h * d, d]
+        if np.abs(row[1:] - goes_on).max() > 2e-6:
+            kept.append(row)
+    return np.array(kept)
+
+
+USUAL_WIDTH_M = 0.12
+"""Of lane lines: 12 cm on most roads (RMS 1993)."""
+
+
+@dataclass(frozen=True)
+class RoadMark:
+    """A mark at the edge of a lane: its kind, "solid", "broken", "curb" or "none", color and width."""
+
+    kind: str
+    color: str = "standard"
+    width_m: float = USUAL_WIDTH_M
+
+
+@dataclass(frozen=True)
+class MarkFinder:
+    """Finds the marks at the edges of lanes among markings and borders by their ids."""
+
+    sides: Mapping[str, Marking | RoadBorder]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> MarkFinder:
+        """Collect the markings and borders of a scenario."""
+        features = scenario.map_features
+        found: dict[str, Marking | RoadBorder] = {}
+        if features is not None:
+            found |= {marking.id: marking for marking in features.markings}
+            found |= {border.id: border for border in features.borders}
+        return cls(found)
+
+    def left_of(self, lane: MapLane) -> RoadMark:
+        """Return the mark at the left edge of a lane."""
+        return self._mark(lane.left)
+
+    def right_of(self, lane: MapLane) -> RoadMark:
+        """Return the mark at the right edge of a lane."""
+        return self._mark(lane.right)
+
+    def _mark(self, name: str | None) -> RoadMark:
+        item = self.sides.get(name) if name is not None else None
+        if isinstance(item, RoadBorder):
+            return RoadMark("curb") if item.kind == "curb" else RoadMark("none")
+        if item is None:
+            return RoadMark("none")
+        return RoadMark("broken" if item.kind == "dashed" else "solid", item.color or "standard", item.width_m)
+
+
+EXTENSION_M = 10.0
+"""Roads go on straight for so long where nothing is known of what is before or after them, so that whole vehicles are on them."""
+
+STEP_M = 2.0
+"""Stations at which widths are taken."""
+
+
+TAPER_M = 10.0
+"""Over so much of its length a lane changes to the width that it has in the next road."""
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """The start or the end of a lane as a road has it: x, y, z, heading (4,) of the road's cross section, and the lane's width."""
+
+    pose: Array
+    width_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """What is before or after a road.
+
+    Attributes
+    ----------
+    kind : str
+        "road" or "junction".
+    number : int
+        Its id.
+    lanes : mapping of int to int
+        Lane ids of this road and those of the other, empty for a junction.
+    point : int
+        Start (0) or end (-1) of the other road.
+    """
+
+    kind: str
+    number: int
+    lanes: Mapping[int, int] = field(default_factory=dict)
+    point: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """A road whose reference line is the middle of one of the lanes that lead along it.
+
+    Attributes
+    ----------
+    number : int
+        Its id.
+    lanes : tuple of MapLane
+        Along the line, from the left to the right: lane -1, -2, ...
+    elevation, offset : (K, 5) float64
+        Stations and coefficients a, b, c, d of cubics: the height, and how far the left edge of lane -1 is left of the line.
+    widths, opposite_widths : tuple of (K, 5) float64
+        Of the lanes, along the line.
+    opposite : tuple of MapLane
+        Against the line, from the right to the left: lane 1, 2, ...
+    """
+
+    number: int
+    lanes: tuple[MapLane, ...]
+    line: ReferenceLine
+    elevation: Array
+    offset: Array
+    widths: tuple[Array, ...]
+    opposite: tuple[MapLane, ...] = ()
+    opposite_widths: tuple[Array, ...] = ()
+    junction: int | None = None
+    before: Link | None = None
+    after: Link | None = None
+
+
+def road_of_lanes(
+    number: int,
+    group: Sequence[MapLane],
+    opposite: Sequence[MapLane],
+    headings: tuple[float | None, float | None],
+    free: tuple[bool, bool],
+    met: Mapping[tuple[str, int], End],
+) -> tuple[Road, dict[tuple[str, int], End]]:
+    """Return a road of lanes side by side, some of which may lead the opposite way, and the ends of its lanes in their own direction.
+
+    Near ends that meet those of lanes of other roads its lanes go over to their edges.
+    """
+    across = [*map(_turned, opposite[::-1]), *group]
+    base = _surest(group)
+    shared = [cross_heading(across, at) if h is None else h for at, h in zip((0, -1), headings)]
+    poses = [None if f else np.array([*p[:2], h]) for f, p, h in zip(free, base.points_m[[0, -1]], shared)]
+    line, stations = fit(base.points_m[:, :2], poses[0], poses[1])
+    s = _width_stations(line)
+    edges = _edges(across, base, line.at(s))
+    for at in (0, -1):
+        near = np.clip(1.0 - np.abs(s - s[at]) / min(TAPER_M, line.length_m), 0.0, 1.0)
+        near = near**2 * (3.0 - 2.0 * near)
+        x, y, heading = line.at(s)[at]
+        for row, lane in enumerate(across):
+            other = met.get((lane.id, -1 - at if row < len(opposite) else at))
+            if other is not None:
+                aside = (other.pose[1] - y) * np.cos(heading) - (other.pose[0] - x) * np.sin(heading)
+                for k, edge in ((row, aside + other.width_m / 2), (row + 1, aside - other.width_m / 2)):
+                    edges[k] += (edge - edges[k, at]) * near
+    ends = {}
+    for at in (0, -1):
+        x, y, z = base.points_m[at]
+        heading = shared[at] if not free[at] else float(line.at(np.array([0.0, line.length_m]))[at, 2])
+        for row, lane in enumerate(across):
+            middle, width = edges[row : row + 2, at].mean(), edges[row, at] - edges[row + 1, at]
+            own, turn = (-1 - at, np.pi) if row < len(opposite) else (at, 0.0)
+            pose = np.array([x - middle * np.sin(heading), y + middle * np.cos(heading), z, heading + turn])
+            ends[lane.id, own] = End(pose, float(width))
+    before, after = (EXTENSION_M if f else 0.0 for f in free)
+    line = line.extended(before, after)
+    stations = stations + before
+    at_m = s + before
+    widths = tuple(cubics_through(at_m, edges[row] - edges[row + 1]) for row in range(len(across)))
+    elevation = elevation_profile(stations, base.points_m[:, 2], line.length_m)
+    middle = len(opposite)
+    return Road(
+        number, tuple(group), line, elevation, cubics_through(at_m, edges[middle]), widths[middle:], tuple(opposite),
+        widths[:middle][::-1],
+    ), ends  # fmt: skip
+
+
+def _turned(lane: MapLane) -> MapLane:
+    """Return a lane from its end to its start."""
+    return replace(lane, points_m=lane.points_m[::-1], width_m=lane.width_m[::-1])
+
+
+def connecting_road(number: int, lane: MapLane, start: End, end: End) -> Road:
+    """Return a road of one lane that begins and ends as the roads that it connects."""
+    points = lane.points_m.copy()
+    line, stations = fit(points[:, :2], start.pose[[0, 1, 3]], end.pose[[0, 1, 3]])
+    points[[0, -1], 2] = start.pose[2], end.pose[2]
+    width = cubics_through(np.array([0.0, line.length_m]), np.array([start.width_m, end.width_m]))
+    elevation = elevation_profile(stations, points[:, 2], line.length_m)
+    return Road(number, (lane,), line, elevation, width * [1.0, 0.5, 0.5, 0.5, 0.5], (width,))
+
+
+def cross_heading(group: Sequence[MapLane], at: int) -> float:
+    """Return the heading of lanes at their start (0) or end (-1): square to the line across several of them."""
+    if len(group) > 1:
+        across = group[0].points_m[at] - group[-1].points_m[at]
+        return float(np.arctan2(across[1], across[0]) - np.pi / 2)
+    return float(Polyline(group[0].points_m).heading_rad[at])
+
+
+def _surest(group: Sequence[MapLane]) -> MapLane:
+    """Return the lane whose middle is the reference line of a road."""
+    return max(group, key=lambda lane: (lane.confidence, -len(lane.id), lane.id))
+
+
+def _width_stations(line: ReferenceLine) -> Array:
+    return np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / STEP_M)), 1) + 1)
+
+
+def _edges(group: Sequence[MapLane], base: MapLane, reference: Array) -> Array:
+    """Return how far left of points (N, 3) x, y, heading of a line the edges (G + 1, N) of G lanes are; neighbors share theirs.
+
+    The middle of the lane `base` is the line itself.
+    """
+    share = np.linspace(0.0, 1.0, len(reference))
+    heading = reference[:, 2]
+    middles, widths = [], []
+    for lane in group:
+        line = Polyline(lane.points_m)
+        feet = _across(reference, line, share * line.length_m)
+        gap = line.at(feet)[:, :2] - reference[:, :2]
+        middle = gap[:, 1] * np.cos(heading) - gap[:, 0] * np.sin(heading)
+        middles.append(np.zeros(len(share)) if lane is base else middle)
+        widths.append(np.interp(feet, line.s_m, lane.width_m))
+    m, h = np.array(middles), np.array(widths) / 2
+    return np.concatenate([m[:1] + h[:1], (m[:-1] - h[:-1] + m[1:] + h[1:]) / 2, m[-1:] - h[-1:]])
+
+
+def _across(reference: Array, line: Polyline, s: Array) -> Array:
+    """Return the stations (N,) of a line straight across from points (N, 3) x, y, heading, starting from a guess."""
+    along = np.column_stack([np.cos(reference[:, 2]), np.sin(reference[:, 2])])
+    for _ in range(8):
+        gap = line.at(s)[:, :2] - reference[:, :2]
+        s = np.clip(s - (gap * along).sum(axis=1), 0.0, line.length_m)
+    return np.asarray(s)
 
 
 @dataclass(frozen=True)
@@ -34,42 +312,76 @@ class Network:
     connections: tuple[Connection, ...]
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a lane is: in which road, as which lane of it, and whether it leads along it."""
+
+    road: int
+    lane: int
+
+    @property
+    def start(self) -> int:
+        """Return the end of the road, 0 or -1, at which the lane starts."""
+        return 0 if self.lane < 0 else -1
+
+    @property
+    def end(self) -> int:
+        """Return the end of the road, 0 or -1, at which the lane ends."""
+        return -1 - self.start
+
+
 def build_network(lanes: Sequence[MapLane]) -> Network:
     """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
-    by_id = {lane.id: lane for lane in lanes}
-    crossing = {lane.id for lane in lanes if _is_connection(lane, by_id)}
-    groups = _groups([lane for lane in lanes if lane.id not in crossing], by_id)
-    place = {lane.id: (k + 1, -1 - row) for k, group in enumerate(groups) for row, lane in enumerate(group)}
-    place |= {name: (len(groups) + k + 1, -1) for k, name in enumerate(sorted(crossing, key=list(by_id).index))}
-    names = list(dict.fromkeys(str(by_id[name].junction) for name in by_id if name in crossing))
+    refused: set[frozenset[str]] = set()
+    while True:
+        parts = cut_together(lanes, refused)
+        by_id = {lane.id: lane for lane in parts}
+        crossing = {lane.id for lane in parts if is_connection(lane, by_id)}
+        sides = _with_opposites(_groups([lane for lane in parts if lane.id not in crossing], by_id))
+        plain = {k + 1: pair for k, pair in enumerate(sides)}
+        place: dict[str, _Place] = {}
+        for number, (group, opposite) in plain.items():
+            place |= {lane.id: _Place(number, -1 - row) for row, lane in enumerate(group)}
+            place |= {lane.id: _Place(number, 1 + row) for row, lane in enumerate(opposite)}
+        torn = _torn(plain, place, by_id) - refused
+        if not torn:
+            break
+        refused |= torn
+    inside = sorted(crossing, key=list(by_id).index)
+    place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
+    names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
-    plain = {k + 1: group for k, group in enumerate(groups)}
     headings = _shared_headings(plain, place, by_id)
-    roads, ends = [], {}
-    for number, group in plain.items():
-        before, after = (_link(group, place, by_id, number_of, way) for way in ("predecessors", "successors"))
+    roads: list[Road] = []
+    ends: dict[tuple[str, int], End] = {}
+    # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
+    for number, (group, opposite) in sorted(plain.items(), key=lambda item: -len(item[1][0]) - len(item[1][1])):
+        before, after = (_link([*group, *opposite], place, by_id, number_of, at) for at in (0, -1))
         road, own = road_of_lanes(
-            number, group, (headings.get((number, 0)), headings.get((number, -1))), (before is None, after is None)
+            number,
+            group,
+            opposite,
+            (headings.get((number, 0)), headings.get((number, -1))),
+            (before is None, after is None),
+            _met([*group, *opposite], place, (before, after), ends),
         )
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
+    roads.sort(key=lambda road: road.number)
     connections = []
-    for name in sorted(crossing, key=list(by_id).index):
+    for name in inside:
         lane = by_id[name]
         origin, target = lane.predecessors[0], lane.successors[0]
-        road = connecting_road(place[name][0], lane, ends[origin, -1], ends[target, 0])
-        links = [Link("road", place[other][0], {-1: place[other][1]}) for other in (origin, target)]
+        one, two = place[origin], place[target]
+        road = connecting_road(place[name].road, lane, ends[origin, -1], ends[target, 0])
+        before, after = (
+            Link("road", one.road, {-1: one.lane}, one.end),
+            Link("road", two.road, {-1: two.lane}, two.start),
+        )
         junction = number_of[str(lane.junction)]
-        roads.append(replace(road, junction=junction, before=links[0], after=links[1]))
-        connections.append(Connection(junction, place[origin][0], road.number, place[origin][1]))
+        roads.append(replace(road, junction=junction, before=before, after=after))
+        connections.append(Connection(junction, one.road, road.number, one.lane))
     return Network(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
-
-
-def _is_connection(lane: MapLane, by_id: Mapping[str, MapLane]) -> bool:
-    """Whether a lane of a junction leads from one lane outside to another."""
-    if lane.junction is None or len(lane.predecessors) != 1 or len(lane.successors) != 1:
-        return False
-    return all(by_id[name].junction is None for name in (*lane.predecessors, *lane.successors))
 
 
 def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list[MapLane]]:
@@ -94,58 +406,138 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
     return found
 
 
+def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane], list[MapLane]]]:
+    """Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road."""
+    by_left = {group[0].id: group for group in groups}
+    found: list[tuple[list[MapLane], list[MapLane]]] = []
+    taken: set[str] = set()
+    for group in groups:
+        if group[0].id in taken:
+            continue
+        other = by_left.get(str(group[0].opposite), [])
+        if other and not (other[0].opposite == group[0].id and _faces(group[0], _turned(other[0]))):
+            other = []
+        taken |= {side[0].id for side in (group, other) if side}
+        found.append((group, other) if _surest([*group, *other]) in group else (other, group))
+    return found
+
+
+def _faces(lane: MapLane, other: MapLane) -> bool:
+    """Whether another lane begins and ends with a lane, to the left of it."""
+    heading = float(Polyline(lane.points_m).heading_rad[0])
+    gap = other.points_m[0] - lane.points_m[0]
+    return bool(gap[1] * np.cos(heading) > gap[0] * np.sin(heading)) and _aligned(lane, other)
+
+
+def _torn(
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
+) -> set[frozenset[str]]:
+    """Return pairs of neighbors in a road, by their names before cuts, that go on in different roads or junctions at one end of it.
+
+    A road has one neighbor at each end, so that such lanes would lose their links.
+    """
+    found: set[frozenset[str]] = set()
+    for group, opposite in plain.values():
+        across = [*opposite[::-1], *group]
+        for at in (0, -1):
+            reached: dict[str, set[tuple[int, str | None]]] = {lane.id: set() for lane in across}
+            for lane, name in _linked(across, place, at):
+                inside = is_connection(by_id[name], by_id)
+                reached[lane.id].add((0, by_id[name].junction) if inside else (place[name].road, None))
+            linked = [k for k, lane in enumerate(across) if reached[lane.id]]
+            for one, two in pairwise(linked):
+                if reached[across[one].id] != reached[across[two].id]:
+                    found.add(frozenset(across[k].id.partition("/")[0] for k in (one, one + 1)))
+    return found
+
+
 def _aligned(one: MapLane, two: MapLane) -> bool:
-    """Whether two lanes begin and end at the same line across the road."""
+    """Whether two lanes begin and end at the same line across the road, seen from either."""
     for at in (0, -1):
-        heading = Polyline(one.points_m).heading_rad[at]
         gap = two.points_m[at] - one.points_m[at]
-        if abs(gap[0] * np.cos(heading) + gap[1] * np.sin(heading)) > ALIGNED_M:
+        headings = [float(Polyline(lane.points_m).heading_rad[at]) for lane in (one, two)]
+        if min(abs(gap[0] * np.cos(h) + gap[1] * np.sin(h)) for h in headings) > ALIGNED_M:
             return False
     return True
 
 
 def _link(
     group: Sequence[MapLane],
-    place: Mapping[str, tuple[int, int]],
+    place: Mapping[str, _Place],
     by_id: Mapping[str, MapLane],
     number_of: Mapping[str, int],
-    way: str,
+    at: int,
 ) -> Link | None:
-    """Return what follows a road: a junction, the one road to which its lanes go on and from which no other comes, or None."""
-    back = "successors" if way == "predecessors" else "predecessors"
-    names = [(lane, name) for lane in group for name in getattr(lane, way)]
+    """Return what adjoins a road at its start (0) or end (-1).
+
+    That is a junction, the one road with which its lanes are linked there one to one, and no others there, or None.
+    """
+    names = _linked(group, place, at)
     for _, name in names:
-        junction = by_id[name].junction
-        if _is_connection(by_id[name], by_id):
-            return Link("junction", number_of[str(junction)])
-    roads = {place[name][0] for _, name in names}
-    if (
-        len(roads) != 1
-        or len({lane.id for lane, _ in names}) < len(names)
-        or len({name for _, name in names}) < len(names)
-    ):
+        if is_connection(by_id[name], by_id):
+            return Link("junction", number_of[str(by_id[name].junction)])
+    own = place[group[0].id].road
+    there = {(place[name].road, _met_at(lane, name, place, at)) for lane, name in names}
+    if len(there) != 1 or any(len(set(side)) < len(names) for side in zip(*((a.id, b) for a, b in names))):
         return None
-    (number,) = roads
-    others = [lane for name, lane in by_id.items() if place[name][0] == number]
-    sources = {place[name][0] for lane in others for name in getattr(lane, back)}
-    if sources != {place[group[0].id][0]} or any(len(getattr(lane, back)) > 1 for lane in others):
+    ((number, point),) = there
+    others = [lane for name, lane in by_id.items() if place[name].road == number]
+    back = {(name, lane.id) for lane, name in _linked(others, place, point)}
+    if back != {(lane.id, name) for lane, name in names} or number == own:
         return None
-    return Link("road", number, {place[lane.id][1]: place[name][1] for lane, name in names})
+    return Link("road", number, {place[lane.id].lane: place[name].lane for lane, name in names}, point)
+
+
+def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> list[tuple[MapLane, str]]:
+    """Return the lanes of a road with those that adjoin them at its start (0) or end (-1)."""
+    return [
+        (lane, name) for lane in group for name in (lane.successors if place[lane.id].end == at else lane.predecessors)
+    ]
+
+
+def _met(
+    group: Sequence[MapLane],
+    place: Mapping[str, _Place],
+    links: tuple[Link | None, Link | None],
+    ends: Mapping[tuple[str, int], End],
+) -> dict[tuple[str, int], End]:
+    """Return the ends, as far as they are there, of the lanes that those of a road are linked with, by lane and its start or end."""
+    found = {}
+    for at in (0, -1):
+        link = links[at]
+        for lane, name in _linked(group, place, at) if link is not None and link.kind == "road" else ():
+            own = -1 if place[lane.id].end == at else 0
+            if (name, -1 - own) in ends:
+                found[lane.id, own] = ends[name, -1 - own]
+    return found
+
+
+def _met_at(lane: MapLane, name: str, place: Mapping[str, _Place], at: int) -> int:
+    """Return at which end, 0 or -1, of its road a lane adjoins another one whose road meets it at `at`."""
+    return place[name].start if place[lane.id].end == at else place[name].end
 
 
 def _shared_headings(
-    plain: Mapping[int, Sequence[MapLane]], place: Mapping[str, tuple[int, int]], by_id: Mapping[str, MapLane]
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
 ) -> dict[tuple[int, int], float]:
     """Return the headings of cross sections where two roads meet, by road and end (0 or -1)."""
     found: dict[tuple[int, int], float] = {}
-    for number, group in plain.items():
-        for lane in group:
+    across = {number: [*map(_turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
+    for number, sides in plain.items():
+        for lane in (*sides[0], *sides[1]):
             for name in lane.successors:
-                if by_id[name].junction is not None or (number, -1) in found:
+                one, two = place[lane.id], place[name]
+                if two.road not in plain or (number, one.end) in found or (two.road, two.start) in found:
                     continue
-                other = place[name][0]
-                one, two = cross_heading(group, -1), cross_heading(plain[other], 0)
-                turn = float(np.angle(np.exp(1j * (two - one))))
-                share = 0.5 if (len(group) > 1) == (len(plain[other]) > 1) else 0.0 if len(group) > 1 else 1.0
-                found[number, -1] = found[other, 0] = one + share * turn
+                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
+                first = cross_heading(across[number], one.end) + turns[0]
+                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
+                wide = [len(across[k]) > 1 for k in (number, two.road)]
+                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
+                found[number, one.end] = first + share * turn - turns[0]
+                found[two.road, two.start] = first + share * turn - turns[1]
     return found

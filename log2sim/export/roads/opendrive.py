@@ -1,23 +1,269 @@
-"""OpenDRIVE 1.7: the roads of a scenario as a file, or the user's own file in their place."""
+"""OpenDRIVE 1.7: the roads of a scenario as a file, with crosswalks and traffic lights, checked."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import MapFrame, Scenario
-from log2sim.errors import ConfigError
-from log2sim.export.placement import ExportPlacement, near_origin, on_map
-from log2sim.export.roads.checks import require_roads
-from log2sim.export.roads.lanes import lanes
-from log2sim.export.roads.marks import MarkFinder, RoadMark
-from log2sim.export.roads.network import Network, build_network
-from log2sim.export.roads.road import Road
-from log2sim.export.roads.road_objects import RoadObjects, add_objects, add_signals
+from log2sim.datatypes import Agent, MapFeatures, MapFrame, MapLane, Marking, Scenario, Signal
+from log2sim.errors import ConfigError, ScenarioError
+from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
+from log2sim.export.roads.network import MarkFinder, Network, Road, RoadMark, build_network
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
+from log2sim.geometry import Array, wrap_angle
+from log2sim.road.lane_graph import add_missing_lanes, infer_lanes
+from log2sim.road.polyline import Polyline
+
+STANDING_M = 20.0
+"""Length of the lane under an agent that stands, where nobody moves: its whole vehicle is on it."""
+
+STANDING_WIDTH_M = 3.5
+"""Of that lane, as of lanes along paths."""
+
+
+def lanes(scenario: Scenario) -> tuple[MapLane, ...]:
+    """Return the lanes of a scenario: those of its map features, else inferred ones, and more where paths leave them.
+
+    Where no vehicle moves, there is a straight one under the agent that moves farthest.
+    """
+    features = scenario.map_features or MapFeatures()
+    if features.lanes:
+        return add_missing_lanes(features.lanes, scenario)
+    found, _ = infer_lanes(features.markings, features.borders, scenario)
+    return found or (_lane_of_standing_agent(_first_agent(scenario)),)
+
+
+def _first_agent(scenario: Scenario) -> Agent:
+    vehicles = [a for a in scenario.agents if a.category != "pedestrian"] or list(scenario.agents)
+    return scenario.ego or max(
+        vehicles, key=lambda a: float(np.hypot(np.ptp(a.waypoints.x_m), np.ptp(a.waypoints.y_m)))
+    )
+
+
+def _lane_of_standing_agent(agent: Agent) -> MapLane:
+    w = agent.waypoints
+    x, y, yaw = (float(np.mean(v)) for v in (w.x_m, w.y_m, np.unwrap(w.yaw_rad)))
+    ground = float(np.mean(w.z_m)) - agent.size_m[2] / 2
+    ahead = np.array([-STANDING_M / 2, STANDING_M / 2])
+    points = np.column_stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), [ground, ground]])
+    return MapLane(
+        "lane-1",
+        points,
+        np.full(2, max(STANDING_WIDTH_M, agent.size_m[1] + 0.8)),
+        inferred_from="paths",
+        confidence=0.0,
+    )
+
+
+def edges_of(lane: MapLane) -> tuple[Array, Array]:
+    """Return the left and the right edge (N, 3) of a lane, point by point."""
+    heading = Polyline(lane.points_m).heading_rad
+    left = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(len(heading))])
+    half = lane.width_m[:, None] / 2
+    return lane.points_m + left * half, lane.points_m - left * half
+
+
+FACING_RAD = float(np.deg2rad(40.0))
+"""Lamps face the traffic that they are for; posts beside the road turn them by some degrees towards it."""
+
+REACH_M = 40.0
+"""A light beyond a junction is at most so far from where its lanes end: across six lanes and two sidewalks."""
+
+ASIDE_M = 12.0
+"""It is at most so far beside the middle of a lane: three lanes and a sidewalk."""
+
+
+def signal_lanes(signal: Signal, lanes: Sequence[MapLane]) -> list[MapLane]:
+    """Return the lanes into a junction that lead towards the face of a light; none where its heading is unknown."""
+    if signal.heading_rad is None:
+        return []
+    by_id = {lane.id: lane for lane in lanes}
+    found = []
+    for lane in lanes:
+        inside = [name for name in lane.successors if by_id[name].junction is not None]
+        if lane.junction is not None or not inside:
+            continue
+        heading = float(Polyline(lane.points_m).heading_rad[-1])
+        dx, dy = (signal.position_m - lane.points_m[-1])[:2]
+        ahead, aside = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
+        facing = abs(float(wrap_angle(np.array([signal.heading_rad - heading - np.pi]))[0])) <= FACING_RAD
+        if facing and -MARGIN_M <= ahead <= REACH_M and abs(aside) <= ASIDE_M:
+            found.append(lane)
+    return found
+
+
+MARGIN_M = 5.0
+"""Lights before the junction stand at the stop line, which may be behind where the lane ends."""
+
+
+LIGHT_TYPE = "1000001"
+"""Of a traffic light with three lamps, in the catalog "OpenDRIVE" that players know."""
+
+LIGHT_HEIGHT_M, LIGHT_WIDTH_M = 0.9, 0.3
+"""Of a signal head with three lamps of 200 mm (EN 12368)."""
+
+DIGITS = 4
+
+STEP_M = 0.5
+"""Stations at which the nearest point of a road is looked for."""
+
+MAX_ASIDE_M = 15.0
+"""Crosswalks farther beside a road's reference line belong to another one."""
+
+
+@dataclass(frozen=True)
+class RoadObjects:
+    """Crosswalks with their stations and offsets, and traffic lights with their lanes, by the number of the road that names them."""
+
+    crosswalks: Mapping[int, Sequence[tuple[Marking, float, float]]]
+    signals: Mapping[int, Sequence[tuple[Signal, MapLane]]]
+
+    @classmethod
+    def of(cls, scenario: Scenario, roads: Sequence[Road]) -> RoadObjects:
+        """Give each crosswalk to the road whose reference line is nearest to its middle, each light to the first of its roads."""
+        crosswalks: dict[int, list[tuple[Marking, float, float]]] = {}
+        markings = scenario.map_features.markings if scenario.map_features is not None else ()
+        for marking in markings:
+            places = [(_place_on(road, marking.points_m[:, :2].mean(axis=0)), road.number) for road in roads]
+            if marking.kind == "crosswalk" and places:
+                (s, t), number_ = min(places, key=lambda place: abs(place[0][1]))
+                if abs(t) <= MAX_ASIDE_M:
+                    crosswalks.setdefault(number_, []).append((marking, s, t))
+        signals: dict[int, list[tuple[Signal, MapLane]]] = {}
+        lanes = [lane for road in roads for lane in (*road.lanes, *road.opposite)]
+        for signal in scenario.signals:
+            for lane in signal_lanes(signal, lanes)[:1]:
+                owner = next(road.number for road in roads if any(lane is o for o in (*road.lanes, *road.opposite)))
+                signals.setdefault(owner, []).append((signal, lane))
+        return cls(crosswalks, signals)
+
+
+def _place_on(road: Road, xy_m: Array) -> tuple[float, float]:
+    """Return the station and offset of a point (2,) on a road; an infinite offset before and after it."""
+    s = np.linspace(0.0, road.line.length_m, max(int(road.line.length_m / STEP_M), 1) + 1)
+    x, y, heading = road.line.at(s).T
+    k = int(np.hypot(x - xy_m[0], y - xy_m[1]).argmin())
+    dx, dy = xy_m[0] - x[k], xy_m[1] - y[k]
+    along = dx * np.cos(heading[k]) + dy * np.sin(heading[k])
+    beyond = abs(along) > STEP_M
+    return float(s[k]), np.inf if beyond else float(dy * np.cos(heading[k]) - dx * np.sin(heading[k]))
+
+
+def add_objects(parent: Element, road: Road, objects: RoadObjects) -> None:
+    """Add the crosswalks of a road."""
+    own = objects.crosswalks.get(road.number, ())
+    nodes = element("objects", parent) if own else parent
+    for marking, s, t in own:
+        heading = float(road.line.at(np.array([s]))[0, 2])
+        _add_crosswalk(nodes, marking, (s, t, heading))
+
+
+def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float, float]) -> None:
+    s, t, heading = place
+    middle = marking.points_m.mean(axis=0)
+    gap = marking.points_m[:, :2] - middle[:2]
+    u, v = (
+        gap[:, 0] * np.cos(heading) + gap[:, 1] * np.sin(heading),
+        gap[:, 1] * np.cos(heading) - gap[:, 0] * np.sin(heading),
+    )
+    node = element(
+        "object", parent, id=escaped(marking.id), name=escaped(marking.id), type="crosswalk", s=number(s, DIGITS), t=number(t, DIGITS),
+        zOffset="0", orientation="none", hdg="0", pitch="0", roll="0", length=number(float(np.ptp(u)), DIGITS),
+        width=number(float(np.ptp(v)), DIGITS), height="0",
+    )  # fmt: skip
+    outline = element("outline", element("outlines", node), id="0", closed="true", outer="true")
+    for k, (a, b) in enumerate(zip(u, v)):
+        element(
+            "cornerLocal", outline, u=number(float(a), DIGITS), v=number(float(b), DIGITS), z="0", height="0", id=str(k)
+        )
+
+
+def add_signals(parent: Element, road: Road, objects: RoadObjects, placement: ExportPlacement) -> None:
+    """Add the traffic lights where the lanes end that they are for: at the end of the road, or for lanes against it at its start."""
+    own = objects.signals.get(road.number, ())
+    nodes = element("signals", parent) if own else parent
+    for signal, lane in own:
+        along = any(lane is other for other in road.lanes)
+        s = road.line.length_m if along else 0.0
+        x, y, heading = road.line.at(np.array([s]))[0]
+        dx, dy, height = signal.position_m - [x, y, lane.points_m[-1, 2]]
+        aside = float(dy * np.cos(heading) - dx * np.sin(heading))
+        node = element(
+            "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(s, DIGITS),
+            t=number(aside, DIGITS), dynamic="yes", orientation="+" if along else "-", zOffset=number(float(height), DIGITS),
+            country="OpenDRIVE", type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2),
+            width=number(LIGHT_WIDTH_M, 2), hOffset="0", pitch="0", roll="0",
+        )  # fmt: skip
+        at = signal.position_m - placement.origin_m
+        place = {key: number(float(v), DIGITS) for key, v in zip("xyz", at)}
+        element("positionInertial", node, **place, hdg=number(float(signal.heading_rad or 0.0), DIGITS))
+
+
+# Stations may repeat the sum of lengths with as little as six decimals.
+GAP_M = 1e-4
+
+
+def require_roads(root: Element, where: str) -> None:
+    """Raise unless every road has geometry without gaps along s, stations in order and lanes with a width.
+
+    Raises
+    ------
+    ScenarioError
+        Naming the file and the road.
+    """
+    if root.tag != "OpenDRIVE" or root.find("header") is None:
+        raise ScenarioError(f"{where}: its root is <{root.tag[:40]}>, expected <OpenDRIVE> with a <header>")
+    roads = root.findall("road")
+    if not roads:
+        raise ScenarioError(f"{where}: has no roads, expected at least one")
+    for road in roads:
+        _require_geometry(road, f"{where}: road '{road.get('id', '')[:40]}'")
+        _require_order(road, f"{where}: road '{road.get('id', '')[:40]}'")
+        _require_widths(road, f"{where}: road '{road.get('id', '')[:40]}'")
+
+
+def _require_geometry(road: Element, where: str) -> None:
+    s = 0.0
+    pieces = road.findall("planView/geometry")
+    for piece in pieces:
+        start, length = (require_number(piece.get(key), f"{where}: geometry {key}") for key in ("s", "length"))
+        if abs(start - s) > GAP_M or length <= 0:
+            raise ScenarioError(
+                f"{where}: geometry at s={start:g} with length {length:g}, expected s={s:g} and a positive length"
+            )
+        s = start + length
+    length = require_number(road.get("length"), f"{where}: length")
+    if not pieces or abs(length - s) > GAP_M:
+        raise ScenarioError(f"{where}: length {length:g}, but its geometry ends at {s:g}")
+
+
+def _require_order(road: Element, where: str) -> None:
+    for path in ("elevationProfile/elevation", "lanes/laneOffset", "lanes/laneSection"):
+        last = -1.0
+        for node in road.iterfind(path):
+            s = require_number(node.get("s"), f"{where}: {node.tag} s")
+            if s <= last:
+                raise ScenarioError(
+                    f"{where}: {node.tag} at s={s:g} follows one at s={last:g}, expected stations in order"
+                )
+            last = s
+
+
+def _require_widths(road: Element, where: str) -> None:
+    sections = road.findall("lanes/laneSection")
+    if not sections:
+        raise ScenarioError(f"{where}: has no lanes, expected at least one <laneSection>")
+    for section in sections:
+        for lane in (*section.iterfind("left/lane"), *section.iterfind("right/lane")):
+            first = lane.find("width") if lane.find("width") is not None else lane.find("border")
+            if first is None or require_number(first.get("sOffset"), f"{where}: width sOffset") != 0:
+                raise ScenarioError(f"{where}: lane {lane.get('id', '')[:10]} has no width from its start on")
+
 
 FILE_NAME = "road.xodr"
 # Positions to 10 nm and angles to 1e-12 rad: no checker finds a gap between consecutive pieces.
@@ -107,7 +353,7 @@ def document(scenario: Scenario, placement: ExportPlacement) -> Element:
 def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> None:
     """Add the geographic reference: projected coordinates are those of the file plus its offset."""
     if frame.projection is not None:
-        element("geoReference", header).text = frame.projection
+        element("geoReference", header).text = geo_reference(frame.projection)
     x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
     if (x, y, z) != (0.0, 0.0, 0.0):
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
@@ -116,13 +362,13 @@ def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> 
 def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> Element:
     x0, y0, z0 = placement.origin_m
     parent = element(
-        "road", root, name=escaped(" ".join(lane.id for lane in road.lanes)), length=number(road.line.length_m, LENGTH_DIGITS),
+        "road", root, name=escaped(" ".join(lane.id for lane in (*road.opposite[::-1], *road.lanes))), length=number(road.line.length_m, LENGTH_DIGITS),
         id=str(road.number), junction=str(road.junction or -1), rule="RHT",
     )  # fmt: skip
     links = element("link", parent)
-    for tag, link, point in (("predecessor", road.before, "end"), ("successor", road.after, "start")):
+    for tag, link in (("predecessor", road.before), ("successor", road.after)):
         if link is not None:
-            there = {"contactPoint": point} if link.kind == "road" else {}
+            there = {"contactPoint": "end" if link.point else "start"} if link.kind == "road" else {}
             element(tag, links, elementType=link.kind, elementId=str(link.number), **there)
     plan = element("planView", parent)
     for piece in road.line.pieces:
@@ -143,23 +389,31 @@ def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: Mark
 
 
 def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
-    """Add lanes -1, -2, ... to the right of the left edge of the first."""
+    """Add lanes -1, -2, ... to the right of the left edge of the first, and 1, 2, ... to the left of it."""
     parts = element("lanes", parent)
     for s, *rest in road.offset:
         _add_cubic(parts, "laneOffset", "s", s, rest)
     section = element("laneSection", parts, s="0")
+    if road.opposite:
+        left = element("left", section)
+        for row in reversed(range(len(road.opposite))):
+            _add_lane(left, road, 1 + row, road.opposite[row], road.opposite_widths[row], marks)
     middle = element("lane", element("center", section), id="0", type="none", level="false")
     _add_mark(middle, marks.left_of(road.lanes[0]))
     right = element("right", section)
     for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
-        node = element("lane", right, id=str(-1 - row), type="driving", level="false")
-        links = element("link", node)
-        for tag, link in (("predecessor", road.before), ("successor", road.after)):
-            if link is not None and -1 - row in link.lanes:
-                element(tag, links, id=str(link.lanes[-1 - row]))
-        for s, *rest in widths:
-            _add_cubic(node, "width", "sOffset", s, rest)
-        _add_mark(node, marks.right_of(lane))
+        _add_lane(right, road, -1 - row, lane, widths, marks)
+
+
+def _add_lane(parent: Element, road: Road, id: int, lane: MapLane, widths: Array, marks: MarkFinder) -> None:
+    node = element("lane", parent, id=str(id), type="driving", level="false")
+    links = element("link", node)
+    for tag, link in (("predecessor", road.before), ("successor", road.after)):
+        if link is not None and id in link.lanes:
+            element(tag, links, id=str(link.lanes[id]))
+    for s, *rest in widths:
+        _add_cubic(node, "width", "sOffset", s, rest)
+    _add_mark(node, marks.right_of(lane))
 
 
 def _add_mark(lane: Element, mark: RoadMark) -> None:

@@ -38,7 +38,6 @@ class LinePiece:
         Station of its start.
     x_m, y_m, heading_rad : float
         At its start.
-    length_m : float
     curvature_1pm : float
         Positive to the left.
     """

@@ -16,16 +16,13 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Log, Stream, Sweep
 from log2sim.errors import LogError
+from log2sim.files.inputs import is_present, require_links_inside
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
-from log2sim.input_files import is_present
-from log2sim.links import require_links_inside
-from log2sim.logs.digest import digest_of
-from log2sim.logs.images import first_image_size, image_stream
-from log2sim.logs.kitti import drive
+from log2sim.logs.excerpt import digest_of
+from log2sim.logs.kitti import labels as drive
 from log2sim.logs.kitti.labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
-from log2sim.logs.notes import note_damaged_rows
-from log2sim.logs.record_files import list_numbered_files
-from log2sim.logs.sweeps import read_sweep, sweep_of
+from log2sim.logs.records import first_image_size, image_stream, list_numbered_files, read_sweep, sweep_of
+from log2sim.logs.stamps import note_damaged_rows
 
 SPLITS = ("training", "testing")
 PERIOD_NS = 100_000_000_000

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
-from log2sim.documents import JSON_LIMIT_BYTES, check, read_json
+from log2sim.datatypes import (
+    CATEGORIES,
+    EgoVehicle,
+    ImageLabels,
+    ImageRegions,
+    Labels,
+    Lidar,
+    Log,
+    MapFrame,
+    Stream,
+    Sweep,
+)
 from log2sim.errors import LogError
+from log2sim.files.documents import JSON_LIMIT_BYTES, check, is_plain, read_json
+from log2sim.files.inputs import inside, open_regular, read_file, require_link_inside
+from log2sim.files.plugins import nearest
 from log2sim.geometry import (
     DISTORTION_LENGTHS,
     Array,
@@ -23,25 +39,294 @@ from log2sim.geometry import (
     shift_poses,
     transform,
 )
-from log2sim.input_files import open_regular, read_file
-from log2sim.links import inside, require_link_inside
-from log2sim.logs.images import image_stream
-from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
-from log2sim.logs.native.labels import (
-    BOX_2D_COLUMNS,
-    BOX_3D_COLUMNS,
-    BOX_3D_OPTIONAL,
-    LABELED_COLUMNS,
-    REGION_COLUMNS,
-    boxes_2d,
-    boxes_3d,
-    regions_2d,
-)
-from log2sim.logs.native.offset import offset_of, shifted_camera, shifted_labels, shifted_lidar
-from log2sim.logs.native.sweep_files import SweepFiles
-from log2sim.logs.notes import note_damaged_rows
-from log2sim.logs.pose_checks import QUATERNION_TOLERANCE, find_not_unit
-from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.records import QUATERNION_TOLERANCE, find_not_unit, image_stream, read_sweep
+from log2sim.logs.stamps import note_damaged_rows, strictly_increasing
+
+MAX_TABLE_BYTES = 256 * 1024 * 1024
+# No coordinate on Earth, in any projection, is near this, and no square of it overflows.
+MAX_NUMBER = 1e8
+
+_DTYPE = {"int": np.int64, "float": np.float64}
+_EXPECTED = {
+    "int": "a whole number",
+    "float": f"a finite number of at most {MAX_NUMBER:g} in size",
+    "bool": "0, 1, true or false",
+    "str": "text",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class CsvTable:
+    """A CSV file with typed columns.
+
+    Attributes
+    ----------
+    columns : mapping of str to (N,) array
+    line : (N,) int64
+        Line of the file of each row, for messages.
+    sha256 : str
+        Of the file.
+    """
+
+    path: Path
+    columns: Mapping[str, NDArray[Any]]
+    line: NDArray[np.int64]
+    sha256: str
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.line)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return a column (N,)."""
+        return self.columns[name]
+
+    def stack(self, *names: str) -> NDArray[np.float64]:
+        """Stack columns to (N, len(names)) float64."""
+        return np.stack([self.columns[n].astype(np.float64) for n in names], axis=1)
+
+    def where(self, row: int, field: str) -> str:
+        """Location of a value, for a message."""
+        return f"{self.path}, line {self.line[row]}, field '{field}'"
+
+
+def read_csv_table(
+    path: Path,
+    columns: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
+    *,
+    damaged: list[str] | None = None,
+) -> CsvTable:
+    """Read a CSV file with a header.
+
+    Parameters
+    ----------
+    columns, optional : mapping of name to "int", "float", "bool" or "str"
+        Columns that must and that may be there, in any order. An unknown one is an error.
+    damaged : list of str, optional
+        Takes a message for each row with fewer or more fields than the header, which is left out; else it is an error.
+
+    Raises
+    ------
+    LogError
+        Naming file, line and field.
+    """
+    kinds = {**columns, **(optional or {})}
+    data = read_file(path, MAX_TABLE_BYTES, LogError)
+    try:
+        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        rows = [(reader.line_num, row) for row in reader if row]
+    except (UnicodeDecodeError, csv.Error) as problem:
+        raise LogError(f"{path}: not a CSV table in UTF-8: {problem}") from None
+    if not rows:
+        raise LogError(f"{path}: is empty; expected the header {','.join(columns)}")
+    header = [name.strip() for name in rows[0][1]]
+    _check_header(path, header, columns, kinds)
+    wrong = [
+        f"{path}, line {n}: {len(row)} fields, the header has {len(header)}"
+        for n, row in rows[1:]
+        if len(row) != len(header)
+    ]
+    if wrong and damaged is None:
+        raise LogError(wrong[0])
+    if damaged is not None:
+        damaged += wrong
+    whole = [(n, row) for n, row in rows[1:] if len(row) == len(header)]
+    line = np.array([n for n, _ in whole], dtype=np.int64)
+    cells = {name: [row[k].strip() for _, row in whole] for k, name in enumerate(header)}
+    values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
+    return CsvTable(path, values, line, hashlib.sha256(data).hexdigest())
+
+
+def _check_header(path: Path, header: list[str], columns: Mapping[str, str], kinds: Mapping[str, str]) -> None:
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise LogError(f"{path}, line 1: column '{missing[0]}' is missing; expected the header {','.join(columns)}")
+    for name in header:
+        if name not in kinds:
+            hint = nearest(name, list(kinds))
+            raise LogError(f"{path}, line 1: unknown column '{name}'{hint}; known: {', '.join(kinds)}")
+        if header.count(name) > 1:
+            raise LogError(f"{path}, line 1: column '{name}' occurs twice")
+
+
+def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind: str) -> NDArray[Any]:
+    if kind == "str":
+        return np.array(text, dtype=np.str_)
+    if kind == "bool":
+        words = {"0": False, "1": True, "false": False, "true": True}
+        good = [t.lower() in words for t in text]
+        values: NDArray[Any] = np.array([words.get(t.lower(), False) for t in text], dtype=bool)
+    else:
+        try:
+            if not is_plain("".join(text)):
+                raise ValueError
+            values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
+            good = list(_is_possible(values))
+        except (ValueError, OverflowError):
+            values, good = np.zeros(0), [_parses(t, kind) for t in text]
+    if not all(good):
+        k = good.index(False)
+        raise LogError(f"{path}, line {line[k]}, field '{name}': '{text[k][:40]}', expected {_EXPECTED[kind]}")
+    return values
+
+
+def _parses(text: str, kind: str) -> bool:
+    try:
+        return is_plain(text) and bool(_is_possible(np.array([text]).astype(_DTYPE[kind]))[0])
+    except (ValueError, OverflowError):
+        return False
+
+
+def _is_possible(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which numbers are finite and, unless whole (stamps), at most `MAX_NUMBER`."""
+    return np.asarray(np.isfinite(values) & ((np.abs(values) <= MAX_NUMBER) | (values.dtype.kind == "i")))
+
+
+SIZE_FIELDS = ("length_m", "width_m", "height_m")
+BOX_3D_FIELDS = ("x_m", "y_m", "z_m", *SIZE_FIELDS, "yaw_rad")
+BOX_3D_COLUMNS = {"t_ns": "int", "track_id": "str", "category": "str", **dict.fromkeys(BOX_3D_FIELDS, "float")}
+BOX_3D_OPTIONAL = {"visible": "bool", "kind": "str", "occlusion": "int"}
+LABELED_COLUMNS = {"t_ns": "int"}
+OCCLUSIONS = (0, 1, 2, 3)
+BOX_2D_FIELDS = ("u0_px", "v0_px", "u1_px", "v1_px")
+REGION_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS, "float")}
+BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
+
+
+def boxes_3d(table: CsvTable) -> Labels:
+    """Labels of a table with `BOX_3D_COLUMNS` and, optionally, some of `BOX_3D_OPTIONAL`."""
+    _check_categories(table)
+    size = table.stack(*SIZE_FIELDS)
+    if np.any(size <= 0):
+        row, column = np.argwhere(size <= 0)[0]
+        raise LogError(f"{table.where(row, SIZE_FIELDS[column])}: {size[row, column]:g}, expected a size above 0")
+    occlusion = table.columns.get("occlusion")
+    if occlusion is not None and not np.isin(occlusion, OCCLUSIONS).all():
+        row = int(np.argmin(np.isin(occlusion, OCCLUSIONS)))
+        raise LogError(f"{table.where(row, 'occlusion')}: {occlusion[row]}, expected 0, 1, 2 or 3")
+    return Labels(
+        table["t_ns"],
+        table["track_id"],
+        table["category"],
+        table.stack("x_m", "y_m", "z_m"),
+        size,
+        table["yaw_rad"],
+        table.columns.get("visible"),
+        kind=table.columns.get("kind"),
+        occlusion=occlusion,
+    )
+
+
+def boxes_2d(table: CsvTable, cameras: set[str]) -> dict[str, ImageLabels]:
+    """Labels by camera of a table with `BOX_2D_COLUMNS`."""
+    _check_categories(table)
+    box, rows = _boxes(table), _rows_by_camera(table, cameras)
+    return {n: ImageLabels(table["t_ns"][r], box[r], table["category"][r]) for n, r in rows.items()}
+
+
+def regions_2d(table: CsvTable, cameras: set[str]) -> dict[str, ImageRegions]:
+    """Ignored regions by camera of a table with `REGION_COLUMNS`."""
+    box, rows = _boxes(table), _rows_by_camera(table, cameras)
+    return {n: ImageRegions(table["t_ns"][r], box[r]) for n, r in rows.items()}
+
+
+def _boxes(table: CsvTable) -> Array:
+    box = table.stack(*BOX_2D_FIELDS)
+    empty = np.flatnonzero((box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1]))
+    if len(empty):
+        raise LogError(f"{table.where(empty[0], 'u1_px,v1_px')}: the box is empty, expected u0 < u1 and v0 < v1")
+    return box
+
+
+def _rows_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, NDArray[np.bool_]]:
+    """Rows (N,) by camera, of cameras that have some."""
+    unknown = np.flatnonzero(~np.isin(table["camera"], sorted(cameras)))
+    if len(unknown):
+        name = table["camera"][unknown[0]]
+        raise LogError(
+            f"{table.where(unknown[0], 'camera')}: no camera '{name}'; there are: {', '.join(sorted(cameras))}"
+        )
+    rows = {name: table["camera"] == name for name in sorted(cameras)}
+    return {n: r for n, r in rows.items() if r.any()}
+
+
+def _check_categories(table: CsvTable) -> None:
+    unknown = np.flatnonzero(~np.isin(table["category"], CATEGORIES))
+    if len(unknown):
+        found = table["category"][unknown[0]]
+        raise LogError(f"{table.where(unknown[0], 'category')}: '{found}', expected one of {', '.join(CATEGORIES)}")
+
+
+OFFSET_STEP_M = 1000.0
+
+
+def offset_of(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: Labels | None) -> Array:
+    """Choose the whole kilometers (3,), m, by which a log is shifted towards the map's origin."""
+    if track is not None:
+        first = track.map_T_ego[0, :3, 3]
+    else:
+        positions = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
+        first = (
+            positions[0]
+            if positions
+            else labels.center_m[0]
+            if labels is not None and len(labels.t_ns)
+            else np.zeros(3)
+        )
+    return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
+
+
+def _mount_T(sensor: Camera | Lidar) -> Array:
+    return sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
+
+
+def shifted_camera(camera: Camera, offset: Array) -> Camera:
+    """Shift a camera that is fixed in the map."""
+    return camera if camera.mount == "ego" else replace(camera, mount_T_cam=shift_poses(camera.mount_T_cam, offset))
+
+
+def shifted_lidar(lidar: Lidar, offset: Array) -> Lidar:
+    """Shift a LiDAR that is fixed in the map."""
+    return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, shift_poses(lidar.mount_T_lidar, offset))
+
+
+def shifted_labels(labels: Labels, offset: Array) -> Labels:
+    """Shift labels."""
+    return replace(labels, center_m=labels.center_m - offset)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepFiles:
+    """Sweeps of one LiDAR.
+
+    Attributes
+    ----------
+    t_ns : (F,) int64
+        Absolute stamps.
+    frame : {"lidar", "map"}
+        Of the points.
+    offset : (3,) float64, m
+        What is taken off coordinates of the map.
+    compensated_ns : (F,) int64 or None
+        Stamps of compensation, as `log2sim.datatypes.Sweep` has them.
+    """
+
+    files: list[Path]
+    t_ns: NDArray[np.int64]
+    frame: Literal["lidar", "map"]
+    offset: Array
+    compensated_ns: NDArray[np.int64] | None
+
+    def read(self, i: int) -> Sweep:
+        """Read sweep `i`; points in the map frame are shifted by the map's offset."""
+        sweep = read_sweep(self.files[i], int(self.t_ns[i]), self.frame)
+        if self.compensated_ns is not None:
+            return replace(sweep, compensated_ns=int(self.compensated_ns[i]))
+        if self.frame == "map" and self.offset.any():
+            return replace(sweep, xyz_m=sweep.xyz_m.astype(np.float64) - self.offset)
+        return sweep
+
 
 MANIFEST = "log.json"
 
@@ -170,7 +455,7 @@ class _Folder:
         else:
             table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
             self._not_empty(table)
-            from log2sim.logs.geodesy import map_frame_of, poses_from_geodetic
+            from log2sim.logs.stamps import map_frame_of, poses_from_geodetic
 
             _check_geodetic(table)
             map_frame = map_frame_of(map_frame, *(float(table[f][0]) for f in GNSS_FIELDS[:3]))

@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
-from log2sim.documents import read_json
 from log2sim.errors import LogError
+from log2sim.files.documents import read_json
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
-from log2sim.logs.digest import digest_of
-from log2sim.logs.images import MAX_IMAGE_PX, first_image_size, image_stream
-from log2sim.logs.notes import defer_notes
-from log2sim.logs.nuscenes.labels import read_labels
-from log2sim.logs.nuscenes.scene import Channel, Scene
-from log2sim.logs.nuscenes.sweeps import sweep_stream
+from log2sim.logs.excerpt import digest_of
+from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, sweep_stream
 from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, text_of
-from log2sim.logs.record_files import list_folders
+from log2sim.logs.records import MAX_IMAGE_PX, first_image_size, image_stream, list_folders
+from log2sim.logs.stamps import defer_notes
 
 REFERENCE_CAMERA = "CAM_FRONT"
 LABELED_LIDAR = "LIDAR_TOP"

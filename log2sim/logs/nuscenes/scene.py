@@ -1,29 +1,111 @@
-"""One scene of nuScenes: its samples, the records of its sensors and the ego poses of all of them."""
+"""One scene of nuScenes: its samples, sweeps, poses and annotations as labels.
+
+Verified on sweeps of two vehicles (n008, n015). Files keep the order of firing: 32 rings in turn, 1084 and 1086 times.
+Rays without a return are stored with range 0 and compensated like the others, so they lie where the sensor was: on a
+straight path that ends at the origin with the last firing. The first one is 0.425 m behind at a speed of 8.5 m/s, the
+way of 50 ms. Hence all points are in the frame of the sensor at the end of the turn, which is the stamp. It begins at
+the left of the vehicle and turns clockwise; times by order and by azimuth agree to 0.2 ms.
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.errors import LogError
-from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
-from log2sim.links import inside
-from log2sim.logs.nuscenes.tables import (
-    DATA,
-    SCENES,
-    Record,
-    Tables,
-    numbers_of,
-    quaternions_of,
-    stamp_ns_of,
-    text_of,
-)
-from log2sim.logs.stamps import strictly_increasing
+from log2sim.datatypes import Labels, Stream, Sweep
+from log2sim.errors import LogError, RecordError
+from log2sim.files.inputs import inside
+from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_quaternion, transform, wrap_angle, yaw_of
+from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, quaternions_of, stamp_ns_of, text_of
+from log2sim.logs.records import MAX_SWEEP_BYTES, MAX_SWEEP_POINTS, read_bytes, sweep_of
+from log2sim.logs.stamps import compute_scan_offset_ns, note_left_out, strictly_increasing
+
+# Velodyne HDL-32E, user's manual: 32 lasers, one firing of all in 46.08 us, no returns nearer than 1 m.
+RINGS = 32
+FIRING_NS = 46_080
+MIN_RANGE_M = 1.0
+# More than a turn: several sweeps joined in one file.
+MAX_FIRINGS = 1200
+TURN_NS = 50_000_000
+
+BYTES_PER_POINT = 20
+
+# Takes stamps (N,) int64 to the poses (N, 4, 4) of the LiDAR in the map, and whether each is known.
+Poses = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
+
+
+def sweep_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], poses: Poses) -> Stream:
+    """Stream of .pcd.bin files.
+
+    Parameters
+    ----------
+    t_ns : (F,) int64
+        Ends of the turns.
+    files : list of Path
+        F files.
+    poses : callable
+        Returns the poses (N, 4, 4) of the LiDAR in the map at stamps (N,), and whether each is known.
+    """
+
+    def read(i: int) -> Sweep:
+        return read_sweep(files[i], int(t_ns[i]), poses)
+
+    return Stream(name, t_ns, read)
+
+
+def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
+    """Read a sweep in the frame of the sensor at `t_ns`; points nearer than 1 m, which are no returns, are left out.
+
+    Raises
+    ------
+    RecordError
+        When the file is missing or its size is not that of whole points.
+    """
+    data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
+    points = len(data) // BYTES_PER_POINT
+    if len(data) % BYTES_PER_POINT:
+        raise RecordError(
+            f"{path} (stamp {t_ns}): {len(data)} bytes, expected five float32 (x, y, z, intensity, ring) a point"
+        )
+    if points > MAX_SWEEP_POINTS:
+        raise RecordError(f"{path} (stamp {t_ns}): {points} points, more than {MAX_SWEEP_POINTS}")
+    rows = np.frombuffer(data, "<f4").reshape(-1, 5)
+    xyz, offset_ns = rows[:, :3], firing_offset_ns(rows[:, 4])
+    away = xyz - sensor_path(offset_ns, t_ns, poses)
+    with np.errstate(over="ignore", invalid="ignore"):
+        returned = np.linalg.norm(away, axis=1) >= MIN_RANGE_M
+    offset_ns = None if offset_ns is None else offset_ns[returned]
+    return sweep_of(xyz[returned], t_ns, offset_ns, "lidar", t_ns, rows[returned, 3])
+
+
+def firing_offset_ns(ring: NDArray[np.float32]) -> NDArray[np.int64] | None:
+    """Time (N,) ns of points relative to the end of the turn by their order; None when it is not that of firing."""
+    firings = len(ring) // RINGS
+    if len(ring) % RINGS or not 0 < firings <= MAX_FIRINGS:
+        return None
+    if not np.array_equal(ring.reshape(firings, RINGS), np.broadcast_to(np.arange(RINGS), (firings, RINGS))):
+        return None
+    return np.repeat((np.arange(firings, dtype=np.int64) - (firings - 1)) * FIRING_NS, RINGS)
+
+
+def sensor_path(offset_ns: NDArray[np.int64] | None, t_ns: int, poses: Poses) -> Array:
+    """Position (N, 3) or (3,) of the sensor at the time of each point, in its frame at the stamp; 0 where not known."""
+    if offset_ns is None:
+        return np.zeros(3)
+    first = int(offset_ns.min())
+    map_T_lidar, known = poses(np.array([t_ns + first, t_ns]))
+    if first == 0 or not known.all():
+        return np.zeros(3)
+    start = map_T_lidar[1, :3, :3].T @ (map_T_lidar[0, :3, 3] - map_T_lidar[1, :3, 3])
+    return np.asarray((offset_ns / first)[:, None] * start)
+
 
 # Names of sensors become names of files.
 CHANNEL = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -67,7 +149,6 @@ class Scene:
 
     Attributes
     ----------
-    tables : Tables
     record : Record
         Of scene.
     notes : list of str
@@ -173,3 +254,228 @@ def _pose_of(record: Record, path: Path) -> Array:
     """Pose (4, 4) of a record with rotation and translation."""
     rotation = rotation_from_quaternion(quaternions_of([record], path)[0])
     return transform(rotation, numbers_of([record], "translation", (3,), path)[0])
+
+
+ANNOTATIONS = "sample_annotation"
+CATEGORY_OF = {
+    "vehicle.car": "car",
+    "vehicle.truck": "truck",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.construction": "other",
+    "vehicle.emergency.ambulance": "other",
+    "vehicle.emergency.police": "other",
+    "vehicle.trailer": "other",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "human.pedestrian.wheelchair": "pedestrian",
+    "human.pedestrian.personal_mobility": "other",
+    "human.pedestrian.stroller": "other",
+}
+NO_ROAD_USERS = {
+    "animal", "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
+    "movable_object.trafficcone", "static_object.bicycle_rack",
+}  # fmt: skip
+WITH_RIDER = "cycle.with_rider"
+# Visibility in the pictures of all cameras together: 1 is up to 40 %.
+HARDLY_VISIBLE = "1"
+# An object that crosses the direction in which the turns start would get two labels within a few ms.
+MIN_STEP_NS = 10_000_000
+# Key frames are 0.4 to 0.6 s apart; over more than a missing one nothing is interpolated.
+MAX_GAP_NS = 1_100_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Annotations as columns, A rows, in the order of instances and stamps."""
+
+    sample: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    track_id: NDArray[np.str_]
+    kind: NDArray[np.str_]
+    category: NDArray[np.str_]
+    center_m: Array
+    size_m: Array
+    yaw_rad: Array
+    visible: NDArray[np.bool_]
+
+    def take(self, index: NDArray[Any], **changes: Any) -> _Rows:
+        """Select rows; `changes` replace columns of the selection."""
+        columns = {name: column[index] for name, column in vars(self).items()}
+        return _Rows(**{**columns, **changes})
+
+
+def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: list[str]) -> Labels | None:
+    """Read the annotations of a scene.
+
+    Parameters
+    ----------
+    lidar : Channel or None
+        In whose sweeps objects were labeled.
+    offset_m : (3,) float64
+        Taken off positions.
+    notes : list of str
+        Takes what was left out.
+
+    Returns
+    -------
+    Labels or None
+        None for a scene without annotations, as those of the test split are.
+
+    Notes
+    -----
+    A box fits the points where they were measured, and the LiDAR scans different directions at different times of its
+    turn. Of the one fast car with points at hand, the box ends 2 cm from points of 16 ms before the stamp, in which it
+    drove 15 cm.
+    Between annotations of an instance in consecutive samples boxes are added for each turn of the LiDAR: positions
+    linear, yaw the shorter way, size, category and visibility of the nearer one. `labeled_ns` are the samples alone.
+    """
+    sample_path = scene.tables.path("sample")
+    samples = {text_of(sample, "token", sample_path): k for k, sample in enumerate(scene.samples)}
+    annotations = scene.tables.matching(ANNOTATIONS, "sample_token", samples)
+    if not annotations:
+        notes.append("the scene has no annotations: nothing is labeled")
+        return None
+    stamps = np.array([stamp_ns_of(sample, sample_path) for sample in scene.samples], dtype=np.int64)
+    rows = _rows_of(scene, annotations, samples, notes)
+    t_ns = scanned_ns(scene, lidar, stamps[rows.sample], rows.center_m)
+    rows = rows.take(np.arange(len(rows.t_ns)), t_ns=t_ns)
+    ends_ns = turn_ends(stamps if lidar is None else np.union1d(stamps, lidar.t_ns))
+    rows = _joined([rows, _between(scene, lidar, rows, stamps, ends_ns)])
+    return Labels(
+        rows.t_ns,
+        rows.track_id,
+        rows.category,
+        rows.center_m - offset_m,
+        rows.size_m,
+        rows.yaw_rad,
+        visible=rows.visible,
+        kind=rows.kind,
+        labeled_ns=np.unique(stamps - (0 if lidar is None else TURN_NS // 2)),
+    )
+
+
+def turn_ends(t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Stamps of all turns of the LiDAR: those known (F,), and others about every 50 ms where they are farther apart.
+
+    Tables with key frames alone know two turns a second. What is nearer than 10 ms to the one before is no turn.
+    """
+    t_ns = t_ns[np.diff(t_ns, prepend=t_ns[0] - MIN_STEP_NS) >= MIN_STEP_NS]
+    step = np.diff(t_ns)
+    missing = np.where(step <= MAX_GAP_NS, np.maximum(np.round(step / TURN_NS).astype(np.int64) - 1, 0), 0)
+    first = np.repeat(np.arange(len(missing)), missing)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
+    step_ns = (step // (missing + 1))[first]
+    return np.union1d(t_ns, t_ns[first] + number * step_ns)
+
+
+def scanned_ns(scene: Scene, lidar: Channel | None, t_ns: NDArray[np.int64], center_m: Array) -> NDArray[np.int64]:
+    """Compute when (L,) the LiDAR scanned objects at `center_m` (L, 3) in the turns that end at `t_ns` (L,)."""
+    if lidar is None:
+        return t_ns
+    map_T_ego, known = scene.ego.at(t_ns)
+    local = apply(inverse(map_T_ego @ lidar.ego_T_sensor), center_m)
+    return np.where(known, t_ns + compute_scan_offset_ns(local, TURN_NS), t_ns).astype(np.int64)
+
+
+def _between(
+    scene: Scene, lidar: Channel | None, rows: _Rows, stamps: NDArray[np.int64], ends_ns: NDArray[np.int64]
+) -> _Rows:
+    """Interpolate annotations of one instance in consecutive samples (S,) at the turns that end between them."""
+    step_ns = np.diff(rows.t_ns)
+    same = (rows.track_id[1:] == rows.track_id[:-1]) & (step_ns > 0) & (step_ns <= MAX_GAP_NS)
+    before = np.flatnonzero(same & (np.diff(rows.sample) == 1))
+    first = np.searchsorted(ends_ns, stamps[rows.sample[before]], side="right")
+    count = np.maximum(np.searchsorted(ends_ns, stamps[rows.sample[before + 1]]) - first, 0)
+    pair = np.repeat(before, count)
+    end_ns = ends_ns[np.repeat(first, count) + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)]
+    begin_ns, span_ns = rows.t_ns[pair], rows.t_ns[pair + 1] - rows.t_ns[pair]
+    step = rows.center_m[pair + 1] - rows.center_m[pair]
+    roughly = ((end_ns - TURN_NS // 2 - begin_ns) / span_ns)[:, None]
+    t_ns = scanned_ns(scene, lidar, end_ns, rows.center_m[pair] + roughly * step)
+    share = (t_ns - begin_ns) / span_ns
+    keep = (t_ns - begin_ns >= MIN_STEP_NS) & (begin_ns + span_ns - t_ns >= MIN_STEP_NS)
+    keep[1:] &= (pair[1:] != pair[:-1]) | (np.diff(t_ns) >= MIN_STEP_NS)
+    turn = wrap_angle(rows.yaw_rad[pair + 1] - rows.yaw_rad[pair])
+    center = rows.center_m[pair] + share[:, None] * step
+    yaw = wrap_angle(rows.yaw_rad[pair] + share * turn)
+    nearer = np.where(share <= 0.5, pair, pair + 1)
+    return rows.take(nearer[keep], t_ns=t_ns[keep], center_m=center[keep], yaw_rad=yaw[keep])
+
+
+def _joined(parts: list[_Rows]) -> _Rows:
+    """Join rows in the order of their stamps."""
+    columns = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+    return _Rows(**columns).take(np.argsort(columns["t_ns"], kind="stable"))
+
+
+def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], notes: list[str]) -> _Rows:
+    """Check annotations and return them as columns; stamps are still 0."""
+    path = scene.tables.path(ANNOTATIONS)
+    kinds = _kinds(scene, annotations, path)
+    attributes = {token: str(r.get("name")) for token, r in scene.tables.all_of("attribute").items()}
+    category = [
+        _category(kind, {attributes.get(str(token), "") for token in _tokens(a, path)})
+        for kind, a in zip(kinds, annotations)
+    ]
+    size = numbers_of(annotations, "size", (3,), path)[:, [1, 0, 2]]  # tables: width, length, height
+    rows = _Rows(
+        np.array([samples[a["sample_token"]] for a in annotations], dtype=np.int64),
+        np.zeros(len(annotations), dtype=np.int64),
+        np.array([a["instance_token"] for a in annotations]),
+        np.array(kinds),
+        np.array(category, dtype="<U16"),
+        numbers_of(annotations, "translation", (3,), path),
+        size,
+        yaw_of(rotation_from_quaternion(quaternions_of(annotations, path))),
+        np.array([_is_visible(a) for a in annotations], dtype=bool),
+    )
+    note_left_out((kind for kind, word in zip(kinds, category) if not word), NO_ROAD_USERS, notes)
+    flat = ~(size > 0).all(axis=1)
+    if flat.any():
+        notes.append(f"{int(flat.sum())} labels left out because a size is not above 0")
+    kept = np.flatnonzero((rows.category != "") & ~flat)
+    kept = kept[np.lexsort((rows.sample[kept], rows.track_id[kept]))]
+    same = (np.diff(rows.sample[kept]) == 0) & (rows.track_id[kept][1:] == rows.track_id[kept][:-1])
+    if same.any():
+        notes.append(f"{int(same.sum())} labels repeat an instance in its sample; dropped")
+    return rows.take(kept[np.r_[True, ~same][: len(kept)]])
+
+
+def _kinds(scene: Scene, annotations: list[Record], path: Path) -> list[str]:
+    """Names of the categories of annotations."""
+    tokens = [text_of(a, "instance_token", path) for a in annotations]
+    instances = scene.tables.by_token("instance", tokens)
+    categories = scene.tables.all_of("category")
+    words = {}
+    for token, instance in instances.items():
+        wanted = text_of(instance, "category_token", scene.tables.path("instance"))
+        if wanted not in categories:
+            raise LogError(
+                f"{scene.tables.path('category')}: no record with token '{wanted[:40]}', which instance.json names"
+            )
+        words[token] = text_of(categories[wanted], "name", scene.tables.path("category"))
+    return [words[token] for token in tokens]
+
+
+def _category(kind: str, attributes: set[str]) -> str:
+    word = CATEGORY_OF.get(kind, "")
+    return "cyclist" if word == "bicycle" and WITH_RIDER in attributes else word
+
+
+def _tokens(annotation: Record, path: Path) -> list[Any]:
+    tokens = annotation.get("attribute_tokens", [])
+    if not isinstance(tokens, list):
+        raise LogError(f"{path}, token {str(annotation.get('token'))[:40]!a}: 'attribute_tokens' is no list")
+    return tokens
+
+
+def _is_visible(annotation: Record) -> bool:
+    """Whether the sensors hit an object and its visibility, where it is stated, is above 40 %."""
+    counts = [annotation.get(key, 0) for key in ("num_lidar_pts", "num_radar_pts")]
+    hit = any(isinstance(count, int) and count > 0 for count in counts)
+    return hit and annotation.get("visibility_token") != HARDLY_VISIBLE

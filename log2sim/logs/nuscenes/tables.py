@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.documents import read_json
 from log2sim.errors import LogError
+from log2sim.files.documents import RepeatedKeysError, read_json, require_unique, unique_decoder
+from log2sim.files.inputs import open_regular, require_link_inside
 from log2sim.geometry import Array
-from log2sim.input_files import open_regular
-from log2sim.json_keys import RepeatedKeysError, require_unique, unique_decoder
-from log2sim.links import require_link_inside
-from log2sim.logs.pose_checks import find_not_unit
+from log2sim.logs.records import find_not_unit
 from log2sim.logs.stamps import MAX_TIME_S
 
 Record = dict[str, Any]
@@ -36,12 +34,7 @@ SCENES, DATA = "scene", "sample_data"
 
 @dataclass(frozen=True)
 class Tables:
-    """Tables of one version, such as the folder v1.0-mini.
-
-    Attributes
-    ----------
-    folder : Path
-    """
+    """Tables of one version, such as the folder v1.0-mini."""
 
     folder: Path
 

@@ -1,4 +1,4 @@
-"""PandaSet sequences: six cameras, a spinning Pandar64 and a forward PandarGT, points and poses in one world frame.
+"""PandaSet sequences: six cameras, a spinning Pandar64 and a forward PandarGT.
 
 What the data set does not document was measured on sequence 002. The pose of a sweep has x right, y forward, z up, and its
 origin is 0.325 m above the road (fit of the road within 15 m, 0.319 to 0.337 m over 40 sweeps), as the rear axle does. The Pandar64 turns
@@ -9,38 +9,326 @@ times of the PandarGT: they are those of its points, so its stamps are read from
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
-from log2sim.documents import JSON_LIMIT_BYTES, read_json
-from log2sim.errors import LogError
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.errors import LogError, RecordError
+from log2sim.files.documents import JSON_LIMIT_BYTES, read_json
+from log2sim.files.inputs import is_present, read_text, require_links_inside
 from log2sim.geometry import (
     NS_PER_S,
     Array,
     Camera,
     PoseTrack,
+    apply,
     inverse,
     nearest_rotation,
     rotation_from_quaternion,
     transform,
+    wrap_angle,
 )
-from log2sim.input_files import is_present, read_text
-from log2sim.links import require_links_inside
-from log2sim.logs.digest import digest_of
-from log2sim.logs.images import first_image_size, image_stream
-from log2sim.logs.notes import defer_notes
-from log2sim.logs.pandaset.labels import read_labels
-from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
-from log2sim.logs.pose_checks import MAX_POSITION_M, find_not_unit
-from log2sim.logs.record_files import list_folders, list_numbered_files
-from log2sim.logs.stamps import MAX_TIME_S, strictly_increasing
-from log2sim.logs.time_checks import Span, say_apart
+from log2sim.logs.checks import Span, say_apart
+from log2sim.logs.excerpt import digest_of
+from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
+from log2sim.logs.records import (
+    MAX_POSITION_M,
+    find_not_unit,
+    first_image_size,
+    image_stream,
+    list_folders,
+    list_numbered_files,
+    sweep_of,
+)
+from log2sim.logs.stamps import (
+    MAX_TIME_S,
+    compute_scan_offset_ns,
+    defer_notes,
+    note_left_out,
+    select_spaced,
+    strictly_increasing,
+)
+
+# Value of the column "d" by LiDAR.
+LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
+COLUMNS = ("x", "y", "z", "t", "d", "i")
+# Tables that are kept from the reading of the stamps until their sweeps are read, so that they are decompressed once.
+MAX_KEPT_BYTES = 256 * 1024**2
+READING_THREADS = 4
+
+
+class SweepFiles:
+    """Files of a sequence, each with the points of both LiDARs; stamps of the PandarGT are read when first used."""
+
+    def __init__(self, files: dict[int, Path], t_ns: NDArray[np.int64], notes: list[str]) -> None:
+        self.files, self._t_ns, self._notes = files, t_ns, notes
+        self._indexes: dict[str, tuple[NDArray[np.int64], list[Path]]] = {}
+        self._lock, self._kept = Lock(), _KeptTables()
+
+    def stream(self, lidar: str) -> Stream:
+        """Return the stream of one LiDAR."""
+
+        def read(i: int) -> Sweep:
+            t_ns, files = self.index(lidar)
+            return _read_sweep(self._kept.take(files[i], lidar), files[i], int(t_ns[i]), LIDARS[lidar])
+
+        return Stream(lidar, lambda: self.index(lidar)[0], read)
+
+    def index(self, lidar: str) -> tuple[NDArray[np.int64], list[Path]]:
+        """Return stamps (F,) and files of the sweeps of one LiDAR, in order."""
+        with self._lock:
+            if lidar not in self._indexes:
+                t_ns = self._t_ns if lidar == "pandar64" else self.gt_stamps
+                numbers = np.array(list(self.files))
+                keep, problems = strictly_increasing(t_ns[numbers], lidar)
+                self._notes += problems
+                self._indexes[lidar] = t_ns[numbers[keep]], [self.files[int(n)] for n in numbers[keep]]
+            return self._indexes[lidar]
+
+    @cached_property
+    def gt_stamps(self) -> NDArray[np.int64]:
+        """Middle (N,) of the PandarGT's points of each sweep.
+
+        Where a sweep is missing or cannot be read, the stamp of the Pandar64 moved as those next to it.
+        """
+        with ThreadPoolExecutor(READING_THREADS) as pool:
+            middles = zip(self.files, pool.map(self._gt_middle_ns, self.files.values()))
+            known = {number: stamp - int(self._t_ns[number]) for number, stamp in middles if stamp is not None}
+        if not known:
+            return self._t_ns.copy()
+        moved = np.interp(np.arange(len(self._t_ns)), list(known), list(known.values()))
+        return np.asarray(self._t_ns + np.round(moved).astype(np.int64))
+
+    def _gt_middle_ns(self, path: Path) -> int | None:
+        try:
+            columns = read_pickled_table(path)
+            self._kept.add(path, columns)
+        except RecordError:
+            return None
+        return _gt_middle_ns(columns)
+
+
+class _KeptTables:
+    """Tables whose sweeps are still to be read, up to `MAX_KEPT_BYTES`; safe to share between threads."""
+
+    def __init__(self) -> None:
+        self._tables: dict[Path, tuple[Columns, set[str]]] = {}
+        self._bytes, self._lock = 0, Lock()
+
+    def add(self, path: Path, columns: Columns) -> None:
+        """Keep the columns of a table that a sweep needs, if there is room."""
+        needed = {name: columns[name] for name in COLUMNS if name in columns}
+        size = sum(column.nbytes for column in needed.values())
+        with self._lock:
+            if self._bytes + size <= MAX_KEPT_BYTES:
+                self._tables[path] = {name: column.copy() for name, column in needed.items()}, set()
+                self._bytes += size
+
+    def take(self, path: Path, lidar: str) -> Columns | None:
+        """Return a table for one LiDAR, None where it is not kept; forget it when all LiDARs have got it."""
+        with self._lock:
+            columns, read = self._tables.get(path, (None, set()))
+            read.add(lidar)
+            if columns is not None and len(read) == len(LIDARS):
+                del self._tables[path]
+                self._bytes -= sum(column.nbytes for column in columns.values())
+            return columns
+
+
+def _gt_middle_ns(columns: Mapping[str, NDArray[Any]]) -> int | None:
+    """Return the middle of the PandarGT's times; None where they cannot be those of a sweep."""
+    try:
+        t_s = columns["t"][columns["d"] == LIDARS["pandargt"]].astype(np.float64)
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+    t_s = t_s[np.abs(t_s) < MAX_TIME_S]  # False for NaN
+    return round((float(t_s.min()) + float(t_s.max())) / 2 * NS_PER_S) if len(t_s) else None
+
+
+# One file holds the sweeps of both LiDARs, which are read one after the other.
+@lru_cache(maxsize=4)
+def _read_points(path: Path) -> Columns:
+    return read_pickled_table(path)
+
+
+def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Sweep:
+    where = f"{path} (stamp {t_ns})"
+    try:
+        columns = _read_points(path) if kept is None else kept
+        # Indices take half the time of a mask.
+        rows = np.flatnonzero(columns["d"] == number)
+        xyz = np.stack([columns[k].take(rows) for k in ("x", "y", "z")], axis=1)
+        t_s = columns["t"].take(rows)
+        strength = columns["i"].take(rows) if "i" in columns and columns["i"].dtype.kind in "iuf" else None
+        if xyz.dtype.kind != "f" or t_s.dtype.kind != "f" or columns["d"].dtype.kind not in "iuf":
+            kinds = f"{xyz.dtype}, {t_s.dtype} and {columns['d'].dtype}"
+            raise RecordError(f"{where}: columns x, y, z, then t and d are {kinds}, expected numbers")
+    except KeyError as missing:
+        raise RecordError(f"{where}: no column {missing}; expected x, y, z, i, t, d") from None
+    timed = np.abs(t_s) < MAX_TIME_S  # False for NaN
+    if not timed.all():
+        xyz, t_s, strength = xyz[timed], t_s[timed], None if strength is None else strength[timed]
+    offset_ns = np.round(t_s * NS_PER_S).astype(np.int64) - t_ns
+    return sweep_of(xyz, t_ns, offset_ns, "map", intensity=strength)
+
+
+PERIOD_NS = 100_000_000
+MIN_STEP_NS = 20_000_000
+
+CATEGORY_OF = {
+    "Car": "car",
+    "Pickup Truck": "truck",
+    "Medium-sized Truck": "truck",
+    "Semi-truck": "truck",
+    "Bus": "bus",
+    "Motorcycle": "motorcycle",
+    "Motorized Scooter": "motorcycle",
+    "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian",
+    "Emergency Vehicle": "other",
+    "Other Vehicle - Construction Vehicle": "other",
+    "Other Vehicle - Pedicab": "other",
+    "Other Vehicle - Uncommon": "other",
+    "Personal Mobility Device": "other",
+    "Towed Object": "other",
+    "Train": "other",
+    "Tram / Subway": "other",
+}
+# Things that are no road users.
+NO_ROAD_USERS = {
+    "Animals - Bird", "Animals - Other", "Cones", "Construction Signs", "Pylons", "Road Barriers", "Rolling Containers",
+    "Signs", "Temporary Construction Barriers",
+}  # fmt: skip
+LABEL_COLUMNS = (
+    "uuid", "label", "yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z",
+)  # fmt: skip
+# Columns that a file lacks where no object of its sweep has the attribute, and the values that they get then.
+OPTIONAL: dict[str, str | int] = {"attributes.rider_status": "", "cuboids.sibling_id": "-", "cuboids.sensor_id": -1}
+RIDER = {"With Rider": "cyclist", "Without Rider": "bicycle"}
+GT_SENSOR = 1
+# A bicycle in a sweep that does not state whether somebody rides it, until its other sweeps decide.
+UNKNOWN_RIDER = "bicycle?"
+
+
+def read_labels(
+    files: dict[int, Path], t_ns: NDArray[np.int64], gt_t_ns: NDArray[np.int64], map_T_lidar: Array, notes: list[str]
+) -> Labels:
+    """Labels of the cuboid files by number of sweep.
+
+    Parameters
+    ----------
+    files : mapping of the sweep's number to its cuboids
+    t_ns, gt_t_ns : (N,) int64
+        Stamps of the sweeps of the Pandar64 and of the PandarGT.
+    map_T_lidar : (N, 4, 4)
+        Poses of the Pandar64 at `t_ns`.
+    notes : list of str
+        Takes what was left out.
+
+    Notes
+    -----
+    A cuboid fits the points where they were measured, and the Pandar64 scans different directions at different times; on
+    moving cars of sequence 002 the time by `compute_scan_offset_ns` is off that of the points inside the box by 0.5 +- 0.4 ms:
+    the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object
+    with a cuboid for each LiDAR the Pandar64's is kept.
+    """
+    parts = []
+    left_out: list[str] = []
+    twice = flat = 0
+    for number, path in files.items():
+        if number < len(t_ns):
+            table = _checked(read_pickled_table(path, LogError), path)
+            twice += len(table["uuid"]) - len(np.unique(table["uuid"].astype(np.str_)))
+            flat += int((_sizes(table) <= 0).any(axis=1).sum())
+            parts.append(_frame(table, int(t_ns[number]), int(gt_t_ns[number]), map_T_lidar[number], left_out))
+    if twice:
+        notes.append(f"{twice} cuboids left out: their sweep has another one of the same uuid")
+    if flat:
+        notes.append(f"{flat} cuboids left out: a side of them is 0 or less")
+    note_left_out(left_out, NO_ROAD_USERS, notes)
+    _note_missing(files, len(t_ns), notes)
+    columns = [np.concatenate([p[k] for p in parts]) for k in range(6)] if parts else None
+    if columns is None:
+        raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
+    keep = select_spaced(columns[0], columns[1], MIN_STEP_NS)
+    t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
+    category = _settle_riders(track_id, category, notes)
+    return Labels(t_ns, track_id, category, center, size, yaw)
+
+
+def _note_missing(files: Collection[int], count: int, notes: list[str]) -> None:
+    """Note the sweeps without a file of cuboids, where others have one."""
+    missing = sorted(set(range(count)) - set(files))
+    if missing:
+        notes.append(f"annotations/cuboids: {len(missing)} of {count} files are missing, first number {missing[0]:02d}")
+
+
+def _checked(table: Columns, path: Path) -> Columns:
+    for name in LABEL_COLUMNS:
+        if name not in table:
+            raise LogError(f"{path}: no column '{name}'; expected cuboids with {', '.join(LABEL_COLUMNS)}")
+    count = len(table["uuid"])
+    table = {name: np.full(count, value) for name, value in OPTIONAL.items()} | table
+    numbers = [n for n in LABEL_COLUMNS if n.startswith(("yaw", "position", "dimensions"))]
+    for name in numbers:
+        if table[name].dtype.kind not in "fiu" or not (np.abs(table[name]) <= MAX_POSITION_M).all():
+            raise LogError(f"{path}, column '{name}': expected finite numbers up to {MAX_POSITION_M:g}")
+    return table
+
+
+def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: list[str]) -> tuple[NDArray[Any], ...]:
+    """Stamps, track ids, categories, centers, sizes and yaws of one sweep's cuboids; `left_out` takes the kinds of others."""
+    category = np.array(
+        [_category(str(k), str(r)) for k, r in zip(c["label"], c["attributes.rider_status"])], dtype="<U16"
+    )
+    left_out += [str(kind) for kind in c["label"][category == ""]]
+    uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
+    of_gt = c["cuboids.sensor_id"] == GT_SENSOR
+    # In sequence 002 one of the two names the other by a part of its uuid only.
+    twin = of_gt & (np.isin(sibling, uuid[~of_gt]) | np.isin(uuid, sibling[~of_gt]))
+    # A cuboid of the PandarGT alone still belongs to the track of its twin.
+    track_id = np.where(of_gt & (np.char.str_len(sibling) > 1), sibling, uuid)
+    center = np.stack([c[f"position.{k}"] for k in "xyz"], axis=1).astype(np.float64)
+    stamp = np.where(of_gt, gt_t_ns, t_ns + compute_scan_offset_ns(apply(inverse(map_T_lidar), center), PERIOD_NS))
+    size, yaw = _sizes(c), wrap_angle(c["yaw"] + np.pi / 2)
+    keep = (category != "") & ~twin & (size > 0).all(axis=1)
+    return tuple(column[keep] for column in (stamp, track_id, category, center, size, yaw))
+
+
+def _sizes(c: Columns) -> Array:
+    """Length, width and height (M, 3) of cuboids; the data set's x is the width and its y the length, a yaw of 0 faces +y."""
+    return np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
+
+
+def _category(label: str, rider: str) -> str:
+    if label == "Bicycle":
+        return RIDER.get(rider, UNKNOWN_RIDER)
+    return CATEGORY_OF.get(label, "")
+
+
+def _settle_riders(track_id: NDArray[np.str_], category: NDArray[np.str_], notes: list[str]) -> NDArray[np.str_]:
+    """Categories in which a bicycle of unknown rider is what it is in most other sweeps; without any, a bicycle."""
+    settled = category.copy()
+    alone = 0
+    for track in np.unique(track_id[category == UNKNOWN_RIDER]):
+        rows = track_id == track
+        words, counts = np.unique(category[rows & (category != UNKNOWN_RIDER)], return_counts=True)
+        settled[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
+        alone += not len(words)
+    if alone:
+        notes.append(
+            f"{alone} bicycle{'s' * (alone != 1)} taken as unridden: no sweep states whether somebody rides them"
+        )
+    return settled
+
 
 TABLE = ".pkl.gz"
 ROAD_BELOW_POSE_M = 0.325
@@ -203,7 +491,7 @@ def georeference(geodetic: Array, xyz_map: Array, where: str) -> tuple[MapFrame,
 
     The map's axes count as east and north only if the track reaches 20 m and the best rotation is below 1 degree.
     """
-    from log2sim.logs.geodesy import geodetic_from_map, poses_from_geodetic, transverse_mercator
+    from log2sim.logs.stamps import geodetic_from_map, poses_from_geodetic, transverse_mercator
 
     n = min(len(geodetic), len(xyz_map))
     latitude, longitude, altitude = (float(v) for v in geodetic[0])

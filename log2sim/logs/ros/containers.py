@@ -1,14 +1,25 @@
-"""What the three container formats of ROS recordings have in common: channels, and messages that are found by number."""
+"""Files of chunks with channels and messages: what ROS 1 bags, MCAP and SQLite recordings have in common."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import bz2
+import importlib
+import os
+import threading
+import weakref
+import zlib
+from collections import OrderedDict
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from log2sim.errors import MissingExtra
+from log2sim.files.inputs import open_regular
 
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 MAX_NAME_CHARACTERS = 256
@@ -22,7 +33,6 @@ class Channel:
 
     Attributes
     ----------
-    topic : str
     msgtype : str
         Such as "sensor_msgs/msg/Image".
     encoding : str
@@ -134,3 +144,199 @@ def checked_size(size_bytes: int) -> int:
     if not 0 <= size_bytes <= MAX_MESSAGE_BYTES:
         raise ValueError(f"{size_bytes} bytes, more than the {MAX_MESSAGE_BYTES} that a message may have")
     return size_bytes
+
+
+MAX_CHUNK_BYTES = 512 * 1024 * 1024
+MAX_RATIO, FREE_BYTES = 256, 16 * 1024 * 1024
+"""A chunk that unpacks to more than `FREE_BYTES`, and to so many times its stored size, holds nothing that was measured: sensor data
+pack to a half to a twentieth. Without this a few kilobytes would keep the reader busy for minutes."""
+READ_BYTES = 16 * 1024
+CACHED_BYTES = 64 * 1024 * 1024
+"""Of decompressed chunks; the last one is kept whatever its size."""
+
+
+class Chunk(NamedTuple):
+    """A chunk: where its stored bytes lie in the file, and what they unpack to."""
+
+    position: int
+    stored_bytes: int
+    size_bytes: int
+    compression: str
+    crc: int = 0
+
+
+class ChunkedFile:
+    """Reads ranges of a file and of the unpacked chunks in it, from any thread."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.chunks: list[Chunk] = []
+        self._file = open_regular(path, buffering=0)
+        weakref.finalize(self, self._file.close)
+        self.size = os.fstat(self._file.fileno()).st_size
+        self._lock = threading.RLock()
+        self._cache: OrderedDict[int, bytes] = OrderedDict()
+        self._intact: set[int] = set()
+        self._damaged: dict[int, str] = {}
+        self._partial: _PartialChunk | None = None
+
+    def at(self, position: int, count: int) -> bytes:
+        """Read `count` bytes; `ValueError` where the file ends before."""
+        if count < 0 or position < 0 or position + count > self.size:
+            raise ValueError(f"{count} bytes at byte {position} of a file of {self.size}; it is truncated or damaged")
+        with self._lock:
+            self._file.seek(position)
+            parts, missing = [], count
+            while missing and (part := self._file.read(missing)):
+                parts.append(part)
+                missing -= len(part)
+        if missing:
+            raise ValueError(f"{count} bytes at byte {position}, but the file ends {missing} bytes before")
+        return b"".join(parts)
+
+    def within(self, chunk: int, offset: int, count: int, *, ahead: bool = False) -> bytes:
+        """Read up to `count` bytes from `offset` of a chunk, or of the file for chunk -1; fewer at its end.
+
+        With `ahead` a compressed chunk is unpacked only as far as needed, for callers that go through the file in order.
+        """
+        if chunk < 0:
+            return self.at(offset, min(count, self.size - offset))
+        c = self.chunks[chunk]
+        if not 0 <= offset < c.size_bytes:
+            raise ValueError(f"message at byte {offset} of a chunk of {c.size_bytes}")
+        count = min(count, c.size_bytes - offset)
+        if c.compression in ("", "none"):
+            return self.at(c.position + offset, count)
+        if ahead and chunk not in self._cache:
+            with self._lock:
+                return bytes(self._unpacked_up_to(chunk, offset + count)[offset : offset + count])
+        return self.unpacked(chunk)[offset : offset + count]
+
+    def _unpacked_up_to(self, number: int, end: int) -> bytearray:
+        """First bytes of a compressed chunk, at least `end` of them; what is stored behind them is not read."""
+        chunk = self.chunks[number]
+        self._require_sizes(chunk)
+        partial = self._partial
+        if partial is None or partial.number != number:
+            partial = self._partial = _PartialChunk(number, decompressor_of(chunk.compression))
+        while len(partial.data) < end:
+            left = chunk.stored_bytes - partial.read_bytes
+            if number in self._damaged or not left:
+                raise ValueError(self._damaged.get(number, f"unpacks to {len(partial.data)} bytes only"))
+            part = self.at(chunk.position + partial.read_bytes, min(left, READ_BYTES))
+            partial.read_bytes += len(part)
+            try:
+                # No more is unpacked than the size that the chunk declares.
+                partial.data += unpack_part(partial.decompressor, part, chunk.size_bytes + 1 - len(partial.data))
+            except ValueError as problem:
+                self._damaged[number] = str(problem)
+        return partial.data
+
+    def unpacked(self, chunk: int) -> bytes:
+        """Bytes of a chunk, decompressed and checked; a damaged one is not tried again."""
+        with self._lock:
+            if chunk in self._cache:
+                self._cache.move_to_end(chunk)
+                return self._cache[chunk]
+        if chunk in self._damaged:
+            raise ValueError(self._damaged[chunk])
+        try:
+            data = self._unpack(self.chunks[chunk])
+        except (ValueError, OSError, EOFError) as problem:
+            self._damaged[chunk] = str(problem)
+            raise
+        with self._lock:
+            self._cache[chunk] = data
+            self._intact.add(chunk)
+            while len(self._cache) > 1 and sum(map(len, self._cache.values())) > CACHED_BYTES:
+                self._cache.popitem(last=False)
+        return data
+
+    def _unpack(self, chunk: Chunk) -> bytes:
+        self._require_sizes(chunk)
+        data = decompress(self.at(chunk.position, chunk.stored_bytes), chunk.compression, chunk.size_bytes)
+        if chunk.crc and zlib.crc32(data) != chunk.crc:
+            raise ValueError(f"the CRC of the chunk at byte {chunk.position} is wrong")
+        return data
+
+    def _require_sizes(self, chunk: Chunk) -> None:
+        """Raise `ValueError` for a chunk whose sizes no recorder writes."""
+        if max(chunk.size_bytes, chunk.stored_bytes) > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk of {chunk.size_bytes} bytes, more than the {MAX_CHUNK_BYTES} that it may have")
+        if chunk.size_bytes > max(FREE_BYTES, MAX_RATIO * chunk.stored_bytes):
+            raise ValueError(
+                f"a chunk of {chunk.stored_bytes} bytes that says to unpack to {chunk.size_bytes}, more than {MAX_RATIO} times as many"
+            )
+
+    def check(self, chunk: int) -> None:
+        """Check the CRC of a chunk that has one, once; `ValueError` where it is wrong."""
+        if chunk >= 0 and self.chunks[chunk].crc and chunk not in self._intact:
+            self.unpacked(chunk)
+
+
+@dataclass
+class _PartialChunk:
+    """A chunk that is unpacked from its beginning on: its number, and how much of it was read and unpacked."""
+
+    number: int
+    decompressor: Any
+    read_bytes: int = 0
+    data: bytearray = field(default_factory=bytearray)
+
+
+def decompress(data: bytes, method: str, size_bytes: int) -> bytes:
+    """Decompress data that unpack to `size_bytes`, without allocating more.
+
+    Raises
+    ------
+    ValueError, OSError, RuntimeError, EOFError
+        For damaged data, and for data that unpack to another size.
+    MissingExtra
+        Where the library of the method is not installed.
+    """
+    checked = min(size_bytes, MAX_CHUNK_BYTES)
+    unpacked = data if method in ("", "none") else decompress_head(data, method, checked + 1)
+    if len(unpacked) != size_bytes:
+        found = f"more than {checked}" if len(unpacked) > checked else f"{len(unpacked)}"
+        raise ValueError(f"unpacks to {found} bytes, expected {size_bytes}")
+    return unpacked
+
+
+def decompress_message(data: bytes, method: str, limit_bytes: int | None) -> bytes:
+    """Decompress a message that was compressed by itself, or its first `limit_bytes`."""
+    if not method:
+        return data
+    if limit_bytes is not None:
+        return decompress_head(data, method, limit_bytes)
+    unpacked = decompress_head(data, method, checked_size(MAX_CHUNK_BYTES // 2) + 1)
+    checked_size(len(unpacked))
+    return unpacked
+
+
+def decompress_head(data: bytes, method: str, limit_bytes: int) -> bytes:
+    """Decompress at most the first `limit_bytes` of data; `ValueError` where they are damaged."""
+    return unpack_part(decompressor_of(method), data, limit_bytes)
+
+
+def unpack_part(decompressor: Any, data: bytes, limit_bytes: int) -> bytes:
+    """Unpack the next part of compressed data into at most `limit_bytes`; `ValueError` where it is damaged."""
+    try:
+        unpacked: bytes = decompressor.decompress(data, max_length=limit_bytes)
+    except Exception as error:  # the libraries have errors of their own
+        raise ValueError(f"damaged compressed data: {error}") from None
+    return unpacked
+
+
+def decompressor_of(method: str) -> Any:
+    """Decompressor of a method; `MissingExtra` where its library is not installed."""
+    if method == "bz2":
+        return bz2.BZ2Decompressor()
+    # Python has zstd from 3.14 on.
+    names = {"lz4": ("lz4.frame",), "zstd": ("compression.zstd", "backports.zstd")}.get(method, ())
+    for name in names:
+        with suppress(ImportError):
+            module = importlib.import_module(name)
+            return module.LZ4FrameDecompressor() if method == "lz4" else module.ZstdDecompressor()
+    if names:
+        raise MissingExtra(f"reading {method} compression of a bag", "ros")
+    raise ValueError(f"unknown compression '{method[:20]}'; known: none, bz2, lz4, zstd")

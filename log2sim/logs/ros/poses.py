@@ -20,9 +20,7 @@ from log2sim.geometry import Array, PoseTrack, shift_poses, transform, whole_kil
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree, pose_of
-from log2sim.logs.ros.messages import decode_bytes
-from log2sim.logs.ros.settings import MapSettings, PoseSettings
-from log2sim.logs.ros.stamping import MIN_POSES, say_uncovered
+from log2sim.logs.ros.messages import MIN_POSES, MapSettings, PoseSettings, decode_bytes, say_uncovered
 from log2sim.logs.stamps import strictly_increasing
 
 MAP_FRAMES = ("map", "world", "earth", "utm")
@@ -54,16 +52,12 @@ class PoseSources:
 
     Attributes
     ----------
-    bag : Bag
     topics : mapping of str to list of str
         Topics by kind.
     messages : mapping of str to sequence of bytes or None
         Their messages.
-    tree : FrameTree
     base : str
         The vehicle's frame.
-    settings : PoseSettings
-    map : MapSettings
     span_ns : (int, int)
         First and last stamp of the sensors.
     damaged : dict of str to int
@@ -197,7 +191,7 @@ class PoseSources:
         )
 
     def _from_gnss(self, name: str) -> FoundPoses:
-        from log2sim.logs.geodesy import map_frame_of, poses_from_geodetic
+        from log2sim.logs.stamps import map_frame_of, poses_from_geodetic
 
         imu, t_ns, base_R = self._orientations(name)
         fixes, stamps = self._decoded(name)

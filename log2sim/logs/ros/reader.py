@@ -11,19 +11,26 @@ import numpy as np
 
 from log2sim.datatypes import Lidar, Log, MapFrame, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.files.inputs import require_link_inside
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack, RollingShutter, inverse
-from log2sim.links import require_link_inside
-from log2sim.logs.ros import calibration, ego
-from log2sim.logs.ros.bag import NAME_BYTES, Bag, Topic
+from log2sim.logs.ros import frames as ego
+from log2sim.logs.ros import sensors as calibration
+from log2sim.logs.ros.bag import NAME_BYTES, SUFFIXES, Bag, Topic, find_recordings
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree
-from log2sim.logs.ros.messages import decode_bytes
+from log2sim.logs.ros.messages import (
+    CameraTopic,
+    LidarTopic,
+    Stamped,
+    TopicSettings,
+    decode_bytes,
+    note_other_clocks,
+    read_settings,
+    stamp_messages,
+)
 from log2sim.logs.ros.poses import FoundPoses, PoseSources
-from log2sim.logs.ros.recordings import SUFFIXES, find_recordings
 from log2sim.logs.ros.roles import FIXED_FRAMES, Roles, assign_roles
-from log2sim.logs.ros.settings import CameraTopic, LidarTopic, TopicSettings, read_settings
-from log2sim.logs.ros.stamping import Stamped, note_other_clocks, stamp_messages
-from log2sim.logs.ros.streams import camera_stream, lidar_stream
+from log2sim.logs.ros.sensors import camera_stream, lidar_stream
 
 MAX_LISTED = 8
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from log2sim import registry
 from log2sim.errors import ConfigError, LogError
-from log2sim.logs.ros import livox
+from log2sim.files import plugins
+from log2sim.logs.ros import messages
 from log2sim.logs.ros.bag import Bag, Topic
-from log2sim.logs.ros.ego import BASE_FRAMES
-from log2sim.logs.ros.messages import find_layout_problem
-from log2sim.logs.ros.settings import CameraTopic, LidarTopic, TopicSettings
+from log2sim.logs.ros.frames import BASE_FRAMES
+from log2sim.logs.ros.messages import CameraTopic, LidarTopic, TopicSettings, find_layout_problem
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CLOUD, CAMERA_INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
@@ -22,7 +21,7 @@ ODOMETRY, FIX, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/NavSatFix", "sens
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 KINDS = {
-    IMAGE: "camera", **dict.fromkeys(livox.TYPES, "lidar"), COMPRESSED: "camera", CLOUD: "lidar", CAMERA_INFO: "camera info", ODOMETRY: "odometry",
+    IMAGE: "camera", **dict.fromkeys(messages.TYPES, "lidar"), COMPRESSED: "camera", CLOUD: "lidar", CAMERA_INFO: "camera info", ODOMETRY: "odometry",
     FIX: "gnss", IMU: "imu", **dict.fromkeys(POSES, "pose"), **dict.fromkeys(TRANSFORMS, "tf"),
 }  # fmt: skip
 FIXED_FRAMES = ("map", "world", "earth", "odom")
@@ -53,7 +52,6 @@ class Roles:
         Topics by kind: "camera info", "odometry", "pose", "gnss", "imu", "tf".
     reasons : dict of str to (str, str)
         Role and reason by topic.
-    notes : list of str
     """
 
     cameras: dict[str, CameraTopic] = field(default_factory=dict)
@@ -123,7 +121,7 @@ def _check_named(bag: Bag, settings: TopicSettings, file: Path | None) -> None:
     named += [("poses.imu", poses.imu, ("imu",))] if poses.imu else []
     for key, name, expected in named:
         if name not in bag.topics:
-            near = registry.nearest(name, list(bag.topics))
+            near = plugins.nearest(name, list(bag.topics))
             raise ConfigError(f"{file}: '{key}' is '{name}', but the recording has no such topic{near}")
         topic = bag.topics[name]
         kind = KINDS.get(topic.msgtype)

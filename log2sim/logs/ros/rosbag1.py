@@ -9,9 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from log2sim.errors import LogError
-from log2sim.logs.ros.chunked import Chunk, ChunkedFile
-from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normalized_type, one_line, printable
-from log2sim.logs.sweeps import PARSER_ERRORS
+from log2sim.logs.records import PARSER_ERRORS
+from log2sim.logs.ros.containers import (
+    Channel,
+    Chunk,
+    ChunkedFile,
+    EntryList,
+    checked_size,
+    normalized_type,
+    one_line,
+    printable,
+)
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES = 1024 * 1024

@@ -1,4 +1,6 @@
-"""Reader of version 2 of the Waymo Open Dataset: parquet components, a folder for each; needs the extra "parquet" (pyarrow).
+"""Reader of version 2 of the Waymo Open Dataset: parquet components of segments.
+
+Types differ between releases (cameras by number or by name, poses in single or double precision): what a column holds decides.
 
 What the components hold is what the frames of version 1 hold. Opening reads poses, stamps and calibration; pictures and range
 images are read row by row.
@@ -6,6 +8,8 @@ images are read row by row.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,20 +18,270 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
-from log2sim.errors import RecordError
-from log2sim.input_files import is_present
-from log2sim.links import require_links_inside
-from log2sim.logs.arrow.parquet_rows import Row
-from log2sim.logs.arrow.tables import read_columns
-from log2sim.logs.arrow.values import Kind
-from log2sim.logs.digest import digest_of
-from log2sim.logs.waymo import components
-from log2sim.logs.waymo.assembly import log_of
-from log2sim.logs.waymo.components import IMAGE, LASER, LIDAR_RETURNS, PIXEL_POSES, STAMP
+from log2sim.errors import LogError, RecordError
+from log2sim.files.inputs import is_present, require_links_inside
+from log2sim.geometry import Array
+from log2sim.logs.arrow import Kind, ParquetRows, Row, read_columns
+from log2sim.logs.excerpt import digest_of
+from log2sim.logs.stamps import MAX_TIME_S
+from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.range_images import checked, shaped
-from log2sim.logs.waymo.segment import CAMERAS, LASERS, FrameRow, RangeImages, Segment
-from log2sim.logs.waymo.sensor_rows import RecordColumns, SensorRows, cell, where
-from log2sim.logs.waymo.wire import WireError
+from log2sim.logs.waymo.reader import log_of
+from log2sim.logs.waymo.segment import (
+    CAMERAS,
+    LASERS,
+    MAX_BEAMS,
+    BoxTable,
+    CameraCalibration,
+    FrameRow,
+    ImageTimes,
+    LaserCalibration,
+    RangeImages,
+    Segment,
+    are_usable,
+    rigid,
+)
+
+Columns = dict[str, NDArray[Any]]
+
+STAMP, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
+POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+IMAGE = "[CameraImageComponent]"
+IMAGE_COLUMNS: Mapping[str, Kind] = {
+    STAMP: "int",
+    CAMERA: "text",
+    f"{IMAGE}.pose.transform": "floats",
+    f"{IMAGE}.pose_timestamp": "float",
+    f"{IMAGE}.rolling_shutter_params.shutter": "float",
+    f"{IMAGE}.rolling_shutter_params.camera_trigger_time": "float",
+    f"{IMAGE}.rolling_shutter_params.camera_readout_done_time": "float",
+}
+CAMERA_PREFIX = "[CameraCalibrationComponent]"
+INTRINSICS = tuple(f"{CAMERA_PREFIX}.intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
+LASER_PREFIX = "[LiDARCalibrationComponent]"
+LIDAR_RETURNS = ("[LiDARComponent].range_image_return1", "[LiDARComponent].range_image_return2")
+PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
+# Component and prefix of its columns.
+LIDAR_BOXES = ("lidar_box", "[LiDARBoxComponent]")
+PROJECTED_BOXES = ("projected_lidar_box", "[ProjectedLiDARBoxComponent]")
+CAMERA_BOXES = ("camera_box", "[CameraBoxComponent]")
+
+
+def component_file(root: Path, component: str, segment: str) -> Path:
+    """Return the path of a component of a segment."""
+    return root / component / f"{segment}.parquet"
+
+
+def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
+    """Read stamps in us and poses (4, 4) of the frames, and remarks on those that are none.
+
+    Raises
+    ------
+    LogError
+        When no row has both.
+    """
+    columns = read_columns(path, {STAMP: "int", POSE: "floats"})
+    found = [(int(t), matrix(cell)) for t, cell in zip(columns[STAMP], columns[POSE])]
+    usable = [(t, pose) for t, pose in found if pose is not None and 0 < t < MAX_TIME_S * 10**6]
+    if not usable:
+        raise LogError(f"{path}: none of its {len(found)} rows is a rigid pose with a stamp in microseconds")
+    lost = len(found) - len(usable)
+    notes = [f"{lost} of {len(found)} frames without a rigid pose left out"] if lost else []
+    return [t for t, _ in usable], [pose for _, pose in usable], notes
+
+
+def read_camera_calibration(path: Path) -> dict[int, CameraCalibration]:
+    """Read the calibration of the cameras by number."""
+    extrinsic = f"{CAMERA_PREFIX}.extrinsic.transform"
+    whole = [f"{CAMERA_PREFIX}.{name}" for name in ("width", "height", "rolling_shutter_direction")]
+    columns = read_columns(
+        path, {CAMERA: "text", extrinsic: "floats", **dict.fromkeys(INTRINSICS, "float"), **dict.fromkeys(whole, "int")}
+    )
+    out = {}
+    for row, number in enumerate(numbers_of(columns[CAMERA], CAMERAS)):
+        intrinsic = np.array([columns[name][row] for name in INTRINSICS], dtype=np.float64)
+        pose = matrix(columns[extrinsic][row])
+        width, height, direction = (int(columns[name][row]) for name in whole)
+        if pose is None or not are_usable(intrinsic, width, height):
+            raise LogError(
+                f"{path}, row {row}: expected finite intrinsics, a rigid extrinsic, width and height of camera {number}"
+            )
+        out[int(number)] = CameraCalibration(intrinsic, pose, width, height, direction)
+    return out
+
+
+def read_laser_calibration(path: Path) -> dict[int, LaserCalibration]:
+    """Read the calibration of the LiDARs by number."""
+    extrinsic, values = f"{LASER_PREFIX}.extrinsic.transform", f"{LASER_PREFIX}.beam_inclination.values"
+    limits = [f"{LASER_PREFIX}.beam_inclination.{name}" for name in ("min", "max")]
+    columns = read_columns(
+        path,
+        {LASER: "text", extrinsic: "floats", values: "floats", **dict.fromkeys(limits, "float")},
+        optional=(values,),
+    )
+    out = {}
+    for row, number in enumerate(numbers_of(columns[LASER], LASERS)):
+        pose = matrix(columns[extrinsic][row])
+        cell = columns[values][row] if values in columns else None
+        beams = np.zeros(0) if cell is None else np.asarray(cell, dtype=np.float64)
+        low, high = (float(columns[name][row]) for name in limits)
+        known = np.isfinite(beams).all() if len(beams) else np.isfinite([low, high]).all()
+        if pose is None or not known or len(beams) > MAX_BEAMS:
+            raise LogError(f"{path}, row {row}: expected a rigid extrinsic and finite inclinations of LiDAR {number}")
+        out[int(number)] = LaserCalibration(pose, beams, (low, high))
+    return out
+
+
+def image_times(columns: Columns, row: int) -> ImageTimes:
+    """Return when the image of a row of the component "camera_image" was taken; NaN counts as unknown."""
+    seconds = [
+        float(columns[name][row]) for name in IMAGE_COLUMNS if name not in (STAMP, CAMERA, f"{IMAGE}.pose.transform")
+    ]
+    return ImageTimes(matrix(columns[f"{IMAGE}.pose.transform"][row]), *(s if np.isfinite(s) else 0.0 for s in seconds))
+
+
+def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int]) -> BoxTable:
+    """Read 3D labels; `frame_of` gives the index of the frame of a stamp."""
+    center, size = ([f"{prefix}.box.{part}.{axis}" for axis in "xyz"] for part in ("center", "size"))
+    numbers = [*center, *size, f"{prefix}.box.heading"]
+    columns = read_columns(
+        path, {STAMP: "int", "key.laser_object_id": "text", f"{prefix}.type": "int", **dict.fromkeys(numbers, "float")}
+    )
+    return _table(columns, "key.laser_object_id", f"{prefix}.type", numbers, frame_of)
+
+
+def read_image_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int) -> BoxTable:
+    """Read the 2D labels of a camera; `frame_of` gives the index of the frame of a stamp."""
+    numbers = [f"{prefix}.box.{part}.{axis}" for part in ("center", "size") for axis in "xy"]
+    columns = read_columns(
+        path, {STAMP: "int", CAMERA: "text", f"{prefix}.type": "int", **dict.fromkeys(numbers, "float")}
+    )
+    of_camera = numbers_of(columns[CAMERA], CAMERAS) == camera
+    columns = {name: values[of_camera] for name, values in columns.items()}
+    return _table(columns, CAMERA, f"{prefix}.type", numbers, frame_of)
+
+
+def _table(columns: Columns, track: str, kind: str, numbers: list[str], frame_of: Mapping[int, int]) -> BoxTable:
+    frame = np.array([frame_of.get(int(t), -1) for t in columns[STAMP]], dtype=np.int64)
+    known = np.flatnonzero(frame >= 0)
+    box = np.stack([columns[name].astype(np.float64) for name in numbers], axis=1)
+    dimensions = len(numbers) // 2
+    heading = box[:, -1] if len(numbers) % 2 else np.zeros(len(box))
+    track_id = np.array([str(word) for word in columns[track]], dtype=np.str_)
+    table = BoxTable(
+        frame,
+        track_id,
+        columns[kind],
+        box[:, :dimensions],
+        box[:, dimensions : 2 * dimensions],
+        heading,
+        len(box) - len(known),
+    )
+    return table.take(known)
+
+
+def numbers_of(words: NDArray[Any], names: Mapping[int, str]) -> NDArray[np.int64]:
+    """Numbers (N,) of sensors that are given by number or by name; 0 for others."""
+    number = {name: k for k, name in names.items()} | {str(k): k for k in names}
+    return np.array([number.get(str(word), 0) for word in words], dtype=np.int64)
+
+
+def matrix(cell: Any) -> Any:
+    """Return the transform (4, 4) of a cell; None when it is none."""
+    return None if cell is None else rigid(np.asarray(cell, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class RecordColumns:
+    """Columns that are large and read row by row.
+
+    Attributes
+    ----------
+    kinds : mapping of str to str
+        What each column holds, as for `log2sim.logs.arrow.read_columns`.
+    optional : collection of str
+        Names that may be absent.
+    """
+
+    kinds: Mapping[str, Kind]
+    optional: Collection[str] = ()
+
+
+@dataclass(eq=False)
+class SensorRows:
+    """A component with one row for each frame and sensor; without any where its file is absent.
+
+    Parameters
+    ----------
+    index : mapping of str to str
+        Columns to read at once, with the stamp and the sensor.
+    names : mapping of int to str
+        Sensors by number.
+    frame_of : mapping of int to int
+        Index of the frame of a stamp in us.
+
+    Attributes
+    ----------
+    rows : dict of (int, int) to int
+        Row of a frame by index and sensor by number.
+    columns : mapping of str to array
+        The columns of `index`.
+    note : str
+        What was left out; empty where nothing was.
+    """
+
+    path: Path
+    index: Mapping[str, Kind]
+    names: Mapping[int, str]
+    frame_of: Mapping[int, int]
+    records: RecordColumns
+    rows: dict[tuple[int, int], int] = field(default_factory=dict)
+    columns: Columns = field(default_factory=dict)
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        """Read the index."""
+        self._files: dict[int, ParquetRows] = {}
+        if not is_present(self.path):
+            return
+        self.columns = read_columns(self.path, self.index)
+        sensor_column = CAMERA if CAMERA in self.index else next(name for name in self.index if name != STAMP)
+        sensor = numbers_of(self.columns[sensor_column], self.names)
+        frame = np.array([self.frame_of.get(int(t), -1) for t in self.columns[STAMP]], dtype=np.int64)
+        known = np.flatnonzero((frame >= 0) & (sensor > 0))
+        self.rows = {(int(frame[row]), int(sensor[row])): int(row) for row in known}
+        if len(self.rows) < len(frame):
+            lost = len(frame) - len(self.rows)
+            self.note = f"{self.path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out"
+        # Rows can only be read on: a file with one sensor after the other is read from several places at once.
+        by_sensor = bool(np.any(np.diff(frame[known]) < 0))
+        shared = ParquetRows(self.path, self.records.kinds, optional=self.records.optional)
+        for number in {number for _, number in self.rows}:
+            own = ParquetRows(self.path, self.records.kinds, optional=self.records.optional) if by_sensor else shared
+            self._files[number] = own
+
+    def read(self, frame: int, sensor: int) -> Row | None:
+        """Return the record of a frame and sensor; None where there is no row, `RecordError` for one that cannot be read."""
+        row = self.rows.get((frame, sensor))
+        return None if row is None else self._files[sensor].read(row)
+
+    def by_frame(self, count: int) -> list[list[int]]:
+        """Return the numbers of the sensors of each of `count` frames."""
+        out: list[list[int]] = [[] for _ in range(count)]
+        for frame, sensor in self.rows:
+            out[frame].append(sensor)
+        return out
+
+
+def where(component: SensorRows, frame: int, sensor: int) -> str:
+    """Name a record in errors."""
+    return f"{component.path}, row {component.rows.get((frame, sensor), 'none')}"
+
+
+def cell(row: Row | None, name: str) -> Any:
+    """Return a value of a row; None where there is none."""
+    return None if row is None else row.get(name)
+
 
 POSES = "vehicle_pose"
 STATISTICS = ("time_of_day", "location", "weather")
@@ -63,7 +317,7 @@ READER = WaymoParquetReader()
 class _SegmentFolder:
     def __init__(self, root: Path, name: str) -> None:
         self.root, self.name = root, name
-        self.stamps_us, self.poses, self.notes = components.read_poses(self._file(POSES))
+        self.stamps_us, self.poses, self.notes = read_poses(self._file(POSES))
         self.frame_of = {t: k for k, t in enumerate(self.stamps_us)}
         of_lidars: dict[str, Kind] = {STAMP: "int", LASER: "text"}
         second = [f"{LIDAR_RETURNS[1]}.{part}" for part in ("values", "shape")]
@@ -71,23 +325,23 @@ class _SegmentFolder:
         self.sweeps = self._rows("lidar", of_lidars, LASERS, ranges)
         self.pixel_poses = self._rows("lidar_pose", of_lidars, LASERS, RecordColumns(_matrices(PIXEL_POSES)))
         jpeg = RecordColumns({f"{IMAGE}.image": "bytes"})
-        self.images = self._rows("camera_image", components.IMAGE_COLUMNS, CAMERAS, jpeg)
+        self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, jpeg)
 
     def log(self) -> Log:
-        boxes = self._path_of(components.LIDAR_BOXES[0])
-        projected, drawn = (self._path_of(c[0]) for c in (components.PROJECTED_BOXES, components.CAMERA_BOXES))
+        boxes = self._path_of(LIDAR_BOXES[0])
+        projected, drawn = (self._path_of(c[0]) for c in (PROJECTED_BOXES, CAMERA_BOXES))
         # Boxes projected from 3D labels go before boxes drawn in the images.
-        kind, in_images = (components.PROJECTED_BOXES if projected else components.CAMERA_BOXES), projected or drawn
+        kind, in_images = (PROJECTED_BOXES if projected else CAMERA_BOXES), projected or drawn
         segment = Segment(
             name=self.name,
             path=self.root,
-            cameras=components.read_camera_calibration(self._file("camera_calibration")) if self.images.rows else {},
-            lasers=components.read_laser_calibration(self._file("lidar_calibration")) if self.sweeps.rows else {},
+            cameras=read_camera_calibration(self._file("camera_calibration")) if self.images.rows else {},
+            lasers=read_laser_calibration(self._file("lidar_calibration")) if self.sweeps.rows else {},
             frames=self._frames(),
             image=self._image,
             ranges=self._ranges,
-            boxes=partial(components.read_boxes, boxes, components.LIDAR_BOXES[1], self.frame_of) if boxes else None,
-            image_boxes=partial(components.read_image_boxes, in_images, kind[1], self.frame_of) if in_images else None,
+            boxes=partial(read_boxes, boxes, LIDAR_BOXES[1], self.frame_of) if boxes else None,
+            image_boxes=partial(read_image_boxes, in_images, kind[1], self.frame_of) if in_images else None,
             image_boxes_are_projected=projected is not None,
             pixel_poses_are_missing=not self.pixel_poses.rows,
             where=lambda frame: f"{self.root}: segment {self.name}, frame {self.stamps_us[frame]}",
@@ -98,7 +352,7 @@ class _SegmentFolder:
 
     def _frames(self) -> list[FrameRow]:
         """Return the frames in the order of the poses."""
-        times = {key: components.image_times(self.images.columns, row) for key, row in self.images.rows.items()}
+        times = {key: image_times(self.images.columns, row) for key, row in self.images.rows.items()}
         count = len(self.poses)
         rows = zip(self.stamps_us, self.poses, self.images.by_frame(count), self.sweeps.by_frame(count))
         return [
@@ -112,7 +366,7 @@ class _SegmentFolder:
         return digest_of([self.name, repr(self.stamps_us), np.stack(self.poses).tobytes().hex(), *sizes], [])
 
     def _file(self, component: str) -> Path:
-        return components.component_file(self.root, component, self.name)
+        return component_file(self.root, component, self.name)
 
     def _path_of(self, component: str) -> Path | None:
         """Path of a component; None where it was not downloaded."""

@@ -1,4 +1,7 @@
-"""Reader of version 1 of the Waymo Open Dataset: TFRecords of `Frame` messages, one file a segment.
+"""Reader of version 1 of the Waymo Open Dataset, and a segment of either version as a log.
+
+The stamp of a sweep is that of the pose which defines the frame of its points, about the middle of the turn. Cameras are called
+as in the data set; LiDARs get "LIDAR_" before their names, for both have a FRONT, a SIDE_LEFT and a SIDE_RIGHT.
 
 Opening reads the lengths of the records and, of each frame, poses, stamps and the offsets of everything else; pictures, range
 images and labels are skipped. The format is that of dataset.proto and label.proto (github.com/waymo-research/waymo-open-dataset).
@@ -6,19 +9,26 @@ images and labels are skipped. The format is that of dataset.proto and label.pro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
-from log2sim.datatypes import Log
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
-from log2sim.links import require_link_inside
-from log2sim.logs.digest import digest_of
-from log2sim.logs.stamps import MAX_TIME_S
-from log2sim.logs.waymo.assembly import log_of
+from log2sim.files.inputs import require_link_inside
+from log2sim.geometry import Camera, PoseTrack, RollingShutter, shift_poses, transform, whole_kilometers
+from log2sim.logs.excerpt import digest_of
+from log2sim.logs.records import decode_image, sweep_of
+from log2sim.logs.stamps import MAX_TIME_S, defer_notes, strictly_increasing
 from log2sim.logs.waymo.messages import (
     FrameIndex,
     Span,
+    WireError,
     read_box,
     read_calibration,
     read_camera_labels,
@@ -26,18 +36,287 @@ from log2sim.logs.waymo.messages import (
     segment_name,
     take_index,
 )
-from log2sim.logs.waymo.range_images import read_range_images
+from log2sim.logs.waymo.range_images import (
+    LabelsOnRequest,
+    image_labels_of,
+    intensities_of,
+    labels_of,
+    points_of,
+    read_range_images,
+)
 from log2sim.logs.waymo.segment import (
     CAMERAS,
+    LASERS,
+    TOP,
     BoxTable,
     CameraCalibration,
     FrameRow,
+    FrameTimes,
     LaserCalibration,
     RangeImages,
     Segment,
+    plausible_stamp,
 )
 from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
-from log2sim.logs.waymo.wire import WireError
+
+# From OpenCV's axes to x forward, y left, z up.
+CAMERA_T_OPENCV = transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+# RollingShutterReadOutDirection of dataset.proto.
+DIRECTIONS = {1: "down", 2: "right", 3: "up", 4: "left"}
+# A Chrysler Pacifica, by its data sheet; the LiDARs at the bumpers of the sample are 5.23 m apart, 1.46 m ahead of the origin
+# in the middle.
+PACIFICA = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
+LASER_FRONT, LASER_REAR = 2, 5
+MAX_BUMPER_MISMATCH_M = 0.3
+# Frame.pose and the pose of the FRONT image are taken to be of one time; a larger distance between them is noted.
+MAX_POSE_MISMATCH_M = 0.05
+
+Stamps = NDArray[np.int64]
+
+
+def log_of(segment: Segment, format: str, digest: str) -> Log:
+    """Make a log of a segment; `LogError` when it has neither images nor points."""
+    return _Assembly(segment).log(format, digest)
+
+
+class _Assembly:
+    """A segment with its frames in order; frames are counted in this order from here on."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment, self.notes = segment, list(segment.notes)
+        stamps = np.array([frame.stamp_ns for frame in segment.frames], dtype=np.int64)
+        self.order, problems = strictly_increasing(stamps, "frames")
+        self.notes += problems
+        self.frames = [segment.frames[k] for k in self.order]
+        self.times = FrameTimes.of(self.frames, self.notes)
+        world_T_vehicle = np.stack([frame.world_T_vehicle for frame in self.frames])
+        self.offset_m = whole_kilometers(world_T_vehicle[:, :3, 3])
+        self.map_T_vehicle = shift_poses(world_T_vehicle, self.offset_m)
+
+    def log(self, format: str, digest: str) -> Log:
+        cameras, streams, image_ns = self._cameras()
+        lidars, sweeps = self._lidars()
+        if not cameras and not lidars:
+            raise LogError(
+                f"{self.segment.path}: {len(self.frames)} frames with neither images nor range images that have a calibration"
+            )
+        self._note_limits(lidars)
+        labels, image_labels = cache(self._labels), self._image_labels(cameras, image_ns)
+        return Log(
+            name=f"waymo-{self.segment.name}",
+            format=format,
+            cameras=cameras,
+            lidars=lidars,
+            streams=streams | sweeps,
+            ego=self._ego(),
+            ego_vehicle=ego_vehicle_of(self.segment.lasers),
+            map=MapFrame(offset_m=(float(self.offset_m[0]), float(self.offset_m[1]), float(self.offset_m[2]))),
+            labels=None if self.segment.boxes is None else labels,
+            image_labels=image_labels,
+            reference_camera=next(iter(cameras), None),
+            digest=digest,
+            notes=defer_notes(self.notes, labels, *(partial(image_labels.get, name) for name in image_labels)),
+            calibrations=dict.fromkeys(streams | sweeps, f"{self.segment.path}, its calibrations"),
+            details=self.segment.details,
+        )
+
+    def _cameras(self) -> tuple[dict[str, Camera], dict[str, Stream], dict[int, Stamps]]:
+        """Cameras with images, their streams, and their stamp (F,) in each frame, -1 where there is none."""
+        cameras, streams, image_ns = {}, {}, {}
+        for number, name in CAMERAS.items():
+            calibration = self.segment.cameras.get(number)
+            rows = np.array([k for k, frame in enumerate(self.frames) if number in frame.images], dtype=np.intp)
+            if calibration is None or not len(rows):
+                if len(rows):
+                    self.notes.append(f"{name}: {len(rows)} images left out: no calibration of this camera")
+                elif calibration is not None:
+                    self.notes.append(f"{name}: no images of this camera")
+                continue
+            camera = camera_of(name, calibration, [self.frames[k] for k in rows], number)
+            untimed = sum(not self.frames[k].images[number].is_timed for k in rows)
+            if untimed:
+                self.notes.append(
+                    f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
+                )
+            t_ns = np.array([self._image_ns(k, number) for k in rows], dtype=np.int64)
+            keep, problems = strictly_increasing(t_ns, name)
+            self.notes += problems
+            rows, t_ns = rows[keep], t_ns[keep]
+            cameras[name], image_ns[number] = camera, np.full(len(self.frames), -1, dtype=np.int64)
+            image_ns[number][rows] = t_ns
+            streams[name] = self._image_stream(camera, number, rows, t_ns)
+        return cameras, streams, image_ns
+
+    def _image_ns(self, k: int, number: int) -> int:
+        frame = self.frames[k]
+        stamp = plausible_stamp(frame.images[number].middle_ns(), frame.stamp_ns)
+        return int(self.times.pose_ns[k]) if stamp is None else stamp
+
+    def _image_stream(self, camera: Camera, number: int, rows: NDArray[np.intp], t_ns: Stamps) -> Stream:
+        def encoded(i: int) -> bytes:
+            return self.segment.image(int(self.order[rows[i]]), number)
+
+        def read(i: int) -> NDArray[np.uint8]:
+            where = f"{self.segment.where(int(self.order[rows[i]]))}, {camera.name} (stamp {t_ns[i]})"
+            return decode_image(encoded(i), where, (camera.width_px, camera.height_px))
+
+        return Stream(camera.name, t_ns, read, encoded)
+
+    def _lidars(self) -> tuple[dict[str, Lidar], dict[str, Stream]]:
+        """LiDARs with range images, and their streams."""
+        lidars, streams = {}, {}
+        for number, word in LASERS.items():
+            name, calibration = f"LIDAR_{word}", self.segment.lasers.get(number)
+            rows = np.array([k for k, frame in enumerate(self.frames) if number in frame.lasers], dtype=np.intp)
+            if len(rows) and calibration is None:
+                self.notes.append(f"{name}: {len(rows)} sweeps left out: no calibration of this LiDAR")
+            if not len(rows) or calibration is None:
+                continue
+            keep, problems = strictly_increasing(self.times.pose_ns[rows], name)
+            self.notes += problems
+            lidars[name] = Lidar(name, "ego", calibration.vehicle_T_lidar)
+            streams[name] = self._sweep_stream(name, number, rows[keep])
+        if not lidars:
+            self.notes.append("the frames hold no range images: there are no sweeps")
+        return lidars, streams
+
+    def _sweep_stream(self, name: str, number: int, rows: NDArray[np.intp]) -> Stream:
+        calibration, stamps = self.segment.lasers[number], self.times.pose_ns[rows]
+
+        def read(i: int) -> Sweep:
+            row, stamp_ns = rows[i], int(stamps[i])
+            images = self.segment.ranges(int(self.order[row]), number)
+            try:
+                xyz_m, turn = points_of(images, calibration, self.frames[row].world_T_vehicle)
+            except WireError as error:
+                where = self.segment.where(int(self.order[row]))
+                raise RecordError(f"{where}, {name} (stamp {stamp_ns}): {error}") from None
+            # How the short-range LiDARs scan is not documented.
+            timed = self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == TOP else None
+            raw = number == TOP and self.segment.pixel_poses_are_missing
+            return sweep_of(xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns, intensities_of(images))
+
+        return Stream(name, stamps, read)
+
+    def _ego(self) -> PoseTrack:
+        """Poses of the frames and of the images, each at its own time."""
+        stamps, poses = [int(t) for t in self.times.pose_ns], list(self.map_T_vehicle)
+        off_m = [0.0]
+        for frame, own_ns, own in zip(self.frames, self.times.pose_ns, self.map_T_vehicle):
+            for image in frame.images.values():
+                stamp = plausible_stamp(image.pose_ns(), frame.stamp_ns)
+                if stamp is None or image.world_T_vehicle is None:
+                    continue
+                pose = shift_poses(image.world_T_vehicle, self.offset_m)
+                if stamp == own_ns:
+                    off_m.append(float(np.linalg.norm(pose[:3, 3] - own[:3, 3])))
+                stamps.append(stamp)
+                poses.append(pose)
+        if max(off_m) > MAX_POSE_MISMATCH_M:
+            self.notes.append(
+                f"the pose that defines a frame is up to {max(off_m):.2f} m from that of the FRONT image, whose time it is taken to be"
+            )
+        # A frame's own pose comes first and stays: its points are made with it.
+        t_ns, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
+        return PoseTrack(t_ns, np.stack(poses)[first])
+
+    def _labels(self) -> Labels | None:
+        if self.segment.boxes is None:
+            return None
+        table = self._in_order(self.segment.boxes())
+        return labels_of(table, self.times, self.map_T_vehicle, self.segment.lasers.get(TOP), self.notes)
+
+    def _image_labels(self, cameras: dict[str, Camera], image_ns: dict[int, Stamps]) -> LabelsOnRequest:
+        boxes = self.segment.image_boxes
+        if boxes is None:
+            return LabelsOnRequest((), _no_labels)
+        number_of = {name: number for number, name in CAMERAS.items()}
+
+        def read(name: str) -> ImageLabels:
+            number, camera = number_of[name], cameras[name]
+            table = self._in_order(boxes(number))
+            lost = table.lost + int((image_ns[number][table.frame] < 0).sum())
+            if lost:
+                self.notes.append(f"{lost} boxes in images of '{name}' are damaged or of no frame, and left out")
+            return image_labels_of(table, image_ns[number], (camera.width_px, camera.height_px))
+
+        return LabelsOnRequest(tuple(cameras), read)
+
+    def _in_order(self, table: BoxTable) -> BoxTable:
+        """Count the frames of a table in their order; drops rows of frames that are not used."""
+        place = np.full(len(self.segment.frames), -1, dtype=np.int64)
+        place[self.order] = np.arange(len(self.order))
+        frame = place[table.frame]
+        rows = np.flatnonzero(frame >= 0)
+        return replace(table, frame=frame, lost=table.lost + len(frame) - len(rows)).take(rows)
+
+    def _note_limits(self, lidars: dict[str, Lidar]) -> None:
+        """Note what the format lacks."""
+        notes = self.notes
+        if f"LIDAR_{LASERS[TOP]}" in lidars:
+            notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
+            if not len(self.segment.lasers[TOP].inclinations_rad):  # only the short-range LiDARs have even beams
+                notes.append(
+                    "the calibration lacks the inclinations of the TOP LiDAR's beams: they are taken to be even between "
+                    "the lowest and the highest"
+                )
+            if self.segment.pixel_poses_are_missing:
+                notes.append(
+                    "the poses of the pixels are missing: points of the TOP LiDAR are as measured, not compensated"
+                )
+        if set(lidars) - {f"LIDAR_{LASERS[TOP]}"}:
+            notes.append("no times of points of the short-range LiDARs")
+        if self.segment.boxes is not None:
+            notes.append(
+                "labels do not distinguish cars from trucks, buses and motorcycles: all vehicles are read as cars"
+            )
+        if self.segment.image_boxes is not None:
+            projected = (
+                "3D labels projected into them" if self.segment.image_boxes_are_projected else "boxes drawn in them"
+            )
+            notes.append(f"labels of images are the {projected}")
+        if ego_vehicle_of(self.segment.lasers) is PACIFICA:
+            notes.append("the size of the ego vehicle is not in the log: that of a Chrysler Pacifica is assumed")
+        else:
+            notes.append(
+                "the size of the ego vehicle is not in the log: length by the LiDARs at its bumpers, the rest as a Pacifica's"
+            )
+
+
+def camera_of(name: str, calibration: CameraCalibration, frames: list[FrameRow], number: int) -> Camera:
+    """Make a camera with OpenCV's axes; the readout is the median of its images in `frames`."""
+    f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = (float(v) for v in calibration.intrinsic)
+    spans = [frame.images[number].readout_s() for frame in frames]
+    known = [s for s in spans if s is not None]
+    direction: Any = DIRECTIONS.get(calibration.direction)
+    shutter = RollingShutter(direction, float(np.median(known))) if direction is not None and known else None
+    return Camera(
+        name,
+        calibration.width_px,
+        calibration.height_px,
+        np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]),
+        "ego",
+        calibration.vehicle_T_camera @ CAMERA_T_OPENCV,
+        "brown",
+        (k1, k2, p1, p2, k3),
+        shutter,
+    )
+
+
+def ego_vehicle_of(lasers: Mapping[int, LaserCalibration]) -> EgoVehicle:
+    """Return the Pacifica, or a vehicle with the distance of the LiDARs at its bumpers as length where that differs."""
+    if LASER_FRONT not in lasers or LASER_REAR not in lasers:
+        return PACIFICA
+    front_m, rear_m = (float(lasers[k].vehicle_T_lidar[0, 3]) for k in (LASER_FRONT, LASER_REAR))
+    length_m, _, _ = PACIFICA.size_m
+    if abs(front_m - rear_m - length_m) < MAX_BUMPER_MISMATCH_M or not 2.0 < front_m - rear_m < 15.0:
+        return PACIFICA
+    return EgoVehicle((front_m - rear_m, *PACIFICA.size_m[1:]), (front_m + rear_m) / 2)
+
+
+def _no_labels(camera: str) -> ImageLabels:
+    raise KeyError(camera)
+
 
 SUFFIX = ".tfrecord"
 

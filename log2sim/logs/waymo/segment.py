@@ -1,4 +1,4 @@
-"""What both versions of the data set hold of a segment, before it becomes a log.
+"""What both versions of the data set hold of a segment, and the stamps of its frames.
 
 Letters in shapes: F frames, I images, B boxes, H rows and W columns of a range image.
 """
@@ -40,7 +40,6 @@ class CameraCalibration:
         f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3.
     vehicle_T_camera : (4, 4) float64
         The camera's frame has x forward, y left, z up.
-    width_px, height_px : int
     direction : int
         RollingShutterReadOutDirection.
     """
@@ -213,7 +212,6 @@ class Segment:
 
     Attributes
     ----------
-    name : str
     path : Path
         Its file or folder, for errors.
     cameras : mapping of number to CameraCalibration
@@ -236,7 +234,6 @@ class Segment:
         Names a frame by index in errors.
     details : mapping
         For `log2sim inspect`.
-    notes : list of str
     """
 
     name: str
@@ -272,3 +269,63 @@ def rigid(numbers: Array) -> Array | None:
     # Version 2 may hold them in single precision.
     out[:3, :3], out[3] = nearest_rotation(rotation), (0.0, 0.0, 0.0, 1.0)
     return out
+
+
+Stamps = NDArray[np.int64]
+
+# The TOP LiDAR turns ten times a second.
+NOMINAL_PERIOD_NS = 100_000_000
+MIN_PERIOD_NS, MAX_PERIOD_NS = 80_000_000, 120_000_000
+# Times that are farther from the stamp of their frame are damaged.
+MAX_LAG_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTimes:
+    """Stamps of F frames in order.
+
+    Attributes
+    ----------
+    start_ns : (F,) int64
+        Of the first column of the TOP LiDAR's turn.
+    period_ns : (F,) int64
+        Duration of the turn, to the start of the next one.
+    pose_ns : (F,) int64
+        Of the pose that defines the vehicle's frame, to which points are compensated.
+    """
+
+    start_ns: Stamps
+    period_ns: Stamps
+    pose_ns: Stamps
+
+    @classmethod
+    def of(cls, frames: list[FrameRow], notes: list[str]) -> FrameTimes:
+        """Determine the stamps of frames in order; `notes` takes what is assumed."""
+        start = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+        step = np.diff(start)
+        whole = (step >= MIN_PERIOD_NS) & (step <= MAX_PERIOD_NS)
+        usual = round(float(np.median(step[whole]))) if whole.any() else NOMINAL_PERIOD_NS
+        period = np.append(np.where(whole, step, usual), usual)
+        # Comments of Frame in dataset.proto: the pose is about the one in the middle of the frame.
+        pose = start + period // 2
+        unknown = 0
+        for k, frame in enumerate(frames):
+            front = frame.images.get(FRONT_CAMERA)
+            stamp = plausible_stamp(None if front is None else front.pose_ns(), frame.stamp_ns)
+            pose[k] = pose[k] if stamp is None else stamp
+            unknown += stamp is None
+        if unknown:
+            notes.append(
+                f"the time of the vehicle's pose, taken from the image of {unknown} of {len(frames)} frames' FRONT camera, is "
+                "missing there: the middle of the LiDAR's turn is assumed"
+            )
+        return cls(start, period, pose)
+
+    def at_turn(self, frame: NDArray[np.int64], turn: NDArray[np.float64]) -> Stamps:
+        """Return the stamps (N,) at shares of the turns (N,) of frames (N,)."""
+        return self.start_ns[frame] + np.round(turn * self.period_ns[frame]).astype(np.int64)
+
+
+def plausible_stamp(stamp: int | None, frame_ns: int) -> int | None:
+    """Return a stamp, ns, if it is known and within `MAX_LAG_NS` of that of its frame; else None."""
+    return stamp if stamp is not None and abs(stamp - frame_ns) <= MAX_LAG_NS else None

@@ -1,17 +1,450 @@
-"""2D boxes of road users in camera frames: from an ONNX model through ONNX Runtime, or from boxes in the log."""
+"""2D boxes of road users in camera frames, by a model, by somebody else's detector, or from the labels of the log.
+
+Track ids are never read: boxes are as anonymous as those of a model, so that tracking has the same task.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
-from log2sim import registry
-from log2sim.datatypes import Detections, Frame, Log
-from log2sim.errors import ConfigError, PluginError
-from log2sim.perception.detect.checked_detector import checked
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import CATEGORIES, Detections, Frame, ImageLabels, Log
+from log2sim.errors import ConfigError, Log2SimError, PluginError
+from log2sim.files import plugins
+from log2sim.files.plugins import DETECT, require_members
+from log2sim.geometry import NS_PER_S, Array, period_of, rectangles_overlap, wrap_angle
+from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 
 __all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
+
+
+MEMBERS = ("name", "default_min_score", "detect")
+ROW = "x0, y0, x1, y1 in px, score, category"
+
+ImageFunction = Callable[[NDArray[np.uint8]], Any]
+"""Takes a picture (H, W, 3) uint8 BGR and returns rows of `ROW`, or `Detections`."""
+
+
+class _WrongRows(PluginError):
+    """A function returned something else than rows; who it was and where is added to the message."""
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedDetector:
+    """A detector of somebody else; what it raises and what it returns is checked.
+
+    Attributes
+    ----------
+    inner : Detector
+    source : str
+        How messages name it.
+    """
+
+    inner: Any
+    source: str
+
+    @property
+    def name(self) -> str:
+        """Name in the provenance of a scenario."""
+        return str(self.inner.name)
+
+    @property
+    def default_min_score(self) -> float:
+        """Score in [0, 1] below which boxes are more often wrong than useful."""
+        return float(self.inner.default_min_score)
+
+    @property
+    def cache_key(self) -> str | None:
+        """What its result depends on besides the picture; None where it does not say, so that nothing of it is cached."""
+        return getattr(self.inner, "cache_key", None)
+
+    def detect(self, frame: Frame) -> Detections:
+        """Detect road users in one frame.
+
+        Raises
+        ------
+        PluginError
+            When the detector raises something, or returns no `Detections` of known categories.
+        """
+        try:
+            found = self.inner.detect(frame)
+        except _WrongRows as error:
+            raise PluginError(f"{self._where(frame)}: {error}") from None
+        except (Log2SimError, MemoryError):
+            raise
+        except Exception as error:
+            raise PluginError(f"{self._where(frame)}: {plugins.say_exception(error)}") from error
+        if not isinstance(found, Detections):
+            raise PluginError(f"{self._where(frame)}: detect returned {type(found).__name__}, expected Detections")
+        defect = find_defect(found)
+        if defect is not None:
+            raise PluginError(f"{self._where(frame)}: {defect}")
+        return found
+
+    def _where(self, frame: Frame) -> str:
+        return f"{self.source}: camera '{frame.camera.name}' at {frame.t_ns}"
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionDetector:
+    """A detector made of a function of a picture.
+
+    Attributes
+    ----------
+    function : callable
+    min_score : float
+        Boxes with lower scores are left out.
+    """
+
+    function: ImageFunction
+    min_score: float = 0.0
+    name: str = "function"
+    default_min_score: float = 0.0
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @property
+    def cache_key(self) -> str | None:
+        """What the function states of its kind, with the score; None where it states nothing."""
+        stated = getattr(self.function, "cache_key", None)
+        return f"{stated} {self.min_score}" if isinstance(stated, str) else None
+
+    def detect(self, frame: Frame) -> Detections:
+        """Call the function with a copy of the picture, one call at a time.
+
+        Raises
+        ------
+        PluginError
+            When it returns something else than rows of `ROW` or `Detections`.
+        """
+        image = frame.image().copy()  # a function may draw on what it gets
+        with self._lock:
+            answer = self.function(image)
+        found = answer if isinstance(answer, Detections) else detections_of(answer)
+        defect = find_defect(found)
+        if defect is not None:
+            raise _WrongRows(defect)
+        order = np.argsort(-found.score, kind="stable")
+        kept = found.take(order[found.score[order] >= self.min_score])
+        return replace(kept, traffic_lights=found.traffic_lights)
+
+
+def checked(detector: Any, source: str) -> CheckedDetector:
+    """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
+
+    Raises
+    ------
+    PluginError
+        When it lacks a member of `Detector`, or its `detect` cannot be called.
+    """
+    require_members(detector, MEMBERS, DETECT, source)
+    return CheckedDetector(detector, source)
+
+
+def detections_of(rows: Any) -> Detections:
+    """Return rows of x0, y0, x1, y1 in px, score, category as detections.
+
+    Raises
+    ------
+    PluginError
+        For anything else.
+    """
+    if isinstance(rows, (str, bytes)) or not isinstance(rows, (Sequence, np.ndarray)):
+        raise _WrongRows(f"returned {type(rows).__name__}, expected a list of rows of {ROW}, or Detections")
+    if not len(rows):
+        return Detections.empty()
+    numbers, categories = [], []
+    for k, row in enumerate(rows):
+        try:
+            *values, category = row
+            numbers.append([float(value) for value in values])
+        except (TypeError, ValueError):
+            raise _WrongRows(f"row {k} is {row!r:.80}, expected {ROW}") from None
+        if len(values) != 5 or not isinstance(category, str):
+            raise _WrongRows(f"row {k} is {row!r:.80}, expected {ROW}")
+        categories.append(str(category))
+    columns = np.array(numbers)
+    return Detections(columns[:, :4], columns[:, 4], np.array(categories, dtype=np.str_))
+
+
+def find_defect(found: Detections) -> str | None:
+    """Return what cannot be true of detections; None where nothing is wrong."""
+    count = len(found.score)
+    if np.shape(found.box_px) != (count, 4) or np.shape(found.category) != (count,):
+        return (
+            f"box_px has the shape {np.shape(found.box_px)} and category {np.shape(found.category)} for {count} scores"
+        )
+    for k, category in enumerate(found.category):
+        if category not in CATEGORIES:
+            hint = plugins.nearest(str(category), list(CATEGORIES))
+            return f"row {k}: unknown category '{category}'{hint}; known: {', '.join(CATEGORIES)}"
+    box, score = np.asarray(found.box_px, dtype=np.float64), np.asarray(found.score, dtype=np.float64)
+    right = np.isfinite(box).all(axis=1) & (box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1])
+    if not right.all():
+        k = int(np.argmin(right))
+        return f"row {k}: the box is {box[k].tolist()}, expected x0 < x1 and y0 < y1"
+    right = (score >= 0) & (score <= 1)
+    if not right.all():
+        k = int(np.argmin(right))
+        return f"row {k}: the score is {score[k]:g}, expected a number from 0 to 1"
+    return None
+
+
+# A box without a partner on the other side of the frame is used up to this age: half a period of 10 Hz and some.
+MAX_AGE_S = 0.055
+# Labels at 1 Hz and denser are interpolated.
+MAX_WINDOW_S = 1.1
+# Labels closer in time than the period of any sensor carry a stamp each; then the sensor turns at 10 Hz.
+SCATTERED_S = 0.03
+SCATTERED_WINDOW_S = 0.15
+# Partners are not farther apart than an object of this speed moves between their stamps.
+MAX_SPEED_MPS = 50.0
+# A difference in size counts this many times a distance between centers: sizes do not change, places do.
+SIZE_WEIGHT = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class LabelBoxes:
+    """Labeled boxes in the map frame.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+    category : (L,) str
+    center_m : (L, 3) float64
+    size_m : (L, 3) float64
+        Length, width, height.
+    yaw_rad : (L,) float64
+    """
+
+    t_ns: NDArray[np.int64]
+    category: NDArray[np.str_]
+    center_m: Array
+    size_m: Array
+    yaw_rad: Array
+
+    def take(self, index: NDArray[np.intp]) -> LabelBoxes:
+        """Select the rows at `index`."""
+        return LabelBoxes(
+            self.t_ns[index], self.category[index], self.center_m[index], self.size_m[index], self.yaw_rad[index]
+        )
+
+
+def window_ns(t_ns: NDArray[np.int64]) -> int:
+    """Compute the time around a frame in which its labels are searched: one period of the labels, ns.
+
+    Notes
+    -----
+    Some logs stamp all boxes of a sweep alike, others each by its own points, from which no period can be read.
+    """
+    stamps = np.unique(t_ns)
+    period_s = period_of(stamps)
+    if period_s < SCATTERED_S:
+        return round(SCATTERED_WINDOW_S * NS_PER_S)
+    return round(min(1.05 * period_s, MAX_WINDOW_S) * NS_PER_S)
+
+
+def interpolate_boxes(boxes: LabelBoxes, t_ns: int, window: int) -> LabelBoxes:
+    """Interpolate boxes to a stamp, between the last one before and the first one after it.
+
+    Parameters
+    ----------
+    boxes
+        Boxes of all stamps in ascending order.
+    window
+        From `window_ns`.
+
+    Notes
+    -----
+    Partners before and after are mutual nearest neighbors in place and size: without interpolation a car at 15 m/s is
+    0.75 m off between two stamps at 10 Hz. A box without a partner is kept in its place up to `MAX_AGE_S`.
+    """
+    low, here, high = np.searchsorted(boxes.t_ns, [t_ns - window, t_ns + 1, t_ns + window + 1])
+    before = boxes.take(drop_repeated_objects(boxes, np.arange(here - 1, low - 1, -1)))
+    after = boxes.take(drop_repeated_objects(boxes, np.arange(here, high)))
+    i, j = mutual_nearest(before, after)
+    alone_before, alone_after = (
+        np.setdiff1d(np.arange(len(before.t_ns)), i),
+        np.setdiff1d(np.arange(len(after.t_ns)), j),
+    )
+    age = round(MAX_AGE_S * NS_PER_S)
+    parts = [
+        interpolate_pairs(before.take(i), after.take(j), t_ns),
+        before.take(alone_before[t_ns - before.t_ns[alone_before] <= age]),
+        after.take(alone_after[after.t_ns[alone_after] - t_ns <= age]),
+    ]
+    return LabelBoxes(
+        np.full(sum(len(p.t_ns) for p in parts), t_ns, dtype=np.int64),
+        np.concatenate([p.category for p in parts]),
+        np.concatenate([p.center_m for p in parts]),
+        np.concatenate([p.size_m for p in parts]),
+        np.concatenate([p.yaw_rad for p in parts]),
+    )
+
+
+def drop_repeated_objects(boxes: LabelBoxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Drop rows of `index` that overlap an earlier row of another stamp: the same object once more.
+
+    Notes
+    -----
+    Two objects never share ground, so boxes of different stamps that overlap are one object seen twice.
+    """
+    if not len(index):
+        return index
+    center, size, stamp = boxes.center_m[index, :2], boxes.size_m[index], boxes.t_ns[index]
+    reach = np.linalg.norm(size[:, :2], axis=1) / 2
+    near = np.linalg.norm(center[:, None] - center, axis=-1) < reach[:, None] + reach
+    k, m = np.nonzero(np.tril(near & (stamp[:, None] != stamp), -1))
+    yaw, step = boxes.yaw_rad[index], center[m] - center[k]
+    shared = rectangles_overlap(step[:, 0], step[:, 1], yaw[k], yaw[m], size[k], size[m])
+    earlier = np.zeros(near.shape, dtype=bool)
+    earlier[k[shared], m[shared]] = True
+    kept = np.ones(len(index), dtype=bool)
+    for row in np.flatnonzero(earlier.any(axis=1)):
+        kept[row] = not kept[earlier[row]].any()
+    return index[kept]
+
+
+def interpolate_pairs(before: LabelBoxes, after: LabelBoxes, t_ns: int) -> LabelBoxes:
+    """Interpolate pairs of boxes of the same object to a stamp; sizes are those of the nearer one in time."""
+    span = (after.t_ns - before.t_ns).astype(np.float64)
+    fraction = (t_ns - before.t_ns).astype(np.float64) / span
+    center = before.center_m + fraction[:, None] * (after.center_m - before.center_m)
+    yaw = wrap_angle(before.yaw_rad + fraction * wrap_angle(after.yaw_rad - before.yaw_rad))
+    size = np.where(fraction[:, None] <= 0.5, before.size_m, after.size_m)
+    return LabelBoxes(before.t_ns, before.category, center, size, yaw)
+
+
+def mutual_nearest(a: LabelBoxes, b: LabelBoxes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the indices of boxes in `a` and `b` that are mutual nearest neighbors of one category and within reach."""
+    if not len(a.t_ns) or not len(b.t_ns):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    distance = np.linalg.norm(a.center_m[:, None] - b.center_m[None], axis=-1)
+    cost = distance + SIZE_WEIGHT * np.linalg.norm(a.size_m[:, None] - b.size_m[None], axis=-1)
+    reachable = distance <= MAX_SPEED_MPS * np.abs(b.t_ns[None] - a.t_ns[:, None]) / NS_PER_S
+    cost = np.where((a.category[:, None] == b.category[None]) & reachable, cost, np.inf)
+    partner = np.argmin(cost, axis=1)
+    own = np.arange(len(partner))
+    mutual = np.isfinite(cost[own, partner]) & (np.argmin(cost, axis=0)[partner] == own)
+    return own[mutual], partner[mutual]
+
+
+# Smaller boxes are left out, as detectors do not find them.
+MIN_SIDE_PX = 6.0
+# Stamps of labels and frames of one moment differ by rounding in some logs.
+STAMP_TOLERANCE_NS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBoxes:
+    """2D labels of a camera that a detector could find, by frame.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Never decreasing.
+    boxes : Detections
+        (L,), those of one stamp in the order of the labels.
+    """
+
+    t_ns: NDArray[np.int64]
+    boxes: Detections
+
+    @classmethod
+    def of(cls, labels: ImageLabels) -> FrameBoxes:
+        """Sort the labels of a camera and leave out categories and boxes that no detector finds."""
+        large = np.all(labels.box_px[:, 2:] - labels.box_px[:, :2] >= MIN_SIDE_PX, axis=1)
+        rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & large)
+        rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
+        box = np.asarray(labels.box_px[rows], dtype=np.float64)
+        return cls(labels.t_ns[rows], Detections(box, np.ones(len(box)), labels.category[rows].astype("<U16")))
+
+    def at(self, t_ns: int) -> Detections:
+        """Return the boxes of the frame at a stamp."""
+        first = np.searchsorted(self.t_ns, t_ns - STAMP_TOLERANCE_NS, side="left")
+        end = np.searchsorted(self.t_ns, t_ns + STAMP_TOLERANCE_NS, side="right")
+        return self.boxes.take(np.arange(first, end))
+
+
+@dataclass(frozen=True, eq=False)
+class LabelDetector:
+    """Detector that returns the labels of a log; it never decodes an image."""
+
+    log: Log
+    min_score: float = 0.0
+    name: str = "labels"
+    default_min_score: float = 0.0
+
+    def detect(self, frame: Frame) -> Detections:
+        """Return the labels of one frame with score 1, nearest first where they come from 3D labels."""
+        labels = self.log.image_labels.get(frame.camera.name)
+        if labels is not None:
+            return self._image_boxes[frame.camera.name].at(frame.t_ns)
+        boxes, window = self._boxes
+        view = view_of(self.log, frame.camera.name, frame.t_ns)
+        if not len(boxes.t_ns) or view is None:
+            return Detections.empty()
+        return project_labels(interpolate_boxes(boxes, frame.t_ns, window), view)
+
+    @cached_property
+    def _image_boxes(self) -> dict[str, FrameBoxes]:
+        """2D labels by camera; sorted once, since a search of all for each frame takes time that grows with the square of the log."""
+        return {camera: FrameBoxes.of(labels) for camera, labels in self.log.image_labels.items()}
+
+    @cached_property
+    def _boxes(self) -> tuple[LabelBoxes, int]:
+        """Visible labels in the order of their stamps, and the time around a frame in which to search them, ns."""
+        labels = self.log.labels
+        if labels is None:
+            return LabelBoxes(
+                np.zeros(0, np.int64), np.zeros(0, "<U16"), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+            ), 0
+        shown = np.isin(labels.category, CATEGORIES)
+        if labels.visible is not None:
+            shown &= labels.visible
+        everything = LabelBoxes(labels.t_ns, labels.category, labels.center_m, labels.size_m, labels.yaw_rad)
+        rows = np.flatnonzero(shown)
+        return everything.take(rows[np.argsort(labels.t_ns[rows], kind="stable")]), window_ns(labels.t_ns)
+
+
+def create(
+    log: Log, *, min_score: float | None, max_overlap: float, tiles: Literal["auto"] | int, **_: Any
+) -> LabelDetector:
+    """Make the detector `labels`; `min_score`, `max_overlap` and `tiles` have no effect on it.
+
+    Raises
+    ------
+    ConfigError
+        When the log has no labels.
+    """
+    if log.labels is None and not log.image_labels:
+        others = ", ".join(name for name in plugins.names("detector") if name != "labels")
+        raise ConfigError(
+            f"detector 'labels': log '{log.name}' ({log.format}) has no labeled boxes; "
+            f"choose another detector: {others}, or the path of an ONNX file"
+        )
+    return LabelDetector(log)
+
+
+def project_labels(boxes: LabelBoxes, view: View) -> Detections:
+    """Project boxes into a frame; those that are large enough, nearest first.
+
+    Occluded boxes are kept: a LiDAR on the roof often sees what the camera does not.
+    """
+    projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
+    box_px = projected.box_px
+    large = projected.valid.copy()
+    large[projected.valid] = np.all(box_px[projected.valid, 2:] - box_px[projected.valid, :2] >= MIN_SIDE_PX, axis=1)
+    kept = np.flatnonzero(large)
+    kept = kept[np.argsort(projected.range_m[kept], kind="stable")]
+    return Detections(box_px[kept], np.ones(len(kept)), boxes.category[kept].astype("<U16"))
+
 
 MAX_OVERLAP = 0.5
 MAX_TILES = 64
@@ -108,17 +541,17 @@ def create_detector(
     if input_px is not None:
         raise ConfigError(f"input_px {input_px}: only a detector given as the path of an ONNX file takes another size")
     try:
-        create = registry.load("detector", name_or_path)
+        create = plugins.load("detector", name_or_path)
     except PluginError:
         raise
     except ConfigError as error:
-        in_sweeps = ", ".join(f"lidar:{name}" for name in registry.names("lidar_detector"))
+        in_sweeps = ", ".join(f"lidar:{name}" for name in plugins.names("lidar_detector"))
         raise ConfigError(f"{error}; in sweeps: {in_sweeps}; or the path of an ONNX file (ending in .onnx)") from None
-    with registry.blaming("detector", name_or_path):
+    with plugins.blaming("detector", name_or_path):
         detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
-    if registry.is_built_in("detector", name_or_path):
+    if plugins.is_built_in("detector", name_or_path):
         return detector
-    return checked(detector, registry.say_plugin("detector", name_or_path))
+    return checked(detector, plugins.say_plugin("detector", name_or_path))
 
 
 def check_settings(min_score: float | None, max_overlap: float, tiles: str | int) -> None:

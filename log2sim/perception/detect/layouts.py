@@ -1,29 +1,497 @@
-"""Table of output layouts, and those of the TensorFlow object detection API and of RT-DETR."""
+"""Inputs and output layouts of detection models, and their classes."""
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import GROUP_OF, GROUPS
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.perception.detect.classes import COCO_80, COCO_91, Classes
-from log2sim.perception.detect.layout import (
-    Candidates,
-    Layout,
-    Outputs,
-    corners_from_centers,
-    find_output,
-    largest_output,
-    required_output,
-    single_output_shape,
-)
-from log2sim.perception.detect.preprocessing import Preprocessing
-from log2sim.perception.detect.yolo import YoloRows, Yolov8, Yolov10, Yolox
+
+# Gray value around a letterboxed image that the YOLO family is trained with.
+LETTERBOX_GRAY = 114
+
+
+@dataclass(frozen=True)
+class InputSpec:
+    """Image input of a model.
+
+    Attributes
+    ----------
+    height_px, width_px : int or None
+        None where the model takes any size.
+    channels_last : bool
+        (1, H, W, 3) instead of (1, 3, H, W).
+    dtype : numpy.dtype
+    """
+
+    name: str
+    height_px: int | None
+    width_px: int | None
+    channels_last: bool
+    dtype: np.dtype[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Placement of the image in the input: `uv_input = uv_image * scale + shift_px`.
+
+    Attributes
+    ----------
+    scale : (2,) float64
+    shift_px : (2,) float64
+    input_px : (int, int)
+        Width and height of the input.
+    """
+
+    scale: Array
+    shift_px: Array
+    input_px: tuple[int, int]
+
+    def to_image(self, box_input: Array) -> Array:
+        """Convert boxes (M, 4) from px of the input to px of the image."""
+        return (box_input - np.tile(self.shift_px, 2)) / np.tile(self.scale, 2)
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """Preprocessing of a family of models.
+
+    Attributes
+    ----------
+    fit : str
+        "corner" and "center" keep the aspect ratio and fill the rest with gray (letterbox), "stretch" does not, "tf1"
+        stretches with the sampling of TensorFlow 1.
+    rgb : bool
+        Channel order RGB instead of BGR.
+    unit : bool
+        Values 0-1 instead of 0-255; never for integer inputs.
+    default_px : int or None
+        Side of the input of a model that takes any size, None for the image's own.
+    """
+
+    fit: Literal["corner", "center", "stretch", "tf1"]
+    rgb: bool
+    unit: bool
+    default_px: int | None = 640
+
+    def __call__(self, image_bgr: NDArray[np.uint8], spec: InputSpec) -> tuple[NDArray[Any], Placement]:
+        """Convert an image (H, W, 3) uint8 BGR to the input (1, 3, h, w) or (1, h, w, 3), with its placement there."""
+        height, width = image_bgr.shape[:2]
+        size = (spec.width_px or self.default_px or width, spec.height_px or self.default_px or height)
+        image, placement = self._place(image_bgr, size)
+        if self.rgb:
+            image = reversed_channels(image)
+        if not spec.channels_last:
+            image = image.transpose(2, 0, 1)
+        tensor = np.ascontiguousarray(image[None], dtype=spec.dtype)
+        if self.unit and spec.dtype.kind == "f":
+            tensor /= 255
+        return tensor, placement
+
+    def _place(self, image: NDArray[np.uint8], size: tuple[int, int]) -> tuple[NDArray[np.uint8], Placement]:
+        height, width = image.shape[:2]
+        if self.fit in ("corner", "center"):
+            return letterbox(image, size, centered=self.fit == "center")
+        placement = Placement(np.array([size[0] / width, size[1] / height]), np.zeros(2), size)
+        if size == (width, height):
+            return image, placement
+        return (resize_as_tf1 if self.fit == "tf1" else resize)(image, size), placement
+
+
+def reversed_channels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image (H, W, 3) with its channels in reverse order, copied in a tenth of the time that NumPy takes."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def letterbox(
+    image: NDArray[np.uint8], size: tuple[int, int], *, centered: bool
+) -> tuple[NDArray[np.uint8], Placement]:
+    """Fit an image into (width, height) px, keep its aspect ratio, and fill the rest with gray."""
+    height, width = image.shape[:2]
+    ratio = min(size[0] / width, size[1] / height)
+    inner = (max(1, min(size[0], round(width * ratio))), max(1, min(size[1], round(height * ratio))))
+    left, top = ((size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2) if centered else (0, 0)
+    out = np.full((size[1], size[0], 3), LETTERBOX_GRAY, dtype=np.uint8)
+    out[top : top + inner[1], left : left + inner[0]] = resize(image, inner)
+    scale = np.array([inner[0] / width, inner[1] / height])
+    return out, Placement(scale, np.array([left, top], dtype=np.float64), size)
+
+
+def resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize to (width, height) px, bilinear, pixel centers at half."""
+    import cv2
+
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+
+
+def resize_as_tf1(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize to (width, height) px as TensorFlow 1 did: output pixel i samples the input at i * in / out.
+
+    Notes
+    -----
+    Pixel centers at the corner instead of the middle, border repeated. SSD models of that time were trained so: other
+    sampling moves their scores by up to 0.27.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    source_from_target = np.array([[width / size[0], 0, 0], [0, height / size[1], 0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpAffine(image, source_from_target, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(warped, dtype=np.uint8)
+
+
+# A train is no road user that a vehicle model could replay, and detectors see one in many a facade.
+CATEGORY_OF_NAME: Mapping[str, str] = {
+    "car": "car", "van": "car", "pickup": "car", "suv": "car", "vehicle": "car",
+    "truck": "truck", "lorry": "truck", "bus": "bus",
+    "motorcycle": "motorcycle", "motorbike": "motorcycle", "motorcyclist": "motorcycle", "motor": "motorcycle",
+    "bicycle": "bicycle", "bike": "bicycle", "cyclist": "cyclist", "bicyclist": "cyclist", "rider": "cyclist",
+    "person": "pedestrian", "pedestrian": "pedestrian", "people": "pedestrian",
+    "traffic light": "traffic_light", "traffic_light": "traffic_light", "traffic signal": "traffic_light",
+}  # fmt: skip
+
+TRAFFIC_LIGHT = "traffic_light"
+"""No road user, but what traffic goes by: a group of its own."""
+
+NAMES_LIMIT_CHARS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Category of each class index of a model; indices that are left out are no road users."""
+
+    category_of: Mapping[int, str]
+
+    def best(self, class_scores: Array, min_score: float) -> tuple[NDArray[np.intp], Array, NDArray[np.str_]]:
+        """Choose categories from scores (N, C): at most one a row and group, so that a rider does not hide the bicycle.
+
+        Parameters
+        ----------
+        class_scores : (N, C) float
+        min_score : float
+            Rows whose best score of a group is lower are left out.
+
+        Returns
+        -------
+        row : (M,) int
+        score : (M,) float64
+        category : (M,) str
+        """
+        rows, scores, categories = [], [], []
+        # Few rows of thousands reach the score.
+        likely = np.unique(np.flatnonzero(np.ravel(class_scores >= min_score)) // max(class_scores.shape[1], 1))
+        of_likely = class_scores[likely]
+        for members in (*GROUPS.values(), (TRAFFIC_LIGHT,)):
+            columns = [i for i, name in self.category_of.items() if name in members and i < class_scores.shape[1]]
+            if not columns:
+                continue
+            part = of_likely[:, columns]
+            best = np.argmax(part, axis=1)
+            top = part[np.arange(len(part)), best]
+            row = np.flatnonzero(top >= min_score)
+            rows.append(likely[row])
+            scores.append(top[row].astype(np.float64))
+            categories.append(np.array([self.category_of[i] for i in columns], dtype="<U16")[best[row]])
+        if not rows:
+            return np.zeros(0, np.intp), np.zeros(0), np.zeros(0, "<U16")
+        return np.concatenate(rows), np.concatenate(scores), np.concatenate(categories)
+
+    def categories_of(self, class_id: NDArray[np.number]) -> NDArray[np.str_]:
+        """Return the categories (N,) of class indices (N,), "" where the class is no road user."""
+        # Some exporters write ids as floats; NaN has no category.
+        return np.array([self.category_of.get(i, "") for i in np.asarray(class_id, float).tolist()], dtype="<U16")
+
+
+COCO_80 = Classes({0: "pedestrian", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 7: "truck", 9: TRAFFIC_LIGHT})
+COCO_91 = Classes({1: "pedestrian", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck", 10: TRAFFIC_LIGHT})
+COCO_90 = Classes({i - 1: category for i, category in COCO_91.category_of.items()})
+BY_COUNT: Mapping[int, Classes] = {80: COCO_80, 90: COCO_90, 91: COCO_91}
+
+
+def choose_classes(names: str | None, count: int | None, default: Classes, where: str) -> Classes:
+    """Find out the classes of a model: by the names in its metadata, else by their number.
+
+    Parameters
+    ----------
+    names
+        The entry `names` of the ONNX metadata: a Python literal, list or dict by index, as Ultralytics writes it.
+    count
+        Number of classes in the output, None where the output holds class ids; then `default` holds.
+    where
+        The file, for messages.
+    """
+    if names is not None:
+        return classes_from_names(names, where)
+    if count is None:
+        return default
+    if count not in BY_COUNT:
+        raise ConfigError(
+            f"{where}: {count} classes without names; expected 80, 90 or 91 (COCO), or the entry 'names' in the "
+            "model's metadata, such as {0: 'car', 1: 'pedestrian'}"
+        )
+    return BY_COUNT[count]
+
+
+def classes_from_names(names: str, where: str) -> Classes:
+    """Read a literal list or dict of class names; nothing in it is executed."""
+    try:
+        if len(names) > NAMES_LIMIT_CHARS:
+            raise ValueError(f"{len(names)} characters")
+        value = ast.literal_eval(names)
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        by_index = {int(i): str(name).strip().lower() for i, name in items}
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
+        raise ConfigError(f"{where}: metadata 'names' is no list or dict of class names: {error}") from None
+    known = {i: CATEGORY_OF_NAME[name] for i, name in by_index.items() if name in CATEGORY_OF_NAME}
+    if not set(known.values()) - {TRAFFIC_LIGHT}:
+        listed = ", ".join(list(by_index.values())[:8])
+        names_known = ", ".join(CATEGORY_OF_NAME)
+        raise ConfigError(f"{where}: none of its classes is a road user ({listed}); known: {names_known}")
+    return Classes(known)
+
+
+def groups_of(category: NDArray[np.str_]) -> NDArray[np.str_]:
+    """Return the groups (M,) of categories (M,)."""
+    return np.array([GROUP_OF.get(name, name) for name in category.tolist()], dtype="<U16")
+
+
+Outputs = Mapping[str, NDArray[Any]]
+
+
+class Candidates(NamedTuple):
+    """Decoded boxes before suppression.
+
+    Attributes
+    ----------
+    box_input : (M, 4) float64
+        u0, v0, u1, v1 in px of the model's input.
+    score : (M,) float64
+    category : (M,) str
+    """
+
+    box_input: Array
+    score: Array
+    category: NDArray[np.str_]
+
+
+class Layout(Protocol):
+    """Output layout of one family of models; `size` is (width, height) of the input in px."""
+
+    @property
+    def name(self) -> str:
+        """Name by which a user chooses it."""
+        ...
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """Preprocessing that the models were trained with."""
+        ...
+
+    @property
+    def default_min_score(self) -> float:
+        """Score in [0, 1] below which boxes are more often wrong than useful."""
+        ...
+
+    @property
+    def default_classes(self) -> Classes:
+        """Classes of a model whose output holds class ids without names."""
+        ...
+
+    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
+        """Return whether outputs of a gray image have this layout."""
+        ...
+
+    def class_count(self, outputs: Outputs) -> int | None:
+        """Return the number of classes; None where the output holds class ids."""
+        ...
+
+    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
+        """Decode the boxes of score `min_score` and higher."""
+        ...
+
+
+def corners_from_centers(center_and_size: Array) -> Array:
+    """Convert boxes (M, 4) from center u, v, width, height to u0, v0, u1, v1."""
+    center, half = center_and_size[:, :2], center_and_size[:, 2:4] / 2
+    return np.concatenate([center - half, center + half], axis=1)
+
+
+def largest_output(outputs: Outputs) -> NDArray[Any]:
+    """Return the largest output; some exports append intermediate outputs or masks to the detections."""
+    return max(outputs.values(), key=lambda a: a.size)
+
+
+def single_output_shape(outputs: Outputs) -> tuple[int, int] | None:
+    """Return the last two dimensions of a single output (1, a, b); None for other or more outputs."""
+    arrays = list(outputs.values())
+    if len(arrays) != 1 or arrays[0].ndim != 3 or arrays[0].shape[0] != 1:
+        return None
+    return arrays[0].shape[1], arrays[0].shape[2]
+
+
+def find_output(outputs: Outputs, name: str) -> NDArray[Any] | None:
+    """Find an output by its name without TensorFlow's ":0"; None if there is none."""
+    return next((array for key, array in outputs.items() if key.split(":")[0] == name), None)
+
+
+def required_output(outputs: Outputs, name: str) -> NDArray[Any]:
+    """Return an output by its name, or raise `ConfigError`."""
+    array = find_output(outputs, name)
+    if array is None:
+        raise ConfigError(
+            f"the model has no output '{name}'; it has {describe_outputs(outputs)}; choose another layout"
+        )
+    return array
+
+
+def describe_outputs(outputs: Outputs) -> str:
+    """Format names and shapes of outputs for messages."""
+    return ", ".join(f"'{name}' {tuple(array.shape)}" for name, array in outputs.items())
+
+
+STRIDES = (8, 16, 32)
+
+# Median offset in cells up to which outputs count as undecoded: offsets are a few cells, decoded centers span the input.
+MAX_OFFSET_CELLS = 24.0
+
+
+def cell_count(size: tuple[int, int]) -> int:
+    """Count the cells of all strides in an input of (width, height) px."""
+    return sum((size[0] // s) * (size[1] // s) for s in STRIDES)
+
+
+@dataclass(frozen=True)
+class Yolox:
+    """YOLOX before decoding: (1, cells, 5 + C), offsets in cells, logarithms of sizes, objectness, class scores."""
+
+    name: str = "yolox"
+    preprocessing: Preprocessing = Preprocessing("corner", rgb=False, unit=False, default_px=416)
+    default_min_score: float = 0.4
+    default_classes: Classes = COCO_80
+
+    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
+        """Return whether outputs of a gray image have this layout."""
+        shape = single_output_shape(outputs)
+        if shape is None or shape[0] != cell_count(size) or shape[1] < 6:
+            return False
+        return bool(np.median(np.abs(largest_output(outputs)[0, :, :2])) < MAX_OFFSET_CELLS)
+
+    def class_count(self, outputs: Outputs) -> int | None:
+        """Return the number of classes; None where the output holds class ids."""
+        return int(largest_output(outputs).shape[2]) - 5
+
+    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
+        """Decode the boxes of score `min_score` and higher."""
+        raw = largest_output(outputs)[0]
+        if len(raw) != cell_count(size):
+            raise ConfigError(
+                f"layout yolox: expected {cell_count(size)} rows for an input of {size}; found {len(raw)}"
+            )
+        row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
+        cell, stride = cell_grid(size)
+        picked = raw[row].astype(np.float64)
+        with np.errstate(over="ignore"):  # an infinite size is dropped with the other boxes that are not finite
+            extent = np.exp(picked[:, 2:4]) * stride[row, None]
+        center = (picked[:, :2] + cell[row]) * stride[row, None]
+        return Candidates(corners_from_centers(np.concatenate([center, extent], axis=1)), score, category)
+
+
+def cell_grid(size: tuple[int, int]) -> tuple[Array, Array]:
+    """Build cell indices (N, 2) u, v and strides (N,) in px, row by row, fine strides first."""
+    cell, stride = [], []
+    for s in STRIDES:
+        v, u = np.mgrid[: size[1] // s, : size[0] // s]
+        cell.append(np.stack([u.ravel(), v.ravel()], axis=1))
+        stride.append(np.full(u.size, float(s)))
+    return np.concatenate(cell).astype(np.float64), np.concatenate(stride)
+
+
+@dataclass(frozen=True)
+class YoloRows:
+    """Decoded rows (1, N, 5 + C): center, size in px of the input, objectness, class scores (YOLOv5, v6, v7, YOLOX)."""
+
+    name: str
+    preprocessing: Preprocessing
+    # Boxes a cell by which the layout is recognized; 0: only a layout given by name.
+    anchors: int = 0
+    default_min_score: float = 0.4
+    default_classes: Classes = COCO_80
+
+    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
+        """Return whether outputs of a gray image have this layout."""
+        shape = single_output_shape(outputs)
+        return shape is not None and self.anchors > 0 and shape[0] == self.anchors * cell_count(size) and shape[1] > 5
+
+    def class_count(self, outputs: Outputs) -> int | None:
+        """Return the number of classes; None where the output holds class ids."""
+        return int(largest_output(outputs).shape[2]) - 5
+
+    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
+        """Decode the boxes of score `min_score` and higher."""
+        raw = largest_output(outputs)[0]
+        row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
+        return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
+
+
+@dataclass(frozen=True)
+class Yolov8:
+    """YOLOv8, v9, 11, 12: columns (1, 4 + C, N) of center, size in px of the input, and class scores."""
+
+    name: str = "yolov8"
+    preprocessing: Preprocessing = Preprocessing("center", rgb=True, unit=True)
+    default_min_score: float = 0.4
+    default_classes: Classes = COCO_80
+
+    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
+        """Return whether outputs of a gray image have this layout."""
+        shape = single_output_shape(outputs)
+        return shape is not None and shape[1] == cell_count(size) and shape[0] > 4
+
+    def class_count(self, outputs: Outputs) -> int | None:
+        """Return the number of classes; None where the output holds class ids."""
+        return int(largest_output(outputs).shape[1]) - 4
+
+    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
+        """Decode the boxes of score `min_score` and higher."""
+        raw = largest_output(outputs)[0].T
+        row, score, category = classes.best(raw[:, 4:], min_score)
+        return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
+
+
+@dataclass(frozen=True)
+class Yolov10:
+    """YOLOv10 and other end-to-end exports: rows (1, N, 6) of u0, v0, u1, v1 in px of the input, score, class id."""
+
+    name: str = "yolov10"
+    preprocessing: Preprocessing = Preprocessing("center", rgb=True, unit=True)
+    default_min_score: float = 0.4
+    default_classes: Classes = COCO_80
+
+    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
+        """Return whether outputs of a gray image have this layout."""
+        shape = single_output_shape(outputs)
+        return shape is not None and shape[1] == 6 and shape[0] not in (cell_count(size), 3 * cell_count(size))
+
+    def class_count(self, outputs: Outputs) -> int | None:
+        """Return the number of classes; None where the output holds class ids."""
+        return None
+
+    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
+        """Decode the boxes of score `min_score` and higher."""
+        raw = largest_output(outputs)[0].astype(np.float64)
+        category = classes.categories_of(raw[:, 5])
+        keep = (raw[:, 4] >= min_score) & (category != "")
+        return Candidates(raw[keep, :4], raw[keep, 4], category[keep])
 
 
 @dataclass(frozen=True)
@@ -31,7 +499,7 @@ class TfOd:
     """TensorFlow object detection API: boxes v0, u0, v1, u1 in 0-1, classes as COCO ids from 1, already suppressed."""
 
     name: str = "tf-od"
-    preprocessing: Preprocessing = Preprocessing("stretch", rgb=True, unit=False, default_px=None)  # noqa: RUF009
+    preprocessing: Preprocessing = Preprocessing("stretch", rgb=True, unit=False, default_px=None)
     default_min_score: float = 0.4
     default_classes: Classes = COCO_91
 
@@ -59,7 +527,7 @@ class TfOdRaw:
     """The same family before its suppression: `boxes` (1, N, 4) as above and `scores` (1, N, C) after the sigmoid."""
 
     name: str = "tf-od-raw"
-    preprocessing: Preprocessing = Preprocessing("tf1", rgb=True, unit=False, default_px=300)  # noqa: RUF009
+    preprocessing: Preprocessing = Preprocessing("tf1", rgb=True, unit=False, default_px=300)
     default_min_score: float = 0.4
     default_classes: Classes = COCO_91
 
@@ -92,7 +560,7 @@ class RtDetr:
     """RT-DETR: boxes as center and size in 0-1; (1, 300, 4 + C) with scores, or `pred_boxes` and `logits` apart."""
 
     name: str = "rt-detr"
-    preprocessing: Preprocessing = Preprocessing("stretch", rgb=True, unit=True)  # noqa: RUF009
+    preprocessing: Preprocessing = Preprocessing("stretch", rgb=True, unit=True)
     default_min_score: float = 0.4
     default_classes: Classes = COCO_80
 

@@ -1,8 +1,10 @@
-"""Detector of road users from an ONNX model, run on the whole image and on tiles of it."""
+"""Detector of road users from an ONNX model, run on the whole image and on tiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import chain
@@ -14,14 +16,318 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections, Frame
 from log2sim.errors import ConfigError
-from log2sim.perception.detect.classes import TRAFFIC_LIGHT, Classes, choose_classes, groups_of
-from log2sim.perception.detect.layout import Layout, Outputs, describe_outputs
-from log2sim.perception.detect.layouts import LAYOUTS, named_layout
-from log2sim.perception.detect.onnx_model import OnnxModel, load_model
-from log2sim.perception.detect.preprocessing import Placement
-from log2sim.perception.detect.riders import join_riders
-from log2sim.perception.detect.suppression import suppress
-from log2sim.perception.detect.tiling import Tile, merge, plan_tiles
+from log2sim.files.inputs import read_file, require_readable
+from log2sim.files.stages import usable_threads
+from log2sim.geometry import Array, box_iou
+from log2sim.perception.detect.layouts import (
+    LAYOUTS,
+    TRAFFIC_LIGHT,
+    Classes,
+    InputSpec,
+    Layout,
+    Outputs,
+    Placement,
+    choose_classes,
+    describe_outputs,
+    groups_of,
+    named_layout,
+)
+from log2sim.perception.detect3d.network import open_session
+
+MAX_FILE_BYTES = 2 * 1024**3
+MAX_INPUT_SIDE_PX = 8192
+# How the name of another file begins in a protocol buffer: field 1, 8 bytes, "location" (onnx.proto, TensorProto.external_data).
+EXTERNAL_DATA = b"\n\x08location"
+DTYPES: Mapping[str, type] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class OnnxModel:
+    """Loaded model; `run` may be called from several threads.
+
+    Attributes
+    ----------
+    metadata : mapping of str to str
+        Custom metadata of the file, such as class names.
+    session : onnxruntime.InferenceSession
+        Runs in the thread that calls it.
+    threads : int
+        That may run it side by side.
+    """
+
+    path: Path
+    spec: InputSpec
+    metadata: Mapping[str, str]
+    session: Any
+    threads: int
+
+    def digest(self) -> str | None:
+        """Return the SHA-256 of the file; None for one whose weights are in other files."""
+        content = read_file(self.path, MAX_FILE_BYTES, ConfigError)
+        return None if EXTERNAL_DATA in content else hashlib.sha256(content).hexdigest()
+
+    def run(self, tensor: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Run the model on one input; returns all outputs by name."""
+        names = [output.name for output in self.session.get_outputs()]
+        try:
+            return dict(zip(names, self.session.run(names, {self.spec.name: tensor}), strict=True))
+        except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
+            raise ConfigError(f"{self.path}: the model fails on an image {tensor.shape}: {first_line(error)}") from None
+
+
+def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
+    """Load an ONNX file.
+
+    Parameters
+    ----------
+    threads
+        That may run it side by side, None for as many as `log2sim.files.stages.usable_threads` says.
+
+    Raises
+    ------
+    ConfigError
+        A missing, oversized or broken file, or a model whose inputs are not one image.
+    """
+    import onnxruntime
+
+    check_file(path)
+    options = onnxruntime.SessionOptions()
+    # Threads that share a run wait for each other; runs side by side do not.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        session = open_session(path, options)
+    except Exception as error:  # as above
+        raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
+    metadata = dict(session.get_modelmeta().custom_metadata_map)
+    return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session, threads or usable_threads())
+
+
+def check_file(path: Path) -> None:
+    """Raise `ConfigError` for a file that cannot be a model, before it is read."""
+    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX model")
+
+
+def input_spec(inputs: list[Any], path: Path) -> InputSpec:
+    """Describe the model's single image input."""
+    listed = ", ".join(f"'{i.name}' {i.type} {i.shape}" for i in inputs)
+    if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].type not in DTYPES:
+        raise ConfigError(f"{path}: inputs {listed}; expected one image (1, 3, H, W) or (1, H, W, 3), float or uint8")
+    batch, *rest = (d if isinstance(d, int) and d > 0 else None for d in inputs[0].shape)
+    channels_last = rest[2] == 3 and rest[0] != 3
+    height, width = rest[:2] if channels_last else rest[1:]
+    if batch not in (None, 1) or (not channels_last and rest[0] != 3):
+        raise ConfigError(f"{path}: input {listed}; expected one image of 3 channels at a time")
+    if max(height or 1, width or 1) > MAX_INPUT_SIDE_PX:
+        raise ConfigError(f"{path}: input {listed}; expected sides of at most {MAX_INPUT_SIDE_PX} px")
+    return InputSpec(inputs[0].name, height, width, channels_last, np.dtype(DTYPES[inputs[0].type]))
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of a message, shortened."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:300] if lines else type(error).__name__
+
+
+# Of more boxes the weakest are cut, since suppression takes time quadratic in their number.
+MAX_CANDIDATES = 2000
+
+
+def strongest_first(detections: Detections) -> Detections:
+    """Sort by descending score, ties by box and category, so that the order of the input does not matter."""
+    box = detections.box_px
+    keys = (detections.category, box[:, 3], box[:, 2], box[:, 1], box[:, 0], -detections.score)
+    return detections.take(np.lexsort(keys))
+
+
+def suppress(detections: Detections, max_overlap: float) -> Detections:
+    """Keep the strongest of boxes that overlap by more than `max_overlap` (IoU) within one group of categories.
+
+    Notes
+    -----
+    Greedy suppression across the classes of a group: a van that a model detects as car and truck becomes one box, while
+    a person in front of a car is kept. O(M^2) time.
+    """
+    ordered = strongest_first(detections).take(slice(MAX_CANDIDATES))
+    keep = suppressed_mask(ordered.box_px, groups_of(ordered.category), max_overlap)
+    return ordered.take(keep)
+
+
+def suppressed_mask(box_px: NDArray[np.float64], group: NDArray[np.str_], max_overlap: float) -> NDArray[np.bool_]:
+    """Compute the mask (M,) of the boxes that are kept, for boxes (M, 4) sorted by descending score."""
+    keep = np.ones(len(box_px), dtype=bool)
+    for i in range(len(box_px)):
+        if keep[i]:
+            later = np.flatnonzero(keep[i + 1 :] & (group[i + 1 :] == group[i])) + i + 1
+            keep[later] = box_iou(box_px[i], box_px[later])[0] <= max_overlap
+    return keep
+
+
+# Overlap of neighboring tiles as a share of a tile's width; wider objects are detected in the whole image.
+OVERLAP = 0.35
+# Margin at a tile's border as a share of its width: about how exactly models place the edge of a cut object.
+BORDER = 0.025
+# Pixels of a tile for each pixel of the input: with more, far cars are missed, with less, time is lost.
+MAX_DOWNSCALING = 1.6
+MAX_AUTO_TILES = 5
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Part of an image: columns u0..u1 and rows v0..v1 in px, ends excluded."""
+
+    u0: int
+    v0: int
+    u1: int
+    v1: int
+
+    def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Crop the tile (h, w, 3) from an image (H, W, 3), without a copy."""
+        return image[self.v0 : self.v1, self.u0 : self.u1]
+
+
+def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:
+    """Plan the whole image and one row of tiles from left to right, vertically centered, no higher than wide.
+
+    Parameters
+    ----------
+    tiles
+        1: only the whole image; N: also N tiles; "auto": see `auto_tile_count`.
+    input_px
+        Width of the model's input, None where it takes any size.
+
+    Notes
+    -----
+    The sky and the road right in front of the car are seen in the whole image only: no far objects are there.
+    """
+    whole = Tile(0, 0, width_px, height_px)
+    count = auto_tile_count(width_px, input_px) if tiles == "auto" else tiles
+    if count < 2:
+        return [whole]
+    tile_width = math.ceil(width_px / (count - (count - 1) * OVERLAP))
+    tile_height = min(height_px, tile_width)
+    v0 = (height_px - tile_height) // 2
+    starts = np.rint(np.linspace(0, width_px - tile_width, count)).astype(int).tolist()
+    return [whole, *(Tile(u, v0, u + tile_width, v0 + tile_height) for u in starts)]
+
+
+def auto_tile_count(width_px: int, input_px: int | None) -> int:
+    """Count the tiles in a row so that none is downscaled by more than `MAX_DOWNSCALING`; 1 if the image is not."""
+    if input_px is None or width_px <= MAX_DOWNSCALING * input_px:
+        return 1
+    needed = (width_px / (MAX_DOWNSCALING * input_px) - OVERLAP) / (1 - OVERLAP)
+    return min(math.ceil(needed), MAX_AUTO_TILES)
+
+
+def is_cut_by_tile(box_px: Array, tile: Tile, width_px: int, height_px: int) -> NDArray[np.bool_]:
+    """Compute the mask (M,) of boxes (M, 4), px of the whole image, that end at a border of the tile inside the image."""
+    margin = BORDER * (tile.u1 - tile.u0)
+    return (
+        ((tile.u0 > 0) & (box_px[:, 0] < tile.u0 + margin))
+        | ((tile.v0 > 0) & (box_px[:, 1] < tile.v0 + margin))
+        | ((tile.u1 < width_px) & (box_px[:, 2] > tile.u1 - margin))
+        | ((tile.v1 < height_px) & (box_px[:, 3] > tile.v1 - margin))
+    )
+
+
+def merge(found: list[tuple[Tile, Detections]], width_px: int, height_px: int, max_overlap: float) -> Detections:
+    """Merge the boxes of all tiles, in px of the whole image, into one set.
+
+    Notes
+    -----
+    A box cut by an inner border is dropped: tiles overlap, and objects larger than the overlap are detected in the whole
+    image. A half box would give a wrong object, a missing box only a missing observation of a track.
+    """
+    kept = [d.take(~is_cut_by_tile(d.box_px, tile, width_px, height_px)) for tile, d in found]
+    if not kept:
+        return Detections.empty()
+    joined = Detections(
+        np.concatenate([d.box_px for d in kept]),
+        np.concatenate([d.score for d in kept]),
+        np.concatenate([d.category for d in kept]),
+    )
+    return suppress(joined, max_overlap)
+
+
+# Shares of the narrower width that rider and two-wheeler have in common.
+MIN_HORIZONTAL_SHARE = 0.5
+# Difference of the lower edges, in heights of the two-wheeler: feet are between its axles and the ground.
+MAX_FEET_OFFSET = 0.5
+# Share of a box's area inside a joined box beyond which it is the same two-wheeler or person once more.
+MAX_INSIDE_SHARE = 0.8
+# How far a rider rises above the two-wheeler, in heights of it.
+MIN_RISE = 0.1
+RIDDEN = {"bicycle": "cyclist", "motorcycle": "motorcycle", "cyclist": "cyclist"}
+
+
+def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detections:
+    """Replace each two-wheeler and the person on it by one box around both; a bicycle without a person stays one.
+
+    Parameters
+    ----------
+    sure_score : float
+        A two-wheeler of a lower score that lies inside the person's box is a bag or clothes, and nothing is joined.
+
+    Notes
+    -----
+    A person rides if its box ends near the two-wheeler's lower edge, rises above it, and shares most of the narrower
+    width of both. A person who pushes a bicycle is often joined too: one image does not tell the two cases apart, and
+    both move as one. Pairs are chosen greedily, each box in one pair. Boxes inside a pair are dropped, since models often
+    detect a wheel or a torso as another bicycle or person.
+    """
+    person = np.flatnonzero(detections.category == "pedestrian")
+    wheeler = np.flatnonzero(np.isin(detections.category, list(RIDDEN)))
+    if not len(person) or not len(wheeler):
+        return detections
+    fit = rider_fit(detections.box_px[person], detections.box_px[wheeler])
+    for weak in np.flatnonzero(detections.score[wheeler] < sure_score).tolist():
+        px = detections.box_px[wheeler[weak]]
+        fit[[inside_share(px[None], p)[0] > MAX_INSIDE_SHARE for p in detections.box_px[person]], weak] = 0
+    box, score = detections.box_px.copy(), detections.score.copy()
+    category, kept = detections.category.copy(), np.ones(len(detections), dtype=bool)
+    while fit.max() > 0:
+        p, w = np.unravel_index(int(np.argmax(fit)), fit.shape)
+        i, j = person[p], wheeler[w]
+        box[j] = np.concatenate([np.minimum(box[i, :2], box[j, :2]), np.maximum(box[i, 2:], box[j, 2:])])
+        score[j], category[j] = max(score[i], score[j]), RIDDEN[str(category[j])]
+        fit[:, w] = 0
+        kept[i] = False
+        again = inside_share(box, box[j]) > MAX_INSIDE_SHARE
+        again[j] = False
+        kept &= ~(again & np.isin(category, ["bicycle", "motorcycle", "pedestrian"]))
+        fit[~kept[person], :], fit[:, ~kept[wheeler]] = 0, 0
+    return strongest_first(Detections(box, score, category).take(kept))
+
+
+def rider_fit(person_px: Array, wheeler_px: Array) -> Array:
+    """Compute the shared width (P, W) in [0, 1] of persons (P, 4) and two-wheelers (W, 4); 0 for pairs that do not fit."""
+    p, w = person_px[:, None], wheeler_px[None]
+    shared = np.minimum(p[..., 2], w[..., 2]) - np.maximum(p[..., 0], w[..., 0])
+    narrow = np.minimum(p[..., 2] - p[..., 0], w[..., 2] - w[..., 0])
+    share = np.divide(shared, narrow, out=np.zeros_like(shared), where=narrow > 0)
+    return np.where((share >= MIN_HORIZONTAL_SHARE) & _is_rider_height(p, w), np.clip(share, 0, 1), 0.0)
+
+
+def inside_share(box_px: Array, outer_px: Array) -> Array:
+    """Compute the share (M,) in [0, 1] of the area of boxes (M, 4) inside one other (4,); 0 for empty ones."""
+    shared = np.minimum(box_px[:, 2:], outer_px[2:]) - np.maximum(box_px[:, :2], outer_px[:2])
+    area = np.prod(box_px[:, 2:] - box_px[:, :2], axis=1)
+    return np.asarray(np.divide(np.clip(shared, 0, None).prod(axis=1), area, out=np.zeros(len(area)), where=area > 0))
+
+
+def _is_rider_height(p: Array, w: Array) -> NDArray[np.bool_]:
+    """Return whether persons end and rise where riders of the two-wheelers do."""
+    height = w[..., 3] - w[..., 1]
+    rises_above = p[..., 1] < w[..., 1] - MIN_RISE * height
+    # Of a person nearer or farther than the two-wheeler the lower edge is elsewhere.
+    same_depth = np.abs(p[..., 3] - w[..., 3]) < MAX_FEET_OFFSET * height
+    return np.asarray(rises_above & same_depth)
+
 
 # Smaller boxes are rounding of the decoder.
 MIN_BOX_PX = 2.0
@@ -39,10 +345,6 @@ class OnnxDetector:
 
     Attributes
     ----------
-    name : str
-    model : OnnxModel
-    layout : Layout
-    classes : Classes
     min_score : float
         Lowest score of a box.
     min_weak_score : float

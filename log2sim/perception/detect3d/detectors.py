@@ -1,18 +1,304 @@
-"""3D boxes of road users in clouds: from a network through ONNX Runtime, or from the 3D labels of the log."""
+"""3D boxes of road users in clouds: LiDAR networks by name, from the cloud to boxes with their points, or labels."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
-from log2sim import registry
-from log2sim.config_sections import LidarConfig
-from log2sim.datatypes import Boxes3D, Log
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import LidarConfig
+from log2sim.datatypes import CATEGORIES, GROUPS, Boxes3D, Log
 from log2sim.errors import ConfigError, Log2SimError, PluginError
-from log2sim.perception.lidar.cloud import Cloud
-from log2sim.plugin_checks import DETECT_IN_CLOUD, require_members
+from log2sim.files import plugins
+from log2sim.files.plugins import DETECT_IN_CLOUD, require_members
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.perception.detect.detectors import LabelBoxes, interpolate_boxes, window_ns
+from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach, most_points, points_of_boxes
+from log2sim.perception.detect3d.boxes import MIN_SCORE, LevelBoxes, decode_centers, decode_votes, sigmoid, suppress
+from log2sim.perception.detect3d.network import (
+    Network,
+    grid_window,
+    ground_under,
+    level_points,
+    load_network,
+    rasterize,
+    stack_points,
+    viewpoints_xy,
+)
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
+
+
+@dataclass(frozen=True, eq=False)
+class LabelBoxDetector:
+    """LiDAR detector that returns the labels of a log in which the cloud has points.
+
+    Attributes
+    ----------
+    max_range_m : float
+        Largest distance from the sensor along an axis, m; infinite without a limit.
+    """
+
+    log: Log
+    max_range_m: float = np.inf
+    name: str = "lidar:labels"
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        """Return the labels at the cloud's stamp with score 1, most points first, then nearest; `earlier` has no effect."""
+        labels, window = self._labels
+        if not len(labels.t_ns):
+            return Boxes3D.empty()
+        found = interpolate_boxes(labels, cloud.stamp_ns, window)
+        local = found.center_m - cloud.origin
+        away = np.abs(local[:, :2] - cloud.sensor[:2])
+        near = np.all(away <= self.max_range_m, axis=1)
+        found, local = found.take(np.flatnonzero(near)), local[near]
+        # Points on the ground count for no box: a box whose lower face is 5 cm too low would gain hundreds.
+        points = points_of_boxes(cloud.xyz, local, found.size_m, found.yaw_rad, ~cloud.ground).count
+        seen = np.flatnonzero(points > 0)
+        seen = seen[np.lexsort((np.hypot(*away[near][seen].T), -points[seen]))]
+        found, one = found.take(seen), np.ones(len(seen))
+        return Boxes3D(
+            found.t_ns,
+            found.center_m,
+            found.size_m,
+            found.yaw_rad,
+            one,
+            found.category.astype("<U16"),
+            one,
+            points[seen],
+        )
+
+    @cached_property
+    def _labels(self) -> tuple[LabelBoxes, int]:
+        """Labels of road users in the order of their stamps, and the time around a cloud in which to search them, ns."""
+        labels = self.log.labels
+        assert labels is not None
+        rows = np.flatnonzero(np.isin(labels.category, CATEGORIES))
+        rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
+        everything = LabelBoxes(labels.t_ns, labels.category, labels.center_m, labels.size_m, labels.yaw_rad)
+        return everything.take(rows), window_ns(labels.t_ns)
+
+
+def create(log: Log, settings: LidarConfig) -> LabelBoxDetector:
+    """Make the detector `lidar:labels`.
+
+    Raises
+    ------
+    ConfigError
+        When the log has no 3D labels.
+    """
+    if log.labels is None:
+        others = ", ".join(f"lidar:{name}" for name in plugins.names("lidar_detector") if name != "labels")
+        raise ConfigError(
+            f"detector 'lidar:labels': log '{log.name}' ({log.format}) has no labeled 3D boxes; "
+            f"choose another detector: {others}, or lidar: and the path of an ONNX file"
+        )
+    return LabelBoxDetector(log, settings.range_m or np.inf)
+
+
+WEIGHTS = Path(__file__).parent / "weights"
+# A network that finds less than half of most groups of road users is named as weak.
+MIN_GROUP_RECALL = 0.5
+
+
+def describe_weakness(name: str) -> str:
+    """State what a shipped network finds and turns round in simulated sweeps if it misses most groups of road users, else nothing.
+
+    The figures are those of the JSON file next to its weights.
+    """
+    file = WEIGHTS / f"{name.removeprefix('lidar:')}.json"
+    if not name.startswith("lidar:") or name.endswith(".onnx") or not file.is_file():
+        return ""
+    card = json.loads(file.read_text(encoding="utf-8"))["simulated"]
+    groups = {group: card[group] for group in GROUPS if group in card}
+    if 2 * sum(row["recall"] < MIN_GROUP_RECALL for row in groups.values()) <= len(groups):
+        return ""
+    found = ", ".join(f"{row['recall']:.0%} of {group.replace('_', '-')}s" for group, row in groups.items())
+    turned = ", ".join(f"{row['headings_flipped']:.0%}" for row in groups.values())
+    return (
+        f"{name} finds {found} within {card['max_range_m']:g} m in a simulated sweep at a score of {card['score']:g}; backwards "
+        f"are {turned} of them, before the motion over several sweeps turns those that move"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Boxes of a cloud before the weak ones and those that overlap are left out.
+
+    Attributes
+    ----------
+    boxes : M LevelBoxes
+    inside : PointsOfBoxes
+        Their points above the ground.
+    index : (n,) int
+        Of the points that `inside` numbers in the cloud.
+    terms : (5, M) float64
+        See `LevelBoxes.terms`.
+    """
+
+    boxes: LevelBoxes
+    inside: PointsOfBoxes
+    index: NDArray[np.intp]
+    terms: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkDetector:
+    """Detector from a network and settings.
+
+    Attributes
+    ----------
+    decode : "centers" or "votes"
+        See `LidarConfig`.
+    range_m : float
+        Largest distance from the sensor along x and along y, m.
+    min_score : float or None
+        Lowest score of a box; None for the network's own of each group.
+    """
+
+    name: str
+    network: Network
+    decode: Literal["centers", "votes"]
+    range_m: float
+    min_score: float | None
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""
+        found = self.candidates(cloud, earlier, weak=False)
+        boxes, points = found.boxes, found.inside.count
+        score = sigmoid(boxes.heat) if self.decode == "votes" else boxes.score(self.network.info, found.terms)
+        # What holds no point is nothing that the LiDAR saw.
+        good = np.flatnonzero((points > 0) & (score >= self._least(boxes)))
+        kept = good[suppress(boxes.rectangles.take(good), score[good], boxes.group[good])]
+        boxes, inside = boxes.take(kept), found.inside.take(kept)
+        center = boxes.center_m + cloud.origin
+        center[:, 2] += ground_under(boxes.center_m[:, :2], inside, cloud, found.index)
+        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s.take(found.index)) * NS_PER_S).astype(np.int64)
+        return Boxes3D(
+            t_ns, center, boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.category, score[kept], points[kept]
+        )
+
+    def candidates(self, cloud: Cloud, earlier: Sequence[Cloud] = (), *, weak: bool = True) -> Candidates:
+        """Find all boxes that may be road users, of those on one peak or cluster the strongest.
+
+        Parameters
+        ----------
+        weak : bool
+            Whether boxes that cannot reach the least score are among them.
+
+        Notes
+        -----
+        The calibration of a network is fitted to the terms of these.
+        """
+        info, sensors = self.network.info, viewpoints_xy(cloud)
+        xyz, index = level_points(cloud, self.range_m)
+        stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
+        center, reach_m = self._square_around(sensors)
+        low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=reach_m, center=center)
+        grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
+        maps = self.network.run(grid)
+        if self.decode == "votes":
+            boxes = decode_votes(maps, grid, info, low)
+        else:
+            boxes = decode_centers(maps, info, low)
+            boxes = boxes if weak else boxes.take(self._may_suffice(boxes, grid, low, sensors))
+            first = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
+            boxes = boxes.take(suppress(boxes.rectangles, first, boxes.group, across=False))
+        inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
+        return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensors)))
+
+    def _square_around(self, sensors: Array) -> tuple[Array, float]:
+        """Return center (2,) and half of the side, m, of the square that holds what is in range of sensors at (V, 2).
+
+        It is as large as the network's grid at most.
+        """
+        low, high = sensors.min(axis=0), sensors.max(axis=0)
+        if len(sensors) == 1:
+            return sensors[0], self.range_m
+        reach_m = self.range_m + float((high - low).max()) / 2
+        return (low + high) / 2, min(reach_m, self.network.info.max_range_m)
+
+    def _may_suffice(
+        self, boxes: LevelBoxes, grid: NDArray[np.float32], low: Array, sensors: Array
+    ) -> NDArray[np.bool_]:
+        """Mark boxes (M,) that reach the least score with as many points as they may hold, or with none.
+
+        Points are counted for these alone, as counting takes longest.
+        """
+        info, reach = self.network.info, bounding_reach(boxes.size_m, boxes.yaw_rad)
+        counts = np.rint(np.expm1(3 * grid[3]))
+        most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
+        range_m = ranges_m(boxes, sensors)
+        best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
+        return np.asarray(best >= self._least(boxes))
+
+    def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
+        """Return the least score (M,) that each box needs."""
+        if self.min_score is not None:
+            return np.full(len(found), self.min_score)
+        if self.decode == "votes":
+            return np.full(len(found), MIN_SCORE)
+        info = self.network.info
+        return np.array([info.min_score[group] for group in info.groups])[found.group]
+
+
+def ranges_m(boxes: LevelBoxes, sensors: Array) -> Array:
+    """Compute the distances (M,), m, of centers from the nearest of the sensors at (V, 2) in the plane."""
+    away = boxes.center_m[:, None, :2] - sensors
+    return np.asarray(np.hypot(away[..., 0], away[..., 1]).min(axis=1))
+
+
+def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDetector:
+    """Make a detector of a network's file.
+
+    Raises
+    ------
+    ConfigError
+        A file that is no usable network, or a range that its grid cannot cover.
+    """
+    network = load_network(path)
+    limit = network.info.max_range_m
+    if settings.range_m > limit:
+        raise ConfigError(
+            f"lidar.range_m {settings.range_m:g}: {path} has cells of {network.info.cell_m:g} m, with which a grid covers "
+            f"up to {limit:g} m"
+        )
+    range_m = settings.range_m or network.info.range_m
+    return NetworkDetector(name, network, settings.decode, range_m, settings.min_score or None)
+
+
+def create_vehicle(log: Log, settings: LidarConfig) -> NetworkDetector:
+    """Make the detector `lidar:vehicle`, for LiDARs on vehicles."""
+    return open_shipped("vehicle", settings)
+
+
+def create_roadside(log: Log, settings: LidarConfig) -> NetworkDetector:
+    """Make the detector `lidar:roadside`, for LiDARs beside the road."""
+    return open_shipped("roadside", settings)
+
+
+def open_shipped(name: str, settings: LidarConfig) -> NetworkDetector:
+    """Make a detector of a network that is part of the package.
+
+    Raises
+    ------
+    ConfigError
+        When its file is missing.
+    """
+    path = WEIGHTS / f"{name}.onnx"
+    if not path.is_file():
+        raise ConfigError(
+            f"detector 'lidar:{name}': its network {path} is missing; install log2sim anew, or give lidar: and the path of "
+            "another ONNX file"
+        )
+    return open_network(path, settings, name=f"lidar:{name}")
+
 
 PREFIX = "lidar:"
 MEMBERS = ("name", "detect")
@@ -64,20 +350,18 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
         )
     rest = name.removeprefix(PREFIX)
     if rest.lower().endswith(".onnx"):
-        from log2sim.perception.detect3d.network_detector import open_network
-
         return open_network(Path(rest), settings, name=f"{PREFIX}{Path(rest).name}")
     try:
-        create = registry.load("lidar_detector", rest)
+        create = plugins.load("lidar_detector", rest)
     except PluginError:
         raise
     except ConfigError as error:
         raise ConfigError(f"{error}, or {PREFIX} and the path of an ONNX file (ending in .onnx)") from None
-    with registry.blaming("lidar_detector", rest):
+    with plugins.blaming("lidar_detector", rest):
         detector: LidarDetector = create(log, settings)
-    if registry.is_built_in("lidar_detector", rest):
+    if plugins.is_built_in("lidar_detector", rest):
         return detector
-    return checked(detector, registry.say_plugin("lidar_detector", rest))
+    return checked(detector, plugins.say_plugin("lidar_detector", rest))
 
 
 def checked(detector: Any, source: str) -> LidarDetector:
@@ -107,7 +391,7 @@ class _CheckedLidarDetector:
         except (Log2SimError, MemoryError):
             raise
         except Exception as error:
-            raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {registry.say_exception(error)}") from error
+            raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {plugins.say_exception(error)}") from error
         if not isinstance(found, Boxes3D):
             raise PluginError(f"{self.source}: detect returned {type(found).__name__}, expected Boxes3D")
         return found

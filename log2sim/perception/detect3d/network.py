@@ -1,4 +1,7 @@
-"""A network on the grid of a cloud: an ONNX file with its description, run on one thread.
+"""A network on the bird's-eye-view grid of a cloud, in the level frame.
+
+Only geometry is used, no intensity, so that a network carries over to sensors that it was not trained on. Height slices
+follow AVOD (Ku et al., IROS 2018) and MSFP (Lin et al. 2021, section 3), logarithmic counts PIXOR's and MV3D's density.
 
 The file holds one input "grid" and one output "maps", and describes itself in its metadata under the key `METADATA_KEY`
 by a JSON document, see `NetworkInfo`. `log2sim/README.md` lists the channels for those who bring their own network.
@@ -6,6 +9,7 @@ by a JSON document, see `NetworkInfo`. `log2sim/README.md` lists the channels fo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +20,237 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from log2sim.datatypes import GROUPS
 from log2sim.errors import ConfigError
-from log2sim.input_files import require_readable
-from log2sim.model_errors import first_problem
-from log2sim.perception.detect3d.grid import CHANNELS, MIN_SIZE_CELLS
-from log2sim.perception.onnx_session import open_session
+from log2sim.files.documents import first_problem
+from log2sim.files.inputs import require_readable
+from log2sim.geometry import Array
+from log2sim.perception.detect3d.box_points import PointsOfBoxes
+from log2sim.perception.lidar.cloud import Cloud
+
+
+def open_session(path: Path, options: Any) -> Any:
+    """Load a model into a session on the CPU.
+
+    Builds of ONNX Runtime for Windows report events to Microsoft unless that is turned off, which is done here.
+
+    Parameters
+    ----------
+    options : onnxruntime.SessionOptions
+
+    Returns
+    -------
+    onnxruntime.InferenceSession
+    """
+    import onnxruntime
+
+    onnxruntime.disable_telemetry_events()
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+CHANNELS = 12
+MIN_HEIGHT_M, MAX_HEIGHT_M = -0.5, 4.5
+# Slices end at a bumper, a hood, a waist, a car's roof or a person's shoulders, a person's head, and above all but trucks.
+SLICE_EDGES_M = (MIN_HEIGHT_M, 0.3, 0.7, 1.2, 1.8, 2.5, MAX_HEIGHT_M)
+# The network halves the grid four times.
+SIZE_MULTIPLE = 16
+MIN_SIZE_CELLS = 64
+
+
+def grid_window(
+    xy: NDArray[np.float32], *, cell_m: float, range_m: float, center: Array
+) -> tuple[Array, tuple[int, int]]:
+    """Choose the part of the plane that a grid covers: the bounding box of the points in range.
+
+    Parameters
+    ----------
+    xy : (N, 2) float32, m
+    range_m : float
+        Largest magnitude of x and y relative to `center`, m.
+    center : (2,) float64, m
+        Position of the sensor.
+
+    Returns
+    -------
+    low : (2,) float64, m
+        Lower corner, a multiple of the cell from `center` less the range.
+    shape : (int, int)
+        Cells along x and y, multiples of `SIZE_MULTIPLE`.
+    """
+    limit = int(np.ceil(2 * range_m / (cell_m * SIZE_MULTIPLE))) * SIZE_MULTIPLE
+    corner = np.asarray(center, np.float64) - limit * cell_m / 2
+    low, high = np.zeros(2), np.zeros(2)
+    for axis in range(2):
+        # Rows in range along both axes would need another pass; along one each, the window is at most larger.
+        values = xy[:, axis]
+        values = values[(values >= corner[axis]) & (values < corner[axis] + limit * cell_m)]
+        if not len(values):
+            return corner, (min(MIN_SIZE_CELLS, limit), min(MIN_SIZE_CELLS, limit))
+        low[axis], high[axis] = values.min(), values.max()
+    first, last = (np.clip(np.floor((v - corner) / cell_m), 0, limit - 1) for v in (low, high))
+    needed = last - first + 1
+    count = np.maximum(np.ceil(needed / SIZE_MULTIPLE) * SIZE_MULTIPLE, min(MIN_SIZE_CELLS, limit))
+    # Even, so that the cells of the maps, twice as large, lie alike in every window.
+    start = np.clip(first - (count - needed) // 2, 0, limit - count) // 2 * 2
+    return corner + start * cell_m, (int(count[0]), int(count[1]))
+
+
+def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Make the grid of a cloud.
+
+    Parameters
+    ----------
+    xyz : (N, 3) float32, m
+        Points whose z is the height above the ground; points outside the grid, of other heights or not finite are left out.
+    low : (2,) float64, m
+        Lower corner of the grid.
+    shape : (int, int)
+        Cells H along x and W along y.
+
+    Returns
+    -------
+    (12, H, W) float32
+        Greatest, mean and least height, each half; logarithm of the count; logarithms of the counts in six slices of
+        height; mean offsets from the middle of the cell along x and y, in cells. All zero in an empty cell.
+    """
+    h, w = shape
+    scale, (x0, y0) = np.float32(1 / cell_m), np.asarray(low, np.float32)
+    x, y, z = (xyz[:, 0] - x0) * scale, (xyz[:, 1] - y0) * scale, xyz[:, 2]
+    inside = np.flatnonzero(
+        (x >= 0) & (x < h) & (y >= 0) & (y < w) & (z > np.float32(MIN_HEIGHT_M)) & (z < np.float32(MAX_HEIGHT_M))
+    )
+    out = np.zeros((CHANNELS, h * w), np.float32)
+    if len(inside) == 0:
+        return out.reshape(CHANNELS, h, w)
+    x, y, z = x.take(inside), y.take(inside), z.take(inside)
+    i, j = x.astype(np.intp), y.astype(np.intp)
+    cell = i * w + j
+    count = np.bincount(cell, minlength=h * w)
+    used = np.flatnonzero(count)
+    # One column for each cell with points, which are a tenth of all.
+    number = np.empty(h * w, np.intp)
+    number[used] = np.arange(len(used))
+    column, points = number.take(cell), count.take(used).astype(np.float32)
+    values = np.empty((CHANNELS, len(used)), np.float32)
+    values[0].fill(-np.inf)
+    values[2].fill(np.inf)
+    np.maximum.at(values[0], column, z)
+    np.minimum.at(values[2], column, z)
+    for channel, of_points in ((1, z), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
+        values[channel] = np.bincount(column, of_points, minlength=len(used)) / points
+    values[:3] /= 2
+    values[3] = np.log1p(points) / 3
+    values[10:12] -= np.float32(0.5)
+    for edge in np.array(SLICE_EDGES_M[1:-1], np.float32):
+        column += (z > edge) * len(used)
+    values[4:10] = np.log1p(np.bincount(column, minlength=6 * len(used)).astype(np.float32)).reshape(6, -1) / 2
+    for channel in range(CHANNELS):
+        out[channel, used] = values[channel]
+    return out.reshape(CHANNELS, h, w)
+
+
+# A sweep has 0.3 million points at most; what is beyond a few of them is thinned out, which bounds time and memory.
+MAX_POINTS = 1_000_000
+# The ground under a box is a plane. Where points reach less than this to all sides it is taken as level.
+PLANE_REACH_M = 0.05
+MAX_SLOPE = 0.4
+PLANE_POINTS = 64
+
+
+def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Take the points in range of a cloud's sensors, relative to the cloud's origin.
+
+    Parameters
+    ----------
+    range_m : float
+        Largest distance from a sensor along x and along y, m.
+
+    Returns
+    -------
+    xyz : (n, 3) float32, m
+        z is the height above the ground, within the limits of the grid.
+    index : (n,) int
+        Of the points in the cloud.
+    """
+    return _cropped(cloud, viewpoints_xy(cloud), range_m)
+
+
+def stack_points(cloud: Cloud, earlier: Sequence[Cloud], range_m: float) -> NDArray[np.float32]:
+    """Merge the points of earlier clouds that are in range of a cloud's sensors: (n, 3) as from `level_points`.
+
+    Notes
+    -----
+    Clouds are in map axes already, so that only their origins differ. Each keeps its height above its own ground.
+    """
+    parts = [np.zeros((0, 3), np.float32)]
+    for old in earlier:
+        shift = (old.origin - cloud.origin)[:2]
+        xyz = _cropped(old, viewpoints_xy(cloud) - shift, range_m)[0]
+        xyz[:, :2] += shift.astype(np.float32)
+        parts.append(xyz)
+    return np.concatenate(parts)
+
+
+def viewpoints_xy(cloud: Cloud) -> Array:
+    """Return the places (V, 2) of the sensors relative to the origin, m, one a viewpoint; the origin where it is not known."""
+    xy = np.array([view.sensor[:2] for view in cloud.views], dtype=np.float64)
+    return np.where(np.isfinite(xy).all(axis=1, keepdims=True), xy, 0.0)
+
+
+def _cropped(cloud: Cloud, centers: Array, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Take the points within range of any of the centers (V, 2)."""
+    x, y, height = cloud.xyz[:, 0], cloud.xyz[:, 1], cloud.height
+    near = np.zeros(len(x), dtype=bool)
+    for center in centers:
+        low, high = (center - range_m).astype(np.float32), (center + range_m).astype(np.float32)
+        # False for NaN.
+        near |= (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+    index = np.flatnonzero(near & (height > MIN_HEIGHT_M) & (height < MAX_HEIGHT_M))
+    if len(index) > MAX_POINTS:
+        index = index[:: -(-len(index) // MAX_POINTS)]
+    xyz = np.empty((len(index), 3), np.float32)
+    xyz[:, 0], xyz[:, 1], xyz[:, 2] = x[index], y[index], height[index]
+    return xyz, index
+
+
+def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[np.intp]) -> Array:
+    """Estimate the height (M,) of the ground under positions (M, 2) by a plane through that under the points of each box.
+
+    Parameters
+    ----------
+    xy : (M, 2) float64, m
+        Centers of the boxes, relative to the cloud's origin.
+    inside : PointsOfBoxes
+        Each box has at least one point.
+    index : (n,) int
+        Of the points that `inside` numbers in the cloud.
+
+    Returns
+    -------
+    (M,) float64, m
+        Relative to the cloud's origin.
+
+    Notes
+    -----
+    A car is seen from one side: on a slope of 10 % the ground under its points is 0.1 to 0.2 m off that under its center.
+    """
+    inside = inside.sample(PLANE_POINTS)
+    box, point = inside.box, index.take(inside.point)
+    x, y = (cloud.xyz[:, axis].take(point) - xy[:, axis].take(box) for axis in range(2))
+    z = (cloud.xyz[:, 2].take(point) - cloud.height.take(point)).astype(np.float64)
+    count = inside.count
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.bincount(box, values, minlength=len(count)) / count)
+
+    mx, my, mz = mean(x), mean(y), mean(z)
+    dx, dy, dz = x - mx[box], y - my[box], z - mz[box]
+    xx, yy = (mean(d * d) + PLANE_REACH_M**2 for d in (dx, dy))
+    xy_, xz, yz = mean(dx * dy), mean(dx * dz), mean(dy * dz)
+    determinant = xx * yy - xy_ * xy_
+    slope_x, slope_y = (
+        np.clip(s / determinant, -MAX_SLOPE, MAX_SLOPE) for s in (yy * xz - xy_ * yz, xx * yz - xy_ * xz)
+    )
+    return np.asarray(mz - slope_x * mx - slope_y * my)
+
 
 METADATA_KEY = "log2sim.lidar"
 VERSION = 1
@@ -36,8 +267,6 @@ class NetworkInfo(BaseModel):
 
     Attributes
     ----------
-    version : int
-    name : str
     cell_m : float
         Side of a cell of the grid, m.
     stride : int
@@ -160,8 +389,6 @@ class Network:
 
     Attributes
     ----------
-    path : Path
-    info : NetworkInfo
     session : onnxruntime.InferenceSession
     """
 

@@ -1,9 +1,15 @@
-"""Correspondences between the image and the ground: foot points of obstacles that the LiDAR measured."""
+"""Correspondences between the image and the ground, and the baselines that the time-aware homography is compared with.
+
+"per-frame" runs one RANSAC for each frame, "min-frame" keeps of all frames' homographies the one of least error over all
+frames, and "straw-man" is "per-frame" with ground positions from average sizes instead of a LiDAR. "per-frame-skimage" is
+"per-frame" by the RANSAC of scikit-image.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +17,137 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import Array, Camera, undistort
-from log2sim.perception.homography.baselines import ground_from_sizes
+from log2sim.perception.homography.fit import HomographyFit, refused_fit, validated_fit
+from log2sim.perception.homography.normalized import CHI2_2DOF_99, NormalizedCorrespondences, bounded_losses, linearize
+from log2sim.perception.homography.ransac import RobustFit
+
+# Heights of cars differ by about a tenth (standard deviation), and so does a range derived from them.
+SIZE_SIGMA_SHARE = 0.1
+# Trials of scikit-image's RANSAC for a frame, and the probability of an outlier-free sample at which it stops.
+SKIMAGE_TRIALS, SKIMAGE_STOP_PROBABILITY = 1000, 0.999
+# Ratio of the eighth to the first singular value of the design matrix below which a sample is collinear.
+MIN_SAMPLE_S8_S1 = 1e-6
+
+FrameEstimator = Callable[[NormalizedCorrespondences], RobustFit]
+
+
+def fit_frames(data: NormalizedCorrespondences, estimate: FrameEstimator, *, keep_all: bool) -> HomographyFit:
+    """Fit one homography a frame, then choose the one of least error over all frames.
+
+    `estimate` fits the correspondences of one frame; `keep_all` also returns the single frames' fits as `per_tick`.
+    """
+    per_tick = np.full((len(data.start), 3, 3), np.nan)
+    hypotheses: list[Array] = []
+    for k, (start, count) in enumerate(zip(data.start, data.count)):
+        if count < 4:
+            continue
+        robust = estimate(data.take(slice(start, start + count)))
+        fit = validated_fit(robust)
+        if fit.ok and robust.h is not None:
+            per_tick[k] = fit.ground_H_image
+            hypotheses.append(robust.h)
+    if not hypotheses:
+        return refused_fit("no frame has correspondences that determine a homography", data.image.shape[1])
+    best = hypotheses[int(np.argmin(bounded_losses(data, np.array(hypotheses))))]
+    fit = validated_fit(RobustFit(best, data, linearize(data, best[None])))
+    return replace(fit, per_tick=per_tick if keep_all and fit.ok else None)
+
+
+class HomographyModel:
+    """Homography from normalized ground to image, as `skimage.measure.ransac` asks for it: `estimate` and `residuals`.
+
+    Attributes
+    ----------
+    h : (3, 3) float64
+    """
+
+    h: Array
+
+    @classmethod
+    def from_estimate(cls, ground: Array, image: Array) -> HomographyModel | None:
+        """Fit a model to points (N, 2), (N, 2); None where they do not determine one."""
+        model = cls()
+        return model if model.estimate(ground, image) else None
+
+    def estimate(self, ground: Array, image: Array) -> bool:
+        """Fit by the direct linear transform to points (N, 2), (N, 2); False where they do not determine one."""
+        (x, y), (u, v) = ground.T, image.T
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        rows = np.concatenate(
+            [
+                np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
+                np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
+            ]
+        )
+        # The gram matrix costs the same for any number of points, where a full SVD of the rows costs its square.
+        values, vectors = np.linalg.eigh(rows.T @ rows)
+        self.h = vectors[:, 0].reshape(3, 3)
+        depth = ground @ self.h[2, :2] + self.h[2, 2]
+        self.h = self.h * np.sign(np.median(depth))
+        return bool(values[1] > MIN_SAMPLE_S8_S1**2 * values[-1])
+
+    def residuals(self, ground: Array, image: Array) -> NDArray[np.float64]:
+        """Compute the distances (N,) in the image; infinite behind the camera."""
+        q = ground @ self.h[:, :2].T + self.h[:, 2]
+        front = q[:, 2] > 0
+        projected = q[:, :2] / np.where(front, q[:, 2], 1.0)[:, None]
+        return np.where(front, np.hypot(*(projected - image).T), np.inf)
+
+
+def ransac_skimage(data: NormalizedCorrespondences, rng: np.random.Generator, trials: int | None) -> RobustFit:
+    """Fit the correspondences of one frame by `skimage.measure.ransac` with at most so many trials."""
+    from skimage.measure import ransac
+
+    # A frame that determines no model is an expected result here, for which scikit-image warns.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        model, _ = ransac(
+            (data.ground[:2].T, data.image.T),
+            HomographyModel,
+            min_samples=4,
+            residual_threshold=float(np.sqrt(CHI2_2DOF_99)) * data.sigma_image,
+            max_trials=trials or SKIMAGE_TRIALS,
+            stop_probability=SKIMAGE_STOP_PROBABILITY,
+            rng=rng,
+        )
+    if not isinstance(model, HomographyModel):
+        return RobustFit(None, data)
+    h = model.h / np.linalg.norm(model.h)
+    return RobustFit(h, data, linearize(data, h[None]))
+
+
+def ground_from_sizes(uv_px: Array, height_px: Array, height_m: Array, K: Array, ego_T_cam: Array) -> Array:
+    """Estimate ground positions of objects from their heights in the image and average heights.
+
+    Parameters
+    ----------
+    uv_px : (N, 2) float64
+        Undistorted foot points, px.
+    height_px, height_m : (N,) float64
+        Heights of the boxes, px, and of the objects, m.
+    K : (3, 3) float64
+    ego_T_cam : (4, 4) float64
+        Pose of the camera.
+
+    Returns
+    -------
+    (N, 2) float64
+        Positions in the ego frame, m; NaN for boxes without height.
+    """
+    depth = K[1, 1] * height_m / np.where(height_px > 0, height_px, np.nan)
+    rays = np.column_stack([(uv_px - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(uv_px))])
+    return np.asarray((rays * depth[:, None]) @ ego_T_cam[:2, :3].T + ego_T_cam[:2, 3])
+
+
+def sigma_from_sizes_m(xy_m: Array) -> float:
+    """Estimate the standard deviation, m, of ground positions (N, 2) from average sizes.
+
+    A tenth of the range, for which twice the spread of the positions stands: it does not depend on the origin.
+    """
+    known = xy_m[np.isfinite(xy_m).all(axis=1)]
+    range_m = 2.0 * float(np.sqrt(known.var(axis=0).sum())) if len(known) else 0.0
+    return SIZE_SIGMA_SHARE * range_m
+
 
 # Fewer LiDAR points leave the nearest side of an obstacle undetermined.
 MIN_FOOT_POINTS = 20

@@ -1,4 +1,4 @@
-"""Estimation of the image-to-ground homography of a camera from correspondences of many ticks."""
+"""Estimation of the homography of a camera, which correspondences it is fitted to, and places of obstacles by it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,28 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, apply_homography
-from log2sim.perception.homography.baselines import fit_frames, ransac_skimage, sigma_from_sizes_m
-from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.fit import HomographyFit, refused_fit, validated_fit
+from log2sim.datatypes import TYPICAL_SIZE_M
+from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian
+from log2sim.perception.homography.correspondences import (
+    Correspondences,
+    fit_frames,
+    ransac_skimage,
+    sigma_from_sizes_m,
+    undistorted_pixels,
+)
+from log2sim.perception.homography.fit import HomographyFit, PitchRoll, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import NormalizedCorrespondences
-from log2sim.perception.homography.pitch_roll import PITCH_SIGMA_PX, fit_pitch_roll
+from log2sim.perception.homography.pitch_roll import (
+    MIN_SIGNIFICANCE_SIGMA,
+    PITCH_SIGMA_PX,
+    HeldOutErrors,
+    angle_sigmas_deg,
+    fit_pitch_roll,
+    held_out_errors,
+    stabilized,
+    stabilizing_warps,
+    two_folds,
+)
 from log2sim.perception.homography.ransac import (
     RANSAC_SCHEDULE,
     RANSAC_SCHEDULE_OF_A_FRAME,
@@ -75,8 +91,6 @@ def estimate_homography(
     ----------
     correspondences : Correspondences
         Rows that are not finite are ignored.
-    options : EstimationOptions, optional
-    rng : numpy.random.Generator
 
     Raises
     ------
@@ -170,3 +184,201 @@ def _of_all_rows(
         per_tick = np.repeat(missing[None], len(ticks), axis=0)
         per_tick[np.unique(number[rows])] = fit.per_tick
     return replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick)
+
+
+# A detector's box ends this far from the true foot point (standard deviation).
+FOOT_SIGMA_PX = 4.0
+# Pixels of LiDAR ground points, off by calibration and timing, and heights of the road's crown and of curbs.
+GROUND_SIGMA_PX = 1.0
+GROUND_SIGMA_M = 0.1
+# Ground positions of foot points: the ground, and the nearest side of an obstacle.
+FOOT_SIGMA_M = 0.2
+# Fewer foot points, or worse conditioned ones, are joined by LiDAR ground points.
+MIN_FEET = 80
+MAX_FEET_CONDITION = 30.0
+# Image homographies nearer to the identity are rounding: the camera does not move.
+MIN_WARP = 1e-9
+# Fewer foot points do not tell whether pitch and roll from ground points place obstacles better.
+MIN_TESTED_FEET = 40
+
+
+def fit_camera(
+    feet: Correspondences, ground: Correspondences, options: EstimationOptions, *, rng: np.random.Generator
+) -> tuple[HomographyFit, str]:
+    """Fit the homography of one camera, with pitch and roll of each tick if they lower held-out errors.
+
+    Foot points of obstacles are taken alone if they suffice. Where they are too few or do not determine the homography
+    (cars of one lane are collinear), LiDAR ground points join them. "straw-man" has no LiDAR and so the obstacles alone.
+
+    Parameters
+    ----------
+    feet, ground : Correspondences
+        Of obstacles and of LiDAR ground points.
+    options : EstimationOptions
+        Its standard deviations are replaced by those of these correspondences; `pitch_roll` is decided by the data.
+
+    Returns
+    -------
+    fit : HomographyFit
+    source : str
+        What it was fitted to, "none" where nothing was.
+    """
+    options = replace(options, pitch_roll=False)
+    fit, source = _fit_fixed(feet, ground, options, rng)
+    if options.method not in STREAM_METHODS or (len(ground) < 4 and len(feet) < MIN_FEET):
+        return fit, source
+    feet, ground = _finite(feet), _finite(ground)
+    rng = rng.spawn(1)[0]
+    tested = _test_ground(fit, feet, ground, options, rng)
+    if tested is None or not tested[1].per_tick:
+        of_feet = _test_feet(feet, options, rng)
+        tested = of_feet if tested is None or (of_feet is not None and of_feet[1].per_tick) else tested
+    if tested is None or not tested[1].per_tick:
+        return replace(fit, pitch_roll=None if tested is None else tested[1]), source
+    moving, pitch_roll = tested
+    stable, source = _fit_fixed(stabilized(feet, moving), stabilized(ground, moving), options, rng)
+    if not stable.ok:
+        return fit, source
+    per_tick = _scaled(stable.ground_H_image @ stabilizing_warps(moving))
+    return replace(stable, ticks=moving.ticks, per_tick=per_tick, pitch_roll=pitch_roll), source
+
+
+def _fit_fixed(
+    feet: Correspondences, ground: Correspondences, options: EstimationOptions, rng: np.random.Generator
+) -> tuple[HomographyFit, str]:
+    """Fit one homography to foot points, joined by ground points where they do not suffice; returns it and its source."""
+    of_feet = replace(options, sigma_px=FOOT_SIGMA_PX)
+    if options.method == "straw-man":
+        if feet.xy_by_size is None:
+            feet = replace(feet, xy_by_size=np.full((len(feet), 2), np.nan))
+        fit = estimate_homography(feet, replace(of_feet, K=None), rng=rng)
+        return fit, "obstacles of average size" if fit.ok else "none"
+    if len(feet) >= MIN_FEET:
+        fit = estimate_homography(feet, replace(of_feet, sigma_m=FOOT_SIGMA_M), rng=rng)
+        if fit.ok and fit.condition < MAX_FEET_CONDITION:
+            return fit, "obstacles"
+    both = Correspondences.join([feet, ground])
+    if len(both) < 4:
+        return refused_fit(f"{len(both)} correspondences in the whole log, at least 4 are needed", len(both)), "none"
+    of_ground = replace(options, sigma_px=GROUND_SIGMA_PX, sigma_m=GROUND_SIGMA_M)
+    return estimate_homography(both, of_ground, rng=rng), "obstacles and ground points"
+
+
+def _test_ground(
+    fit: HomographyFit,
+    feet: Correspondences,
+    ground: Correspondences,
+    options: EstimationOptions,
+    rng: np.random.Generator,
+) -> tuple[HomographyFit, PitchRoll] | None:
+    """Estimate the angles from ground points and test them on the foot points; None where there are too few."""
+    if len(ground) < 4 or len(feet) < MIN_TESTED_FEET:
+        return None
+    of_ground = replace(options, pitch_roll=True, sigma_px=GROUND_SIGMA_PX, sigma_m=GROUND_SIGMA_M)
+    moving = estimate_homography(ground, of_ground, rng=rng)
+    if not moving.ok:
+        return None
+    stable_feet = stabilized(feet, moving)
+    stable = _fit_fixed(stable_feet, stabilized(ground, moving), options, rng)[0]
+    errors = held_out_errors((fit, feet), (stable, stable_feet), FOOT_SIGMA_PX, FOOT_SIGMA_M)
+    return moving, _decide(errors, moving, "ground points", options)
+
+
+def _test_feet(
+    feet: Correspondences, options: EstimationOptions, rng: np.random.Generator
+) -> tuple[HomographyFit, PitchRoll] | None:
+    """Estimate the angles from one half of the foot points and test them on the other; None where there are too few."""
+    if len(feet) < MIN_FEET:
+        return None
+    fixed_options = replace(options, sigma_px=FOOT_SIGMA_PX, sigma_m=FOOT_SIGMA_M)
+    moving_options = replace(fixed_options, pitch_roll=True)
+    errors = []
+    for training, test in two_folds(feet):
+        moving = estimate_homography(training, moving_options, rng=rng)
+        if not moving.ok:
+            return None
+        fixed = estimate_homography(training, fixed_options, rng=rng)
+        stable = estimate_homography(stabilized(training, moving), fixed_options, rng=rng)
+        errors.append(held_out_errors((fixed, test), (stable, stabilized(test, moving)), FOOT_SIGMA_PX, FOOT_SIGMA_M))
+    moving = estimate_homography(feet, moving_options, rng=rng)
+    if not moving.ok:
+        return None
+    return moving, _decide(HeldOutErrors.join(errors), moving, "obstacles", options)
+
+
+def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: EstimationOptions) -> PitchRoll:
+    """Accept or refuse the angles by the held-out errors."""
+    pitches = np.abs(stabilizing_warps(moving) - np.eye(3)).max() > MIN_WARP
+    significance = errors.significance() if pitches else 0.0
+    sigmas_deg = (float("nan"), float("nan")) if options.K is None else angle_sigmas_deg(moving, options.K)
+    before, after = np.median(errors.distance_px, axis=1).tolist()
+    return PitchRoll(significance > MIN_SIGNIFICANCE_SIGMA, source, *sigmas_deg, (before, after), significance)
+
+
+def _finite(correspondences: Correspondences) -> Correspondences:
+    """Select the rows whose pixels and positions are finite."""
+    values = np.column_stack([correspondences.uv, correspondences.xy_ego])
+    return correspondences.take(np.isfinite(values).all(axis=1))
+
+
+def _scaled(h: Array) -> Array:
+    """Scale homographies (T, 3, 3) so that their third rows are unit vectors."""
+    return np.asarray(h / np.linalg.norm(h[:, 2], axis=1)[:, None, None])
+
+
+# Beyond this range one pixel of a camera at car height is several meters.
+MAX_RANGE_M = 60.0
+# Standard deviation, m, of the ground itself and of where the nearest side of an obstacle is, along each axis.
+GROUND_POSITION_SIGMA_M = 0.2
+
+
+def place_obstacle(
+    ground_H_image: Array, camera: Camera, box_px: Array, category: str, camera_xy: Array
+) -> tuple[Array, Array] | None:
+    """Place an obstacle by the middle of the lower edge of its box.
+
+    Parameters
+    ----------
+    ground_H_image : (3, 3) float64
+    box_px : (4,) float64
+    category : str
+        Its typical size is used.
+    camera_xy : (2,) float64
+        Position of the camera in the frame of the ground positions, m.
+
+    Returns
+    -------
+    center : (2,) float64
+        Center of the obstacle on the ground, m.
+    covariance : (2, 2) float64
+    or None
+        Above the horizon and beyond 60 m.
+    """
+    uv = undistorted_pixels(camera, np.array([[(box_px[0] + box_px[2]) / 2, box_px[3]]]))
+    xy, below = apply_homography(ground_H_image, uv)
+    if not below[0] or np.hypot(*(xy[0] - camera_xy)) > MAX_RANGE_M:
+        return None
+    direction = (xy[0] - camera_xy) / np.hypot(*(xy[0] - camera_xy))
+    length, width, _ = TYPICAL_SIZE_M[category]
+    # The foot is on the nearest side. Half of the depth behind it depends on the heading, which is unknown: from half the
+    # width to half the length.
+    depth, depth_sigma = (length + width) / 4, (length - width) / 4
+    slope = homography_jacobian(ground_H_image, uv)[0]
+    covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * GROUND_POSITION_SIGMA_M**2
+    covariance = covariance + depth_sigma**2 * np.outer(direction, direction)
+    return xy[0] + direction * depth, covariance
+
+
+def spanned_height_m(ground_H_image: Array, camera: Camera, box_px: Array, base_T_cam: Array) -> float:
+    """Return the height that a box (4,) spans above its foot, m; NaN where it is seen straight from above.
+
+    The pose of the camera (4, 4) is that in the frame of the ground positions.
+    """
+    middle = (box_px[0] + box_px[2]) / 2
+    uv = undistorted_pixels(camera, np.array([[middle, box_px[1]], [middle, box_px[3]]]))
+    rays = np.column_stack([uv, np.ones(2)]) @ np.linalg.inv(camera.K).T @ base_T_cam[:3, :3].T
+    across = np.hypot(rays[:, 0], rays[:, 1])
+    if not across.all():
+        return float("nan")
+    foot_xy = apply_homography(ground_H_image, uv[1:])[0][0]
+    return float(-np.diff(rays[:, 2] / across)[0] * np.hypot(*(foot_xy - base_T_cam[:2, 3])))

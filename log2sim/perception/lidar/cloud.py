@@ -1,16 +1,370 @@
-"""Sweeps in the map frame, compensated for the motion of their sensor, as one cloud with its ground."""
+"""Sweeps in the map frame, compensated, as one cloud with its viewpoints, rays and ground."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ENDS, VEHICLE, Log, Sweep
+from log2sim.datatypes import ENDS, VEHICLE, Log, Rays, Sweep, end_of
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.lidar.azimuth_index import AzimuthIndex
+from log2sim.perception.boxes import upper_median
+
+CELL_M = 1.0
+REACH_M = 100.0
+ROUNDS = 6
+# A cell whose lowest point is higher than this above the smooth surface contains an object; ditches and falling edges of
+# slopes may be deeper.
+ACCEPT_ABOVE_M = 0.2
+ACCEPT_BELOW_M = 0.4
+ON_GROUND_M = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Ground heights on a grid.
+
+    Attributes
+    ----------
+    center : (2,) float64
+        m, middle of the grid, in the frame of the points.
+    z : (K, K) float64
+        m, heights at the cell centers, first axis along x.
+    """
+
+    center: Array
+    z: Array
+
+    def at(self, xy: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """Interpolate the height (N,) under positions (N, 2) bilinearly; constant beyond the grid's edge."""
+        k = self.z.shape[0]
+        (i, fi), (j, fj) = (self._cell(xy[:, axis], axis) for axis in range(2))
+        z, corner = self.z.astype(np.float32).ravel(), i * k + j
+        low, high = z.take(corner), z.take(corner + k)
+        low += (z.take(corner + 1) - low) * fj
+        high += (z.take(corner + k + 1) - high) * fj
+        return np.asarray(low + (high - low) * fi)
+
+    def _cell(self, values: NDArray[np.floating[Any]], axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Find the cell center below each coordinate (N,): its index (N,) and the fraction (N,) toward the next one."""
+        k = self.z.shape[0]
+        place = (values - values.dtype.type(self.center[axis])).astype(np.float32)
+        place *= np.float32(1 / CELL_M)
+        place += np.float32((k - 1) / 2)
+        np.clip(place, 0, np.float32(k - 1.001), out=place)
+        i = place.astype(np.intp)
+        place -= i
+        return i, place
+
+
+def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float) -> Ground:
+    """Estimate the ground under points (N, 3) within `REACH_M` of `center` (2,).
+
+    Parameters
+    ----------
+    xyz : (N, 3) float, m
+    center : (2,) float64, m
+        In the frame of the points.
+    z_hint : float
+        Expected height at the center, m. Without any point the ground is flat at this height.
+
+    Notes
+    -----
+    A quadratic surface is fitted to the lowest point of every cell by iteratively reweighted least squares, with
+    `z_hint` as an anchor; the smoothed residuals of cells near that surface are added.
+    """
+    k = int(2 * REACH_M / CELL_M) + 1
+    lowest = _lowest_points(xyz, center, k)
+    terms, range_m = _terms(k)
+    filled = np.isfinite(lowest)
+    surface = np.full((k, k), z_hint)
+    if filled.sum() >= 12:
+        surface = terms @ _fit_surface(terms[filled], lowest[filled], range_m[filled], z_hint)
+    lowest = np.where(filled, lowest, 0.0)
+    residual = np.where(filled, lowest - surface, 0.0)
+    for widened in (2.0, 1.0):
+        on_ground = (residual < widened * ACCEPT_ABOVE_M) & (residual > -widened * ACCEPT_BELOW_M)
+        weight = (filled & on_ground).astype(np.float64)
+        total, blurred = _blur(weight), _blur(weight * residual)
+        surface = surface + np.divide(blurred, total, out=np.zeros_like(total), where=total > 1e-6)
+        residual = np.where(filled, lowest - surface, 0.0)
+    return Ground(np.asarray(center, dtype=np.float64), surface)
+
+
+@lru_cache(maxsize=1)
+def _terms(k: int) -> tuple[Array, Array]:
+    """Return the terms (K, K, 6) of a quadratic surface at the cells of a grid, and their distance (K, K), m, from its middle."""
+    axis = (np.arange(k) - (k - 1) / 2) * CELL_M
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1), np.hypot(x, y)
+
+
+def _blur(grid: Array) -> Array:
+    """Smooth a grid (K, K) by a Gaussian of two cells, plus one of eight cells with weight 1e-3 to fill empty areas."""
+    import cv2
+
+    single = grid.astype(np.float32)
+    near, far = (cv2.GaussianBlur(single, (8 * s + 1, 8 * s + 1), s, borderType=cv2.BORDER_CONSTANT) for s in (2, 8))
+    return np.asarray(near + np.float32(1e-3) * far, dtype=np.float64)
+
+
+def _lowest_points(xyz: NDArray[np.floating[Any]], center: Array, k: int) -> Array:
+    """Find the lowest height in every cell (K, K), without single false returns below the road; inf if empty."""
+    kind = xyz.dtype.type
+    i, j = ((xyz[:, axis] - kind(center[axis])) * kind(1 / CELL_M) + kind(k / 2) for axis in range(2))
+    inside = np.flatnonzero((i >= 0) & (i < k) & (j >= 0) & (j < k))
+    flat = i.take(inside).astype(np.int32) * k + j.take(inside).astype(np.int32)
+    z = xyz[:, 2].take(inside).astype(np.float64)
+    lowest = np.full(k * k, np.inf)
+    np.minimum.at(lowest, flat, z)
+    second = np.full(k * k, np.inf)
+    above = np.flatnonzero(z > lowest.take(flat))
+    np.minimum.at(second, flat.take(above), z.take(above))
+    # Mirror reflections are decimeters below the road; roughness is centimeters.
+    reflected = np.isfinite(second) & (second > lowest + 0.3)
+    return np.where(reflected, second, lowest).reshape(k, k)
+
+
+def _fit_surface(terms: Array, z: Array, range_m: Array, z_hint: float) -> Array:
+    """Fit the coefficients (6,) of a quadratic surface robustly; cells above it lose weight twice as fast as those below."""
+    nearness = 1.0 / (1.0 + (range_m / 25.0) ** 2)
+    tolerance = 0.1 + 0.02 * range_m
+    weight = nearness * (np.abs(z - z_hint) < 1.0 + 0.15 * range_m)
+    prior = np.diag([0.0, 1.0, 1.0, 3e2, 3e2, 3e2])
+    solution = np.array([z_hint, 0, 0, 0, 0, 0.0])
+    for _ in range(ROUNDS):
+        # The anchor has a tenth of the weight of all cells, and only a constant term.
+        anchor = 0.1 * max(float(weight.sum()), 1.0)
+        weighted = terms * weight[:, None]
+        normal, right = weighted.T @ terms + prior, weighted.T @ z
+        normal[0, 0] += anchor
+        right[0] += anchor * z_hint
+        solution = np.linalg.solve(normal, right)
+        residual = z - terms @ solution
+        scaled = np.where(residual > 0, residual, residual / 2) / tolerance
+        weight = nearness / (1 + scaled**2) ** 2
+    return solution
+
+
+# Width of the window next to an end in which ranges are compared, in m at the end's range, and its limits as an angle: a
+# narrower one holds no ray of a usual LiDAR (0.1 to 0.4 degrees apart), a wider one reaches the next object.
+WINDOW_M = 0.5
+MIN_WINDOW_RAD, MAX_WINDOW_RAD = np.deg2rad(0.6), np.deg2rad(6.0)
+# A return this much farther than the end belongs to something behind the object.
+MIN_DEPTH_STEP_M = 0.5
+MIN_RAYS_BEYOND = 2
+# Share of a cluster's points skipped at each end, so that a stray one is not taken for the end.
+TRIM, MAX_TRIMMED_POINTS = 0.01, 2
+# Points this near to an end form the face that ends there; a corner has more than this share of their variance across.
+FACE_M, MAX_FLATNESS = 1.5, 0.05
+SLOPE_MARGIN = 0.01
+# Azimuths are integer steps that fit into 16 bits; one turn has this many.
+STEPS_PER_TURN = 60_000
+STEP_RAD = 2 * np.pi / STEPS_PER_TURN
+MIN_WINDOW_STEPS = round(MIN_WINDOW_RAD / STEP_RAD)
+
+
+@dataclass(frozen=True, eq=False)
+class AzimuthIndex:
+    """Points of a cloud around their sensor, sorted by azimuth.
+
+    Attributes
+    ----------
+    azimuth : (N,) uint16
+        In steps of `STEP_RAD` from -pi, map frame, not decreasing.
+    range_m : (N,) float32
+        Horizontal distance from the sensor.
+    slope : (N,) float32
+        Height over horizontal distance, relative to the sensor.
+    obstacle : (N,) bool
+        False for points on the ground.
+    rank : (N,) int
+        Position of every point of the cloud in the columns above.
+    """
+
+    azimuth: NDArray[np.uint16]
+    range_m: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    obstacle: NDArray[np.bool_]
+    rank: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, xyz: NDArray[np.float32], sensor: NDArray[np.float32], ground: NDArray[np.bool_]) -> AzimuthIndex:
+        """Sort points (N, 3) by their azimuth around a sensor (3,); `ground` (N,) marks those on the ground."""
+        x, y, z = (xyz - sensor).T
+        # NumPy sorts 16-bit integers by radix, ten times as fast as angles.
+        azimuth = ((np.arctan2(y, x) + np.pi) / STEP_RAD).astype(np.uint16)
+        order = np.argsort(azimuth, kind="stable")
+        range_m = np.hypot(x, y)
+        rank = np.empty(len(order), dtype=np.intp)
+        rank[order] = np.arange(len(order))
+        slope = z / np.maximum(range_m, 1e-3)
+        return cls(azimuth[order], range_m[order], slope[order], ~ground[order], rank)
+
+    def ends_visible(self, members: Sequence[NDArray[np.intp]]) -> NDArray[np.bool_]:
+        """Decide which of the right and the left end (R, 2) of clusters are ends of their objects.
+
+        Parameters
+        ----------
+        members : R arrays (n,) of int
+            Rows of each cluster's points in the cloud, at least one.
+
+        Notes
+        -----
+        Next to an end of the object, rays at its height reach what lies behind it. If they stop at something nearer, if
+        they hit the same surface, or if there are no rays at all, the object may extend beyond what was seen.
+        """
+        clusters = _Clusters.of(self, members)
+        end, edge = clusters.ends()
+        range_m = clusters.ranges_near(edge)
+        width = np.clip(WINDOW_M / np.maximum(range_m, 1e-3), MIN_WINDOW_RAD, MAX_WINDOW_RAD) / STEP_RAD
+        sign = np.array([-1, 1])
+        beside = np.sort([edge + 2 * sign, edge + sign * np.round(width).astype(np.int64)], axis=0)
+        window, row = self._between(*beside.reshape(2, -1))
+        slope, low, high = self.slope[row], *(np.repeat(v, 2)[window] for v in clusters.slopes())
+        found = np.flatnonzero((slope >= low) & (slope <= high))
+        found = found[~clusters.contain(window[found] // 2, row[found])]
+        window, row = window[found], row[found]
+        least_m = np.maximum(clusters.extended_face_ranges(end, window, self.azimuth[row]), range_m.ravel()[window])
+        beyond = self.range_m[row] > least_m + MIN_DEPTH_STEP_M
+        ends = end.size
+        rays = np.bincount(window[beyond], minlength=ends)
+        blocked = np.bincount(window[~beyond & self.obstacle[row]], minlength=ends)
+        return np.asarray(rays >= np.maximum(MIN_RAYS_BEYOND, blocked)).reshape(-1, 2)
+
+    def _between(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Find the rows with an azimuth in each window (W,) from `first` up to `last`, less than a turn later: window (n,), row (n,)."""
+        first, last = first % STEPS_PER_TURN, first % STEPS_PER_TURN + last - first
+        wrapped = np.maximum(last - STEPS_PER_TURN, 0)
+        bounds = np.stack([first, np.minimum(last, STEPS_PER_TURN - 1), wrapped]).astype(np.uint16)
+        begin, end, rest = np.searchsorted(self.azimuth, bounds)
+        start = np.stack([begin, np.zeros_like(begin)], axis=1).ravel()
+        count = np.stack([np.maximum(end - begin, 0), rest], axis=1).ravel()
+        ordinal = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return np.repeat(np.arange(len(count)) // 2, count), np.repeat(start, count) + ordinal
+
+
+@dataclass(frozen=True, eq=False)
+class _Clusters:
+    """Points of R clusters, one cluster after the other, each in the order of their azimuths.
+
+    Attributes
+    ----------
+    count, start : (R,) int
+        Number of points of each cluster, and the place of its first.
+    group : (K,) int
+        The cluster of each point.
+    row : (K,) int
+        The point in the index.
+    azimuth : (K,) int64
+        In steps, negative for the points of a cluster that lie before the azimuth at which a turn begins.
+    """
+
+    index: AzimuthIndex
+    count: NDArray[np.intp]
+    start: NDArray[np.intp]
+    group: NDArray[np.intp]
+    row: NDArray[np.intp]
+    azimuth: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, index: AzimuthIndex, members: Sequence[NDArray[np.intp]]) -> _Clusters:
+        """Sort the points of clusters, given as rows of the cloud."""
+        count = np.array([len(rows) for rows in members])
+        start, group = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
+        row = np.sort(group * len(index.rank) + index.rank[np.concatenate(members)]) - group * len(index.rank)
+        azimuth = index.azimuth[row].astype(np.int64)
+        across = azimuth[start + count - 1] - azimuth[start] > STEPS_PER_TURN // 2
+        if across.any():
+            azimuth = np.where(across[group] & (azimuth >= STEPS_PER_TURN // 2), azimuth - STEPS_PER_TURN, azimuth)
+            order = np.lexsort((azimuth, group))
+            row, azimuth = row[order], azimuth[order]
+        return cls(index, count, start, group, row, azimuth)
+
+    def ends(self) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+        """Return the place (R, 2) of the points at the ends, stray ones left out, and their azimuths (R, 2)."""
+        cut = np.minimum(np.round(TRIM * (self.count - 1)).astype(np.intp), MAX_TRIMMED_POINTS)
+        end = np.stack([self.start + cut, self.start + self.count - 1 - cut], axis=1)
+        return end, self.azimuth[end]
+
+    def ranges_near(self, edge: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the upper median (R, 2) of the ranges of a cluster's points around azimuths (R, 2)."""
+        # Azimuths of different clusters are so far apart that those of all clusters are sorted, windows across their ends included.
+        own = 3 * STEPS_PER_TURN
+        ordered, first = self.group * own + self.azimuth, own * np.arange(len(edge))[:, None] + edge
+        low = np.searchsorted(ordered, first - MIN_WINDOW_STEPS + 1).ravel().tolist()
+        high = np.searchsorted(ordered, first + MIN_WINDOW_STEPS).ravel().tolist()
+        ranges = self.index.range_m[self.row]
+        return np.array([upper_median(ranges[a:b]) for a, b in zip(low, high)]).reshape(-1, 2)
+
+    def slopes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the slopes (R,), (R,) between which rays are at the height of a cluster."""
+        slope = self.index.slope[self.row]
+        low, high = np.minimum.reduceat(slope, self.start), np.maximum.reduceat(slope, self.start)
+        return low - np.float32(SLOPE_MARGIN), high + np.float32(SLOPE_MARGIN)
+
+    def contain(self, group: NDArray[np.intp], row: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Mark points (n,) of the index that belong to a cluster (n,)."""
+        size = len(self.index.rank)
+        own, wanted = np.sort(self.group * size + self.row), group * size + row
+        place = np.minimum(np.searchsorted(own, wanted), len(own) - 1)
+        return np.asarray(own[place] == wanted)
+
+    def extended_face_ranges(
+        self, end: NDArray[np.intp], window: NDArray[np.intp], azimuth: NDArray[np.uint16]
+    ) -> NDArray[np.float64]:
+        """Range (n,) in m, at azimuths (n,), of the face that ends at an end of a cluster, were it to go on; 0 at a corner.
+
+        Parameters
+        ----------
+        end : (R, 2) int
+            See `ends`.
+        window : (n,) int
+            Twice the cluster, plus one at its left end.
+        azimuth : (n,) uint16
+        """
+        xy = self.index.range_m[self.row, None] * _direction(self.index.azimuth[self.row])
+        near, points = [], []
+        for side in range(2):
+            x, y = (xy - xy[end[self.group, side]]).T
+            point = np.flatnonzero(np.hypot(x, y) < FACE_M)
+            near.append(2 * self.group[point] + side)
+            points.append(xy[point])
+        of, (x, y) = np.concatenate(near), np.concatenate(points).T
+        count = np.maximum(np.bincount(of, minlength=end.size), 1)
+
+        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(np.bincount(of, values, minlength=end.size), dtype=np.float64)
+
+        center_x, center_y = total(x) / count, total(y) / count
+        x, y = x - center_x[of], y - center_y[of]
+        xx, cross, yy = total(x * x), total(x * y), total(y * y)
+        # Eigenvalues and first eigenvector of a symmetric matrix of two rows.
+        mean, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, cross)
+        is_face = (count > 2) & (mean - radius <= MAX_FLATNESS * (mean + radius))
+        angle, ray = np.arctan2(2 * cross, xx - yy) / 2, _direction(azimuth)
+        along_x, along_y = np.cos(angle), np.sin(angle)
+        sine = ray[:, 0] * along_y[window] - ray[:, 1] * along_x[window]
+        distance = (center_x * along_y - center_y * along_x)[window]
+        meets_m = distance / np.where(sine == 0, np.inf, sine)
+        return np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
+
+
+def _direction(azimuth: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """Return unit vectors (n, 2) of azimuths (n,) in steps."""
+    return np.take(_unit_vectors(), azimuth, axis=0)
+
+
+@lru_cache(maxsize=1)
+def _unit_vectors() -> NDArray[np.float64]:
+    """Return unit vectors (`STEPS_PER_TURN` + 1, 2) of all azimuths: a look-up takes a tenth of a sine and a cosine."""
+    angle = np.arange(STEPS_PER_TURN + 1) * STEP_RAD
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
 
 # Rotation is constant within a bin, which errs by 2.5 cm at 1 rad/s and 50 m; translation is interpolated for every point.
 POSE_BIN_NS = 500_000
@@ -55,7 +409,6 @@ class Cloud:
 
     Attributes
     ----------
-    stamp_ns : int
     origin : (3,) float64
         m, map frame. Coordinates are relative to it, so that single precision resolves 1e-5 m.
     xyz : (N, 3) float32
@@ -247,3 +600,209 @@ def cloud_origin(log: Log, t_ns: int) -> tuple[Array, float]:
     poses = [log.map_T_sensor(name, t_ns) for name in (*log.lidars, *log.cameras)]
     places = [map_T_sensor[0, :3, 3] for map_T_sensor, known in poses if known[0]]
     return np.mean(places, axis=0) if places else np.zeros(3), log.ground_z_ego_m
+
+
+# LiDARs of one end that are nearer to each other see the same sides of what is around: those of a car or a pole are.
+MAX_APART_M = 5.0
+
+
+def assemble_views(
+    log: Log,
+    sweeps: Mapping[str, Sweep],
+    *,
+    origin: Array,
+    ground_z: float,
+    max_range_m: float,
+    compensate: bool = True,
+) -> Cloud | None:
+    """Merge the simultaneous sweeps of all LiDARs into one cloud, by parts where both ends have LiDARs.
+
+    Parameters are those of `assemble_cloud`, which makes the cloud of a log with one end.
+
+    Notes
+    -----
+    The ground is estimated from each viewpoint's own points: between two of them there may be none.
+    """
+    groups = group_by_viewpoint(log, sweeps)
+    parts = []
+    for names in groups:
+        part = assemble_cloud(
+            log,
+            {name: sweeps[name] for name in names},
+            origin=origin,
+            ground_z=ground_z,
+            max_range_m=max_range_m,
+            compensate=compensate,
+        )
+        if part is not None:
+            parts.append(part)
+    return join_parts(parts)
+
+
+def group_by_viewpoint(log: Log, names: Mapping[str, Sweep] | Sequence[str]) -> list[list[str]]:
+    """Group LiDARs by where they look from: the vehicle's together, those of the road by their place; one group without both ends."""
+    if len({end_of(lidar) for lidar in log.lidars.values()}) < len(ENDS):
+        return [list(names)]
+    groups: list[list[str]] = [[name for name in names if end_of(log.lidars[name]) == ENDS[0]]]
+    for name in names:
+        if end_of(log.lidars[name]) == ENDS[0]:
+            continue
+        place = log.lidars[name].mount_T_lidar[:2, 3]
+        near = [g for g in groups[1:] if np.hypot(*(log.lidars[g[0]].mount_T_lidar[:2, 3] - place)) <= MAX_APART_M]
+        if near:
+            near[0].append(name)
+        else:
+            groups.append([name])
+    return [group for group in groups if group]
+
+
+def join_parts(parts: Sequence[Cloud]) -> Cloud | None:
+    """Merge clouds of one origin into one that keeps them as its parts; a single one is returned as it is."""
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    first = parts[0]
+    late_s = [(part.stamp_ns - first.stamp_ns) / NS_PER_S for part in parts]
+    sensors = [
+        replace(s, position=s.position - late * s.velocity_mps)
+        for part, late in zip(parts, late_s)
+        for s in part.sensors
+    ]
+    return Cloud(
+        first.stamp_ns,
+        first.origin,
+        np.concatenate([part.xyz for part in parts]),
+        np.concatenate([part.t_s + np.float32(late) for part, late in zip(parts, late_s)]),
+        first.sensor,
+        np.concatenate([part.ground for part in parts]),
+        np.concatenate([part.height for part in parts]),
+        tuple(sensors),
+        tuple(parts),
+    )
+
+
+def assemble_cloud(
+    log: Log,
+    sweeps: Mapping[str, Sweep],
+    *,
+    origin: Array,
+    ground_z: float,
+    max_range_m: float,
+    compensate: bool = True,
+) -> Cloud | None:
+    """Merge the simultaneous sweeps of all LiDARs into one cloud in the map frame and estimate its ground.
+
+    Parameters
+    ----------
+    sweeps : mapping of LiDAR name to Sweep
+    origin : (3,) float64, m, map frame
+        Position of the ego, or of the sensors; points farther than `max_range_m` along an axis are left out.
+    ground_z : float
+        Expected height of the ground at the origin, m, map frame.
+    compensate : bool
+        See `sweep_to_map`.
+
+    Returns
+    -------
+    Cloud or None
+        None when no sweep has a known pose and points.
+    """
+    parts, sensors, stamp = [], [], 0
+    for name, sweep in sweeps.items():
+        mapped = sweep_to_map(log, name, sweep, compensate=compensate)
+        if mapped is None or len(mapped[0]) == 0:
+            continue
+        stamp = stamp or sweep.stamp_ns
+        # Halfway through the sweep: a sensor at 30 m/s is 3 m away from there at its begin or end.
+        middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
+        sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
+        local = (mapped[0] - origin).astype(np.float32)
+        near = np.flatnonzero(np.logical_and.reduce([np.abs(local[:, axis]) <= max_range_m for axis in range(3)]))
+        t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
+        position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
+        parts.append((local.take(near, axis=0), t_s.take(near), position))
+        place = _follow_sensor(log, name, stamp, t_s, origin)
+        sensors.append(CloudSensor(len(near), *place, end_of(log.lidars[name])))
+    if not parts:
+        return None
+    xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+    surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
+    height = xyz[:, 2] - surface.at(xyz[:, :2])
+    # A distant LiDAR without points in range must not shift the viewpoint.
+    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
+    ground = np.abs(height) <= ON_GROUND_M
+    return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
+
+
+def _follow_sensor(log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32], origin: Array) -> tuple[Array, Array]:
+    """Follow a LiDAR through times (N,) relative to a stamp: position (3,) at the stamp relative to `origin`, velocity (3,).
+
+    The line goes through its places at the first and the last time; without known poses it stands at the origin.
+    """
+    first_s, last_s = float(t_s.min()), float(t_s.max())
+    t_ns = stamp_ns + np.round(np.array([first_s, last_s]) * NS_PER_S).astype(np.int64)
+    map_T_lidar, known = log.map_T_sensor(name, t_ns)
+    if not known.all():
+        return np.zeros(3), np.zeros(3)
+    first, last = map_T_lidar[:, :3, 3] - origin
+    velocity = (last - first) / (last_s - first_s) if last_s > first_s else np.zeros(3)
+    return first - first_s * velocity, velocity
+
+
+# One ray is kept of each cell of directions. At 50 m cells are 0.4 m wide: the side of a car has twenty.
+CELL_RAD = np.deg2rad(0.5)
+CELL_STEPS = round(CELL_RAD / STEP_RAD)
+COLUMNS = STEPS_PER_TURN // CELL_STEPS + 1
+# Cells from straight down to straight up, more than there are.
+CELLS_PER_COLUMN = 1024
+MAX_REACH_M = 70.0
+
+
+def sample_rays(cloud: Cloud) -> Rays:
+    """Take a ray of every cell of directions and every sensor of those that end within reach and below what hangs over the road.
+
+    Notes
+    -----
+    Cells of directions, unlike voxels, keep the same share of the rays that hit something near and of those that pass it.
+    Directions are those from the middle of the sensors of a viewpoint, which does for a sample.
+    """
+    if cloud.parts:
+        return _join([sample_rays(part) for part in cloud.parts], cloud)
+    index = cloud.azimuth_index
+    point = np.flatnonzero((index.range_m[index.rank] < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
+    row = index.rank[point]
+    # The slope of a ray differs from its angle where it is steep: near the sensor, where rays are many.
+    slope = np.clip(index.slope[row] / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
+    column = _sensor_of(cloud, point) * COLUMNS + index.azimuth[row] // CELL_STEPS
+    cell = column * CELLS_PER_COLUMN + np.floor(slope).astype(np.int64) + CELLS_PER_COLUMN // 2
+    # Written from the last to the first point, a cell holds its first one; cells without points are not read.
+    first = np.empty(max(len(cloud.sensors), 1) * COLUMNS * CELLS_PER_COLUMN, dtype=np.int32)
+    first[cell[::-1]] = point[::-1]
+    kept = point[first[cell] == point]
+    sensors = cloud.sensors or (CloudSensor(len(cloud.xyz), cloud.sensor.astype(np.float64), np.zeros(3)),)
+    return Rays(
+        cloud.xyz[kept],
+        cloud.t_s[kept],
+        _sensor_of(cloud, kept).astype(np.uint8),
+        np.array([s.position for s in sensors], dtype=np.float32),
+        np.array([s.velocity_mps for s in sensors], dtype=np.float32),
+    )
+
+
+def _join(parts: Sequence[Rays], cloud: Cloud) -> Rays:
+    """Join the rays of the parts of a cloud; their sensors are numbered on."""
+    before = np.cumsum([0, *(len(part.position) for part in parts)])
+    late_s = [(part.stamp_ns - cloud.stamp_ns) / NS_PER_S for part in cloud.parts]
+    return Rays(
+        np.concatenate([part.end for part in parts]),
+        np.concatenate([part.t_s + np.float32(late) for part, late in zip(parts, late_s)]),
+        np.concatenate([part.sensor + np.uint8(first) for part, first in zip(parts, before)]),
+        np.concatenate([part.position - np.float32(late) * part.velocity_mps for part, late in zip(parts, late_s)]),
+        np.concatenate([part.velocity_mps for part in parts]),
+    )
+
+
+def _sensor_of(cloud: Cloud, point: NDArray[np.intp]) -> NDArray[np.int64]:
+    """Return the number (n,) of the sensor that measured each point."""
+    if len(cloud.sensors) < 2:
+        return np.zeros(len(point), dtype=np.int64)
+    return np.repeat(np.arange(len(cloud.sensors)), [sensor.points for sensor in cloud.sensors])[point]

@@ -40,8 +40,6 @@ class View:
 
     Attributes
     ----------
-    camera : Camera
-    t_ns : int
     map_T_cam : (4, 4) float64
         Pose at the stamp.
     cam_T_map_at : callable or None

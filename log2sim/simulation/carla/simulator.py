@@ -20,8 +20,7 @@ from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Array, whole_kilometers
 from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents
-from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, VehicleGroup
-from log2sim.simulation.step_clock import StepClock
+from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, StepClock, VehicleGroup
 from log2sim.simulation.vehicles.vehicle import (
     PointControls,
     PointState,
@@ -38,10 +37,6 @@ class CarlaServer:
 
     Attributes
     ----------
-    host : str
-    port : int
-    timeout_s : float
-    town : str or None
     opendrive : Path or None
         An OpenDRIVE file.
     """

@@ -1,24 +1,429 @@
-"""All metrics of a replay: tracking errors, collisions, conflicts, comfort."""
+"""All metrics of a replay: tracking errors, collisions, conflicts, comfort, limits, and a summary in text."""
 
 from __future__ import annotations
 
-from collections import defaultdict
+import math
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Trajectory
-from log2sim.simulation.metrics.box_tracks import BoxTracks
-from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, collisions
-from log2sim.simulation.metrics.comfort import comfort
+from log2sim.datatypes import EGO, STANDSTILL_MPS, Trajectory
+from log2sim.errors import CheckFailed, ConfigError
+from log2sim.files.plugins import nearest
+from log2sim.geometry import Array, rectangles_overlap, wrap_angle
+from log2sim.simulation.corridors import PathTable
+from log2sim.simulation.groups import StepClock
+from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, BoxTracks, collisions
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
-from log2sim.simulation.metrics.ego_figures import ego_figures
-from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_metrics, scenario_metrics
-from log2sim.simulation.result import AgentReplay
-from log2sim.simulation.step_clock import StepClock
+from log2sim.simulation.result import AgentReplay, Replay
 from log2sim.simulation.vehicles.parameters import WHEELED
+from log2sim.simulation.warnings import describe_warnings
+
+SEARCH_S = 1.0
+SEARCH_STEP_S = 0.05
+
+OFF_PATH_M = 0.5
+"""Cross-track error beyond which an agent is off its path: a 1.9 m wide car in a 3.5 m lane has 0.8 m on each side."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingErrors:
+    """Distance of an agent from the scenario at its rows (S,); left, ahead, faster and counter-clockwise are positive.
+
+    Attributes
+    ----------
+    across_m, along_m, speed_mps, yaw_rad : (S,) float64
+    """
+
+    across_m: Array
+    along_m: Array
+    speed_mps: Array
+    yaw_rad: Array
+
+
+def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
+    """Compute the errors of an agent; one that is not on time may be far along its path and still on it."""
+    near_s = agent.t_s if follows else _nearest_times(trajectory, agent.x_m, agent.y_m)
+    across, along = tracking_errors(trajectory, agent.t_s, agent.x_m, agent.y_m, near_s)
+    log = trajectory.at(agent.t_s)
+    return TrackingErrors(across, along, agent.speed_mps - log.speed_mps, wrap_angle(agent.yaw_rad - log.yaw_rad))
+
+
+def tracking_errors(
+    trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the errors across and along the path of the scenario, (S,) each in m, left and ahead positive.
+
+    Along: from the scenario's box center at the same time, in the direction of its heading. Across: distance from the
+    nearest point of the path of the scenario's box centers within `SEARCH_S` of the same time, or of the times `near_s`
+    (S,), so a delay in a curve is no error across. Where the nearest point is an end of that path, or the scenario
+    stands, the component along its direction counts as along.
+    """
+    log_x, log_y, _, log_yaw, _ = trajectory.at(t_s)
+    along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
+    begin_s, end_s = trajectory.t_s[0] - SEARCH_S, trajectory.t_s[-1] + SEARCH_S
+    px, py, _, yaw, _ = trajectory.at(np.arange(begin_s, end_s + SEARCH_STEP_S, SEARCH_STEP_S))
+    ux, uy = np.diff(px), np.diff(py)
+    square = ux**2 + uy**2
+    moves = square > (STANDSTILL_MPS * SEARCH_STEP_S) ** 2
+    # Segments near each row (S, K): on each the share of it at which it is nearest.
+    reach = round(SEARCH_S / SEARCH_STEP_S)
+    middle = np.rint(((t_s if near_s is None else near_s) - begin_s) / SEARCH_STEP_S).astype(np.intp)
+    near = np.clip(middle[:, None] + np.arange(-reach, reach), 0, len(square) - 1)
+    dx, dy, sx, sy = x_m[:, None] - px.take(near), y_m[:, None] - py.take(near), ux.take(near), uy.take(near)
+    slope = np.divide(1.0, square, out=np.zeros_like(square), where=moves)
+    share = np.clip((dx * sx + dy * sy) * slope.take(near), 0.0, 1.0)
+    best = np.argmin((dx - share * sx) ** 2 + (dy - share * sy) ** 2, axis=1)
+    row = np.arange(len(t_s))
+    k, dx, dy = near[row, best], dx[row, best], dy[row, best]
+    length = np.sqrt(np.where(moves, square, 1.0))
+    cos, sin = np.where(moves, ux / length, np.cos(yaw[:-1])), np.where(moves, uy / length, np.sin(yaw[:-1]))
+    # For a vehicle in reverse, left of its heading is right of its direction of travel.
+    left = np.where(cos * np.cos(yaw[:-1]) + sin * np.sin(yaw[:-1]) < 0, -1.0, 1.0)
+    return left[k] * (dy * cos[k] - dx * sin[k]), along
+
+
+def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
+    """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
+    across = np.abs(errors.across_m)
+    return {
+        "cross_track_rms_m": _rms(errors.across_m),
+        "cross_track_max_m": round(float(np.max(across)), 6),
+        "along_track_rms_m": _rms(errors.along_m),
+        "speed_rms_mps": _rms(errors.speed_mps),
+        "yaw_rms_rad": _rms(errors.yaw_rad),
+        "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
+    }
+
+
+def scenario_metrics(
+    by_agent: Mapping[str, Mapping[str, Any]], on_time: Mapping[str, int], on_way: Mapping[str, int]
+) -> dict[str, Any]:
+    """Average the errors over all followers, every stored sample counting alike; 0 without followers.
+
+    Parameters
+    ----------
+    by_agent : by id
+        The errors of each agent.
+    on_time, on_way : by id
+        The samples of agents that follow the scenario in time, and of all that keep to its path.
+    """
+    out: dict[str, Any] = {}
+    for key, samples in (
+        ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
+    ):  # fmt: skip
+        out[key] = round(float(np.sqrt(_mean({k: e[key] ** 2 for k, e in by_agent.items()}, samples))), 6)
+    out["cross_track_max_m"] = max((e["cross_track_max_m"] for k, e in by_agent.items() if k in on_way), default=0.0)
+    out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
+    out["followers"] = len(on_time)
+    return out
+
+
+def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
+    """Return the mean of the values weighted by their samples; 0 without any."""
+    total = sum(samples.values())
+    return sum(count * values[k] for k, count in samples.items()) / total if total else 0.0
+
+
+def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
+    """Return the times (S,) at which the scenario is nearest to places."""
+    from scipy.spatial import cKDTree
+
+    t = np.arange(trajectory.t_s[0], trajectory.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+    x, y = trajectory.relative(t)[:2]
+    _, nearest = cKDTree(np.stack([x, y], axis=1)).query(
+        np.stack([x_m - trajectory.origin_m[0], y_m - trajectory.origin_m[1]], axis=1)
+    )
+    result: Array = t[nearest]
+    return result
+
+
+def _rms(values: Array) -> float:
+    return round(float(np.sqrt(np.mean(values**2))), 6)
+
+
+ACCEL_WINDOW_S = 0.75
+JERK_WINDOW_S = 1.5
+"""Lengths of the fits. Shorter ones show the steps of the controller and the noise of the scenario."""
+
+MIN_ROWS = 5
+"""Fewest rows of a window: a cubic with one degree of freedom left. With sparse rows the windows are longer."""
+
+LIMITS = {
+    "lon_accel_max_mps2": 2.40,
+    "lon_decel_max_mps2": 4.05,
+    "lat_accel_max_mps2": 4.89,
+    "lon_jerk_max_mps3": 4.13,
+    "jerk_max_mps3": 8.37,
+    "yaw_rate_max_radps": 0.95,
+    "yaw_accel_max_radps2": 1.93,
+}
+"""Comfort limits of nuPlan's planning benchmark (Karnchanachari et al., 2024), derived from human drivers."""
+
+
+def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
+    """Compute greatest and RMS acceleration, jerk and yaw rates, and whether all are within `LIMITS`.
+
+    Parameters
+    ----------
+    t_s, x_m, y_m, yaw_rad : (S,) float64, s, m and rad
+        Evenly spaced box centers without discontinuities.
+
+    Returns
+    -------
+    dict or None
+        None for fewer than five rows.
+
+    Notes
+    -----
+    Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
+    heading, lateral across it, both of the box center. Changes faster than the window are damped.
+    """
+    if len(t_s) < MIN_ROWS:
+        return None
+    spacing_s = round((t_s[-1] - t_s[0]) / (len(t_s) - 1), 9)  # as times are stored, and the same for all agents
+    ax, ay = (_derivative(c, 2, ACCEL_WINDOW_S, spacing_s) for c in (x_m, y_m))
+    jx, jy = (_derivative(c, 3, JERK_WINDOW_S, spacing_s) for c in (x_m, y_m))
+    yaw = np.unwrap(yaw_rad)
+    yaw_rate, yaw_accel = (_derivative(yaw, order, ACCEL_WINDOW_S, spacing_s) for order in (1, 2))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    lon_accel, lat_accel, lon_jerk = ax * cos + ay * sin, ay * cos - ax * sin, jx * cos + jy * sin
+    out = {
+        "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0),
+        "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
+        "lon_accel_rms_mps2": _rms_of_columns(lon_accel),
+        "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
+        "lat_accel_rms_mps2": _rms_of_columns(lat_accel),
+        "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
+        "lon_jerk_rms_mps3": _rms_of_columns(lon_jerk),
+        "jerk_max_mps3": float(np.hypot(jx, jy).max()),
+        "yaw_rate_max_radps": float(np.abs(yaw_rate).max()),
+        "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
+    }
+    rounded: dict[str, float | bool] = {k: round(v, 4) for k, v in out.items()}
+    rounded["comfortable"] = all(out[k] <= limit for k, limit in LIMITS.items())
+    return rounded
+
+
+def _derivative(values: Array, order: int, window_s: float, spacing_s: float) -> Array:
+    """Return the derivative (S,) of cubics fitted to a window around each row; near an end, of the window at the end."""
+    longest = len(values) - (len(values) + 1) % 2
+    half = min(max(round(window_s / spacing_s / 2), MIN_ROWS // 2), longest // 2)
+    weights = _weights(half, order, spacing_s)
+    values = values - values[0]  # far map offsets would cost digits
+    return np.concatenate(
+        [
+            weights[:half] @ values[: 2 * half + 1],
+            np.correlate(values, weights[half], mode="valid"),
+            weights[half + 1 :] @ values[-2 * half - 1 :],
+        ]
+    )
+
+
+@lru_cache(maxsize=64)
+def _weights(half: int, order: int, spacing_s: float) -> Array:
+    """Return weights (W, W) of the values of a window of W = 2 half + 1 rows in the derivative at each of its rows."""
+    at_s = np.arange(-half, half + 1) * spacing_s
+    fit = np.linalg.pinv(np.vander(at_s, 4, increasing=True))
+    return sum(
+        (math.perm(k, order) * np.outer(at_s ** (k - order), fit[k]) for k in range(order, 4)),
+        start=np.zeros((len(at_s), len(at_s))),
+    )
+
+
+def _rms_of_columns(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+MAX_PAIRS = 100_000
+"""Pairs of boxes whose distance is computed at once, which bounds memory."""
+
+MIN_SPEED_MPS = 0.05
+"""Below this a vehicle stands, and what its acceleration is then is no braking."""
+
+
+def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path: Trajectory) -> dict[str, Any]:
+    """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`.
+
+    Parameters
+    ----------
+    index : int
+        Its column in `boxes`.
+    boxes : BoxTracks
+        Of all agents.
+    t_s : (S,) float64, s
+        Times of the rows of `boxes`.
+    path : Trajectory
+        Of the ego in the scenario.
+    """
+    table = PathTable([path])
+    gone_m = 0.0
+    for x, y in zip(ego.x_m.tolist(), ego.y_m.tolist()):
+        gone_m = table.progress_near(0, gone_m, x, y)
+    length_m = float(table.at(np.zeros(1, dtype=np.intp), np.array([path.t_s[-1]])).distance_m[0])
+    steps_m = np.hypot(np.diff(ego.x_m), np.diff(ego.y_m))
+    return {
+        "driven_m": round(float(steps_m.sum()), 3),
+        "progress_m": round(gone_m, 3),
+        "path_m": round(length_m, 3),
+        "min_gap": smallest_gap(boxes, index, t_s),
+        "max_brake": hardest_brake(ego),
+    }
+
+
+def hardest_brake(ego: AgentReplay) -> dict[str, float] | None:
+    """Return the largest deceleration, m/s2, and when it was; None where the ego never slows down."""
+    # What the actuators do between two states shows in the speed at its end, so the larger of both speeds says if it moves.
+    speed = np.abs(ego.speed_mps)
+    moves = np.maximum(speed, np.r_[speed[:1], speed[:-1]]) > MIN_SPEED_MPS
+    direction = np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, np.r_[ego.speed_mps[:1], ego.speed_mps[:-1]]))
+    brake = np.where(moves, -ego.accel_mps2 * direction, 0.0)
+    k = int(np.argmax(brake)) if len(brake) else 0
+    if not len(brake) or brake[k] <= 0:
+        return None
+    return {"mps2": round(float(brake[k]), 3), "t_s": round(float(ego.t_s[k]), 6)}
+
+
+def smallest_gap(boxes: BoxTracks, index: int, t_s: Array) -> dict[str, Any] | None:
+    """Return the smallest distance of an agent's box, m, from another one at the rows, of which agent (column) and when.
+
+    It is 0 where they overlap. Boxes at different heights, as on a bridge, are not compared. None without any other agent.
+    """
+    rows, others = _near_pairs(boxes, index)
+    if not len(rows):
+        return None
+    gap = np.concatenate([
+        box_distances(boxes, rows[begin : begin + MAX_PAIRS], others[begin : begin + MAX_PAIRS], index)
+        for begin in range(0, len(rows), MAX_PAIRS)
+    ])  # fmt: skip
+    k = int(np.argmin(gap))
+    return {"m": round(float(gap[k]), 3), "t_s": round(float(t_s[rows[k]]), 6), "agent": int(others[k])}
+
+
+def _near_pairs(boxes: BoxTracks, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows and agents, (P,) each, among which the nearest box is, whatever the directions of the boxes."""
+    far, nearest = boxes.radius_m + boxes.radius_m[index], np.inf
+    height = (boxes.size_m[:, 2] + boxes.size_m[index, 2]) / 2
+    count = max(1, MAX_PAIRS // len(boxes.size_m))
+    found = [np.zeros((2, 0), dtype=np.intp)]
+    for begin in range(0, len(boxes.x_m), count):
+        rows = slice(begin, begin + count)
+        dx, dy, dz = (c[rows] - c[rows, index][:, None] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
+        distance = np.where(np.abs(dz) < height, np.hypot(dx, dy), np.inf)  # NaN where one of them is absent: not level
+        distance[:, index] = np.inf
+        nearest = min(nearest, float(distance.min(initial=np.inf)))
+        row, agent = np.nonzero(np.isfinite(distance) & (distance - far <= nearest))
+        found.append(np.stack([row + begin, agent]))
+    rows_near, agents_near = np.concatenate(found, axis=1)
+    return rows_near, agents_near
+
+
+def box_distances(boxes: BoxTracks, rows: NDArray[np.intp], others: NDArray[np.intp], index: int) -> Array:
+    """Return the distances (P,), m, in plan between the box of an agent and those of others at rows; 0 where they overlap."""
+    a, b = np.full(len(rows), index), others
+    dx, dy = (c[rows, b] - c[rows, a] for c in (boxes.x_m, boxes.y_m))
+    yaw_a, yaw_b = boxes.yaw_rad[rows, a], boxes.yaw_rad[rows, b]
+    size_a, size_b = boxes.size_m[a], boxes.size_m[b]
+    # Of two rectangles that are apart, a corner of one is nearest to the other.
+    apart = np.minimum(
+        _corner_distance(dx, dy, yaw_a, yaw_b, size_a, size_b), _corner_distance(-dx, -dy, yaw_b, yaw_a, size_b, size_a)
+    )
+    return np.where(rectangles_overlap(dx, dy, yaw_a, yaw_b, size_a, size_b), 0.0, apart)
+
+
+def _corner_distance(dx: Array, dy: Array, yaw_a: Array, yaw_b: Array, size_a: Array, size_b: Array) -> Array:
+    """Return the distance (P,) of the nearest corner of rectangles b from rectangles a; `dx`, `dy` lead from a to b."""
+    cos, sin = np.cos(yaw_a), np.sin(yaw_a)
+    ahead, left, turn = dx * cos + dy * sin, dy * cos - dx * sin, yaw_b - yaw_a
+    least = np.full(len(dx), np.inf)
+    for front, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        u, v = front * size_b[:, 0] / 2, side * size_b[:, 1] / 2
+        x, y = ahead + u * np.cos(turn) - v * np.sin(turn), left + u * np.sin(turn) + v * np.cos(turn)
+        out_x, out_y = np.abs(x) - size_a[:, 0] / 2, np.abs(y) - size_a[:, 1] / 2
+        least = np.minimum(least, np.hypot(np.maximum(out_x, 0.0), np.maximum(out_y, 0.0)))
+    return least
+
+
+LOWER_LIMITS = ("min_ttc_s", "min_pet_s")
+UPPER_LIMITS = (
+    "cross_track_max_m", "cross_track_rms_m", "along_track_rms_m", "speed_rms_mps", "yaw_rms_rad", "off_path_share",
+    *LIMITS,
+)  # fmt: skip
+
+
+def parse_limits(texts: Iterable[str]) -> dict[str, float]:
+    """Parse limits by name from texts "name=value".
+
+    Raises
+    ------
+    ConfigError
+        When a name is not known or a value is no finite number.
+    """
+    limits: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        name = name.strip()
+        if name not in LOWER_LIMITS + UPPER_LIMITS:
+            known = ", ".join(LOWER_LIMITS + UPPER_LIMITS)
+            raise ConfigError(
+                f"limit '{text}': no metric '{name}'{nearest(name, [*LOWER_LIMITS, *UPPER_LIMITS])}; known: {known}"
+            )
+        try:
+            limits[name] = float(value)
+        except ValueError:
+            limits[name] = math.nan
+        if not math.isfinite(limits[name]):
+            raise ConfigError(f"limit '{text}': expected a number, such as {name}=1.0")
+    return limits
+
+
+def check_limits(replay: Replay, limits: Mapping[str, float]) -> list[str]:
+    """Return which of the given limits are broken: by the ego if a policy drives it, else by any agent that moves."""
+    driven = [a.id for a in replay.agents if a.driver == "policy"]
+    by_agent = replay.metrics["by_agent"]
+    broken = []
+    for id in driven or by_agent:
+        values = by_agent.get(id, {})
+        for name, limit in limits.items():
+            value = values[name] if name in values else (values.get("comfort") or {}).get(name)
+            if value is not None and (value < limit if name in LOWER_LIMITS else value > limit):
+                side = "at least" if name in LOWER_LIMITS else "at most"
+                broken.append(f"agent '{id}': {name} {value:g}, limit {side} {limit:g}")
+    return broken
+
+
+def check_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> list[str]:
+    """Return what breaks a limit of `--strict`: collisions of the replay, large errors, infeasible scenarios.
+
+    Comfort, time to collision and post-encroachment time count only when named in `limits`: what the drivers did in
+    the scenario is no failure of a replay.
+    """
+    broken = [
+        f"{' and '.join(e['agents'])} collide at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s); the scenario has no such collision"
+        for e in replay.metrics["collisions"]
+        if e["belongs_to"] == REPLAY
+    ]
+    for agent in replay.agents:
+        if agent.driver in ("policy", "reactive"):
+            continue
+        worst = replay.metrics["by_agent"].get(agent.id, {}).get("cross_track_max_m", 0.0)
+        if worst > OFF_PATH_M:
+            broken.append(f"agent '{agent.id}': {worst:.2f} m off its path, limit {OFF_PATH_M:g} m")
+        broken += [f"agent '{agent.id}': {flag}" for flag in agent.flags]
+    return broken + check_limits(replay, limits or {})
+
+
+def require_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> None:
+    """Raise `CheckFailed` with all broken limits."""
+    broken = check_strict(replay, limits)
+    if broken:
+        raise CheckFailed("the replay breaks limits:\n  " + "\n  ".join(broken))
+
 
 SCENARIO_FOLLOWERS = ("pid", "exact")
 """Drivers that follow the scenario in place and time."""
@@ -37,7 +442,6 @@ def replay_metrics(
 
     Parameters
     ----------
-    agents : sequence of AgentReplay
     stored : sequence of (S,) int
         The steps of each agent's rows; of a static agent all stored steps at which it is present.
     trajectories, errors : by id
@@ -126,3 +530,111 @@ def _box_tracks(
     size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
     x, y, z, yaw, speed = columns
     return BoxTracks(x, y, z, yaw, speed, size)
+
+
+MAX_LISTED = 5
+
+
+def summarize(replay: Replay, *, limit: int | None = MAX_LISTED) -> str:
+    """Summarize errors, conflicts and models in a line each, and list the first collisions, those of the replay first.
+
+    Where a policy drives the ego, how it fared comes first, and the times are those of the ego. An error that no agent has is
+    shown as a dash. Of each list the first `limit` are named, or all without one.
+    """
+    m = replay.metrics
+    driven = any(a.driver == "policy" for a in replay.agents)
+    near = [e for e in m["conflicts"] if e["ego"] or not driven]
+    whose = " of the ego" if driven else ""
+    lines = [
+        *(_ego_lines(m) if "ego" in m else ()),
+        _error_line(replay),
+        f"{_collision_counts(m['collisions'])} · least time to collision{whose} {_critical_time(near, 'min_ttc')} · post-encroachment time {_critical_time(near, 'pet')}",
+    ]
+    lines += _model_lines(replay, limit)
+    events = sorted(m["collisions"], key=lambda e: (e["belongs_to"] != REPLAY, e["t_s"]))
+    lines += _first([f"  {_collision_line(e)}" for e in events], limit)
+    lines += _left_out_lines(replay, limit)
+    if replay.warnings is not None:
+        lines.append(describe_warnings(replay.warnings))
+    return "\n".join(lines)
+
+
+def _first(lines: list[str], limit: int | None) -> list[str]:
+    """Return the first lines, and one that counts the others."""
+    rest = 0 if limit is None else len(lines) - limit
+    return [*lines[:limit], f"  and {rest} more"] if rest > 0 else lines
+
+
+def _ego_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Say how the ego fared: progress, smallest gap, hardest brake, collisions."""
+    ego, events = metrics["ego"], [e for e in metrics["collisions"] if EGO in e["agents"]]
+    gap, brake, path_m = ego["min_gap"], ego["max_brake"], ego["path_m"]
+    share = f" ({ego['progress_m'] / path_m:.0%})" if path_m > 0 else ""
+    hits = [f"{_other_of(e)} at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s)" for e in events]
+    return [
+        f"ego: progress {ego['progress_m']:.1f} of {path_m:.1f} m along its path{share}",
+        "  smallest gap " + ("-" if gap is None else f"{gap['m']:.2f} m to {gap['agent']} at {gap['t_s']:.2f} s"),
+        "  hardest brake " + ("-" if brake is None else f"{brake['mps2']:.1f} m/s2 at {brake['t_s']:.2f} s"),
+        f"  collisions {'none' if not hits else 'with ' + ', '.join(hits)}",
+    ]
+
+
+def _other_of(event: Mapping[str, Any]) -> str:
+    """Return the id of the agent that the ego collides with."""
+    return str(next(id for id in event["agents"] if id != EGO))
+
+
+def _collision_counts(events: Sequence[Mapping[str, Any]]) -> str:
+    """Count collisions by whose they are: "3 collisions, 1 of the replay and 2 of the reconstruction itself"."""
+    total, whose = _counted(len(events), "collision"), Counter(e["belongs_to"] for e in events)
+    parts = [f"{whose[REPLAY]} of the replay", *(f"{n} of the {k} itself" for k, n in whose.items() if k != REPLAY)]
+    return f"{total}, {' and '.join(parts)}" if events else total
+
+
+def _error_line(replay: Replay) -> str:
+    """Cross-track errors of agents on the path of the scenario, and the other errors of those that also keep its times."""
+    m, drivers = replay.metrics, {a.driver for a in replay.agents}
+    on_time = bool(drivers & {*SCENARIO_FOLLOWERS})
+    across, along, speed = "-", "-", "-"
+    if on_time or "reactive" in drivers:
+        across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
+    if on_time:
+        along, speed = f"{m['along_track_rms_m']:.3f} m rms", f"{m['speed_rms_mps']:.3f} m/s rms"
+    return f"cross-track {across} · along-track {along} · speed {speed}"
+
+
+def _model_lines(replay: Replay, limit: int | None) -> list[str]:
+    """Count the agents of each model, and give the reason for the first of those with the dynamic model by choice."""
+    counts = Counter(a.model for a in replay.agents if a.model != "none")
+    if not counts:
+        return []
+    chosen = [a for a in replay.agents if a.model == "dynamic" and replay.model == "auto"]
+    found = _first([f"  {a.id} dynamic: {a.model_reason}" for a in chosen], limit)
+    return ["models: " + ", ".join(f"{count} {model}" for model, count in counts.most_common()), *found]
+
+
+def _left_out_lines(replay: Replay, limit: int | None) -> list[str]:
+    """Say which agents of the scenario were left out, and why; the ego is none of them."""
+    if not replay.left_out:
+        return []
+    count, named = len(replay.left_out), [f"{k} ({why})" for k, why in replay.left_out.items()]
+    total = count + sum(agent.id != EGO for agent in replay.agents)
+    rest = 0 if limit is None else count - limit
+    more = f" and {rest} more" if rest > 0 else ""
+    return [f"{count} of {total} agents left out: {', '.join(named[:limit])}{more}"]
+
+
+def _collision_line(event: Mapping[str, Any]) -> str:
+    known = "" if event["belongs_to"] == REPLAY else f", in the {event['belongs_to']} itself"
+    return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
+
+
+def _critical_time(near: Sequence[Mapping[str, Any]], key: str) -> str:
+    found = most_critical(near, key)
+    if found is None:
+        return "-"
+    return f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

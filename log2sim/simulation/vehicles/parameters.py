@@ -30,14 +30,12 @@ class VehicleProportions(NamedTuple):
     ----------
     wheelbase, rear_axle : float
         As shares of the length; the rear axle behind the box center.
-    max_steer_rad, max_throttle_mps2, max_brake_mps2 : float
     cg_to_rear : float
         Of the wheelbase: the share of the weight on the front axle.
     cg_height : float
         Of the height.
     front_stiffness_1prad, rear_stiffness_1prad : float
         Cornering stiffness over load and friction.
-    friction : float
     """
 
     wheelbase: float
@@ -75,11 +73,8 @@ class PublishedVehicle(NamedTuple):
 
     Attributes
     ----------
-    length_m, width_m : float
-    cg_to_front_m, cg_to_rear_m : float
     cg_height_m : float
         Of the sprung mass, as in the single-track model.
-    mass_kg, inertia_kgm2, max_steer_rad : float
     """
 
     length_m: float

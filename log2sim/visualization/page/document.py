@@ -1,23 +1,183 @@
-"""The document of a page: agents as short columns of integers, in the colors of the pictures."""
+"""The document of a page: agents, map features, predictions and background as short columns of integers."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from log2sim.datatypes import GROUP_OF, Agent, Doubt, Scenario, Trajectory, Waypoints, why_doubtful
+from log2sim.datatypes import (
+    GROUP_OF,
+    MIN_TRUSTED_CONFIDENCE,
+    STANDSTILL_MPS,
+    Agent,
+    Doubt,
+    MapFeatures,
+    Scenario,
+    Trajectory,
+    Waypoints,
+    why_doubtful,
+)
 from log2sim.errors import ConfigError
-from log2sim.simulation.warnings.known import ends_of
-from log2sim.visualization.page.background import embed
-from log2sim.visualization.page.columns import SCALES, second_differences
-from log2sim.visualization.page.features import feature_columns
-from log2sim.visualization.page.predictions import predicted_columns
-from log2sim.visualization.plot.doubts import shown_spans
+from log2sim.geometry import Array
+from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
+from log2sim.simulation.expected_motion import ends_of
 from log2sim.visualization.plot.drawing import Background
-from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
+from log2sim.visualization.plot.layers import lane_arrows, lane_outline, shown_spans
+from log2sim.visualization.plot.viewport import AgentRole, assign_roles, is_moving
+
+# Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s; standard deviations of cm, mrad and cm/s; predictions of
+# cm and mrad.
+SCALES = {
+    "t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3, "vx_mps": 1e3, "vy_mps": 1e3,
+    "sigma_xy_m": 1e2, "sigma_yaw_rad": 1e3, "sigma_speed_mps": 1e2,
+    "dx_m": 1e2, "dy_m": 1e2, "course_rad": 1e3, "along_m": 1e2, "across_m": 1e2,
+}  # fmt: skip
+
+
+def second_differences(values: ArrayLike, scale: float) -> list[int]:
+    """Compute second differences (T,) of a column in whole units of 1 / `scale`; two cumulative sums restore it exactly."""
+    whole = np.rint(np.asarray(values, dtype=np.float64) * scale).astype(np.int64)
+    return list(np.diff(whole, n=2, prepend=[0, 0]).tolist())
+
+
+TOLERANCE_M = 0.02
+"""Points of a line that lie so near to the line through the others are left out; a browser shows no less than 2.5 mm."""
+
+
+def feature_columns(scenario: Scenario) -> dict[str, Any]:
+    """Return faces and arrows of lanes, lines and areas of markings, borders, and traffic lights; empty where there are none."""
+    features = scenario.map_features or MapFeatures()
+    return {
+        "lanes": [
+            {"outline": _columns(lane_outline(lane)), "arrows": [_columns(a) for a in lane_arrows(lane)]}
+            for lane in features.lanes
+        ],
+        "borders": [_columns(border.points_m) for border in features.borders],
+        "markings": [
+            {
+                **_columns(marking.points_m),
+                "kind": marking.kind,
+                "yellow": marking.color == "yellow",
+                "width_m": round(marking.width_m, 3),
+                "doubtful": marking.confidence < MIN_TRUSTED_CONFIDENCE,
+            }
+            for marking in features.markings
+        ],
+        "signals": [
+            {
+                "id": signal.id,
+                "at_m": [round(float(v), 2) for v in signal.position_m[:2]],
+                "t_s": [round(float(t), 3) for t in signal.t_s],
+                "state": [str(state) for state in signal.state],
+            }
+            for signal in scenario.signals
+        ],
+        "sensors": [
+            {k: round(float(sensor[k]), 3) for k in ("x_m", "y_m", "yaw_rad", "fov_rad", "range_m")}
+            for sensor in scenario.sensors
+        ],
+        "notes": list(features.notes),
+    }
+
+
+def _columns(points_m: Array) -> dict[str, list[int]]:
+    """Return x and y of points (N, 2 or more) without those that lie on the line through the others."""
+    from skimage.measure import approximate_polygon
+
+    kept = approximate_polygon(np.asarray(points_m)[:, :2], TOLERANCE_M)
+    return {key: second_differences(column, SCALES[key]) for key, column in zip(("x_m", "y_m"), kept.T)}
+
+
+EVERY_TICKS = 2
+"""A page shows a new prediction five times a second, which looks steady and takes half as much room as one at every tick."""
+
+MAX_PREDICTIONS = 1_000_000
+"""Of all agents together: 30 MB of a page for 3 s each."""
+
+
+def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[str, Any]]:
+    """Predict agents while they move: by agent, paths relative to where it was, and the ellipse at their ends.
+
+    Raises
+    ------
+    ConfigError
+        For a horizon that predictions do not have, or more predictions than a browser can be expected to hold.
+    """
+    found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
+    table, forecast = found.table, found.forecasts[DEFAULT_METHOD]
+    moves = np.abs(table.velocity_mps[found.row, found.tick]) >= STANDSTILL_MPS
+    shown = moves & (found.tick % EVERY_TICKS == 0)
+    if shown.sum() > MAX_PREDICTIONS:
+        raise ConfigError(
+            f"{shown.sum()} predictions are more than the {MAX_PREDICTIONS} that a page can hold; take fewer agents, such as "
+            f"with `log2sim edit --only`, or leave predictions out"
+        )
+    out = {}
+    for agent in scenario.agents:
+        rows = found.rows_of(agent.id)
+        rows = rows[shown[rows]]
+        if len(rows):
+            way = forecast.position_m[rows] - table.position_m[found.row[rows], found.tick[rows], None]
+            columns = {
+                "course_rad": np.unwrap(np.angle(forecast.course[rows, -1])),
+                "along_m": forecast.sigma_m[rows, -1, 0],
+                "across_m": forecast.sigma_m[rows, -1, 1],
+            }
+            out[agent.id] = {
+                "t_s": second_differences(table.t_s[found.tick[rows]], SCALES["t_s"]),
+                "dx_m": [second_differences(column, SCALES["dx_m"]) for column in way.real.T],
+                "dy_m": [second_differences(column, SCALES["dy_m"]) for column in way.imag.T],
+                **{name: second_differences(column, SCALES[name]) for name, column in columns.items()},
+            }
+    return out
+
+
+# A screen shows no more, and a browser decodes it in an instant.
+MAX_EDGE_PX = 2400
+# Of the picture; half the edge has about a quarter of the bytes.
+MAX_BYTES = 3_000_000
+QUALITY = 75  # of 100; artifacts are invisible below the tracks
+
+
+def embed(picture: Background) -> dict[str, Any] | None:
+    """Return the picture as a data URL with its extent, x0, x1, y0, y1, m; None where it shows nothing.
+
+    Cut to what it shows; WebP, since that has opacity and every browser shows it.
+    """
+    seen = picture.alpha > 0
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    if not len(rows):
+        return None
+    part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    image = _shrunk(np.dstack([picture.image_bgr[part], picture.alpha[part]]), MAX_EDGE_PX)
+    x0, x1, y0, y1 = picture.extent_m
+    dx, dy = (x1 - x0) / seen.shape[1], (y1 - y0) / seen.shape[0]
+    extent = [x0 + part[1].start * dx, x0 + part[1].stop * dx, y1 - part[0].stop * dy, y1 - part[0].start * dy]
+    data = _encode(image)
+    while len(data) > MAX_BYTES:
+        image = _shrunk(image, max(image.shape[:2]) // 2)
+        data = _encode(image)
+    source = "data:image/webp;base64," + base64.b64encode(data).decode()
+    return {"source": source, "extent_m": [round(float(v), 3) for v in extent]}
+
+
+def _encode(image: NDArray[np.uint8]) -> bytes:
+    done, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    return bytes(data.tobytes()) if done else b""
+
+
+def _shrunk(image: NDArray[np.uint8], edge_px: int) -> NDArray[np.uint8]:
+    """Return a picture whose longer edge has at most so many pixels."""
+    shrink = min(edge_px / max(image.shape[:2]), 1.0)
+    if shrink == 1:
+        return image
+    return np.asarray(cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
 
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
 SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
@@ -86,7 +246,7 @@ def page_document(
 
 def _replay_metrics(replay: Any) -> list[tuple[str, str]]:
     """Return the summary of a replay with its title."""
-    from log2sim.simulation.metrics.summary import summarize
+    from log2sim.simulation.metrics.all_metrics import summarize
 
     return [] if replay is None else [("Replay", summarize(replay))]
 
@@ -99,7 +259,7 @@ def _events(replay: Any) -> list[dict[str, Any]]:
 
 def _warnings(replay: Any) -> dict[str, Any]:
     """Describe the warnings of a replay, and say when they hold."""
-    from log2sim.simulation.warnings.sentences import count_warnings, describe_briefly, describe_warning
+    from log2sim.simulation.warnings import count_warnings, describe_briefly, describe_warning
 
     warnings = None if replay is None else replay.warnings
     if warnings is None:
@@ -107,6 +267,7 @@ def _warnings(replay: Any) -> dict[str, Any]:
     events = [
         {
             "agent": w.agent,
+            "driver": w.driver,
             "t_s": w.begin_s,
             "spans": [list(span) for span in w.spans_s],
             "brief": describe_briefly(w),

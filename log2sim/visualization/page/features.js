@@ -11,13 +11,13 @@ const pathOf = (columns, scales, closed) => {
 
 // Paths are in m of the map and are drawn through the transformation of the view.
 const loadFeatures = (document_) => {
-  const { lanes, borders, markings, signals, notes } = document_.features, scales = document_.scales;
+  const { lanes, borders, markings, signals, sensors, notes } = document_.features, scales = document_.scales;
   return {
     lanes: lanes.map((lane) => pathOf(lane.outline, scales, true)),
     arrows: lanes.flatMap((lane) => lane.arrows.map((arrow) => pathOf(arrow, scales, true))),
     borders: borders.map((border) => pathOf(border, scales, false)),
     markings: markings.map((marking) => ({ ...marking, area: AREAS.includes(marking.kind), path: pathOf(marking, scales, AREAS.includes(marking.kind)) })),
-    signals, notes, some: lanes.length + borders.length + markings.length > 0,
+    signals, sensors, notes, some: lanes.length + borders.length + markings.length > 0,
   };
 };
 
@@ -54,6 +54,25 @@ const stateOf = (signal, t) => {
   let k = -1;
   while (k + 1 < signal.t_s.length && signal.t_s[k + 1] <= t + 1e-4) k++;
   return k < 0 ? "unknown" : signal.state[k];
+};
+
+// Sensors that are fixed in the map, with their fields of view.
+const drawSensors = (painter, sensors) => {
+  const { ctx, view } = painter;
+  ctx.fillStyle = ctx.strokeStyle = theme.road;
+  for (const { x_m, y_m, yaw_rad, fov_rad, range_m } of sensors) {
+    const x = view.sx(x_m), y = view.sy(y_m);
+    ctx.beginPath();
+    if (fov_rad < 6.28) ctx.moveTo(x, y);
+    ctx.arc(x, y, range_m * view.scale, -yaw_rad - fov_rad / 2, -yaw_rad + fov_rad / 2);
+    ctx.closePath();
+    ctx.globalAlpha = 0.06;
+    ctx.fill();
+    ctx.globalAlpha = 0.5;
+    ctx.stroke();
+    ctx.globalAlpha = 1;
+    ctx.fillRect(x - 4, y - 4, 8, 8);
+  }
 };
 
 const drawSignals = (painter, signals, t) => {

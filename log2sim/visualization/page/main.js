@@ -64,14 +64,13 @@ const zoom = (factor, sx = view.width / 2, sy = view.height / 2) => {
 
 const fit = () => {
   follow(false);
-  const title = document.querySelector("header"), below = getComputedStyle(byId("layers-toggle")).display === "none" ? 44 : 24;
-  view.fit(tracks, { left: 24, right: byId("tools").offsetWidth + 20, top: title.offsetTop + title.offsetHeight + 24, bottom: below });
+  view.fit(tracks, { left: 24, right: 56, top: 76, bottom: 44 });
   requestDraw();
 };
 
 // The list is shown beside the map until hidden; on a narrow screen it is hidden until shown.
 const showList = () => {
-  const narrow = matchMedia("(max-width: 720px), (max-height: 500px)").matches && state.chosen !== null;
+  const narrow = matchMedia("(max-width: 720px), (max-height: 480px)").matches && state.chosen !== null;
   if (narrow) choose(null);
   document.body.classList.toggle("flipped", narrow || undefined);
 };

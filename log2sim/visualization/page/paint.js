@@ -29,6 +29,7 @@ class Painter {
     ctx.fillStyle = theme.ground;
     ctx.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
     if (shown.ground && background) drawBackground(this, background);
+    drawSensors(this, features.sensors);
     if (shown.lanes) drawFeatures(this, features, shown.ground && background !== null);
     this.grid();
     if (shown.points && points) points.draw(this, t);

@@ -71,11 +71,10 @@ class Pictures {
     byId("tiles").append(...this.tiles.map((tile) => tile.element));
     byId("pictures").classList.toggle("single", this.tiles.length === 1);
     byId("tiles").style.setProperty("--aspect", this.tiles[0].width / this.tiles[0].height);
-    // A single camera needs no button for all: its own makes the picture large, and small again.
     this.choices = this.tiles.length > 1 ? [null, ...this.tiles] : this.tiles;
     this.buttons = this.choices.map((tile) => {
       const button = element("button", { type: "button" }, tile?.name ?? "All");
-      button.addEventListener("click", () => (tile ? enlarge(tile) : this.enlarge(null)));
+      button.addEventListener("click", () => this.enlarge(this.tiles.length > 1 || this.large === null ? tile : null));
       return button;
     });
     byId("cameras").append(...this.buttons);

@@ -150,7 +150,7 @@ const load = (text) => {
   }));
   const named = (name, id) => (layers[name] ?? []).find((track) => track.id === id) ?? null;
   const warnings = document_.warnings.events.map((warning) => ({
-    ...warning, agents: [warning.agent], ego: layers.replay?.find((track) => track.id === "ego"),
+    ...warning, agents: [warning.agent], driver: layers.replay?.find((track) => track.id === warning.driver),
     track: named("replay", warning.agent), shown: named("scenario", warning.agent),
   }));
   const { name, origin, north, metrics, recording, begin_s: begin, end_s: end } = document_;

@@ -1,4 +1,4 @@
-// Warnings of collisions with the ego: listed, marked below the slider, and drawn while they last.
+// Warnings of collisions: listed, marked below the slider, and drawn while they last.
 
 const WARNED_DASHES = [6, 4], BESIDE_PX = 11, cornersA = new Float64Array(8), cornersB = new Float64Array(8);
 
@@ -36,17 +36,17 @@ const isWarned = (warning, t) => {
   return false;
 };
 
-// A ring around who is warned of, and a line from the ego with the distance.
+// A ring around whom the warning is about, and a line from who is warned with the distance.
 const drawWarnings = (painter, warnings, t) => {
   const { ctx, view } = painter;
   for (let i = 0; i < warnings.length; i++) {
-    const { ego, track } = warnings[i];
-    if (!ego || !track || !isWarned(warnings[i], t)) continue;
-    ego.moveTo(t);
+    const { driver, track } = warnings[i];
+    if (!driver || !track || !isWarned(warnings[i], t)) continue;
+    driver.moveTo(t);
     track.moveTo(t);
-    if (!ego.present || !track.present) continue;
+    if (!driver.present || !track.present) continue;
     painter.ring(track, theme.warn, 2.4);
-    const x = view.sx(track.px), y = view.sy(track.py), ex = view.sx(ego.px), ey = view.sy(ego.py);
+    const x = view.sx(track.px), y = view.sy(track.py), ex = view.sx(driver.px), ey = view.sy(driver.py);
     ctx.beginPath();
     ctx.moveTo(ex, ey);
     ctx.lineTo(x, y);
@@ -59,7 +59,7 @@ const drawWarnings = (painter, warnings, t) => {
     ctx.textBaseline = "middle";
     ctx.lineWidth = 3;
     ctx.strokeStyle = theme.halo;
-    const text = `${boxGap(ego, track).toFixed(1)} m`, length = Math.max(Math.hypot(x - ex, y - ey), 1);
+    const text = `${boxGap(driver, track).toFixed(1)} m`, length = Math.max(Math.hypot(x - ex, y - ey), 1);
     const side = x < ex ? -1 : 1, tx = (x + ex) / 2 - (side * BESIDE_PX * (y - ey)) / length, ty = (y + ey) / 2 + (side * BESIDE_PX * (x - ex)) / length;
     ctx.strokeText(text, tx, ty);
     ctx.fillStyle = theme.warn;

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from log2sim.datatypes import Log, Scenario
-from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
+from log2sim.files.documents import refuse_existing, replaced
 from log2sim.localization.choice import localize_like
-from log2sim.visualization.page.columns import SCALES
-from log2sim.visualization.page.document import page_document
+from log2sim.visualization.page.document import SCALES, page_document
 from log2sim.visualization.plot.drawing import Background
-from log2sim.visualization.recording.recording import Recorded, recording_document
+from log2sim.visualization.recording import Recorded, recording_document
 
 SUFFIXES = (".html", ".htm")
 MARGIN_BYTES = 10_000

@@ -2,25 +2,160 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba
 
-from log2sim.datatypes import Scenario
-from log2sim.documents import replaced
-from log2sim.visualization.plot import drawing
-from log2sim.visualization.plot.animated_artists import AnimatedArtists
+from log2sim.datatypes import Agent, Scenario, Signal
+from log2sim.files.documents import replaced
+from log2sim.geometry import Array
+from log2sim.visualization.plot import drawing, viewport
 from log2sim.visualization.plot.encoding import FilmFile, Image, write_gif
-from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.options import FPS, MAX_REAL_TIME_S, PlotOptions
-from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.roles import AgentRoles
+from log2sim.visualization.plot.layers import (
+    DOTS,
+    STRIPE_PT,
+    Overlays,
+    SignalLights,
+    box_stripes,
+    is_doubted_at,
+    new_collisions,
+    show_expected,
+)
+from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, FigureLayout, MovingLabels
 from log2sim.visualization.plot.scene import draw_base
-from log2sim.visualization.plot.selection import Span
-from log2sim.visualization.plot.style import ALARM, TRACK_ALPHA
+from log2sim.visualization.plot.selection import FPS, MAX_REAL_TIME_S, PlotOptions, TimeRange
+from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, TAIL_ALPHA, TRACK_ALPHA
+from log2sim.visualization.plot.time_series import TimelineCharts
+from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, centers_xy, paint_of
+
+TAIL_S = 1.5
+REAL_TIME = 1.05
+"""Faster playing is said."""
+
+
+class AnimatedArtists:
+    """The artists that change from frame to frame; `show` moves them and draws them onto the canvas."""
+
+    def __init__(
+        self,
+        layout: FigureLayout,
+        roles: AgentRoles,
+        overlays: Overlays,
+        speed_up: float = 1.0,
+        charts: TimelineCharts | None = None,
+        signals: Sequence[Signal] = (),
+    ) -> None:
+        self.layout, self.roles, self.overlays, self.speed_up, self.charts = layout, roles, overlays, speed_up, charts
+        if charts is not None:
+            charts.start()
+        self.signals = SignalLights(layout.ax, signals)
+        self.labels = MovingLabels(layout.ax, layout.view, roles)
+        self.collision_s, self.collision_xy_m = new_collisions(overlays.replay)
+        self.collisions = drawing.draw_collisions(layout.ax, self.collision_xy_m, animated=True)
+        driven = {a.id: a for a in overlays.replay.agents} if overlays.replay is not None else {}
+        self.replayed = [(driven[r.agent.id], r) for r in roles.movers if r.agent.id in driven]
+        self._add_collections()
+        width, height = layout.figure.get_size_inches()
+        self.stamp = layout.figure.text(
+            1 - (SIDE_IN + 0.2) / width, 1 - (TOP_IN - 0.16) / height, "", ha="right", fontsize=11, color=INK,
+            family=FONT, fontweight="bold", parse_math=False, animated=True,
+        )  # fmt: skip
+
+    def _add_collections(self) -> None:
+        hidden: dict[str, Any] = {"animated": True, "zorder": drawing.BOX}
+        self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
+        self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
+        self.noses = PolyCollection([], linewidths=0, **hidden)
+        self.hatches = LineCollection([], colors=PAPER, linewidths=STRIPE_PT, **hidden)
+        dashes: dict[str, Any] = {"linewidths": 0.8, "linestyles": [(0, (3, 2))]}
+        self.truths = PolyCollection([], facecolors="none", edgecolors=INK, **dashes, **hidden)
+        self.driven = PolyCollection([], facecolors="none", linewidths=1.2, linestyles=[(0, (1, 1.2))], **hidden)
+        self.predicted_paths = LineCollection([], **hidden, **DOTS)
+        self.ellipses = PolyCollection([], linewidths=0.7, **hidden)
+        self.collections = [
+            self.ellipses, self.tails, self.predicted_paths, self.boxes, self.hatches, self.noses, self.truths, self.driven,
+        ]  # fmt: skip
+        for collection in self.collections:
+            self.layout.ax.add_collection(collection, autolim=False)
+
+    def show(self, t_s: float) -> None:
+        """Draw the state at `t_s` over the static artists."""
+        posed = [(role, _pose(role.agent, t_s)) for role in self.roles.movers]
+        present = [(role, pose) for role, pose in posed if pose is not None]
+        corners = [viewport.footprints(role.agent, pose[:2], pose[2])[0] for role, pose in present]
+        self._show_boxes(present, corners, t_s)
+        self._show_overlays(t_s)
+        for collection in self.collections:
+            self.layout.ax.draw_artist(collection)
+        self.signals.show(t_s)
+        self.labels.show([(role, c, float(pose[3])) for (role, pose), c in zip(present, corners)])
+        self.collisions.set_data(*self.collision_xy_m[self.collision_s <= t_s + 1e-6].T)
+        self.layout.ax.draw_artist(self.collisions)
+        fast = "" if 1 / REAL_TIME < self.speed_up < REAL_TIME else f"  (×{self.speed_up:.2g})"
+        self.stamp.set_text(f"t = {t_s:.1f} s{fast}")
+        self.layout.figure.draw_artist(self.stamp)
+        if self.charts is not None:
+            self.charts.show(t_s)
+
+    def _show_boxes(self, present: list[tuple[AgentRole, Array]], corners: list[Array], t_s: float) -> None:
+        self.boxes.set_verts(corners)
+        self.boxes.set_facecolor([to_rgba(role.color, 1.0 if role.leading else 0.6) for role, _ in present])
+        self.noses.set_facecolor([paint_of(role.agent, to_rgba(PAPER, 0.85)) for role, _ in present])
+        self.noses.set_verts(list(viewport.heading_triangles(np.array(corners))) if corners else [])
+        doubted = [(role.agent, pose) for role, pose in present if is_doubted_at(role.agent, t_s)]
+        self.hatches.set_segments([s for a, p in doubted for s in box_stripes(a, p[:2], p[2], self.layout.view)])
+        self.tails.set_segments([_tail(role.agent, pose, t_s) for role, pose in present])
+        self.tails.set_color([to_rgba(role.color, TAIL_ALPHA) for role, _ in present])
+
+    def _show_overlays(self, t_s: float) -> None:
+        if self.overlays.predicted is not None:
+            leading = [
+                (role, self.overlays.predicted.at(role.agent.id, t_s)) for role in self.roles.movers if role.leading
+            ]
+            expected = [(role, found) for role, found in leading if found is not None]
+            show_expected(self.predicted_paths, expected)
+            show_expected(self.ellipses, expected)
+        if self.overlays.truth is not None:
+            there = [(a, _pose(a, t_s)) for a in self.overlays.truth.agents]
+            self.truths.set_verts(
+                [viewport.footprints(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None]
+            )
+        if self.replayed:
+            self._show_driven(t_s)
+
+    def _show_driven(self, t_s: float) -> None:
+        verts, colors = [], []
+        for driven, role in self.replayed:
+            t = np.asarray(driven.t_s)
+            if len(t) and t[0] - 1e-6 <= t_s <= t[-1] + 1e-6:
+                x, y = np.interp(t_s, t, driven.x_m), np.interp(t_s, t, driven.y_m)
+                yaw = np.interp(t_s, t, np.unwrap(driven.yaw_rad))
+                verts.append(viewport.footprints(role.agent, (x, y), yaw)[0])
+                colors.append(to_rgba(INK if not role.leading else role.color))
+        self.driven.set_verts(verts)
+        self.driven.set_edgecolor(colors)
+
+
+def _pose(agent: Agent, t_s: float) -> Array | None:
+    """Return x, y, yaw, speed at a time; None outside the trajectory."""
+    if len(agent.waypoints) == 1 and agent.static:
+        return np.array([agent.waypoints.x_m[0], agent.waypoints.y_m[0], agent.waypoints.yaw_rad[0], 0.0])
+    state = agent.at(t_s)
+    values = [state.x_m[0], state.y_m[0], state.yaw_rad[0], state.speed_mps[0]]
+    return np.array(values) if state.valid[0] else None
+
+
+def _tail(agent: Agent, pose: Array, t_s: float) -> Array:
+    """Return the positions (K, 2) of the last `TAIL_S` seconds up to a pose."""
+    t = agent.waypoints.t_s
+    chosen = centers_xy(agent)[(t >= t_s - TAIL_S) & (t <= t_s)]
+    return np.concatenate([chosen, [pose[:2]]])
+
 
 WIDTH_PX = {".gif": 960, ".mp4": 1280, ".webm": 1280}
 """Without a size of the user's."""
@@ -34,7 +169,6 @@ class FrameTiming:
 
     Attributes
     ----------
-    frames : int
     step_s : float, s
         Of the scenario from frame to frame.
     start_s : float, s
@@ -54,7 +188,7 @@ class FrameTiming:
         return self.step_s * self.fps
 
 
-def choose_frame_timing(span: Span, options: PlotOptions, suffix: str) -> FrameTiming:
+def choose_frame_timing(span: TimeRange, options: PlotOptions, suffix: str) -> FrameTiming:
     """Choose the frames of a film: in real time, or faster where it would take longer than `MAX_REAL_TIME_S`."""
     fps = FPS[suffix] if options.fps is None else options.fps
     if suffix == ".gif":

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
-from log2sim.visualization.plot import shapes
-from log2sim.visualization.plot.roles import AgentRole, AgentRoles, centers_xy, is_moving, paint_of
-from log2sim.visualization.plot.style import (
-    COLLISION_MARK,
-    INK,
-    MARKERS,
-    PAPER,
-    PARKED_EDGE,
-    PARKED_FACE,
+from log2sim.visualization.plot import viewport
+from log2sim.visualization.plot.style import COLLISION_MARK, INK, MARKERS, PAPER, PARKED_EDGE, PARKED_FACE
+from log2sim.visualization.plot.viewport import (
+    MAX_UNCROWDED_MOVERS,
+    AgentRole,
+    AgentRoles,
+    Viewport,
+    centers_xy,
+    is_moving,
+    paint_of,
 )
-from log2sim.visualization.plot.viewport import MAX_UNCROWDED_MOVERS, Viewport
 
 BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
 """z-order, from the bottom up."""
@@ -61,7 +61,7 @@ def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
         return
     middle = [len(a.waypoints) // 2 for a in agents]
     xy = np.array([centers_xy(a)[k] for a, k in zip(agents, middle)])
-    corners = np.concatenate([shapes.footprints(a, p, a.waypoints.yaw_rad[k]) for a, p, k in zip(agents, xy, middle)])
+    corners = np.concatenate([viewport.footprints(a, p, a.waypoints.yaw_rad[k]) for a, p, k in zip(agents, xy, middle)])
     style: dict[str, Any] = {
         "facecolors": PARKED_FACE,
         "edgecolors": PARKED_EDGE,
@@ -71,7 +71,7 @@ def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
     ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
     ax.add_collection(
         PolyCollection(
-            list(shapes.heading_triangles(corners)),
+            list(viewport.heading_triangles(corners)),
             facecolors=[paint_of(a, PARKED_EDGE) for a in agents],
             edgecolors=PARKED_EDGE,
             linewidths=0.3,
@@ -103,7 +103,7 @@ def draw_tracks(
         (head, role.color)
         for role in roles.movers
         if role.leading
-        for head in shapes.arrows(centers_xy(role.agent), view)
+        for head in viewport.arrows(centers_xy(role.agent), view)
     ]
     if heads and not faint:
         ax.add_collection(
@@ -123,19 +123,19 @@ def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: flo
         alpha = 1.0 if role.leading else 0.55
         z = BOX + rank / (len(roles.movers) + 1) * 0.5
         if ghosts_step_s is not None and role.leading:
-            t, at = shapes.time_marks(agent, ghosts_step_s)
-            apart = shapes.spaced_apart(at, xy[[0, -1]], 1.15 * agent.size_m[0])
+            t, at = viewport.time_marks(agent, ghosts_step_s)
+            apart = viewport.spaced_apart(at, xy[[0, -1]], 1.15 * agent.size_m[0])
             if apart.any():
-                ghost = shapes.footprints(agent, at[apart], agent.at(t[apart]).yaw_rad)
+                ghost = viewport.footprints(agent, at[apart], agent.at(t[apart]).yaw_rad)
                 _polygons(
                     ax, ghost, facecolors=to_rgba(role.color, 0.10), edgecolors=to_rgba(role.color, 0.4), z=TRACK - 0.5
                 )
-        first, last = (shapes.footprints(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
+        first, last = (viewport.footprints(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
         _polygons(ax, first, facecolors=to_rgba(PAPER, 0.75), edgecolors=to_rgba(role.color, 0.9 * alpha), z=z - 0.6)
         _polygons(ax, last, facecolors=to_rgba(role.color, 0.92 * alpha), edgecolors=PAPER, z=z)
         paint = paint_of(agent, to_rgba(PAPER, 0.85))
         rim = "none" if agent.color is None else to_rgba(PAPER, 0.85)
-        _polygons(ax, shapes.heading_triangles(last), facecolors=paint, edgecolors=rim, z=z)
+        _polygons(ax, viewport.heading_triangles(last), facecolors=paint, edgecolors=rim, z=z)
         if max(agent.size_m[:2]) < 9 * view.m_per_pt:
             face = to_rgba(role.color, alpha)
             ax.plot(*xy[-1], MARKERS[role.group], ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
@@ -148,7 +148,7 @@ def draw_truth(ax: Axes, truth: Scenario) -> None:
         xy = centers_xy(agent)
         if is_moving(agent):
             tracks.append(xy)
-        corners.append(shapes.footprints(agent, xy[-1], agent.waypoints.yaw_rad[-1])[0])
+        corners.append(viewport.footprints(agent, xy[-1], agent.waypoints.yaw_rad[-1])[0])
     style: dict[str, Any] = {"linewidths": 0.8, "linestyles": [(0, (3, 2))], "zorder": BOX + 0.8}
     ax.add_collection(LineCollection(tracks, colors=to_rgba(INK, 0.9), **style), autolim=False)
     ax.add_collection(PolyCollection(corners, facecolors="none", edgecolors=to_rgba(INK, 0.9), **style), autolim=False)
@@ -165,7 +165,7 @@ def draw_replay(ax: Axes, replay: Any, roles: AgentRoles) -> None:
         xy = np.column_stack([driven.x_m, driven.y_m])
         tracks.append(xy)
         colors.append(to_rgba(role.color))
-        ends.append(shapes.footprints(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
+        ends.append(viewport.footprints(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
         end_colors.append(to_rgba(role.color))
     dots: dict[str, Any] = {"linestyles": [(0, (0.1, 2.0))], "linewidths": 1.6, "capstyle": "round"}
     ax.add_collection(LineCollection(tracks, colors=colors, zorder=REPLAY, **dots), autolim=False)
@@ -184,7 +184,7 @@ def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> Non
     observed: list[tuple[Array, str]] = []
     filled: list[tuple[Array, str]] = []
     for role in reversed(roles):
-        for kind, parts in zip((observed, filled), shapes.observed_and_filled(role.agent)):
+        for kind, parts in zip((observed, filled), viewport.observed_and_filled(role.agent)):
             kind.extend((part, role.color) for part in parts)
     ribbon = 1.5 if alpha < 1.0 else 1.0
     width = [ribbon * (2.4 if c == INK else 1.7) for _, c in observed] if leading else [1.0] * len(observed)
@@ -204,7 +204,7 @@ def _time_marks(ax: Axes, roles: AgentRoles, view: Viewport, step_s: float) -> N
     for role in roles.movers:
         if not role.leading:
             continue
-        t, xy = shapes.time_marks(role.agent, step_s)
+        t, xy = viewport.time_marks(role.agent, step_s)
         apart = (
             np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt])
             if len(t)

@@ -53,7 +53,6 @@ class FilmFile:
 
     Attributes
     ----------
-    path : Path
     write : callable or None
         Takes frames, the path of the file and the frames a second; None for a .gif or a still picture.
     note : str or None

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from log2sim.documents import replaced
+from log2sim.files.documents import replaced
 from log2sim.visualization.plot.style import FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, printable
 
 SIDE_IN = 3.4
@@ -26,7 +26,6 @@ class Reliability:
 
     Attributes
     ----------
-    name : str
     noun : str
         What is counted, in the plural: "boxes", "ticks".
     error : float

@@ -1,4 +1,4 @@
-"""The base of still pictures and animations: layout, background, stationary agents, legend and charts."""
+"""The base of pictures and animations: layout, background, legend and charts; axes of one's own."""
 
 from __future__ import annotations
 
@@ -7,30 +7,46 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from log2sim.datatypes import Scenario
-from log2sim.visualization.plot import doubts, drawing
-from log2sim.visualization.plot.collisions import new_collisions
-from log2sim.visualization.plot.labels import MapLabel, place_labels
+from log2sim.visualization.plot import drawing, layers
+from log2sim.visualization.plot.layers import (
+    Overlays,
+    draw_road,
+    draw_signals,
+    new_collisions,
+    observer_rows,
+    prediction_row,
+    road_rows,
+    tells_ends,
+    warned_places,
+    warning_row,
+)
 from log2sim.visualization.plot.layout import (
     FigureLayout,
+    MapLabel,
+    draw_labels,
     draw_legend,
     draw_scale_and_north,
     legend_rows,
     make_layout,
+    names_fit,
+    place_labels,
     write_title,
 )
-from log2sim.visualization.plot.moving_labels import names_fit
-from log2sim.visualization.plot.observers import observer_rows, tells_ends
-from log2sim.visualization.plot.options import PlotOptions
-from log2sim.visualization.plot.overlays import Overlays
-from log2sim.visualization.plot.predicted import prediction_row
-from log2sim.visualization.plot.road_features import draw_road, draw_signals, road_rows
-from log2sim.visualization.plot.roles import AgentRoles, centers_xy, is_moving
-from log2sim.visualization.plot.selection import Span
+from log2sim.visualization.plot.selection import PlotOptions, TimeRange
+from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
-from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
-from log2sim.visualization.plot.warned import warned_places, warning_row
+from log2sim.visualization.plot.viewport import (
+    AgentRoles,
+    Viewport,
+    assign_roles,
+    centers_xy,
+    choose_viewport,
+    is_moving,
+    time_step_s,
+)
 
 Rows = list[tuple[Any, str]]
 """Handles and texts of a legend."""
@@ -42,7 +58,6 @@ class PictureBase:
 
     Attributes
     ----------
-    layout : FigureLayout
     step_s : float, s
         Between time marks.
     charts : TimelineCharts or None
@@ -80,7 +95,7 @@ def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, movi
         draw_signals(layout.ax, scenario.signals, span.stop_s)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
     drawing.draw_stationary(layout.ax, roles.stationary, layout.view)
-    doubts.hatch_stationary(layout.ax, roles, layout.view, drawing.STATIONARY + 0.1)
+    layers.hatch_stationary(layout.ax, roles, layout.view, drawing.STATIONARY + 0.1)
     draw_legend(layout, rows)
     draw_scale_and_north(layout, projected=projected)
     write_title(layout, overlays.title or scenario.name or "scenario", _subtitle(scenario, roles, span))
@@ -111,10 +126,10 @@ def _fit_labels(
         return lay_out(rows), rows, ()
     told = leading | {agent.id for agent in roles.stationary}
     layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, told))
-    placed = place_labels(roles, layout.view, mark_step_s, label_static=overlays.options.label_static)
+    placed = place_labels(roles, layout.view, mark_step_s, static=overlays.options.label_static)
     if not told <= placed.told | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
         layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, placed.told))
-        placed = place_labels(roles, layout.view, mark_step_s, label_static=overlays.options.label_static)
+        placed = place_labels(roles, layout.view, mark_step_s, static=overlays.options.label_static)
     return layout, _legend(scenario, roles, overlays, mark_step_s, placed.told), tuple(placed.labels)
 
 
@@ -126,7 +141,7 @@ def _legend(
     shown = {"truth": overlays.truth is not None, "replay": overlays.replay is not None}
     collisions = len(new_collisions(overlays.replay)[0])
     rows = legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
-    rows += doubts.doubt_rows(roles, told)
+    rows += layers.doubt_rows(roles, told)
     if overlays.predicted is not None and roles.movers:
         rows.append(prediction_row(overlays.predicted.horizon_s))
     if tells_ends(scenario) and mark_step_s is not None:
@@ -136,7 +151,7 @@ def _legend(
     return rows + road_rows(scenario)
 
 
-def _subtitle(scenario: Scenario, roles: AgentRoles, span: Span) -> str:
+def _subtitle(scenario: Scenario, roles: AgentRoles, span: TimeRange) -> str:
     moving = sum(is_moving(r.agent) for r in roles.movers if not r.is_ego)
     agents = len(scenario.others)
     parts = [f"{span.duration_s:.1f} s" if span.start_s == 0 else f"{span.start_s:.1f} to {span.stop_s:.1f} s"]
@@ -159,3 +174,106 @@ def _outside(roles: AgentRoles, view: Viewport) -> int:
 def _typical_speed(roles: AgentRoles) -> float:
     speeds = [float(np.abs(r.agent.waypoints.speed_mps).mean()) for r in roles.movers if is_moving(r.agent)]
     return float(np.median(speeds)) if speeds else 0.0
+
+
+SIZE_IN = (9.5, 6.0)
+
+
+def plot(
+    scenario: Scenario,
+    ax: Axes | None = None,
+    *,
+    replay: Any = None,
+    truth: Scenario | None = None,
+    background: drawing.Background | None = None,
+    legend: bool | None = None,
+) -> Axes:
+    """Draw a scenario from above.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes, optional
+        Drawn into; limits of axes that show something already are kept. Without, a new figure of pyplot.
+    replay : Replay, optional
+        Drawn over the scenario.
+    truth : Scenario, optional
+        Brought to the scenario's start and map.
+    background : GroundMap, optional
+        A picture of the ground in the map frame.
+    legend : bool, optional
+        By default only in a new figure.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ScenarioError
+        When the truth's map has another projection.
+    """
+    aligned = None if truth is None else truth.aligned_to(scenario)
+    new = ax is None
+    if ax is None:
+        import matplotlib.pyplot as plt
+
+        ax = plt.subplots(figsize=SIZE_IN, layout="constrained")[1]
+    roles = assign_roles(scenario)
+    view = _set_view(ax, roles)
+    step_s = time_step_s(scenario.duration_s, len(roles.movers), _usual_speed(roles), view.m_per_pt)
+    if background is not None:
+        drawing.draw_background(ax, background)
+    draw_road(ax, scenario, view, over_picture=background is not None)
+    draw_signals(ax, scenario.signals, scenario.duration_s)
+    drawing.draw_stationary(ax, roles.stationary, view)
+    layers.hatch_stationary(ax, roles, view, drawing.STATIONARY + 0.1)
+    drawing.draw_tracks(ax, roles, view, step_s, alpha=1.0 if replay is None and truth is None else 0.45)
+    drawing.draw_ends(ax, roles, view, ghosts_step_s=None)
+    layers.hatch_movers(ax, roles, view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
+    if aligned is not None:
+        drawing.draw_truth(ax, aligned)
+    if replay is not None:
+        drawing.draw_replay(ax, replay, roles)
+        drawing.draw_collisions(ax, new_collisions(replay)[1])
+    placed = place_labels(roles, view, step_s)
+    draw_labels(ax, placed.labels)
+    ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
+    if new if legend is None else legend:
+        overlays = {"truth": truth is not None, "replay": replay is not None}
+        collisions = len(new_collisions(replay)[0])
+        rows = legend_rows(roles, step_s, placed.told, collisions=collisions, outside=0, **overlays)
+        _draw_legend(ax, [*rows, *layers.doubt_rows(roles, placed.told), *road_rows(scenario)])
+    return ax
+
+
+def _set_view(ax: Axes, roles: AgentRoles) -> Viewport:
+    """Style axes, and return the part of the map that they show: theirs where they show something, else the agents'."""
+    extent, per_pt = ax.get_window_extent(), 72 / ax.figure.dpi
+    size_pt = max(extent.width * per_pt, 1.0), max(extent.height * per_pt, 1.0)
+    if ax.has_data():
+        (x0, x1), (y0, y1) = sorted(ax.get_xlim()), sorted(ax.get_ylim())
+        return Viewport(x0, x1, y0, y1, max((x1 - x0) / size_pt[0], (y1 - y0) / size_pt[1]))
+    view = choose_viewport(roles).fitted(*size_pt)
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_axisbelow(True)
+    ax.set_xlabel("x of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
+    ax.set_ylabel("y of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
+    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6)
+    for spine in ax.spines.values():
+        spine.set(color=FRAME, linewidth=0.8)
+    return view
+
+
+def _usual_speed(roles: AgentRoles) -> float:
+    speeds = [float(abs(r.agent.waypoints.speed_mps).mean()) for r in roles.movers if is_moving(r.agent)]
+    return sum(speeds) / len(speeds) if speeds else 0.0
+
+
+def _draw_legend(ax: Axes, rows: list[tuple[Any, str]]) -> None:
+    """Draw the legend beside the map, where it covers nothing."""
+    made = ax.legend(
+        [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=(1.01, 1.0),
+        borderaxespad=0, frameon=False, prop={"family": FONT, "size": 7.0}, labelcolor=INK,
+    )  # fmt: skip
+    for text in made.get_texts():
+        text.set_parse_math(False)

@@ -1,4 +1,4 @@
-"""The part of a scenario and its replay that a picture shows: a range of time, and some of the agents."""
+"""The part of a scenario that a picture shows, and how."""
 
 from __future__ import annotations
 
@@ -11,14 +11,153 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
-from log2sim.registry import nearest
-from log2sim.visualization.plot.options import PlotOptions
+from log2sim.files.plugins import nearest
+
+STILL, MOVING = (".png", ".svg", ".pdf"), (".gif", ".mp4", ".webm")
+IN_PIXELS = (".png", *MOVING)
+"""Kinds of pictures that have pixels."""
+
+FPS = {".gif": 10.0, ".mp4": 25.0, ".webm": 25.0}
+"""A .gif of more frames is large; films at the rate of the logs would jerk, and states between waypoints are known."""
+
+MIN_FPS = 1.0
+MAX_FPS = {".gif": 50.0, ".mp4": 120.0, ".webm": 120.0}
+"""A .gif states the time of a frame in hundredths of a second, and browsers slow down those of one hundredth."""
+
+MAX_REAL_TIME_S = {".gif": 30.0, ".mp4": 60.0, ".webm": 60.0}
+"""What lasts longer is shown faster than real time unless the speed is given, and the picture says so."""
+
+MIN_SIDE_PX, MAX_SIDE_PX = 240, 7680
+MAX_SPEED = 1000.0
+MIN_EXTENT_M = 1.0
+
+
+@dataclass(frozen=True)
+class PlotOptions:
+    """What a picture shows and how; None stands for a choice that fits the scenario.
+
+    Attributes
+    ----------
+    size_px : (width, height) or None
+        Of pictures that have pixels.
+    fps : float or None
+        Frames of a film a second.
+    speed : float or None
+        How many times faster than real time a film plays.
+    start_s, stop_s : float or None, s
+        Range of the scenario's time.
+    extent_m : (x0, y0, x1, y1) or None, m
+        Two opposite corners of the part of the map, map frame. A picture of other proportions shows more of the map.
+    agents : tuple of str or None
+        Ids of the agents that are shown; None for all.
+    label_static : bool
+        Whether static agents have labels too; those that are doubtful always have.
+    """
+
+    size_px: tuple[int, int] | None = None
+    fps: float | None = None
+    speed: float | None = None
+    start_s: float | None = None
+    stop_s: float | None = None
+    extent_m: tuple[float, float, float, float] | None = None
+    agents: tuple[str, ...] | None = None
+    label_static: bool = False
+
+    def require_fits(self, suffix: str, name: str) -> None:
+        """Raise `ConfigError` when a file with this suffix and name has no such options, or a value is out of its limits."""
+        moving = suffix in MOVING
+        for option, value in (("fps", self.fps), ("speed", self.speed)):
+            if value is not None and not moving:
+                raise ConfigError(f"{option}: {name} is a still picture; choose a name that ends in {_listed(MOVING)}")
+        if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS[suffix]:
+            raise ConfigError(
+                f"fps: {self.fps:g}, expected {MIN_FPS:g} to {MAX_FPS[suffix]:g} frames a second in a {suffix}"
+            )
+        if self.speed is not None and not 1 / MAX_SPEED <= self.speed <= MAX_SPEED:
+            raise ConfigError(f"speed: {self.speed:g}, expected {1 / MAX_SPEED:g} to {MAX_SPEED:g} times real time")
+        if self.size_px is not None:
+            self._require_size(suffix, name)
+        if self.extent_m is not None:
+            x0, y0, x1, y1 = self.extent_m
+            if not (abs(x1 - x0) >= MIN_EXTENT_M and abs(y1 - y0) >= MIN_EXTENT_M):
+                shown = ",".join(f"{v:g}" for v in self.extent_m)
+                raise ConfigError(
+                    f"extent: {shown}, expected two corners X0,Y0,X1,Y1 at least {MIN_EXTENT_M:g} m apart in x and y"
+                )
+
+    def _require_size(self, suffix: str, name: str) -> None:
+        width, height = self.size_px or (0, 0)
+        if suffix not in IN_PIXELS:
+            raise ConfigError(f"size: {name} has no pixels; choose a name that ends in {_listed(IN_PIXELS)}")
+        if not (MIN_SIDE_PX <= width <= MAX_SIDE_PX and MIN_SIDE_PX <= height <= MAX_SIDE_PX):
+            raise ConfigError(f"size: {width}x{height}, expected sides of {MIN_SIDE_PX} to {MAX_SIDE_PX} px")
+        if suffix in (".mp4", ".webm") and (width % 2 or height % 2):
+            raise ConfigError(f"size: {width}x{height}, expected even sides, which films have")
+
+
+NO_OPTIONS = PlotOptions()
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """Read a size such as "1280x720"; None stays None.
+
+    Raises
+    ------
+    ConfigError
+        For anything but two whole numbers with an x between them.
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and len(part) < 6 for part in parts):
+        raise ConfigError(f"size: '{text}', expected width and height in pixels such as 1280x720")
+    return int(parts[0]), int(parts[1])
+
+
+def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
+    """Read two corners such as "-20,-10,60,40"; None stays None.
+
+    Raises
+    ------
+    ConfigError
+        For anything but four finite numbers.
+    """
+    if text is None:
+        return None
+    try:
+        x0, y0, x1, y1 = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"extent: '{text}', expected two corners X0,Y0,X1,Y1 in m such as -20,-10,60,40") from None
+    if not all(abs(v) < 1e9 for v in (x0, y0, x1, y1)):
+        raise ConfigError(f"extent: '{text}', expected finite numbers of meters")
+    return x0, y0, x1, y1
+
+
+def parse_ids(text: str | None) -> tuple[str, ...] | None:
+    """Read ids separated by commas; None stays None.
+
+    Raises
+    ------
+    ConfigError
+        When it names nobody.
+    """
+    if text is None:
+        return None
+    ids = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    if not ids:
+        raise ConfigError("agents: names nobody; give ids separated by commas, or leave it out to show all")
+    return ids
+
+
+def _listed(suffixes: tuple[str, ...]) -> str:
+    return ", ".join(suffixes[:-1]) + f" or {suffixes[-1]}"
+
 
 SAME_TIME_S = 1e-6
 
 
 @dataclass(frozen=True)
-class Span:
+class TimeRange:
     """A range of a scenario's time.
 
     Attributes
@@ -40,7 +179,7 @@ class Span:
         return (t >= self.start_s - SAME_TIME_S) & (t <= self.stop_s + SAME_TIME_S)
 
 
-def choose_span(scenario: Scenario, options: PlotOptions) -> Span:
+def choose_span(scenario: Scenario, options: PlotOptions) -> TimeRange:
     """Return the range of time that the options ask for.
 
     Raises
@@ -55,7 +194,7 @@ def choose_span(scenario: Scenario, options: PlotOptions) -> Span:
         raise ConfigError(
             f"start, stop: {start:g} to {asked} s, expected a range within the scenario, 0 to {scenario.duration_s:g} s"
         )
-    return Span(start, stop)
+    return TimeRange(start, stop)
 
 
 def select_shown(scenario: Scenario, replay: Any, options: PlotOptions) -> tuple[Scenario, Any]:
@@ -78,15 +217,14 @@ def select_shown(scenario: Scenario, replay: Any, options: PlotOptions) -> tuple
     collisions = [e for e in replay.metrics.get("collisions", ()) if set(e["agents"]) <= set(options.agents)]
     warnings = replay.warnings
     if warnings is not None:
-        shown = "ego" in options.agents
-        events = tuple(e for e in warnings.events if shown and e.agent in options.agents)
+        events = tuple(e for e in warnings.events if {e.driver, e.agent} <= set(options.agents))
         warnings = replace(warnings, events=events)
     agents = tuple(a for a in replay.agents if a.id in options.agents)
     metrics: Mapping[str, Any] = {**replay.metrics, "collisions": collisions}
     return scenario, replace(replay, agents=agents, metrics=metrics, warnings=warnings)
 
 
-def cut_scenario(scenario: Scenario, span: Span) -> Scenario:
+def cut_scenario(scenario: Scenario, span: TimeRange) -> Scenario:
     """Return a scenario with what is within a range of its time; times stay, and agents that are not there go."""
     if span.start_s <= 0.0 and span.stop_s >= scenario.duration_s:
         return scenario
@@ -94,7 +232,7 @@ def cut_scenario(scenario: Scenario, span: Span) -> Scenario:
     return replace(scenario, agents=tuple(agents), duration_s=span.stop_s)
 
 
-def cut_replay(replay: Any, span: Span, scenario: Scenario) -> Any:
+def cut_replay(replay: Any, span: TimeRange, scenario: Scenario) -> Any:
     """Return a replay with what is within a range of the scenario's time."""
     if replay is None or (span.start_s <= 0.0 and span.stop_s >= scenario.duration_s):
         return replay
@@ -105,13 +243,15 @@ def cut_replay(replay: Any, span: Span, scenario: Scenario) -> Any:
     warnings = replay.warnings
     if warnings is not None:
         kept = tuple(
-            w for w in warnings.events if w.warned is not None and span.holds(w.warned.t_s) and w.agent in there
+            w
+            for w in warnings.events
+            if w.warned is not None and span.holds(w.warned.t_s) and {w.driver, w.agent} <= there
         )
         warnings = replace(warnings, events=kept)
     return replace(replay, agents=agents, metrics={**replay.metrics, "collisions": events}, warnings=warnings)
 
 
-def _cut_agent(agent: Agent, span: Span) -> Agent | None:
+def _cut_agent(agent: Agent, span: TimeRange) -> Agent | None:
     """Return an agent with the waypoints within a range and interpolated ones at its ends; None when it is not there."""
     w = agent.waypoints
     if agent.is_permanent:
@@ -127,7 +267,7 @@ def _cut_agent(agent: Agent, span: Span) -> Agent | None:
     return replace(agent, waypoints=replace(taken, t_s=t_s, **exact))
 
 
-def _cut_states(agent: Any, span: Span) -> Any:
+def _cut_states(agent: Any, span: TimeRange) -> Any:
     """Return the states of a replayed agent within a range; None when it is not there."""
     keep = span.holds(agent.t_s)
     if not keep.any():  # what stands has a state at the start and one at the end

@@ -25,8 +25,8 @@ from log2sim.visualization.plot.layout import (
     TIME_IN,
     FigureLayout,
 )
-from log2sim.visualization.plot.roles import AgentRole, AgentRoles
 from log2sim.visualization.plot.style import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable
+from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 
 KMH = 3.6
 
@@ -37,7 +37,6 @@ class Curve:
 
     Attributes
     ----------
-    label : str
     t_s, values : (T,) float64
     style : {"thin", "ribbon", "muted"}
         A ribbon is the reference of the thin line over it; muted curves are secondary.
@@ -55,7 +54,6 @@ class Chart:
 
     Attributes
     ----------
-    name, unit : str
     min_span : float
         Smallest range of the value axis, in `unit`.
     lines : tuple of Curve
@@ -74,9 +72,6 @@ class AgentTimeline:
 
     Attributes
     ----------
-    role : AgentRole
-    driver : str
-    charts : tuple of Chart
     collisions_s : tuple of float, s
         Start of its collisions that belong to the replay.
     """
@@ -138,7 +133,6 @@ class TimelineCharts:
 
     Attributes
     ----------
-    timeline : AgentTimeline
     axes : tuple of Axes
         From the top, one for each chart.
     moving : list

@@ -8,21 +8,34 @@ from typing import Any
 import matplotlib
 
 from log2sim.datatypes import Scenario
-from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
-from log2sim.visualization.plot import doubts, drawing
-from log2sim.visualization.plot.collisions import new_collisions
+from log2sim.files.documents import refuse_existing, replaced
+from log2sim.visualization.plot import drawing, layers
 from log2sim.visualization.plot.encoding import FilmFile, choose_film_file
-from log2sim.visualization.plot.labels import draw_labels
-from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.observers import draw_observers, tells_ends
-from log2sim.visualization.plot.options import MOVING, NO_OPTIONS, STILL, PlotOptions
-from log2sim.visualization.plot.overlays import NO_OVERLAYS, Overlays
-from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
-from log2sim.visualization.plot.roles import AgentRoles, agent_colors, assign_roles
+from log2sim.visualization.plot.layers import (
+    NO_OVERLAYS,
+    Overlays,
+    PredictedPaths,
+    draw_observers,
+    draw_predictions,
+    draw_warnings,
+    new_collisions,
+    tells_ends,
+    warned_places,
+)
+from log2sim.visualization.plot.layout import FigureLayout, draw_labels
 from log2sim.visualization.plot.scene import draw_base
-from log2sim.visualization.plot.selection import choose_span, cut_replay, cut_scenario, select_shown
-from log2sim.visualization.plot.warned import draw_warnings, warned_places
+from log2sim.visualization.plot.selection import (
+    MOVING,
+    NO_OPTIONS,
+    STILL,
+    PlotOptions,
+    choose_span,
+    cut_replay,
+    cut_scenario,
+    select_shown,
+)
+from log2sim.visualization.plot.viewport import AgentRoles, assign_roles
 
 
 def plot_tracks(
@@ -76,7 +89,7 @@ def plot_tracks(
     suffix = film.path.suffix.lower()
     options.require_fits(suffix, film.path.name)
     refuse_existing(film.path, overwrite=overwrite)
-    colors = agent_colors(scenario)
+    whole = scenario
     scenario, replay = select_shown(scenario, replay, options)
     span = choose_span(scenario, options)
     overlays = Overlays(
@@ -89,7 +102,7 @@ def plot_tracks(
         options=options,
     )
     scenario = cut_scenario(scenario, span)
-    roles = assign_roles(scenario, colors)
+    roles = assign_roles(scenario, whole)
     if suffix in MOVING:
         from log2sim.visualization.plot.animation import write_animation
 
@@ -108,7 +121,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
     drawing.draw_tracks(ax, roles, layout.view, base.step_s, alpha=0.45 if overlaid else 1.0)
     ghosts = None if overlaid or drawing.view_is_crowded(roles) else base.step_s
     drawing.draw_ends(ax, roles, layout.view, ghosts_step_s=ghosts)
-    doubts.hatch_movers(ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
+    layers.hatch_movers(ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
     if overlays.truth is not None:
         drawing.draw_truth(ax, overlays.truth)
     if replay is not None:

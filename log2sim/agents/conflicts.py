@@ -1,0 +1,278 @@
+"""Conflicts: agents that are in one place at one time, and how long static agents exist."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.agents.candidate import AgentCandidate, Timeline, spans_of
+from log2sim.agents.evidence import MIN_TICK_RAYS, SAME_S, BoxTable, count_at
+from log2sim.datatypes import Agent, Doubt, Obstacles, Waypoints
+from log2sim.geometry import Array, overlap_of_smaller, separating_axes
+
+# Boxes that share less than this of the smaller one only touch: their errors.
+TOUCHING = 0.05
+# Less is rounding: 4 mm of the length of a car.
+ROUNDING = 1e-3
+# Boxes are not so deep in each other by their errors alone: two standard deviations of the distance of two positions that are
+# known to 0.2 m each.
+IN_ONE_PLACE_M = 0.5
+# What is left of a life without its conflicts is kept alone if it is at least this share.
+MIN_KEPT_SHARE = 0.5
+# Fewer ticks are no trajectory.
+MIN_KEPT_TICKS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Conflict:
+    """Two agents in one place.
+
+    Attributes
+    ----------
+    first, second : int
+        Indices of the agents.
+    tick : (n,) intp
+        When.
+    share : (n,) float64
+        Of the smaller box that they share.
+    depth_m : (n,) float64
+        By which one of them would have to move to be apart.
+    """
+
+    first: int
+    second: int
+    tick: NDArray[np.intp]
+    share: Array
+    depth_m: Array
+
+
+def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict]:
+    """Find the pairs of A agents whose boxes share more than `touching` of the smaller one, with the ticks at which they do."""
+    first, second = np.triu_indices(len(boxes.present), 1)
+    radius = np.hypot(boxes.size_m[:, 0], boxes.size_m[:, 1]) / 2
+    low, high = (f(boxes.center_m[..., :2], axis=1) for f in (np.nanmin, np.nanmax))
+    reach = (radius[first] + radius[second])[:, None]
+    meet = ((low[first] - high[second] <= reach) & (low[second] - high[first] <= reach)).all(axis=1)
+    first, second = first[meet], second[meet]
+    apart = np.hypot(*np.moveaxis(boxes.center_m[first, :, :2] - boxes.center_m[second, :, :2], -1, 0))
+    pair, tick = np.nonzero(apart < (radius[first] + radius[second])[:, None])
+    rectangles = [
+        np.column_stack([boxes.center_m[row, tick, :2], boxes.size_m[row, :2], boxes.yaw_rad[row, tick]])
+        for row in (first[pair], second[pair])
+    ]
+    share = overlap_of_smaller(*rectangles)
+    over = share > touching
+    pair, tick, share, depth = pair[over], tick[over], share[over], _depths(*(r[over] for r in rectangles))
+    return [
+        Conflict(int(first[p]), int(second[p]), *(column[pair == p] for column in (tick, share, depth)))
+        for p in np.unique(pair).tolist()
+    ]
+
+
+def find_all_conflicts(
+    agents: Sequence[Agent], t_s: Array, touching: float = TOUCHING
+) -> tuple[list[Conflict], NDArray[np.bool_]]:
+    """Find the conflicts of A agents at ticks (T,) as `find_conflicts` does, and mark (A, T) when each agent is there."""
+    present = np.zeros((len(agents), len(t_s)), dtype=bool)
+    parts: dict[tuple[int, int], list[Conflict]] = {}
+    for rows, first, boxes in BoxTable.in_turn(agents, t_s):
+        present[rows, first : first + boxes.present.shape[1]] = boxes.present
+        for found in find_conflicts(boxes, touching):
+            pair = int(rows[found.first]), int(rows[found.second])
+            parts.setdefault(pair, []).append(replace(found, tick=found.tick + first))
+    return [
+        Conflict(
+            *pair, *(np.concatenate([getattr(c, name) for c in parts[pair]]) for name in ("tick", "share", "depth_m"))
+        )
+        for pair in sorted(parts)
+    ], present
+
+
+def _depths(a: Array, b: Array) -> Array:
+    """Return by how much (n,) one of two rectangles, (n, 5) each: x, y, length, width, yaw, has to move to be apart."""
+    dx, dy = (b[:, :2] - a[:, :2]).T
+    axes = separating_axes(a[:, 4], b[:, 4], a[:, 2:4], b[:, 2:4])
+    return np.asarray(np.min([reach - np.abs(dx * nx + dy * ny) for nx, ny, reach, _ in axes], axis=0))
+
+
+def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[AgentCandidate]:
+    """Trim the less likely one of two candidates that are in one place, and drop those that are in the ego all the time.
+
+    Parameters
+    ----------
+    candidates : sequence of AgentCandidate
+        Their `evidence` says which is more likely.
+    ego : Agent, optional
+        It is where it is.
+    t_s : (T,) float64
+        Ticks.
+
+    Notes
+    -----
+    A life is cut to its longest part without a conflict if that is at least `MIN_KEPT_SHARE` of it; otherwise it stays, to be
+    doubted. Nothing of it stays in the ego, at whose place nothing else can be.
+    """
+    agents = [c.agent for c in candidates]
+    evidence = [c.evidence for c in candidates]
+    if ego is not None:
+        agents, evidence = [*agents, ego], [*evidence, np.inf]
+    conflicts, present = find_all_conflicts(agents, t_s)
+    alive = present.copy()
+    for conflict in sorted(conflicts, key=lambda c: -max(evidence[c.first], evidence[c.second])):
+        of_ego = ego is not None and conflict.second == len(candidates)
+        stronger, weaker = conflict.first, conflict.second
+        if evidence[weaker] > evidence[stronger]:
+            stronger, weaker = weaker, stronger
+        over = conflict.tick[conflict.share > TOUCHING if of_ego else conflict.depth_m > IN_ONE_PLACE_M]
+        over = over[alive[stronger, over]]
+        left = alive[weaker].copy()
+        left[over] = False
+        left = _longest_run(left)
+        if of_ego or left.sum() >= MIN_KEPT_SHARE * alive[weaker].sum():
+            alive[weaker] = left
+    kept = [k for k in range(len(candidates)) if alive[k].sum() >= min(MIN_KEPT_TICKS, present[k].sum())]
+    return [_cut(candidates[k], t_s, present[k], alive[k]) for k in kept]
+
+
+def _longest_run(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep only the longest run of a mask (T,), the first of several; gaps of absence end it."""
+    out = np.zeros_like(mask)
+    out[max(spans_of(mask), key=len, default=np.zeros(0, dtype=np.intp))] = True
+    return out
+
+
+def _cut(candidate: AgentCandidate, t_s: Array, present: NDArray[np.bool_], alive: NDArray[np.bool_]) -> AgentCandidate:
+    """Return a candidate at the ticks (T,) at which it is alive, out of those at which it is present."""
+    if (alive == present).all():
+        return candidate
+    first_s, last_s = t_s[alive][[0, -1]]
+    agent, w = candidate.agent, candidate.agent.waypoints
+    return replace(candidate, agent=replace(agent, waypoints=_during(agent, w, float(first_s), float(last_s))))
+
+
+def _during(agent: Agent, w: Waypoints, first_s: float, last_s: float) -> Waypoints:
+    """Take the waypoints from a first to a last time; those of a static agent stand at its ends."""
+    if agent.static:
+        ends = w.take(np.array([0, len(w) - 1])[: 1 + (last_s > first_s)])
+        return replace(ends, t_s=np.array([first_s, last_s])[: len(ends)])
+    return w.take((w.t_s >= first_s - SAME_S) & (w.t_s <= last_s + SAME_S))
+
+
+def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[list[Doubt]]:
+    """Doubt the less likely one of two named candidates that are in one place, and who touches the ego, while they do so.
+
+    Returns a list for each candidate.
+    """
+    agents = [c.agent for c in candidates] + ([ego] if ego is not None else [])
+    doubts: list[list[Doubt]] = [[] for _ in agents]
+    for conflict in find_all_conflicts(agents, t_s, touching=ROUNDING)[0]:
+        a, b = conflict.first, conflict.second
+        if b == len(candidates):
+            doubts[a].append(_doubt(conflict, t_s, "in_ego", "touches the ego", agents[a]))
+        elif conflict.depth_m.max() > IN_ONE_PLACE_M:
+            weaker, other = (a, b) if candidates[a].evidence <= candidates[b].evidence else (b, a)
+            words = "stands in" if agents[a].static and agents[b].static else "passes through"
+            doubts[weaker].append(
+                _doubt(conflict, t_s, "passes_through", f"{words} {agents[other].id}", agents[weaker])
+            )
+    return doubts[: len(candidates)]
+
+
+def _doubt(conflict: Conflict, t_s: Array, flag: str, words: str, agent: Agent) -> Doubt:
+    """Make a doubt that holds during a conflict, of the whole life where it always holds."""
+    worst_s, first_s, last_s = (
+        float(t_s[k]) for k in (conflict.tick[conflict.share.argmax()], conflict.tick[0], conflict.tick[-1])
+    )
+    if first_s <= agent.waypoints.t_s[0] + SAME_S and last_s >= agent.waypoints.t_s[-1] - SAME_S:
+        return Doubt(flag, words)
+    return Doubt(flag, f"{words} at {worst_s:.1f} s", first_s, last_s)
+
+
+# Rays tell whether a place is free up to this distance: a car holds about ten of them there by a LiDAR of 64 lines.
+MAX_FREE_RANGE_M = 60.0
+# A place is free at a tick at which more than this share of the rays toward it goes on behind it.
+FREE_SHARE = 0.5
+
+
+def extend_static(
+    agents: Sequence[Agent], ego: Agent | None, clouds: Sequence[Obstacles | None], timeline: Timeline
+) -> list[Agent]:
+    """Let static agents exist for the whole scenario, up to the last time before and the first time after at which their place is free.
+
+    It is free where LiDAR rays pass through it, and where something else is. Waypoints outside of the time in which the agent was
+    observed say so (`observed` false).
+    """
+    t_s = timeline.seconds(timeline.t_ns)
+    rows = [k for k, agent in enumerate(agents) if agent.static]
+    free = _free_places([agents[k] for k in rows], clouds, t_s)
+    out = list(agents)
+    # The surest first: what it takes, the others cannot have.
+    for n in sorted(range(len(rows)), key=lambda n: -agents[rows[n]].confidence):
+        agent, w = agents[rows[n]], agents[rows[n]].waypoints
+        others = [a for k, a in enumerate(out) if k != rows[n]] + ([] if ego is None else [ego])
+        taken = free[n] | _occupied(agent, others, t_s)
+        before, after = np.flatnonzero(t_s < w.t_s[0]), np.flatnonzero(t_s > w.t_s[-1])
+        before = before[before > max(before[taken[before]], default=-1)]
+        after = after[after < min(after[taken[after]], default=len(t_s))]
+        if len(before) or len(after):
+            out[rows[n]] = replace(agent, waypoints=_held(w, t_s[before], t_s[after]))
+    return out
+
+
+def _held(w: Waypoints, before_s: Array, after_s: Array) -> Waypoints:
+    """Return waypoints that stay at their ends at earlier and later times, at which nothing was observed."""
+    index = np.concatenate([np.zeros(len(before_s)), np.arange(len(w)), np.full(len(after_s), len(w) - 1)]).astype(
+        np.intp
+    )
+    observed = np.concatenate([np.zeros(len(before_s), bool), w.observed, np.zeros(len(after_s), bool)])
+    return replace(w.take(index), t_s=np.concatenate([before_s, w.t_s, after_s]), observed=observed)
+
+
+def _free_places(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], t_s: Array) -> NDArray[np.bool_]:
+    """Return at which ticks (A, T) outside of their lives rays pass through the places of static agents."""
+    free = np.zeros((len(agents), len(t_s)), dtype=bool)
+    if not agents:
+        return free
+    first = [a.waypoints.take(slice(0, 1)) for a in agents]
+    center = np.array([(w.x_m[0], w.y_m[0], w.z_m[0]) for w in first])
+    yaw, size = np.array([w.yaw_rad[0] for w in first]), np.array([a.size_m for a in agents])
+    life = np.array([(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in agents])
+    for tick, cloud in enumerate(clouds):
+        if cloud is None or cloud.free is None or not len(cloud.free):
+            continue
+        outside = (t_s[tick] < life[:, 0]) | (t_s[tick] > life[:, 1])
+        near = np.hypot(*(center[:, :2] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M
+        rows = np.flatnonzero(outside & near)
+        if len(rows):
+            boxes = BoxTable(
+                np.ones((len(rows), 1), dtype=bool),
+                center[rows, None],
+                np.zeros((len(rows), 1, 2)),
+                yaw[rows, None],
+                size[rows],
+            )
+            inside, through, _ = count_at(boxes, 0, cloud.origin, cloud.free)[0]
+            free[rows, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
+    return free
+
+
+def _occupied(agent: Agent, others: Sequence[Agent], t_s: Array) -> NDArray[np.bool_]:
+    """Return at which times (T,) another agent is in the place of a static one."""
+    w, (length, width) = agent.waypoints, agent.size_m[:2]
+    place = np.array([w.x_m[0], w.y_m[0], length, width, w.yaw_rad[0]])
+    occupied = np.zeros(len(t_s), dtype=bool)
+    for other in others:
+        reach_m = (np.hypot(length, width) + np.hypot(*other.size_m[:2])) / 2
+        v = other.waypoints
+        if np.hypot(v.x_m - place[0], v.y_m - place[1]).min() > reach_m + np.hypot(np.ptp(v.x_m), np.ptp(v.y_m)):
+            continue
+        s = other.at(t_s)
+        rows = np.flatnonzero(s.valid & ~(np.hypot(s.x_m - place[0], s.y_m - place[1]) > reach_m))
+        if len(rows):
+            sides = (np.full(len(rows), side) for side in other.size_m[:2])
+            boxes = np.column_stack([s.x_m[rows], s.y_m[rows], *sides, s.yaw_rad[rows]])
+            occupied[rows] |= overlap_of_smaller(np.tile(place, (len(rows), 1)), boxes) > TOUCHING
+    return occupied

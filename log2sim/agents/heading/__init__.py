@@ -1,1 +1,0 @@
-"""Which end of a vehicle is its front."""

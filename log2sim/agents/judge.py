@@ -1,0 +1,217 @@
+"""The judge: of all candidates together, which are agents, and what speaks against each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from log2sim.agents.candidate import AgentCandidate, Support, confirm, name_agents
+from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
+from log2sim.agents.evidence import Recording, doubt_size, weigh
+from log2sim.agents.size import independent
+from log2sim.datatypes import GROUP_OF, Agent, Doubt
+from log2sim.geometry import Array, overlap_of_smaller
+
+# Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
+# by distance, since the boxes of two people who stand close together overlap.
+SHARED_AREA = 0.25
+# A person whose center is outside a vehicle's box is beside it, so that less than half of the person is inside.
+SHARED_AREA_OF_PERSON = 0.5
+SAME_PERSON_M = 0.35
+SAMPLES = 12
+
+
+def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
+    """Keep, of the candidates that overlap, the one with the most evidence, and none that overlaps the ego."""
+    taken = [ego] if ego is not None else []
+    extents = _Extents(taken)
+    kept: list[AgentCandidate] = []
+    for candidate in sorted(built, key=lambda b: -b.evidence):
+        if not any(_are_duplicates(candidate.agent, taken[k]) for k in extents.near(candidate.agent)):
+            kept.append(candidate)
+            taken.append(candidate.agent)
+            extents.add(candidate.agent)
+    return kept
+
+
+class _Extents:
+    """Extents in time and space of agents, by which most pairs are told apart at once."""
+
+    def __init__(self, agents: Sequence[Agent]) -> None:
+        self._rows: Array = np.zeros((max(len(agents), 64), 7))
+        self._count = 0
+        for agent in agents:
+            self.add(agent)
+
+    def add(self, agent: Agent) -> None:
+        """Add an agent."""
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._count] = self._row(agent)
+        self._count += 1
+
+    def near(self, agent: Agent) -> list[int]:
+        """Return the numbers of the agents that are there at the same time, and near enough for the boxes to touch."""
+        t0, t1, x0, x1, y0, y1, radius = self._row(agent)
+        rows = self._rows[: self._count].T
+        reach = rows[6] + radius
+        apart = (rows[0] > t1) | (rows[1] < t0)
+        apart |= (rows[2] - x1 > reach) | (x0 - rows[3] > reach) | (rows[4] - y1 > reach) | (y0 - rows[5] > reach)
+        return [int(k) for k in np.flatnonzero(~apart)]
+
+    @staticmethod
+    def _row(agent: Agent) -> tuple[float, ...]:
+        w = agent.waypoints
+        ends = (w.t_s[0], w.t_s[-1], w.x_m.min(), w.x_m.max(), w.y_m.min(), w.y_m.max())
+        return *map(float, ends), float(np.hypot(*agent.size_m[:2])) / 2
+
+
+def _are_duplicates(a: Agent, b: Agent) -> bool:
+    """Return whether two agents overlap for most of the time that they have in common."""
+    first, last = max(a.waypoints.t_s[0], b.waypoints.t_s[0]), min(a.waypoints.t_s[-1], b.waypoints.t_s[-1])
+    t = np.linspace(first, last, SAMPLES)
+    groups = {GROUP_OF[a.category], GROUP_OF[b.category]}
+    if groups == {"pedestrian"}:
+        p, q = a.at(t), b.at(t)
+        return bool(np.median(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m)) < SAME_PERSON_M)
+    if not _touch_long_enough(a, b, t):
+        return False
+    least = SHARED_AREA_OF_PERSON if groups == {"pedestrian", "vehicle"} else SHARED_AREA
+    return bool(np.median(_shared_areas(a, b, t)) > least)
+
+
+def _touch_long_enough(a: Agent, b: Agent, t_s: Array) -> bool:
+    """Return whether two agents are near enough for their boxes to touch at half of the times (T,); else they share 0 on the median."""
+    p, q = a.at(t_s), b.at(t_s)
+    reach_m = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
+    return bool(np.sum(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) <= reach_m) >= len(t_s) // 2)
+
+
+def _shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
+    """Return the overlap (T,) of two agents' boxes at times (T,) as a share of the smaller box; 0 where one is absent."""
+    rectangles = []
+    for agent in (a, b):
+        s = agent.at(t_s)
+        length, width = (np.full(len(t_s), v) for v in agent.size_m[:2])
+        rectangles.append(np.column_stack([s.x_m, s.y_m, length, width, s.yaw_rad]))
+    return overlap_of_smaller(*rectangles)
+
+
+# Share of the rays that pass through the solid part of labeled boxes in real logs and of exact ones in synthetic ones: below
+# 0.2 for vehicles; people and bicycles have gaps, below 0.6.
+MAX_THROUGH_SHARE = {"vehicle": 0.35}
+MAX_THROUGH_SHARE_WITH_GAPS = 0.8
+# From here on nothing is there; below, something may be that is smaller than the box or beside it.
+EMPTY_SHARE = 0.8
+# Fewer rays, or those of fewer ticks, may all have gone through a window or past a corner.
+MIN_RAYS, MIN_EMPTY_TICKS = 20, 3
+# A surface counts that is there at more than this share of the searched ticks.
+MOSTLY = 0.5
+# Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken
+# to find one that is there: no detector finds all.
+FALSE_RATE = 0.05
+MAX_USUAL_RATE = 0.9
+# Fewer ticks tell no rate.
+MIN_SHOWN_TICKS = 8
+# Nats against a vehicle by a surface that goes on beyond it: one in ten labeled ones stands that close to something.
+BESIDE_STRUCTURE_NATS = 2.3
+# The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5 is three standard deviations low. Then the
+# points are not those of what the image shows, but of something nearer that hides it.
+MIN_IMAGE_HEIGHT_SHARE = 0.5
+# Odds of 20 to 1 against a candidate.
+REFUTED_NATS = 3.0
+
+
+def usual_detection_rate(candidates: Sequence[AgentCandidate]) -> float:
+    """Return the share of the ticks at which a searched image shows a candidate well and it is detected, over all of them."""
+    supports = [c.support for c in candidates if c.support is not None]
+    shown = sum(s.shown_ticks for s in supports)
+    return sum(s.detected_ticks for s in supports) / shown if shown else 0.0
+
+
+def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
+    """Return whether the sensors show that a candidate is not there, or show something else in its place.
+
+    Parameters
+    ----------
+    usual_rate : float
+        Of `usual_detection_rate`.
+    """
+    s = candidate.support
+    if s is None:
+        return False
+    if s.image_height_share is not None and s.image_height_share < MIN_IMAGE_HEIGHT_SHARE:
+        return True
+    if s.unreached or s.in_structure > MOSTLY or _through_more_than(EMPTY_SHARE, s):
+        return True
+    beside = BESIDE_STRUCTURE_NATS if s.beside_structure > MOSTLY else 0.0
+    return missing_nats(s, usual_rate) + beside > REFUTED_NATS
+
+
+def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Doubt]:
+    """Doubt a candidate through which rays pass, that has no points, or that is seldom detected where it is well seen."""
+    s, doubts = candidate.support, []
+    if s is None:
+        return []
+    if _through_more_than(MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS), s):
+        doubts.append(Doubt("empty", f"{s.through_share:.0%} of the LiDAR's rays pass through its place"))
+    if s.pointless:
+        doubts.append(Doubt("hardly_observed", "the LiDAR looks toward it and has no point of it"))
+    if missing_nats(s, usual_rate) > 0:
+        doubts.append(
+            Doubt("hardly_observed", f"is detected at {s.detected_ticks} of {s.shown_ticks} ticks that show it well")
+        )
+    elif missing_nats(replace(s, detected_ticks=s.image_ticks), usual_rate) > REFUTED_NATS:
+        # Sweeps alone show it, and images next to them hardly ever do.
+        doubts.append(
+            Doubt(
+                "hardly_observed",
+                f"is detected in images at {s.image_ticks} of {s.shown_ticks} ticks that show it well",
+            )
+        )
+    return doubts
+
+
+def missing_nats(s: Support, usual_rate: float) -> float:
+    """Return the evidence against an agent, in nats, by the share of the ticks that show it well at which it is detected.
+
+    Notes
+    -----
+    The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, nothing at `FALSE_RATE`.
+    Successive images err alike, which is why they count as few independent ones.
+    """
+    usual = min(usual_rate, MAX_USUAL_RATE)
+    if s.shown_ticks < MIN_SHOWN_TICKS or usual <= FALSE_RATE:
+        return 0.0
+    rate = s.detected_ticks / s.shown_ticks
+    mean = rate * np.log(FALSE_RATE / usual) + (1 - rate) * np.log((1 - FALSE_RATE) / (1 - usual))
+    return float(mean) * independent(s.shown_ticks)
+
+
+def _through_more_than(limit: float, s: Support) -> bool:
+    """Return whether rays of several ticks, in sum enough to tell, pass through the place of an agent by more than a share."""
+    share, enough = s.through_share, s.inside + s.through >= MIN_RAYS and s.seen_ticks >= MIN_EMPTY_TICKS
+    return enough and share is not None and share > limit
+
+
+def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording) -> list[AgentCandidate]:
+    """Keep the candidates that are confirmed and can be true together, each named and with what speaks against it.
+
+    Parameters
+    ----------
+    candidates : sequence of AgentCandidate
+        Of all tracks.
+    ego : Agent, optional
+        At its place there is no other agent.
+    """
+    t_s = recording.t_s
+    weighed = weigh(confirm(candidates), recording)
+    usual_rate = usual_detection_rate(weighed)
+    apart = suppress_duplicates([c for c in weighed if not is_refuted(c, usual_rate)], ego)
+    apart = resolve_conflicts(apart, ego, t_s)
+    # A doubt may name another agent.
+    named = name_agents(apart)
+    conflicts = conflict_doubts(named, ego, t_s)
+    return [c.doubted([*contradict(c, usual_rate), *doubt_size(c.agent), *found]) for c, found in zip(named, conflicts)]

@@ -1,1 +1,0 @@
-"""Offsets of clocks and rotations of mounts, estimated from a log, and their correction."""

@@ -1,0 +1,446 @@
+"""What is observed at one tick: boxes, measurements, obstacles, rays, and tracks of them over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes.log import Deferred, seen_from
+from log2sim.files.arrays import ArrayFile, ArrayList, join_arrays, take_arrays
+from log2sim.files.documents import short_repr
+from log2sim.geometry import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes3D:
+    """Boxes of M road users, map frame.
+
+    Attributes
+    ----------
+    t_ns : (M,) int64
+        Time of the points in each box, absolute.
+    center_m : (M, 3) float64
+        Box centers, m.
+    size_m : (M, 3) float64
+        Length, width, height, m.
+    yaw_rad : (M,) float64
+        Heading, counter-clockwise from the map's x axis.
+    heading_score : (M,) float64
+        Probability in [0.5, 1] that front and back are not swapped.
+    category : (M,) str
+    score : (M,) float64
+        Calibrated probability in [0, 1] that the box is right.
+    points : (M,) int64
+        Number of points in the box.
+    seen_by : (M, 2) bool, optional
+        Which of the `ENDS` found it; None where their clouds were searched as one.
+    """
+
+    __repr__ = short_repr
+
+    t_ns: NDArray[np.int64]
+    center_m: Array
+    size_m: Array
+    yaw_rad: Array
+    heading_score: Array
+    category: NDArray[np.str_]
+    score: Array
+    points: NDArray[np.int64]
+    seen_by: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.t_ns)
+
+    def take(self, index: Any) -> Self:
+        """Take the boxes at `index`, integers or a mask."""
+        columns: dict[str, Any] = {k: None if v is None else v[index] for k, v in vars(self).items()}
+        return type(self)(**columns)
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return no boxes."""
+        text = np.zeros(0, dtype="<U16")
+        flat = np.zeros(0)
+        return cls(
+            np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), flat, flat, text, flat, np.zeros(0, np.int64)
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[Boxes3D]) -> Boxes3D:
+        """Concatenate several sets; an empty sequence gives no boxes. Who found them is known if it is of all."""
+        if not parts:
+            return cls.empty()
+        columns: dict[str, Any] = {}
+        for name in vars(parts[0]):
+            values = [getattr(p, name) for p in parts]
+            columns[name] = None if any(v is None for v in values) else np.concatenate(values)
+        return cls(**columns)
+
+
+TUPLES = ("cluster", "others")
+"""Columns of measurements that are no arrays."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """2D boxes of one camera frame.
+
+    Attributes
+    ----------
+    box_px : (M, 4) float64
+        u0, v0, u1, v1.
+    score : (M,) float64
+        In [0, 1].
+    category : (M,) str
+    traffic_lights : (K, 5) float64
+        Boxes u0, v0, u1, v1 and scores of traffic lights in the frame, which are no road users.
+    """
+
+    __repr__ = short_repr
+
+    box_px: Array
+    score: Array
+    category: NDArray[np.str_]
+    traffic_lights: Array = field(default_factory=lambda: np.zeros((0, 5)))
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.box_px)
+
+    @classmethod
+    def empty(cls) -> Detections:
+        """Return detections without rows."""
+        return cls(np.zeros((0, 4)), np.zeros(0), np.zeros(0, dtype="<U16"))
+
+    def take(self, index: Any) -> Detections:
+        """Take the rows at `index`, integers or a mask; of traffic lights none."""
+        return Detections(self.box_px[index], self.score[index], self.category[index])
+
+
+@dataclass(frozen=True, eq=False)
+class OtherView:
+    """What a second LiDAR, far from the first, shows of an object at the same tick.
+
+    Attributes
+    ----------
+    sensor_m : (3,) float64
+        Viewpoint, m, map frame.
+    ends_visible : (2,) bool
+        Whether the right and the left end of the points, as seen from there, are ends of the object.
+    cluster : (n, 4) float64
+        These points, subsampled: x, y, z in m, and the time after `t_ns` of the row in s.
+    """
+
+    sensor_m: Array
+    ends_visible: NDArray[np.bool_]
+    cluster: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BoxEvidence:
+    """What cameras and LiDARs observed of each object, map frame; nothing unobserved is completed but by a 3D detector.
+
+    Attributes
+    ----------
+    t_ns : (M,) int64
+        Mean time of the object's LiDAR points, else the stamp of the camera frame.
+    category : (M,) str
+    score : (M,) float64
+        Of the detector, in [0, 1].
+    camera : (M,) str
+        "" for an object that no camera detected.
+    box_px : (M, 4) float64
+        u0, v0, u1, v1; NaN without camera.
+    truncated : (M,) bool
+        Whether the image border cuts the box.
+    height_px_m : (M,) float64
+        Height in m that the image box spans at the object's depth, or above where a homography places its foot; NaN where
+        neither is known.
+    points : (M,) int64
+        Number of LiDAR points on the object.
+    cluster : M arrays (n, 4) or (n, 3) float64
+        These points, subsampled: x, y, z in m, and where it is known the time after `t_ns` in s at which each was measured.
+    sensor_m : (M, 3) float64
+        Viewpoint.
+    yaw_rad : (M,) float64
+        Direction of the object's length up to half turns, for short sides up to quarter turns; NaN without points.
+    low_m, high_m : (M, 2) float64
+        Ends of the points along the length and the width axis, relative to the viewpoint; NaN without points.
+    ends_visible : (M, 2) bool
+        Whether the right and the left end of the points, as seen from the viewpoint, are ends of the object.
+    bottom_m, top_m : (M,) float64
+        Heights of the ground under the object and of its highest points; NaN where unknown.
+    box_center_m : (M, 3) float64
+        Center of the box that a detector found in the LiDAR's sweep, m; NaN without one, as in the next three.
+    box_size_m : (M, 3) float64
+        Its length, width, height, m.
+    box_yaw_rad : (M,) float64
+        Its heading.
+    heading_score : (M,) float64
+        Probability in [0.5, 1] that its front and back are not swapped.
+    seen_by : (M, 2) bool
+        Which of the `ENDS` measured it.
+    others : M OtherView or None
+        What a second viewpoint shows, None for rows without; empty where no row has one.
+    """
+
+    __repr__ = short_repr
+
+    t_ns: NDArray[np.int64]
+    category: NDArray[np.str_]
+    score: Array
+    camera: NDArray[np.str_]
+    box_px: Array
+    truncated: NDArray[np.bool_]
+    height_px_m: Array
+    points: NDArray[np.int64]
+    cluster: Sequence[NDArray[np.float64]]
+    sensor_m: Array
+    yaw_rad: Array
+    low_m: Array
+    high_m: Array
+    ends_visible: NDArray[np.bool_]
+    bottom_m: Array
+    top_m: Array
+    box_center_m: Array
+    box_size_m: Array
+    box_yaw_rad: Array
+    heading_score: Array
+    seen_by: NDArray[np.bool_]
+    others: tuple[OtherView | None, ...] = field(default=(), kw_only=True)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.t_ns)
+
+    def views_of(self, rows: NDArray[np.signedinteger[Any]]) -> list[tuple[int, OtherView]]:
+        """List the viewpoints of rows (n,), first their own in their order, then the others: the row, and what is seen from there."""
+        own = [(int(k), OtherView(self.sensor_m[k], self.ends_visible[k], self.cluster[k])) for k in rows]
+        return own + [(int(k), view) for k in rows if self.others and (view := self.others[k]) is not None]
+
+    def points_of(self, k: int) -> NDArray[np.float64]:
+        """Return the places (n, 3) of the points of a row from all viewpoints."""
+        view = self.others[k] if self.others else None
+        own = self.cluster[k][:, :3]
+        return own if view is None else np.concatenate([own, view.cluster[:, :3]])
+
+    def take(self, index: Any) -> Self:
+        """Take the rows at `index`, integers or a mask."""
+        rows = np.arange(len(self))[index]
+        columns = {k: v[rows] for k, v in vars(self).items() if k not in TUPLES}
+        others = tuple(self.others[i] for i in rows) if self.others else ()
+        return type(self)(**columns, cluster=take_arrays(self.cluster, rows.tolist()), others=others)
+
+    def stored(self, file: ArrayFile) -> Self:
+        """Return the same rows with their points in the keeping of a file."""
+        return replace(self, cluster=ArrayList(file.keep(points) for points in self.cluster))
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements(BoxEvidence):
+    """Evidence for the objects of one tick with a provisional position of each, for gating and tracking.
+
+    Attributes
+    ----------
+    center_m : (M, 3) float64
+        Box center, m, NaN without a position. It assumes the typical size of the category where no end was observed; the
+        final size and positions are estimated from the evidence of a whole track.
+    covariance : (M, 2, 2) float64
+        Of the center's x, y, m2.
+    source : (M,) str
+        "lidar", "topdown", or "" without a position.
+    """
+
+    __repr__ = short_repr
+
+    center_m: Array
+    covariance: Array
+    source: NDArray[np.str_]
+
+    @classmethod
+    def join(cls, parts: Sequence[Measurements]) -> Measurements:
+        """Concatenate several sets; an empty sequence gives an empty set."""
+        if not parts:
+            return cls.empty()
+        columns = {k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0]) if k not in TUPLES}
+        others = tuple(v for p in parts for v in p.others or (None,) * len(p)) if any(p.others for p in parts) else ()
+        return cls(**columns, cluster=join_arrays(p.cluster for p in parts), others=others)
+
+    @classmethod
+    def empty(cls) -> Measurements:
+        """Return measurements without rows."""
+        return cls.unplaced(Detections.empty(), t_ns=0, camera="", sensor_m=np.zeros(3))
+
+    @classmethod
+    def of_boxes(cls, boxes: Boxes3D, sensor_m: Array) -> Measurements:
+        """Return a row for each box (M,) of a 3D detector, seen from a sensor (3,), without LiDAR points and position."""
+        found = Detections(np.full((len(boxes), 4), np.nan), boxes.score, boxes.category)
+        return replace(
+            cls.unplaced(found, t_ns=0, camera="", sensor_m=sensor_m),
+            t_ns=boxes.t_ns,
+            box_center_m=boxes.center_m,
+            box_size_m=boxes.size_m,
+            box_yaw_rad=boxes.yaw_rad,
+            heading_score=boxes.heading_score,
+        )
+
+    @classmethod
+    def unplaced(
+        cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array, end: str = ""
+    ) -> Measurements:
+        """Return a row a detection (M,) of a frame of a camera at an end, without LiDAR points and without a position."""
+        m = len(detections)
+        return cls(
+            t_ns=np.full(m, t_ns, dtype=np.int64),
+            category=detections.category,
+            score=detections.score,
+            camera=np.full(m, camera),
+            box_px=detections.box_px,
+            truncated=np.zeros(m, dtype=bool),
+            height_px_m=np.full(m, np.nan),
+            points=np.zeros(m, dtype=np.int64),
+            cluster=tuple(np.zeros((0, 3)) for _ in range(m)),
+            sensor_m=np.tile(sensor_m, (m, 1)),
+            yaw_rad=np.full(m, np.nan),
+            low_m=np.full((m, 2), np.nan),
+            high_m=np.full((m, 2), np.nan),
+            ends_visible=np.zeros((m, 2), dtype=bool),
+            bottom_m=np.full(m, np.nan),
+            top_m=np.full(m, np.nan),
+            box_center_m=np.full((m, 3), np.nan),
+            box_size_m=np.full((m, 3), np.nan),
+            box_yaw_rad=np.full(m, np.nan),
+            heading_score=np.full(m, np.nan),
+            seen_by=seen_from(end, m),
+            center_m=np.full((m, 3), np.nan),
+            covariance=np.full((m, 2, 2), np.nan),
+            source=np.full(m, "", dtype="<U16"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """A sample of the rays of one tick that ended on the ground or on an obstacle, evenly spread over directions.
+
+    Positions are in m, map axes, relative to the origin of the cloud.
+
+    Attributes
+    ----------
+    end : (K, 3) float32
+        The points that they hit.
+    t_s : (K,) float32
+        Times relative to the stamp of the cloud.
+    sensor : (K,) uint8
+        Number of the LiDAR.
+    position : (S, 3) float32
+        Of the LiDARs at the stamp of the cloud.
+    velocity_mps : (S, 3) float32
+        Of the LiDARs.
+    """
+
+    end: NDArray[np.float32]
+    t_s: NDArray[np.float32]
+    sensor: NDArray[np.uint8]
+    position: NDArray[np.float32]
+    velocity_mps: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Return the number of rays."""
+        return len(self.end)
+
+    @property
+    def start(self) -> NDArray[np.float32]:
+        """Where their LiDARs were (K, 3) when they sent them."""
+        return np.asarray(self.position[self.sensor] + self.velocity_mps[self.sensor] * self.t_s[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """Points above the ground at one tick, one a voxel; points and rays may be given as functions that read them.
+
+    Attributes
+    ----------
+    origin : (3,) float64
+        m, map frame.
+    xyz : (N, 3) float32
+        m, map axes, relative to `origin`.
+    t_s : (N,) float32
+        Times relative to `stamp_ns`.
+    sensor : (3,) float32
+        Position of the sensor relative to `origin`, mean over several; of viewpoints far from each other the first.
+    free : Rays, optional
+        A sample of all rays, those that end on the ground too: where they passed is nothing.
+    viewpoints : (V, 3) float32, optional
+        Positions of LiDARs far from each other relative to `origin`; None where all points are seen from `sensor`.
+    seen_from : (N,) uint8, optional
+        The viewpoint of each point.
+    """
+
+    stamp_ns: int
+    origin: Array
+    xyz: Deferred[NDArray[np.float32]] = Deferred()  # a descriptor
+    t_s: Deferred[NDArray[np.float32]] = Deferred()  # a descriptor
+    sensor: NDArray[np.float32]  # type: ignore[misc]  # those before it are descriptors, they have no default
+    free: Deferred[Rays | None] = Deferred(None)  # a descriptor
+    viewpoints: NDArray[np.float32] | None = None
+    seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # a descriptor
+
+    def sensor_of(self, index: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Return the position (3,) of the sensor that sees most of the points at `index`."""
+        if self.viewpoints is None or self.seen_from is None or not len(index):
+            return self.sensor
+        return np.asarray(self.viewpoints[np.bincount(self.seen_from[index]).argmax()])
+
+    @cached_property
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Azimuth (N,) rad in the map frame, horizontal distance (N,) m and slope (N,) of every point from the sensor."""
+        x, y, z = (self.xyz - self.sensor).T
+        reach = np.hypot(x, y)
+        return np.arctan2(y, x), reach, z / np.maximum(reach, np.float32(1e-3))
+
+    def near(self, xy: Array, reach_m: float) -> NDArray[np.intp]:
+        """Return the indices (n,), rising, of the points in the square of `reach_m` to all four sides of a place (2,), map frame."""
+        x, y = (xy - self.origin[:2]).astype(np.float32)
+        near = np.flatnonzero(np.abs(self._x - x) <= reach_m)
+        return np.asarray(near[np.abs(self.xyz[near, 1] - y) <= reach_m], dtype=np.intp)
+
+    @cached_property
+    def _x(self) -> NDArray[np.float32]:
+        """The x of all points (N,) side by side, which many places are compared with."""
+        return np.ascontiguousarray(self.xyz[:, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One object over time.
+
+    Attributes
+    ----------
+    tick : (n,) int64
+        Strictly increasing indices of ticks.
+    measurements : Measurements
+        n rows, one at each of these ticks.
+    unrecorded : (U,) int64
+        Increasing indices of ticks at which no sensor that measured it recorded anything: that it was not measured there says
+        nothing.
+    searched : float
+        Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone.
+    """
+
+    __repr__ = short_repr
+
+    category: str
+    tick: NDArray[np.int64]
+    measurements: Measurements
+    unrecorded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    searched: float = 1.0
+
+    def __len__(self) -> int:
+        """Return the number of measurements."""
+        return len(self.tick)

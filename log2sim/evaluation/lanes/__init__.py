@@ -1,1 +1,0 @@
-"""Compares markings, borders, lanes, colors and traffic lights with the truth."""

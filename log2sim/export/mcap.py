@@ -1,0 +1,68 @@
+"""Export to MCAP files with Foxglove's messages, for Foxglove, Lichtblick and Rerun."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from log2sim.datatypes import Scenario, why_doubtful
+from log2sim.errors import MissingExtra, ScenarioError
+from log2sim.export.exporters import Options, file_name, near_origin
+from log2sim.export.viewers import agent_steps, viewer_records
+
+if TYPE_CHECKING:
+    from log2sim.export.viewers import Message
+
+
+class Mcap:
+    """`<name>.mcap`: `/agents`, `/paths`, `/tf`, and with a log `/camera/<name>/...` and `/lidar/<name>`.
+
+    Times are those of the log, to the nanosecond. The metadata record "log2sim" holds the offset of the positions and
+    why agents are doubtful.
+    """
+
+    options: tuple[str, ...] = ("log",)
+    loses = (
+        "uncertainty and observed flags, times between steps of 0.1 s, colors (boxes are colored by category), stages; of a "
+        "log: full resolution of pictures wider than 960 px, and points beyond 10,000 a sweep"
+    )
+
+    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the file."""
+        try:
+            from mcap_protobuf.writer import Writer
+
+            from log2sim.export import viewers
+        except ImportError:
+            raise MissingExtra("export to MCAP", "mcap") from None
+        steps = agent_steps(scenario)
+        if steps.t_ns[0] < 0:
+            raise ScenarioError(f"scenario '{scenario.name}' starts before 1970, which MCAP has no stamps for")
+        placement = near_origin(scenario)
+        origin = np.array(placement.origin_m)
+        parts: list[Iterable[Message]] = [viewers.scene_messages(steps, origin)]
+        if options.log is not None:
+            parts.append(
+                m for record in viewer_records(scenario, options.log) for m in viewers.record_messages(record, origin)
+            )
+        with (folder / f"{file_name(scenario.name)}.mcap").open("wb") as file, Writer(file) as writer:
+            writer.add_metadata("log2sim", dict(_about(scenario, placement.origin_m)))
+            for t_ns, topic, message in heapq.merge(*parts, key=lambda m: m[0]):
+                writer.write_message(topic, message, log_time=t_ns, publish_time=t_ns)
+
+
+def _about(scenario: Scenario, origin_m: tuple[float, float, float]) -> Iterator[tuple[str, str]]:
+    """Describe the map frame of the file, as text."""
+    yield "scenario", scenario.name
+    yield "position_offset_m", json.dumps(origin_m)
+    yield "doubtful", json.dumps({a.id: why_doubtful(a) for a in scenario.doubtful})
+    yield from ((f"map.{key}", json.dumps(value)) for key, value in asdict(scenario.map).items())
+
+
+EXPORTER = Mcap()

@@ -1,1 +1,0 @@
-"""Export to viewers: Foxglove's messages and Rerun's recordings."""

@@ -1,0 +1,146 @@
+"""Arrays that wait in a temporary file instead of in memory, so that a long log takes no more of it than a short one."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import weakref
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Arrays of short logs never leave the memory.
+MEMORY_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StoredArray:
+    """An array in the file of an `ArrayFile`.
+
+    Attributes
+    ----------
+    offset : int
+        Of its first byte.
+    dtype : dtype
+    """
+
+    file: ArrayFile
+    offset: int
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    def read(self) -> NDArray[Any]:
+        """Read the array, a new one each time, which cannot be written to."""
+        return self.file.read(self)
+
+
+class ArrayFile:
+    """Keep arrays: the first ones in memory, and those beyond `memory_bytes` in a file; safe to share between threads.
+
+    The file has no name, and the system removes it when the process ends in whatever way. It lies in the folder of temporary
+    files, which the environment variable TMPDIR names.
+
+    Attributes
+    ----------
+    memory_bytes : int
+        Of the arrays that stay in memory.
+    """
+
+    def __init__(self, memory_bytes: int | None = None) -> None:
+        self.memory_bytes = MEMORY_BYTES if memory_bytes is None else memory_bytes
+        self._kept = 0
+        self._size = 0
+        self._file: BinaryIO | None = None
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return an empty one for other processes; an `ArrayList` takes its arrays along."""
+        return ArrayFile, (self.memory_bytes,)
+
+    def keep(self, array: NDArray[Any]) -> NDArray[Any] | StoredArray:
+        """Return the array itself while there is room for it in memory, else what reads it from the file.
+
+        Raises
+        ------
+        OSError
+            Where the folder of temporary files has no room.
+        """
+        with self._lock:
+            if self._kept + array.nbytes <= self.memory_bytes or not array.nbytes:
+                self._kept += array.nbytes
+                return array
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="log2sim-", buffering=0)  # noqa: SIM115  # closed with this
+                weakref.finalize(self, self._file.close)
+            offset = self._size
+            data = np.ascontiguousarray(array).data.cast("B")
+            while len(data):
+                written = os.pwrite(self._file.fileno(), data, self._size)
+                data, self._size = data[written:], self._size + written
+        return StoredArray(self, offset, array.shape, array.dtype)
+
+    def read(self, stored: StoredArray) -> NDArray[Any]:
+        """Read an array of this file."""
+        assert self._file is not None
+        size = stored.dtype.itemsize * int(np.prod(stored.shape))
+        data = b""
+        while len(data) < size:
+            more = os.pread(self._file.fileno(), size - len(data), stored.offset + len(data))
+            if not more:
+                raise OSError("a temporary file of log2sim is shorter than it was written")
+            data = data + more if data else more
+        return np.frombuffer(data, stored.dtype).reshape(stored.shape)
+
+
+class ArrayList(Sequence[NDArray[Any]]):
+    """Arrays of which some are in a file; each is read when it is asked for, and not kept.
+
+    Parameters
+    ----------
+    items : sequence of arrays and `StoredArray`
+    """
+
+    __slots__ = ("items",)
+
+    def __init__(self, items: Iterable[NDArray[Any] | StoredArray]) -> None:
+        self.items = tuple(items)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return a copy for other processes that holds the arrays themselves."""
+        return ArrayList, (tuple(self),)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.items)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return one array, or an `ArrayList` of those of a slice."""
+        if isinstance(index, slice):
+            return ArrayList(self.items[index])
+        item = self.items[index]
+        return item.read() if isinstance(item, StoredArray) else item
+
+
+def take_arrays(arrays: Sequence[NDArray[Any]], rows: Iterable[int]) -> Sequence[NDArray[Any]]:
+    """Return some of several arrays, without reading those that are in a file."""
+    if isinstance(arrays, ArrayList):
+        return ArrayList(arrays.items[k] for k in rows)
+    return tuple(arrays[k] for k in rows)
+
+
+def array_lengths(arrays: Sequence[NDArray[Any]]) -> list[int]:
+    """Return how many rows each of several arrays has, without reading those that are in a file."""
+    items = arrays.items if isinstance(arrays, ArrayList) else arrays
+    return [item.shape[0] for item in items]
+
+
+def join_arrays(parts: Iterable[Sequence[NDArray[Any]]]) -> Sequence[NDArray[Any]]:
+    """Return the arrays of several sequences in one, without reading those that are in a file."""
+    parts = list(parts)
+    if any(isinstance(part, ArrayList) for part in parts):
+        return ArrayList(item for part in parts for item in (part.items if isinstance(part, ArrayList) else part))
+    return tuple(array for part in parts for array in part)

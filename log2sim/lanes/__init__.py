@@ -1,1 +1,0 @@
-"""Markings, borders of roads, and lanes."""

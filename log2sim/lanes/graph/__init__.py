@@ -1,1 +1,0 @@
-"""Lanes between markings and along paths, linked to each other."""

@@ -1,0 +1,506 @@
+"""Mounts of cameras, checked against a LiDAR and the motion of the ego.
+
+An error of some degrees, or of the poses, hardly shows in the direction of the motion; the mount of another camera does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import Config
+from log2sim.datatypes import Fault, Log, Treatment
+from log2sim.geometry import NS_PER_S, Array, Camera, inverse, rotation_from_rpy, transform, undistort
+from log2sim.localization.camera_motion import FollowSettings, follow_points
+from log2sim.localization.choice import during_ns
+from log2sim.localization.clocks import check_lidars, turn_mount
+from log2sim.localization.edges import (
+    REACH_RAD,
+    EdgeView,
+    EdgeViews,
+    YawEstimate,
+    choose_moments,
+    estimate_yaw,
+    is_near,
+    read_gray,
+    score_angles,
+)
+from log2sim.localization.odometry import densest_lidar
+from log2sim.plan import LABELS, Sensors
+
+MAX_PAIRS, MIN_PAIRS = 6, 3
+# The ego moves so far between two frames: errors of its poses are small against it, and a post is not taken for the next one.
+MIN_APART_M, MAX_APART_M, MAX_APART_S = 0.5, 1.5, 1.0
+MAX_CORNERS, CORNER_QUALITY, SPACING_PX, WINDOW_PX, LEVELS = 300, 0.01, 9, 21, 4
+# Slower motions are of what is far away or moves along, or of errors of the rotation.
+MIN_FLOW_RAD, MIN_MOVING = 0.01, 20
+# With the own mount the cosine is 0.99 or more. Vehicles that overtake move against it, but not in all cameras.
+MIN_AGREEMENT, MAX_DISAGREEMENT = 0.9, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class FlowPair:
+    """Points followed from one frame to another.
+
+    Attributes
+    ----------
+    first, second : (N, 3) float64
+        Rays of unit length, cam frame.
+    second_T_first : (4, 4) float64
+        The motion of the ego: from its frame at the first frame to that at the second.
+    """
+
+    first: Array
+    second: Array
+    second_T_first: Array
+
+
+def follow_pairs(log: Log, name: str, during_ns: tuple[int, int] | None) -> list[FlowPair]:
+    """Follow points in pairs of frames of a camera on the ego, spread over the log; none where the ego stands."""
+    camera, stream, ego = log.cameras[name], log.streams[name], log.ego
+    if ego is None or camera.mount != "ego":
+        return []
+    pairs = []
+    for first, second in _choose_pairs(log, stream.t_ns, during_ns):
+        images = [read_gray(stream, row, camera) for row in (first, second)]
+        if images[0] is None or images[1] is None:
+            continue
+        rays = _follow(camera, images[0], images[1])
+        poses, _ = ego.at(stream.t_ns[[first, second]])
+        pairs.append(FlowPair(rays[0], rays[1], inverse(poses[1]) @ poses[0]))
+    return pairs
+
+
+def flow_agreement(camera: Camera, pairs: Sequence[FlowPair]) -> float | None:
+    """Compute how well points move as they should: median cosine of the angle to the direction in which what stands moves.
+
+    Over the pairs with enough points that move; None with too few such pairs.
+    """
+    mount_R_cam, position = camera.mount_T_cam[:3, :3], camera.mount_T_cam[:3, 3]
+    medians = []
+    for pair in pairs:
+        turn, shift = pair.second_T_first[:3, :3], pair.second_T_first[:3, 3]
+        # In the axes of the ego, the points move by this against the camera.
+        moved = turn @ position + shift - position
+        before, after = pair.first @ (turn @ mount_R_cam).T, pair.second @ mount_R_cam.T
+        flow, expected = after - before, moved - (before @ moved)[:, None] * before
+        size, expected_size = np.linalg.norm(flow, axis=1), np.linalg.norm(expected, axis=1)
+        moves = (size > MIN_FLOW_RAD) & (expected_size > 0)
+        if moves.sum() >= MIN_MOVING:
+            cosine = (flow[moves] * expected[moves]).sum(axis=1) / (size[moves] * expected_size[moves])
+            medians.append(float(np.median(cosine)))
+    return float(np.median(medians)) if len(medians) >= MIN_PAIRS else None
+
+
+def find_exchanged(cameras: Mapping[str, Camera], pairs: Mapping[str, Sequence[FlowPair]]) -> dict[str, str]:
+    """Find cameras in whose images points move against their own mounts, but as the mount of the other says in both.
+
+    Parameters
+    ----------
+    pairs : mapping of str to sequence of FlowPair
+        By camera, of those that may be exchanged.
+
+    Returns
+    -------
+    dict of str to str
+        The other camera, by camera.
+    """
+    own = {name: flow_agreement(cameras[name], pairs[name]) for name in pairs}
+    against = [name for name, cosine in own.items() if cosine is not None and cosine < MAX_DISAGREEMENT]
+    fits: dict[str, set[str]] = {}
+    for name in against:
+        mounts = {other: replace(cameras[name], mount_T_cam=cameras[other].mount_T_cam) for other in against}
+        agreed = {other: flow_agreement(camera, pairs[name]) for other, camera in mounts.items() if other != name}
+        fits[name] = {other for other, cosine in agreed.items() if cosine is not None and cosine > MIN_AGREEMENT}
+    both = {name: [other for other in fits[name] if name in fits[other]] for name in against}
+    return {name: others[0] for name, others in both.items() if len(others) == 1}
+
+
+def agrees(camera: Camera, pairs: Sequence[FlowPair]) -> bool:
+    """Return whether points move in the images of a camera as its mount says."""
+    cosine = flow_agreement(camera, pairs)
+    return cosine is not None and cosine > MIN_AGREEMENT
+
+
+def _choose_pairs(log: Log, t_ns: NDArray[np.int64], during_ns: tuple[int, int] | None) -> list[tuple[int, int]]:
+    """Choose up to `MAX_PAIRS` pairs of rows between which the ego moves by about `MIN_APART_M`."""
+    assert log.ego is not None
+    poses, known = log.ego.at(t_ns) if len(t_ns) else (np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
+    if during_ns is not None:
+        known &= (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+    rows = np.flatnonzero(known)
+    if len(rows) < 2:
+        return []
+    place = poses[rows, :3, 3]
+    path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
+    later = np.searchsorted(path_m, path_m + MIN_APART_M)
+    first = np.flatnonzero(later < len(rows))
+    second = later[first]
+    apart_s = (t_ns[rows[second]] - t_ns[rows[first]]) / NS_PER_S
+    near = (path_m[second] - path_m[first] < MAX_APART_M) & (apart_s < MAX_APART_S)
+    first, second = first[near], second[near]
+    if not len(first):
+        return []
+    chosen = np.unique(np.floor((np.arange(MAX_PAIRS) + 0.5) / MAX_PAIRS * len(first)).astype(np.int64))
+    return [(int(rows[first[k]]), int(rows[second[k]])) for k in chosen]
+
+
+def _follow(camera: Camera, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Follow corners from one image to another: rays (N, 3), (N, 3) of unit length."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(first, MAX_CORNERS, CORNER_QUALITY, SPACING_PX)
+    followed = follow_points(first, second, corners, FollowSettings(WINDOW_PX, LEVELS))
+    scale = first.shape[1] / camera.width_px
+    xy = [undistort(camera, (px + 0.5) / scale - 0.5) for px in followed]
+    usable = np.isfinite(xy[0]).all(axis=1) & np.isfinite(xy[1]).all(axis=1)
+    rays = [np.column_stack([side[usable], np.ones(int(usable.sum()))]) for side in xy]
+    unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in rays]
+    return unit[0], unit[1]
+
+
+# What may be left of the yaw with the mount of another camera.
+MAX_LEFT_RAD = np.deg2rad(1.5)
+# A camera that is turned far is looked at again from there, so that the whole range of angles lies around it.
+MAX_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class MountCheck:
+    """What the mounts of a log are checked with, and what came of it.
+
+    Attributes
+    ----------
+    lidar : str
+        "" without one to check against.
+    views : mapping of str to list of EdgeView
+        By camera, of those beside the LiDAR.
+    yaws : mapping of str to YawEstimate or None
+        By camera, with its own mount; None where it is not known.
+    """
+
+    log: Log
+    lidar: str
+    views: Mapping[str, list[EdgeView]]
+    yaws: Mapping[str, YawEstimate | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Mistake:
+    """A mount that fits the images of a camera where its own does not.
+
+    Attributes
+    ----------
+    kind : str
+        Of the fault.
+    words : str
+        What is wrong, with a place for the LiDAR.
+    mount_T_cam : (4, 4) float64
+        What fits.
+    other : str
+        The camera whose mount it is; "" for none.
+    certain : bool
+        Whether the run rather goes on without the camera.
+    """
+
+    kind: str
+    words: str
+    mount_T_cam: Array
+    other: str = ""
+    certain: bool = True
+
+
+def estimate_mount_yaw(camera: Camera, views: list[EdgeView]) -> YawEstimate | None:
+    """Estimate the yaw that the mount of a camera lacks."""
+    turned_rad = 0.0
+    for _ in range(MAX_ROUNDS):
+        turned = replace(camera, mount_T_cam=turn_by(camera.mount_T_cam, turned_rad))
+        found = estimate_yaw([score_angles(turned, view) for view in views])
+        if found is None:
+            return None
+        turned_rad += found.yaw_rad
+        if abs(found.yaw_rad) < REACH_RAD / 2:
+            return replace(found, yaw_rad=turned_rad)
+    return None
+
+
+def find_mistakes(check: MountCheck, during_ns: tuple[int, int] | None) -> dict[str, Mistake]:
+    """Find the cameras of which the own mount does not fit while another one does, within some time."""
+    by_edges = _find_by_edges(check)
+    found = by_edges | _list_exchanged(check, by_edges)
+    return found | _find_by_flow(
+        check, [n for n, yaw in check.yaws.items() if yaw is None and n not in found], during_ns
+    )
+
+
+def _find_by_edges(check: MountCheck) -> dict[str, Mistake]:
+    """Find the cameras whose images edges fit with another mount: the one with the clearest edges."""
+    mistakes = {}
+    for name, yaw in check.yaws.items():
+        camera, best = check.log.cameras[name], 0.0
+        for mistake in _list_mistakes(check, name) if yaw is None and check.views.get(name) else ():
+            found = estimate_mount_yaw(replace(camera, mount_T_cam=mistake.mount_T_cam), check.views[name])
+            if found is not None and abs(found.yaw_rad) < MAX_LEFT_RAD and found.gain > best:
+                mistakes[name], best = mistake, found.gain
+    return mistakes
+
+
+def _list_exchanged(check: MountCheck, mistakes: Mapping[str, Mistake]) -> dict[str, Mistake]:
+    """List the cameras whose mount is another one's, though their own images do not show it: they get what that one had."""
+    return {
+        mistake.other: Mistake(
+            "swapped_cameras",
+            f"its mount is that of {name}, whose images fit edges of {{}} with it and not with their own",
+            check.log.cameras[name].mount_T_cam,
+            name,
+        )
+        for name, mistake in mistakes.items()
+        if mistake.other and mistake.other not in mistakes
+    }
+
+
+def _list_mistakes(check: MountCheck, name: str) -> list[Mistake]:
+    """List the mounts that a camera may have instead of its own: those of others that do not fit them either, and likely slips."""
+    cameras, own = check.log.cameras, check.log.cameras[name].mount_T_cam
+    others = [other for other, yaw in check.yaws.items() if other != name and yaw is None]
+    fits = "edges of {} fit its images with"
+    listed = [
+        Mistake(
+            "swapped_cameras",
+            f"sees {other}'s points: {fits} the mount of {other} and not with its own",
+            cameras[other].mount_T_cam,
+            other,
+        )
+        for other in others
+    ]
+    inverted = f"its mount in the calibration is inverted: {fits} the inverse and not as it is"
+    listed.append(Mistake("wrong_mount", inverted, inverse(own)))
+    for degrees in (90, 180, 270):
+        about_axis = transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(degrees)), np.zeros(3))
+        words = f"its images are turned by {degrees} degrees: {fits} its mount turned about the optical axis and not as it is"
+        listed.append(Mistake("wrong_mount", words, own @ about_axis))
+    return listed
+
+
+def _find_by_flow(check: MountCheck, names: Sequence[str], during_ns: tuple[int, int] | None) -> dict[str, Mistake]:
+    """Find cameras with each other's mounts among those that show no edges, by how points move in their images.
+
+    Only where some camera agrees with the motion of the ego, so that the poses are not those that are turned around.
+    """
+    if len(names) < 2:
+        return {}
+    log = check.log
+    pairs = {name: follow_pairs(log, name, during_ns) for name in names}
+    known = any(yaw is not None for yaw in check.yaws.values())
+    if not known and not any(agrees(log.cameras[name], pairs[name]) for name in names):
+        return {}
+    return {
+        name: Mistake(
+            "swapped_cameras",
+            f"sees {other}'s points: they move in its images as with the mount of {other} and against its own",
+            log.cameras[other].mount_T_cam,
+            other,
+            False,
+        )
+        for name, other in find_exchanged(log.cameras, pairs).items()
+    }
+
+
+def turn_by(mount_T_cam: Array, yaw_rad: float) -> Array:
+    """Turn a mount (4, 4) about the upright axis through the camera."""
+    return turn_mount(mount_T_cam, np.array([0.0, 0.0, yaw_rad]))
+
+
+# At 30 m this is 0.3 m, half the width of a pedestrian: LiDAR points leave the image boxes of their objects.
+MIN_TOLD_RAD = 0.01
+MIN_SIGMAS = 4.0
+# Up to half of that, a camera is sound whatever more frames say.
+SOUND_RAD = MIN_TOLD_RAD / 2
+FIX = "--fix-calibration"
+DONE: Mapping[Treatment, str] = {
+    "corrected": "corrected",
+    "left_out": f"the camera is not used, unless {FIX} corrects it",
+    "kept": f"not corrected, which {FIX} does",
+}
+NOT_SEEN = "the mount is not corrected: the edges that {} sees do not show whether it is turned"
+
+Progress = Callable[[str, int, int], None]
+
+
+def check_cameras(
+    log: Log, config: Config, sensors: Sensors, *, of_lidars: tuple[Fault, ...] = (), progress: Progress
+) -> tuple[Log, tuple[Fault, ...]]:
+    """Return the log, corrected where the settings ask for it, and what is wrong with its cameras.
+
+    Parameters
+    ----------
+    log : Log
+        With the poses and the LiDARs that the run uses.
+    config : Config
+        `calibration.fix_mounts`: whether mounts are corrected.
+    sensors : Sensors
+        Those that the run uses; others are not checked.
+    of_lidars : tuple of Fault
+        Of clocks and mounts of LiDARs. Cameras are not checked against a LiDAR with one that is not corrected.
+    progress : callable
+        Called as `progress(stage, done, total)`.
+
+    Notes
+    -----
+    No yaw is estimated of a camera with which no LiDAR is mounted, that shows no edges, or of which several angles fit
+    alike; and no image is read where boxes come from the log. Where all cameras are turned alike, it is the LiDAR that is.
+    """
+    if config.detect.in_images in ("", LABELS):
+        return log, ()
+    lidar = densest_lidar(sensors.restrict(log)) or ""
+    if any(fault.sensor == lidar and _is_wrong(fault) for fault in of_lidars):
+        lidar = ""
+    check = _look(log, lidar, config, sensors, progress)
+    fix = config.calibration.fix_mounts
+    mistakes = find_mistakes(check, during_ns(log, config))
+    mounts = {name: mistake.mount_T_cam for name, mistake in mistakes.items()}
+    treatments = _treat_mistakes(mistakes, config, sensors)
+    faults = [_fault_of_mistake(name, lidar, mistake, treatments[name]) for name, mistake in mistakes.items()]
+    off = {name: yaw for name, yaw in check.yaws.items() if yaw is not None and is_off(yaw)}
+    if turns_together(check.yaws):
+        faults.append(_fault_of_lidar(lidar, off, fix=fix))
+    else:
+        faults += [_fault_of_yaw(name, check, yaw, fix=fix) for name, yaw in off.items()]
+    mounts |= {name: turn_by(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
+    unknown = [name for name, yaw in check.yaws.items() if fix and lidar and yaw is None and name not in mistakes]
+    faults += [Fault("unknown_rotation", name, NOT_SEEN.format(lidar), "kept") for name in unknown]
+    return (with_mounts(log, mounts) if fix and mounts else log), tuple(faults)
+
+
+def _is_wrong(fault: Fault) -> bool:
+    """Return whether a LiDAR is used as it is though its clock or mount is off."""
+    return fault.treatment == "kept" and fault.kind in ("time_offset", "lidar_rotation")
+
+
+def _treat_mistakes(mistakes: Mapping[str, Mistake], config: Config, sensors: Sensors) -> dict[str, Treatment]:
+    """Decide what is done about cameras with wrong mounts; they are left out where the run can go on without them."""
+    certain = {name for name, mistake in mistakes.items() if mistake.certain}
+    dispensable = bool(set(sensors.cameras) - certain) and config.sync.reference not in certain
+    if config.calibration.fix_mounts:
+        return dict.fromkeys(mistakes, "corrected")
+    return {name: "left_out" if dispensable and name in certain else "kept" for name in mistakes}
+
+
+def is_off(yaw: YawEstimate) -> bool:
+    """Return whether a camera is turned significantly, and by so much that it matters."""
+    return abs(yaw.yaw_rad) > max(MIN_TOLD_RAD, MIN_SIGMAS * yaw.sigma_rad)
+
+
+def turns_together(yaws: Mapping[str, YawEstimate | None]) -> bool:
+    """Return whether several cameras are turned against the LiDAR, all by the same angle, so that it may be the LiDAR's."""
+    known = [yaw for yaw in yaws.values() if yaw is not None]
+    angles, sigmas = np.array([y.yaw_rad for y in known]), np.array([y.sigma_rad for y in known])
+    if len(known) < 2 or not all(is_off(yaw) for yaw in known):
+        return False
+    mean = float(np.average(angles, weights=1 / sigmas**2))
+    return bool(np.all(np.abs(angles - mean) < MIN_SIGMAS * sigmas))
+
+
+def with_mounts(log: Log, mounts: Mapping[str, Array]) -> Log:
+    """Return a log whose cameras have other mounts (4, 4), by name."""
+    moved = {name: replace(log.cameras[name], mount_T_cam=mount_T_cam) for name, mount_T_cam in mounts.items()}
+    return log.changed(cameras={**log.cameras, **moved})
+
+
+def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Progress) -> MountCheck:
+    """Look at frames of the cameras beside a LiDAR and at its sweeps, over the log."""
+    unknown = dict.fromkeys(sensors.cameras)
+    names = [name for name in sensors.cameras if lidar and is_near(log, name, lidar)]
+    if not names:
+        return MountCheck(log, lidar, {}, unknown)
+    reference = log.reference_camera if log.reference_camera in names else names[0]
+    moments = choose_moments(log, lidar, reference, during_ns(log, config))
+    seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
+    looks = {name: _look_through(log.cameras[name], seen) for name in names}
+    progress("check cameras", len(moments.sweeps), len(moments.sweeps))
+    views = {name: views for name, (views, _) in looks.items()}
+    return MountCheck(log, lidar, views, unknown | {name: yaw for name, (_, yaw) in looks.items()})
+
+
+def _look_through(camera: Camera, seen: EdgeViews) -> tuple[list[EdgeView], YawEstimate | None]:
+    """Return views of a camera and its yaw: by every second moment, and by all where those do not show that it is sound."""
+    few = seen.of_camera(camera.name, every=2)
+    yaw = estimate_mount_yaw(camera, few)
+    if yaw is not None and abs(yaw.yaw_rad) < SOUND_RAD:
+        return few, yaw
+    views = seen.of_camera(camera.name)
+    return views, estimate_mount_yaw(camera, views)
+
+
+def _fault_of_mistake(name: str, lidar: str, mistake: Mistake, treatment: Treatment) -> Fault:
+    return Fault(mistake.kind, name, f"{mistake.words.format(lidar)}; {DONE[treatment]}", treatment)
+
+
+def _fault_of_yaw(name: str, check: MountCheck, yaw: YawEstimate, *, fix: bool) -> Fault:
+    treatment: Treatment = "corrected" if fix else "kept"
+    alone = sum(other is not None for other in check.yaws.values()) == 1
+    message = (
+        f"its mount in the calibration is turned by {_words(yaw)} against edges that {check.lidar} sees too"
+        f"{f', or the mount of {check.lidar} is' if alone else ''}; {DONE[treatment]}"
+    )
+    return Fault("camera_rotation", name, message, treatment, values=_values(yaw))
+
+
+def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], *, fix: bool) -> Fault:
+    """Describe the mount of a LiDAR, with which that of no camera agrees; corrected are those of the cameras."""
+    weights = np.array([1 / yaw.sigma_rad**2 for yaw in yaws.values()])
+    mean = YawEstimate(
+        -float(np.average([yaw.yaw_rad for yaw in yaws.values()], weights=weights)),
+        max(yaw.sigma_rad for yaw in yaws.values()),
+        min(yaw.gain for yaw in yaws.values()),
+        sum(yaw.edges for yaw in yaws.values()),
+    )
+    done = "the cameras are turned to fit it" if fix else f"not corrected; {FIX} turns the cameras to fit it"
+    message = (
+        f"its mount in the calibration is turned by {_words(mean)} against edges that {', '.join(yaws)} see too, all of them "
+        f"alike; {done}"
+    )
+    return Fault("lidar_rotation", lidar, message, "corrected" if fix else "kept", values=_values(mean))
+
+
+def _words(yaw: YawEstimate) -> str:
+    values = _values(yaw)
+    return f"yaw {values['yaw_deg']:+.2f} degrees (sigma {values['yaw_sigma_deg']:.2f})"
+
+
+def _values(yaw: YawEstimate) -> dict[str, float]:
+    """Return the yaw of the mount in the calibration against the truth, which is minus that which it lacks."""
+    off, sigma = np.rad2deg([-yaw.yaw_rad, yaw.sigma_rad])
+    return {"yaw_deg": float(off), "yaw_sigma_deg": float(sigma)}
+
+
+def check_calibration(
+    log: Log, config: Config, sensors: Sensors, *, progress: Progress
+) -> tuple[Log, tuple[Fault, ...]]:
+    """Estimate offsets of clocks and rotations of mounts from a log.
+
+    Parameters
+    ----------
+    log : Log
+        With the poses that the run uses.
+    config : Config
+        `calibration`: whether to check, and what to correct; `start_s`, `stop_s`: what is looked at.
+    sensors : Sensors
+        Those that the run uses; others are not checked.
+    progress : callable
+        Called as `progress(stage, done, total)`.
+
+    Returns
+    -------
+    log : Log
+        With the corrections that the settings ask for.
+    faults : tuple of Fault
+    """
+    if not config.calibration.check:
+        return log, ()
+    log, of_lidars = check_lidars(log, config, sensors, progress=progress)
+    log, of_cameras = check_cameras(log, config, sensors, of_lidars=of_lidars, progress=progress)
+    return log, (*of_lidars, *of_cameras)

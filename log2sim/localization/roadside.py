@@ -1,0 +1,603 @@
+"""Roadside units registered to the map and the clock of the ego."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import Config
+from log2sim.datatypes import Fault, Log, Stream, Sweep
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform
+from log2sim.localization.choice import during_ns
+from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.roadside_fit import (
+    DELAY,
+    PRIOR_SIGMA,
+    CommonGround,
+    CommonObjects,
+    Matched,
+    MatchedStructure,
+    RoadView,
+    Surfaces,
+    VehicleView,
+    Visibility,
+    choose_moments,
+    common_ground,
+    detect_boxes,
+    detectors_of,
+    ground_below,
+    link_boxes,
+    look_through,
+    match_ground,
+    match_objects,
+    match_structure,
+    solve,
+    surfaces_of,
+    track_of,
+    upright_points,
+    view_from_road,
+    view_from_vehicle,
+)
+from log2sim.localization.surfaces import exp_of, log_of
+from log2sim.plan import Sensors
+
+# Sensors of one pole are not farther apart in the plane.
+MAX_UNIT_M = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """Sensors at one place of the roadside.
+
+    Attributes
+    ----------
+    site_m : (3,) float64, m
+        Mean place of its LiDARs in the map.
+    """
+
+    lidars: tuple[str, ...]
+    cameras: tuple[str, ...]
+    site_m: Array
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """All of them, LiDARs first."""
+        return (*self.lidars, *self.cameras)
+
+
+def units_of(log: Log, lidars: Sequence[str]) -> list[Unit]:
+    """Group LiDARs of the roadside, and the cameras beside them, by their places."""
+    groups: list[list[str]] = []
+    for name in lidars:
+        near = [group for group in groups if any(_apart_m(log, name, other) < MAX_UNIT_M for other in group)]
+        groups = [group for group in groups if group not in near] + [[*(n for group in near for n in group), name]]
+    units = []
+    for group in groups:
+        site = np.mean([log.lidars[name].mount_T_lidar[:3, 3] for name in group], axis=0)
+        beside = [
+            n
+            for n, c in log.cameras.items()
+            if c.mount == "map" and np.hypot(*(c.mount_T_cam[:2, 3] - site[:2])) < MAX_UNIT_M
+        ]
+        units.append(Unit(tuple(group), tuple(beside), site))
+    return units
+
+
+def _apart_m(log: Log, first: str, second: str) -> float:
+    return float(np.hypot(*(log.lidars[first].mount_T_lidar - log.lidars[second].mount_T_lidar)[:2, 3]))
+
+
+def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log:
+    """Return the log with a unit's sensors moved and its stamps put right.
+
+    Parameters
+    ----------
+    correction : (4, 4) float64
+        Takes places by the unit's poses to right ones, both in the frame of the site: map axes, origin at `site_m`.
+    delay_s : float, s
+        By which its stamps are late.
+    """
+    shift = transform(np.eye(3), unit.site_m)
+    moved = shift @ correction @ inverse(shift)
+    lidars, cameras, streams = dict(log.lidars), dict(log.cameras), dict(log.streams)
+    for name in unit.lidars:
+        lidars[name] = replace(lidars[name], mount_T_lidar=moved @ lidars[name].mount_T_lidar)
+    for name in unit.cameras:
+        cameras[name] = replace(cameras[name], mount_T_cam=moved @ cameras[name].mount_T_cam)
+    for name in unit.sensors:
+        if name in streams:
+            streams[name] = _corrected_stream(streams[name], moved, -round(delay_s * NS_PER_S))
+    return log.changed(lidars=lidars, cameras=cameras, streams=streams)
+
+
+def _corrected_stream(stream: Stream, moved: Array, shift_ns: int) -> Stream:
+    """Move the stamps of all records, and the points of sweeps that are given in the map."""
+
+    def read(i: int) -> Any:
+        record = stream.read(i)
+        return _corrected_sweep(record, moved, shift_ns) if isinstance(record, Sweep) else record
+
+    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded)
+
+
+def _corrected_sweep(sweep: Sweep, moved: Array, shift_ns: int) -> Sweep:
+    return replace(
+        sweep,
+        stamp_ns=int(sweep.stamp_ns) + shift_ns,
+        xyz_m=apply(moved, sweep.xyz_m) if sweep.frame == "map" else sweep.xyz_m,
+        t_ns=None if sweep.t_ns is None else sweep.t_ns + shift_ns,
+        compensated_ns=None if sweep.compensated_ns is None else int(sweep.compensated_ns) + shift_ns,
+    )
+
+
+# An error of 0.5 m and 2 degrees moves what is 40 m away by 1.9 m; then within what noise and edges leave.
+SURFACE_WITHIN_M = (2.0, 1.5, 1.0, 0.7, 0.5, 0.4, 0.3, 0.3, 0.3)
+OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
+# Delays that are tried; stamps of a sweep's begin instead of its end are early by a period.
+TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
+JUDGED_WITHIN_M = 0.5
+# Of the vehicle's way, to see how far its poses err.
+PARTS, HELD_SHARE = 3, 0.3
+# Where structure holds the pose in the plane, objects are needed for the delay alone, for which fewer moments do.
+HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What both ends see around a unit, in the frame of its site: map axes, origin at `Unit.site_m`.
+
+    Attributes
+    ----------
+    view : VehicleView or None
+        Of the vehicle; None where it never comes near.
+    road : RoadView
+        What stands still by the unit's LiDARs.
+    """
+
+    view: VehicleView | None
+    road: RoadView
+    surfaces: Surfaces | None
+    ground: CommonGround | None
+    objects: CommonObjects
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a unit's pose and clock lack.
+
+    Attributes
+    ----------
+    values : (7,) float64
+        Twist (m, rad) of the site that corrects it, and the delay of its stamps, s.
+    covariance : (7, 7) float64
+    structure, objects : pair of MatchedStructure or None, pair of Matched or None
+        Without and with the correction, by the same limit.
+    """
+
+    values: Array
+    covariance: Array
+    structure: tuple[MatchedStructure | None, MatchedStructure | None]
+    objects: tuple[Matched | None, Matched | None]
+
+    @property
+    def correction(self) -> Array:
+        """The twist as a transform (4, 4)."""
+        return exp_of(self.values[:DELAY])
+
+
+def look_around(log: Log, config: Config, unit: Unit, report: Callable[[int, int], None]) -> Sight:
+    """Collect what both ends see around a unit."""
+    during = during_ns(log, config)
+    report(0, 3)
+    view = view_from_vehicle(log, unit.site_m, during)
+    road = view_from_road(log, unit.lidars, unit.site_m, during)
+    report(1, 3)
+    surfaces = None if view is None else surfaces_of(view, road.xyz_m)
+    report(2, 3)
+    ground = None if view is None else common_ground(view, road.xyz_m)
+    sight = Sight(view, road, surfaces, ground, CommonObjects(()))
+    covariance = _refine(sight, np.zeros(7), with_objects=False)[1]
+    held = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]) < HELD_M
+    moments = choose_moments(log, unit.site_m, during, FEW_MOMENTS if held else MANY_MOMENTS)
+    return replace(sight, objects=_objects_around(log, config, unit, road.xyz_m, moments))
+
+
+def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array, moments: NDArray[np.int64]) -> CommonObjects:
+    if log.ego is None or len(moments) == 0:
+        return CommonObjects(())
+    of_vehicle, of_road = detectors_of(log, config)
+    pose, _ = log.ego.at(moments)
+    floor = pose[:, :3, 3] + pose[:, :3, 2] * log.ground_z_ego_m
+    at_pole = np.repeat((unit.site_m + np.array([0.0, 0.0, ground_below(road_m)]))[None], len(moments), axis=0)
+    start = int(moments[0])
+    places = log.ego_centers(pose) - unit.site_m
+    known = np.ones((len(moments), 1))
+    own = np.hstack([(moments - start)[:, None] / NS_PER_S, places, 0 * known, np.inf * known])
+    seen = link_boxes(detect_boxes(log, lidars_on_ego(log), of_vehicle, moments, floor), unit.site_m, start)
+    road = link_boxes(detect_boxes(log, unit.lidars, of_road, moments, at_pole), unit.site_m, start)
+    return CommonObjects.of((track_of(own), *seen), road)
+
+
+def estimate_error(sight: Sight) -> Estimate:
+    """Estimate what a unit's pose and clock lack.
+
+    Notes
+    -----
+    Structure first, with limits that become tighter; then the delay with which most common objects fall onto each other; then
+    all together by Gauss and Newton's method.
+    """
+    by_structure, _ = _refine(sight, np.zeros(7), with_objects=False)
+    tried = [_refine(sight, start, with_objects=True) for start in _starts(sight, by_structure)]
+    values, covariance = max(tried, key=lambda found: _gain(sight, found[0], OBJECT_WITHIN_M[-1]))
+    return Estimate(
+        values,
+        covariance,
+        (_structure(sight, np.zeros(7), JUDGED_WITHIN_M), _structure(sight, values, JUDGED_WITHIN_M)),
+        (_objects(sight, np.zeros(7), OBJECT_WITHIN_M[0]), _objects(sight, values, OBJECT_WITHIN_M[0])),
+    )
+
+
+def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate:
+    """Return the estimate with the errors of the ego's poses in its covariance: those that the track states, and those seen.
+
+    Notes
+    -----
+    The ego's poses err for seconds. What parts of its way say about the unit's pose differs by that, and the mean of them all
+    errs by the square root of their number less. Of each kind, translation and rotation, one variance is taken for all axes.
+    """
+    if sight.view is None:
+        return found
+    parts = [_sight_of_part(sight, part) for part in sight.view.parts(PARTS) if len(part.xyz_m)]
+    fits = [_refine(part, np.zeros(7), with_objects=False) for part in parts]
+    variance = np.zeros(7)
+    if len(fits) == PARTS:
+        values = np.array([value for value, _ in fits])
+        # What structure does not hold scatters by the noise of surfaces alone.
+        held = np.max([np.diag(covariance) for _, covariance in fits], axis=0) < (HELD_SHARE * PRIOR_SIGMA) ** 2
+        for rows in (np.arange(3), np.arange(3, DELAY)):
+            if held[rows].any():
+                variance[rows] = values[:, rows[held[rows]]].var(axis=0, ddof=1).mean() / PARTS
+    sigma_m, sigma_rad = track.sigmas_at(sight.view.t_ns, (0.0, 0.0)).mean(axis=0)
+    variance[:3] += sigma_m**2
+    variance[5] += sigma_rad**2
+    return replace(found, covariance=found.covariance + np.diag(variance))
+
+
+def _sight_of_part(sight: Sight, part: VehicleView) -> Sight:
+    road = sight.road.xyz_m
+    return replace(sight, view=part, surfaces=surfaces_of(part, road), ground=common_ground(part, road))
+
+
+def _starts(sight: Sight, by_structure: Array) -> list[Array]:
+    """Choose delays, and the pose by structure or that of the calibration, by which objects fit best: within a wide and a narrow limit."""
+    nearest_first = TRIED_DELAYS_S[np.argsort(np.abs(TRIED_DELAYS_S), kind="stable")]
+    tried = [np.append(pose[:DELAY], delay_s) for pose in (by_structure, np.zeros(7)) for delay_s in nearest_first]
+    limits = (OBJECT_WITHIN_M[0], OBJECT_WITHIN_M[-1])
+    chosen = {int(np.argmax([_gain(sight, values, within_m) for values in tried])) for within_m in limits}
+    return [tried[k] for k in sorted(chosen)]
+
+
+def _gain(sight: Sight, values: Array, within_m: float) -> float:
+    found = _objects(sight, values, within_m)
+    return 0.0 if found is None else found.gain
+
+
+def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, Array]:
+    """Improve values (7,) step by step; return them with their covariance (7, 7)."""
+    values, covariance = start, np.diag(PRIOR_SIGMA**2)
+    for near_surface, near_object in zip(SURFACE_WITHIN_M, OBJECT_WITHIN_M):
+        structure = _structure(sight, values, near_surface)
+        objects = _objects(sight, values, near_object) if with_objects else None
+        parts = [part.evidence for part in (structure, objects) if part is not None]
+        ground = None if sight.ground is None else match_ground(sight.ground, exp_of(values[:DELAY]), near_surface)
+        parts += [] if ground is None else [ground]
+        step, covariance = solve(parts, values)
+        pose = exp_of(step[:DELAY]) @ exp_of(values[:DELAY])
+        values = np.append(log_of(pose), values[DELAY] + step[DELAY])
+    return values, covariance
+
+
+def _structure(sight: Sight, values: Array, within_m: float) -> MatchedStructure | None:
+    if sight.surfaces is None:
+        return None
+    return match_structure(sight.surfaces, sight.road.xyz_m, exp_of(values[:DELAY]), within_m)
+
+
+def _objects(sight: Sight, values: Array, within_m: float) -> Matched | None:
+    return match_objects(sight.objects, exp_of(values[:DELAY]), float(values[DELAY]), within_m)
+
+
+# What is certain is corrected if it matters: as much as agents are misplaced anyway, near the unit and 20 to 40 m away; stamps
+# by as much at city speeds.
+MIN_SHIFT_M, MIN_TURN_RAD, MIN_DELAY_S = 0.1, np.radians(0.3), 0.02
+# Chance explains as much in one of 100 checks of six normal variables, or of the three in the plane (chi-square), and in one of
+# 300 of one. The sigmas of poses are bounds by what points have in common: on streets with houses, estimates are within a third.
+MAX_CHANCE_CHI2, MAX_CHANCE_PLANE_CHI2, MIN_SIGMAS = 16.8, 11.3, 3.0
+# Nothing is verified that could be off by more than objects are apart.
+MAX_SIGMA_M, MAX_SIGMA_RAD = 0.25, np.radians(1.0)
+# Of upright points that the vehicle looked at, the share that it saw through: in synthetic streets up to 3 % with a right pose,
+# 7 % with an error of 0.5 m and 2 degrees, 17 to 77 % with larger ones.
+MAX_CONTRADICTING, MAX_LEFT, MIN_LOOKED_AT = 0.2, 0.1, 50
+# Of matched points, where both ends show one place; in synthetic streets 66 to 96 % of them lie on surfaces, of wrong ones 20 to 36 %.
+MIN_ON_SURFACE = 0.5
+POSE = slice(0, DELAY)
+HEIGHT_AND_TILT, PLANE = [2, 3, 4], [0, 1, 5]
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What a unit is found to lack.
+
+    Attributes
+    ----------
+    visibility : pair of Visibility or None
+        Without and with the correction.
+    """
+
+    unit: Unit
+    found: Estimate
+    visibility: tuple[Visibility | None, Visibility | None]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (7,) of the estimate."""
+        return np.asarray(np.sqrt(np.diag(self.found.covariance)))
+
+    @cached_property
+    def _looked_rows(self) -> list[int]:
+        """The rows of the pose that both ends show: all, or height, roll and pitch where the ground alone ties them."""
+        certain = self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 and self._objects_agree
+        return list(range(DELAY)) if self.verified or certain else HEIGHT_AND_TILT
+
+    @property
+    def _objects_agree(self) -> bool:
+        """Whether several common objects fit better with the correction: one alone may be matched by mistake."""
+        before, after = self.found.objects
+        return after is not None and after.pairs > 1 and after.gain > (0.0 if before is None else before.gain)
+
+    def _chi2(self, rows: list[int]) -> float:
+        """How far some values are from 0, squared, in units of their covariance."""
+        values = self.found.values[rows]
+        return float(values @ np.linalg.solve(self.found.covariance[np.ix_(rows, rows)], values))
+
+    def _likeliest(self, rows: list[int]) -> tuple[Array, Array]:
+        """Return values (7,) of some rows and their covariance, if the others are right and so 0."""
+        values, covariance, out = self.found.values, self.found.covariance, np.zeros(7)
+        others = [k for k in range(7) if k not in rows]
+        share = covariance[np.ix_(rows, others)] @ np.linalg.inv(covariance[np.ix_(others, others)])
+        out[rows] = values[rows] - share @ values[others]
+        return out, covariance[np.ix_(rows, rows)] - share @ covariance[np.ix_(others, rows)]
+
+    @cached_property
+    def moved(self) -> bool:
+        """Whether the pose is off for certain, by enough to matter, and both ends fit better with another."""
+        rows, values = self._looked_rows, self.found.values
+        if len(rows) == DELAY:
+            chi2 = self._chi2(rows)
+        else:
+            values, covariance = self._likeliest(rows)
+            chi2 = float(values[rows] @ np.linalg.solve(covariance, values[rows]))
+        large = np.linalg.norm(values[:3]) > MIN_SHIFT_M or np.linalg.norm(values[3:DELAY]) > MIN_TURN_RAD
+        better = self._fits and self._fits_better and self._is_free(1, MAX_LEFT)
+        return bool(large and chi2 > MAX_CHANCE_CHI2 and better)
+
+    @cached_property
+    def late(self) -> bool:
+        """Whether the stamps are off for certain and by enough to matter."""
+        objects = self.found.objects[1]
+        delay_s = abs(float(self.found.values[DELAY]))
+        seen = objects is not None and objects.moving > 0
+        return seen and delay_s > max(MIN_DELAY_S, MIN_SIGMAS * self.sigma[DELAY])
+
+    @property
+    def _fits_better(self) -> bool:
+        """Whether more points lie on surfaces and objects on each other with the correction."""
+        structure = [0 if part is None else part.on_surface for part in self.found.structure]
+        objects = [0.0 if part is None else part.gain for part in self.found.objects]
+        return structure[1] + objects[1] > structure[0] + objects[0]
+
+    @property
+    def _fits(self) -> bool:
+        """Whether what is matched lies on each other."""
+        structure = self.found.structure[1]
+        return structure is None or structure.on_surface > MIN_ON_SURFACE * structure.points
+
+    @cached_property
+    def verified(self) -> bool:
+        """Whether the pose is known in the plane, in which agents are placed, as well as it must be."""
+        plane = np.linalg.eigvalsh(self.found.covariance[:2, :2])[-1]
+        return bool(self._fits and np.sqrt(plane) < MAX_SIGMA_M and self.sigma[5] < MAX_SIGMA_RAD)
+
+    @cached_property
+    def contradicted(self) -> bool:
+        """Whether the vehicle saw through most of what the unit sees upright, with and without the correction."""
+        return not self._is_free(1 if self.moved else 0, MAX_CONTRADICTING)
+
+    def _is_free(self, row: int, limit: float) -> bool:
+        """Whether the vehicle saw through few of the unit's points without (0) or with (1) the correction."""
+        looked = self.visibility[row]
+        if looked is None or looked.seen + looked.seen_through < MIN_LOOKED_AT:
+            return True
+        return looked.contradicting <= limit
+
+    @cached_property
+    def applied(self) -> Array:
+        """What is corrected (7,): all, or what is likeliest of a part where the rest is taken to be right."""
+        rows = [*(self._looked_rows if self.moved else []), *([DELAY] if self.late else [])]
+        if self.contradicted or not rows:
+            return np.zeros(7)
+        return self.found.values if len(rows) == len(self.found.values) else self._likeliest(rows)[0]
+
+    @property
+    def correction(self) -> Array:
+        """The pose of what is corrected, (4, 4)."""
+        return exp_of(self.applied[POSE])
+
+    def faults(self) -> list[Fault]:
+        """Describe what is wrong, and what cannot be said."""
+        if self.contradicted:
+            return [Fault("wrong_road_pose", name, self._contradiction(), "left_out") for name in self.unit.sensors]
+        faults, lidar, values = [], self.unit.lidars[0], self._values()
+        if self.moved:
+            faults.append(Fault("road_pose", lidar, self._displacement(), "corrected", values=values))
+        if self.late:
+            faults.append(Fault("road_clock", lidar, self._lateness(), "corrected", values=values))
+        if not self.verified:
+            faults.append(Fault("unknown_road_pose", lidar, self._uncertainty(), "kept", values=values))
+        return faults
+
+    def _displacement(self) -> str:
+        shift, turn = np.linalg.norm(self.applied[:3]), np.degrees(np.linalg.norm(self.applied[3:DELAY]))
+        return (
+            f"its pose is {shift:.2f} m and {turn:.1f} degrees off the ego's map (sigma {max(self.sigma[:2]):.2f} m, "
+            f"{np.degrees(self.sigma[5]):.2f} degrees of yaw), by {self._sources()}; "
+            f"{'corrected' if len(self._looked_rows) == DELAY else 'its height and tilt are corrected'}{self._company()}"
+        )
+
+    def _lateness(self) -> str:
+        delay_s = float(self.applied[DELAY])
+        return (
+            f"its stamps are {abs(delay_s) * 1e3:.0f} ms {'late' if delay_s > 0 else 'early'} against the ego's clock "
+            f"(sigma {self.sigma[DELAY] * 1e3:.0f} ms), by road users that both ends see move; corrected{self._company()}"
+        )
+
+    def _uncertainty(self) -> str:
+        return (
+            "its place in the plane cannot be verified: the vehicle sees too little of what it sees "
+            f"(sigma {max(self.sigma[:2]):.2f} m, {np.degrees(self.sigma[5]):.1f} degrees of yaw); kept"
+        )
+
+    def _contradiction(self) -> str:
+        looked = self.visibility[0]
+        share = 0.0 if looked is None else looked.contradicting
+        return (
+            f"its pose cannot be trusted: the vehicle saw through {share:.0%} of the upright surfaces that it sees, and no "
+            "pose within 0.5 m and 2 degrees makes both fit; left out"
+        )
+
+    def _sources(self) -> str:
+        structure, objects = self.found.structure[1], self.found.objects[1]
+        parts = [] if structure is None else [f"{structure.points} points on surfaces"]
+        parts += [] if objects is None else [f"{objects.pairs} common road users"]
+        return " and ".join(parts)
+
+    def _company(self) -> str:
+        others = self.unit.sensors[1:]
+        return f", as {', '.join(others)} on the same pole" if others else ""
+
+    def _values(self) -> dict[str, float]:
+        values, sigma = self.found.values, self.sigma
+        return {
+            **{f"{name}_m": float(values[k]) for k, name in enumerate("xyz")},
+            **{f"{name}_sigma_m": float(sigma[k]) for k, name in enumerate("xyz")},
+            **{f"{name}_deg": float(np.degrees(values[3 + k])) for k, name in enumerate(("roll", "pitch", "yaw"))},
+            **{f"{name}_sigma_deg": float(np.degrees(sigma[3 + k])) for k, name in enumerate(("roll", "pitch", "yaw"))},
+            "delay_s": float(values[DELAY]),
+            "delay_sigma_s": float(sigma[DELAY]),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures of the report: the estimate, what was done, and how well both ends fit before and after."""
+        names = ("before", "after")
+        return {
+            "sensors": list(self.unit.sensors),
+            "treatment": "left_out" if self.contradicted else "corrected" if self.applied.any() else "kept",
+            "verified": self.verified,
+            **self._values(),
+            "structure": {n: None if s is None else _structure_figures(s) for n, s in zip(names, self.found.structure)},
+            "objects": {n: None if o is None else _object_figures(o) for n, o in zip(names, self.found.objects)},
+            "seen_through": {n: None if v is None else v.contradicting for n, v in zip(names, self.visibility)},
+        }
+
+
+def _structure_figures(part: Any) -> dict[str, float]:
+    return {"points": part.points, "on_surface": part.on_surface / part.points, "residual_m": part.rms_m}
+
+
+def _object_figures(part: Any) -> dict[str, float]:
+    return {"pairs": part.pairs, "moving": part.moving, "residual_m": part.rms_m}
+
+
+Progress = Callable[[str, int, int], None]
+
+# GNSS with an IMU errs by less; a larger error is the unit's.
+MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD = 0.4, np.radians(1.5)
+
+
+@dataclass(frozen=True, eq=False)
+class RoadRegistration:
+    """What came of the registration of the road's sensors.
+
+    Attributes
+    ----------
+    log : Log
+        With the corrected mounts and stamps.
+    figures : list of dict
+        For the report, one entry for each roadside unit.
+    """
+
+    log: Log
+    faults: tuple[Fault, ...] = ()
+    figures: list[dict[str, Any]] = field(default_factory=list)
+
+
+def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> RoadRegistration:
+    """Estimate poses and clocks of the road's sensors against what the vehicle's sensors see.
+
+    Parameters
+    ----------
+    log : Log
+        With the poses that the run uses.
+    config : Config
+        `cooperation.register_road`: whether to do so.
+    sensors : Sensors
+        Those that the run uses.
+    progress : callable
+        Called as `progress(stage, done, total)`.
+
+    Notes
+    -----
+    The ego's poses and its clock are the reference. Nothing is read of a log without LiDARs at both ends.
+    """
+    used = sensors.restrict(log)
+    at_road = [n for n, lidar in used.lidars.items() if lidar.mount == "map" and len(log.streams[n].t_ns)]
+    if not config.cooperation.register_road or log.ego is None or not at_road or not lidars_on_ego(used):
+        return RoadRegistration(log)
+    faults: list[Fault] = []
+    figures = []
+    for unit in units_of(used, at_road):
+        findings = _check_unit(used, config, unit, progress)
+        log = (
+            correct_unit(log, unit, findings.correction, float(findings.applied[-1])) if findings.applied.any() else log
+        )
+        faults += findings.faults()
+        figures.append(findings.to_dict())
+    return RoadRegistration(log, tuple(faults), figures)
+
+
+def _check_unit(log: Log, config: Config, unit: Unit, progress: Progress) -> Findings:
+    """Estimate what a unit lacks, and look whether what it sees can be there."""
+    sight = look_around(log, config, unit, lambda done, total: progress(f"register {unit.lidars[0]}", done, total))
+    found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
+    visibility = (_visibility(sight, upright, np.eye(4)), _visibility(sight, upright, found.correction))
+    findings = Findings(unit, found, visibility)
+    if log.ego is None or not findings.moved or not _may_be_of_ego(found):
+        return findings
+    return replace(findings, found=add_pose_errors(sight, found, log.ego))
+
+
+def _may_be_of_ego(found: Estimate) -> bool:
+    """Whether errors of the ego's poses can be as large as what a unit's pose is off by."""
+    shift_m, turn_rad = np.linalg.norm(found.values[:3]), np.linalg.norm(found.values[3:DELAY])
+    return bool(shift_m < MAX_POSE_ERROR_M and turn_rad < MAX_POSE_ERROR_RAD)
+
+
+def _visibility(sight: Sight, upright_m: Array, correction: Array) -> Visibility | None:
+    if sight.view is None:
+        return None
+    return look_through(sight.view, upright_m @ correction[:3, :3].T + correction[:3, 3])

@@ -1,0 +1,853 @@
+"""What ties a roadside unit to the ego's map: standing structure, the ground, and road users that both detect."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
+from log2sim.datatypes import Boxes3D, Log, Sweep
+from log2sim.errors import RecordError
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.localization.odometry import lidars_on_ego
+from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Ground, assemble_cloud, estimate_ground, sweep_to_map
+
+# Points farther from a pole than this are too sparse in sweeps of usual LiDARs, and turned farther than any error is meant to be.
+MAX_REACH_M = 60.0
+# Returns nearer to the vehicle's LiDAR are of its own body.
+MIN_RANGE_M = 2.5
+MAX_VEHICLE_SWEEPS, MAX_ROAD_SWEEPS = 16, 10
+MAX_SWEEP_POINTS = 20_000
+# Sweeps of a moving vehicle from places nearer to each other than this show the same.
+MIN_APART_M = 0.5
+NEIGHBORS = 12
+# Voxels and largest neighborhoods: fine ones where there are many points, coarse ones between the rings of a vehicle that stands.
+VOXEL_M = 0.25
+SCALES_M = ((VOXEL_M, 0.9), (0.7, 3.0), (2.0, 7.0))
+# What an error of 0.5 m and 2 degrees moves at the end of the reach.
+MAX_ERROR_M = 2.5
+# A piece of a plane is thin (RMS over its points, range noise and all) and no line, as the points of one ring are.
+MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
+MIN_UPRIGHT_Z, MAX_POST_WIDTH_M, MIN_POST_LENGTH_M = 0.95, 0.12, 0.25
+# What stands still is in a place in a third of the sweeps or more; what passes is not, unless it waits.
+STATIC_VOXEL_M, MIN_STATIC_SHARE, STEADY_SHARE = 0.4, 0.35, 0.8
+MAX_ROAD_POINTS = 6000
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Pieces of surfaces that the vehicle saw, in the frame of the site: map axes, origin at a pole's LiDARs.
+
+    Attributes
+    ----------
+    xyz_m : (P, 3) float64, m
+    normals : (P, 2, 3) float64
+        Directions in which each piece holds a point: one of a plane, turned to where it was seen from, and NaN; two of a post.
+    reach_m : (P,) float64, m
+        How far along itself each piece goes.
+    tree : cKDTree
+        Of `xyz_m`.
+    """
+
+    xyz_m: Array
+    normals: Array
+    reach_m: Array
+    tree: cKDTree
+
+    @property
+    def post(self) -> NDArray[np.bool_]:
+        """Whether each piece (P,) is one of a post."""
+        return np.isfinite(self.normals[:, 1, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleView:
+    """What the vehicle saw around a site.
+
+    Attributes
+    ----------
+    xyz_m : (N, 3) float64, m
+        Points in the frame of the site, those of several sweeps.
+    sensor_m : (S, 3) float64, m
+        Where the LiDAR was in the middle of each sweep.
+    t_ns : (S,) int64
+        Stamps of the sweeps.
+    sweep : (N,) int64
+        Row of `sensor_m` for each point.
+    """
+
+    xyz_m: Array
+    sensor_m: Array
+    t_ns: NDArray[np.int64]
+    sweep: NDArray[np.int64]
+
+    def parts(self, count: int) -> list[VehicleView]:
+        """Split into runs of successive sweeps; fewer than `count` where there are fewer sweeps."""
+        runs = np.array_split(np.argsort(self.t_ns, kind="stable"), min(count, len(self.t_ns)))
+        kept = [np.isin(self.sweep, run) for run in runs]
+        return [VehicleView(self.xyz_m[rows], self.sensor_m, self.t_ns, self.sweep[rows]) for rows in kept]
+
+
+def view_from_vehicle(log: Log, site_m: Array, during_ns: tuple[int, int] | None) -> VehicleView | None:
+    """Collect points of the vehicle's LiDARs around a site (3,), m, by the poses of the ego; None where it never comes near."""
+    if log.ego is None:
+        return None
+    points: list[Array] = []
+    sensors: list[Array] = []
+    rows: list[NDArray[np.int64]] = []
+    stamps: list[int] = []
+    lidars = lidars_on_ego(log)
+    for name in lidars:
+        for i in _near_sweeps(log, name, site_m, during_ns, MAX_VEHICLE_SWEEPS // len(lidars) or 1):
+            mapped = _read(log, name, int(i))
+            if mapped is None:
+                continue
+            xyz, sensor = mapped[0] - site_m, mapped[1] - site_m
+            near = (np.linalg.norm(xyz, axis=1) < MAX_REACH_M) & (np.linalg.norm(xyz - sensor, axis=1) > MIN_RANGE_M)
+            rows.append(np.full(int(near.sum()), len(sensors), dtype=np.int64))
+            points.append(xyz[near])
+            sensors.append(sensor)
+            stamps.append(int(log.streams[name].t_ns[i]))
+    if not points:
+        return None
+    return VehicleView(np.concatenate(points), np.array(sensors), np.array(stamps), np.concatenate(rows))
+
+
+def _near_sweeps(
+    log: Log, lidar: str, site_m: Array, during_ns: tuple[int, int] | None, count: int
+) -> NDArray[np.intp]:
+    """Choose sweeps from places within reach of a site that are apart, or over time where the vehicle stands."""
+    t_ns = log.streams[lidar].t_ns
+    pose, known = log.map_T_sensor(lidar, t_ns)
+    away = np.linalg.norm(pose[:, :3, 3] - site_m, axis=1)
+    near = known & (away < MAX_REACH_M)
+    if during_ns is not None:
+        near &= (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+    rows = np.flatnonzero(near)
+    if len(rows) == 0:
+        return rows
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(pose[rows, :3, 3], axis=0), axis=1))])
+    # A way of its own for time, so that sweeps of a vehicle that stands are chosen too.
+    gone += np.linspace(0, MIN_APART_M, len(rows))
+    places = np.linspace(0, gone[-1], count)
+    return np.asarray(rows[np.unique(np.searchsorted(gone, places).clip(0, len(rows) - 1))])
+
+
+@dataclass(frozen=True, eq=False)
+class RoadView:
+    """What stands still around a site by the LiDARs of a pole.
+
+    Attributes
+    ----------
+    xyz_m : (N, 3) float64, m
+        Points in the frame of the site, one a voxel.
+    share : (N,) float64
+        Of the sweeps that have a point in the same place.
+    """
+
+    xyz_m: Array
+    share: Array
+
+    @property
+    def steady_m(self) -> Array:
+        """The points (n, 3) that are there nearly all the time: what waits for a while is not among them."""
+        return self.xyz_m[self.share > STEADY_SHARE]
+
+
+def view_from_road(
+    log: Log, lidars: Sequence[str], site_m: Array, during_ns: tuple[int, int] | None = None
+) -> RoadView:
+    """Collect the points of what stands still around a site (3,), m, by the LiDARs of a pole."""
+    parts = [_static_points(log, name, site_m, during_ns) for name in lidars]
+    points = np.concatenate(parts) if parts else np.zeros((0, 4))
+    points = points[:: max(-(-len(points) // MAX_ROAD_POINTS), 1)]
+    return RoadView(points[:, :3], points[:, 3])
+
+
+def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, int] | None) -> Array:
+    """Return points with the share of sweeps that have one in the same place, (N, 4)."""
+    t_ns = log.streams[lidar].t_ns
+    rows = np.arange(len(t_ns))
+    if during_ns is not None:
+        rows = rows[(t_ns >= during_ns[0]) & (t_ns <= during_ns[1])]
+    chosen = (
+        rows[np.unique(np.linspace(0, len(rows) - 1, MAX_ROAD_SWEEPS).round().astype(np.int64))] if len(rows) else rows
+    )
+    parts = []
+    for i in chosen.tolist():
+        mapped = _read(log, lidar, i)
+        if mapped is not None:
+            xyz = mapped[0] - site_m
+            parts.append(xyz[np.linalg.norm(xyz, axis=1) < MAX_REACH_M])
+    if not parts or not sum(map(len, parts)):
+        return np.zeros((0, 4))
+    xyz = np.concatenate(parts)
+    sweep = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    place = _voxels(xyz, STATIC_VOXEL_M)
+    seen = np.unique(place * len(parts) + sweep) // len(parts)
+    share = (np.bincount(seen, minlength=int(place.max()) + 1) / len(parts))[place]
+    static = share >= MIN_STATIC_SHARE
+    return thin(np.hstack([xyz[static], share[static, None]]), VOXEL_M)
+
+
+def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
+    """Read a sweep: points (N, 3) and the place (3,) of the sensor in the map, m; None where that fails."""
+    try:
+        sweep: Sweep = log.streams[lidar].read(index)
+    except RecordError:
+        return None
+    step = max(-(-len(sweep.xyz_m) // MAX_SWEEP_POINTS), 1)
+    t_ns = None if sweep.t_ns is None else sweep.t_ns[::step]
+    sweep = Sweep(sweep.stamp_ns, sweep.xyz_m[::step], sweep.frame, t_ns, sweep.compensated_ns)
+    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
+    pose, known = log.map_T_sensor(lidar, sweep.stamp_ns)
+    return (mapped[0], pose[0, :3, 3]) if mapped is not None and known[0] and len(mapped[0]) else None
+
+
+def _voxels(xyz_m: Array, voxel_m: float) -> NDArray[np.int64]:
+    """Assign numbers (N,), from 0 without gaps, to the voxels of points (N, 3)."""
+    cell = np.floor(xyz_m / voxel_m).astype(np.int64) + (1 << 20)
+    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+    return np.asarray(np.unique(key, return_inverse=True)[1], dtype=np.int64)
+
+
+def thin(xyz_m: Array, voxel_m: float) -> Array:
+    """Replace the points (N, D), of which three columns are coordinates, of each voxel by their mean."""
+    if len(xyz_m) == 0:
+        return xyz_m
+    place = _voxels(xyz_m[:, :3], voxel_m)
+    count = np.bincount(place)
+    return np.stack([np.bincount(place, column) / count for column in xyz_m.T], axis=1)
+
+
+def surfaces_of(view: VehicleView, near_m: Array) -> Surfaces | None:
+    """Find pieces of planes and posts in what the vehicle saw, within an error of the pose of points (N, 3) of the road.
+
+    Where points are too sparse for fine pieces, as between the rings of a LiDAR on a vehicle that stands, coarser ones fill in.
+    """
+    points = thin(np.hstack([view.xyz_m, view.sensor_m[view.sweep]]), VOXEL_M)
+    near = (
+        cKDTree(near_m).query(points[:, :3], distance_upper_bound=MAX_ERROR_M)[0]
+        if len(near_m)
+        else np.full(len(points), np.inf)
+    )
+    points = points[np.isfinite(near)]
+    middles, normals, reach = np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
+    for voxel_m, radius_m in SCALES_M:
+        found, facing = _pieces(thin(points, voxel_m), radius_m)
+        if len(middles) and len(found):
+            alone = ~np.isfinite(cKDTree(middles).query(found, distance_upper_bound=voxel_m)[0])
+            found, facing = found[alone], facing[alone]
+        middles, normals = np.concatenate([middles, found]), np.concatenate([normals, facing])
+        reach = np.concatenate([reach, np.full(len(found), voxel_m)])
+    return Surfaces(middles, normals, reach, cKDTree(middles)) if len(middles) else None
+
+
+def _pieces(points: Array, radius_m: float) -> tuple[Array, Array]:
+    """Find pieces of planes and posts among points with the places of their sensors (N, 6): middles (P, 3), normals (P, 2, 3)."""
+    if len(points) < NEIGHBORS:
+        return np.zeros((0, 3)), np.zeros((0, 2, 3))
+    away, index = cKDTree(points[:, :3]).query(points[:, :3], k=NEIGHBORS)
+    near = away[:, -1] < radius_m
+    sensor, around = points[near, 3:], points[index[near], :3]
+    middle = around.mean(axis=1)
+    off = around - middle[:, None]
+    spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / NEIGHBORS)
+    plane = (spread[:, 0] < MAX_THICKNESS_M**2) & (spread[:, 1] > MIN_WIDTH_M**2) & (spread[:, 1] > 9 * spread[:, 0])
+    post = ~plane & (np.abs(axes[:, 2, 2]) > MIN_UPRIGHT_Z) & (spread[:, 1] < MAX_POST_WIDTH_M**2)
+    post &= spread[:, 2] > MIN_POST_LENGTH_M**2
+    normals = axes.transpose(0, 2, 1)[:, :2].copy()
+    facing = np.einsum("nj,nj->n", normals[:, 0], sensor - middle)
+    normals[:, 0] *= np.where(facing < 0, -1.0, 1.0)[:, None]
+    normals[plane, 1] = np.nan
+    # The pole, at the origin, cannot see a plane from behind.
+    seen = post | (plane & (np.einsum("nj,nj->n", normals[:, 0], -middle) > 0))
+    return middle[seen], normals[seen]
+
+
+# Bins of directions as wide as the gaps between the lines of LiDARs with few of them.
+BIN_RAD = np.radians(2.0)
+COLUMNS = round(2 * np.pi / BIN_RAD)
+ROWS = round(np.pi / BIN_RAD)
+# Ranges within this agree, with an error of the pose that is left and what is seen of a thing from another side.
+AGREE_M = 1.0
+MAX_SWEEPS, MAX_POINTS = 6, 3000
+MIN_FREE_RANGE_M = 3.0
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """What the vehicle saw where a roadside unit sees upright things.
+
+    Attributes
+    ----------
+    seen, seen_through : int
+        Points with a return there, and with returns from behind alone.
+    """
+
+    seen: int
+    seen_through: int
+
+    @property
+    def contradicting(self) -> float:
+        """Share of points that the vehicle saw through."""
+        looked_at = self.seen + self.seen_through
+        return self.seen_through / looked_at if looked_at else 0.0
+
+
+def look_through(view: VehicleView, upright_m: Array) -> Visibility:
+    """Compare upright things of a unit, points (N, 3), m, with the ranges of the vehicle's sweeps."""
+    upright = upright_m[:: max(len(upright_m) // MAX_POINTS, 1)]
+    if len(upright) == 0:
+        return Visibility(0, 0)
+    seen = np.isfinite(cKDTree(view.xyz_m).query(upright, distance_upper_bound=AGREE_M)[0])
+    through = np.zeros(len(upright), bool)
+    chosen = np.unique(np.linspace(0, len(view.sensor_m) - 1, MAX_SWEEPS).round().astype(np.int64))
+    for row in chosen.tolist():
+        sensor = view.sensor_m[row]
+        nearest = _nearest(view.xyz_m[view.sweep == row] - sensor)
+        place, range_m = _bins(upright - sensor)
+        through |= np.isfinite(nearest[place]) & (range_m > MIN_FREE_RANGE_M) & (nearest[place] > range_m + AGREE_M)
+    return Visibility(int(seen.sum()), int((through & ~seen).sum()))
+
+
+def _bins(off: Array) -> tuple[NDArray[np.int64], Array]:
+    """Return the bin (N,) of the directions of offsets (N, 3) and their lengths (N,)."""
+    range_m = np.linalg.norm(off, axis=1)
+    azimuth = np.arctan2(off[:, 1], off[:, 0])
+    elevation = np.arcsin(np.clip(off[:, 2] / np.maximum(range_m, 1e-6), -1.0, 1.0))
+    column = np.floor((azimuth + np.pi) / BIN_RAD).astype(np.int64) % COLUMNS
+    row = np.clip(np.floor((elevation + np.pi / 2) / BIN_RAD).astype(np.int64), 0, ROWS - 1)
+    return row * COLUMNS + column, range_m
+
+
+def _nearest(off: Array) -> Array:
+    """Return the nearest range of each bin and those beside it, infinite where there is none."""
+    place, range_m = _bins(off)
+    nearest = np.full(ROWS * COLUMNS, np.inf)
+    np.minimum.at(nearest, place, range_m)
+    grid = nearest.reshape(ROWS, COLUMNS)
+    wide = np.minimum(np.minimum(grid, np.roll(grid, 1, axis=1)), np.roll(grid, -1, axis=1))
+    out = wide.copy()
+    out[1:] = np.minimum(out[1:], wide[:-1])
+    out[:-1] = np.minimum(out[:-1], wide[1:])
+    return out.ravel()
+
+
+SPACING_S = 0.2
+# Farther from a pole, boxes have too few points.
+MAX_AWAY_M = 70.0
+REACH_M = 60.0
+MIN_SCORE = 0.4
+NO_DETECTIONS = "lidar:labels"
+GIVEN = LIDAR_PREFIX + GIVEN_PREFIX
+
+
+def choose_moments(log: Log, site_m: Array, during_ns: tuple[int, int] | None, count: int) -> NDArray[np.int64]:
+    """Choose `count` stamps (K,) or fewer at which the vehicle is near a site (3,), evenly spaced around the nearest."""
+    if log.ego is None:
+        return np.zeros(0, dtype=np.int64)
+    first, last = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
+    if during_ns is not None:
+        first, last = max(first, during_ns[0]), min(last, during_ns[1])
+    t_ns = np.arange(first, last + 1, round(SPACING_S * NS_PER_S), dtype=np.int64)
+    pose, known = log.ego.at(t_ns)
+    away = np.hypot(*(pose[:, :2, 3] - site_m[:2]).T)
+    usable = np.flatnonzero(known & (away < MAX_AWAY_M))
+    if len(usable) > count:
+        nearest = int(np.argmin(away[usable]))
+        begin = int(np.clip(nearest - count // 2, 0, len(usable) - count))
+        usable = usable[begin : begin + count]
+    return np.asarray(t_ns[usable])
+
+
+def detect_boxes(
+    log: Log, lidars: Sequence[str], detector: LidarDetector, moments_ns: NDArray[np.int64], floor_m: Array
+) -> list[Boxes3D]:
+    """Detect road users in the clouds of some LiDARs nearest to moments (K,).
+
+    Parameters
+    ----------
+    floor_m : (K, 3) float64, m
+        Where clouds begin: a place on the ground, map frame.
+    """
+    out, before = [], None
+    for moment, floor in zip(moments_ns.tolist(), floor_m):
+        index = {name: _nearest_moments(log.streams[name].t_ns, moment) for name in lidars}
+        if index == before:
+            continue
+        before = index
+        sweeps = {name: sweep for name, i in index.items() if (sweep := _read_detections(log, name, i)) is not None}
+        cloud = (
+            assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=REACH_M) if sweeps else None
+        )
+        if cloud is not None:
+            boxes = detector.detect(cloud)
+            out.append(boxes.take(boxes.score >= MIN_SCORE))
+    return out
+
+
+def _nearest_moments(t_ns: NDArray[np.int64], moment: int) -> int:
+    return int(np.argmin(np.abs(t_ns - moment)))
+
+
+def _read_detections(log: Log, lidar: str, index: int) -> Sweep | None:
+    try:
+        sweep: Sweep = log.streams[lidar].read(index)
+    except RecordError:
+        return None
+    return sweep
+
+
+def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector]:
+    """Make the detectors for the clouds of the vehicle and of the road.
+
+    Labels are no detections: they are where they are, whatever a sensor's pose.
+    """
+    vehicle, road = config.detect.in_sweeps, config.cooperation.road_detector
+    names = (
+        vehicle if vehicle not in ("", NO_DETECTIONS) and not vehicle.startswith(GIVEN) else "lidar:vehicle",
+        road if road not in (AUTO, NO_DETECTIONS) else "lidar:roadside",
+    )
+    first, second = (create_lidar_detector(name, log, config.lidar) for name in names)
+    return first, second
+
+
+# What an error may be before anything is known; a direction that nothing holds stays where it was.
+PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, np.radians(2.0), np.radians(2.0), np.radians(2.0), 0.3])
+DELAY = 6
+MAD_TO_SIGMA = 1.4826
+MIN_SCALE_M = 0.02
+# Points so many standard deviations off count half.
+CAUCHY = 2.0
+# Points on surfaces that face one way err together, as those on all posts do: by so much, m.
+PLANE_BIAS_M, POST_BIAS_M = 0.02, 0.1
+# Pieces that are matched by mistake decide where few hold a direction: so many pieces count half. A turn moves points at this
+# distance as much as a translation does.
+FEW_PIECES, LEVER_M = 30.0, 15.0
+MIN_NORMAL_Z = 0.8
+# Points nearer than this to a surface lie on it.
+ON_SURFACE_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What some observations say about a correction: translation, m, and rotation vector, rad, of the site, and delay, s.
+
+    Attributes
+    ----------
+    information : (7, 7) float64
+    gradient : (7,) float64
+        Of half the sum of weighted squares at the correction so far.
+    """
+
+    information: Array
+    gradient: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedStructure:
+    """Points of the road on surfaces of the vehicle.
+
+    Attributes
+    ----------
+    points : int
+        Matched points.
+    on_surface : int
+        Those within `ON_SURFACE_M`.
+    rms_m : float, m
+        Robust, of the distances along the normals.
+    """
+
+    evidence: Evidence
+    points: int
+    on_surface: int
+    rms_m: float
+
+
+def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within_m: float) -> MatchedStructure | None:
+    """Match points (N, 3) of the road, corrected by a transform (4, 4), with surfaces of the vehicle; None with too few.
+
+    Notes
+    -----
+    Point-to-plane ICP (Chen, Medioni, IVC 1992) with Cauchy weights; posts hold points in two directions.
+    """
+    at = road_m @ correction[:3, :3].T + correction[:3, 3]
+    away, index = surfaces.tree.query(at, distance_upper_bound=np.hypot(within_m, surfaces.reach_m.max()))
+    found = np.flatnonzero(np.isfinite(away))
+    off = at[found] - surfaces.xyz_m[index[found]]
+    first = np.einsum("kj,kj->k", surfaces.normals[index[found], 0], off)
+    along_m = np.sqrt(np.maximum(away[found] ** 2 - first**2, 0.0))
+    near = (np.abs(first) < within_m) & (along_m < np.maximum(surfaces.reach_m[index[found]], within_m))
+    found, off, first = found[near], off[near], first[near]
+    if len(found) < FEW_PIECES:
+        return None
+    at, piece = at[found], index[found]
+    post = surfaces.post[piece]
+    normals = np.concatenate([surfaces.normals[piece, 0], surfaces.normals[piece[post], 1]])
+    at, off = np.concatenate([at, at[post]]), np.concatenate([off, off[post]])
+    residual = np.einsum("kj,kj->k", normals, off)
+    jacobian = np.hstack([normals, np.cross(at, normals)])
+    share, weight = _weights(normals, residual, np.concatenate([post, post[post]]))
+    return MatchedStructure(
+        _damped(jacobian, residual, share, weight),
+        len(found),
+        int((np.abs(first) < ON_SURFACE_M).sum()),
+        MAD_TO_SIGMA * float(np.median(np.abs(first))),
+    )
+
+
+def _weights(normals: Array, residual: Array, post: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Weigh rows (K,): the share that each counts by Cauchy's function, and the inverse variance with what rows have in common."""
+    up = ~post & (np.abs(normals[:, 2]) > MIN_NORMAL_Z)
+    along = ~post & ~up & (np.abs(normals[:, 0]) > np.abs(normals[:, 1]))
+    share, weight = np.zeros(len(residual)), np.zeros(len(residual))
+    for group, bias_m in (
+        (up, PLANE_BIAS_M),
+        (along, PLANE_BIAS_M),
+        (~post & ~up & ~along, PLANE_BIAS_M),
+        (post, POST_BIAS_M),
+    ):
+        if not group.any():
+            continue
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual[group]))), MIN_SCALE_M)
+        share[group] = 1.0 / (1.0 + (residual[group] / (CAUCHY * scale)) ** 2)
+        weight[group] = share[group] / (scale**2 + float(share[group].sum()) * bias_m**2)
+    return share, weight
+
+
+def _damped(jacobian: Array, residual: Array, share: Array, weight: Array) -> Evidence:
+    """Weaken what rows (K, 6) say about directions that few of them hold, as the noise of normals makes it up."""
+    scaled = jacobian * np.array([1.0, 1.0, 1.0, 1 / LEVER_M, 1 / LEVER_M, 1 / LEVER_M])
+    pieces, directions = np.linalg.eigh((scaled * share[:, None]).T @ scaled)
+    pieces = np.maximum(pieces, 0.0)
+    trust = (directions * np.sqrt(pieces / (pieces + FEW_PIECES))) @ directions.T
+    information = (scaled * weight[:, None]).T @ scaled
+    best = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ ((scaled * weight[:, None]).T @ residual)
+    trusted = trust @ information @ trust
+    unscale = np.array([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
+    full, gradient = np.zeros((7, 7)), np.zeros(7)
+    full[:6, :6] = trusted * unscale * unscale[:, None]
+    gradient[:6] = (trusted @ best) * unscale
+    return Evidence(full, gradient)
+
+
+def solve(evidence: Sequence[Evidence], so_far: Array) -> tuple[Array, Array]:
+    """Find the step (7,) that fits best and the covariance (7, 7) of the whole, given what was corrected so far (7,)."""
+    information, gradient = np.diag(PRIOR_SIGMA**-2.0), PRIOR_SIGMA**-2.0 * so_far
+    for part in evidence:
+        information = information + part.information
+        gradient = gradient + part.gradient
+    covariance = np.linalg.inv(information)
+    return np.asarray(-covariance @ gradient), np.asarray(covariance)
+
+
+# Where the vehicle has no ground point so near, its surface is a guess; measured in synthetic streets it errs by 5 cm up to here.
+MAX_GAP_M = 1.5
+BIAS_M = 0.03
+GROUND_VOXEL_M = 0.5
+# For slopes of the surface.
+STEP_M = 0.5
+# Of upright things: above curbs and the errors of a surface on slopes.
+MIN_HEIGHT_M = 0.7
+# Of the lowest points around a pole, those of the ground.
+GROUND_RADIUS_M, GROUND_SHARE = 20.0, 0.1
+# Of a pole that sees no ground.
+USUAL_BELOW_M = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class CommonGround:
+    """Ground around a unit.
+
+    Attributes
+    ----------
+    surface : Ground
+        By the vehicle, in the frame of the site.
+    known : cKDTree
+        Of the places (x, y) of the vehicle's ground points.
+    road_m : (N, 3) float64, m
+        Ground points of the unit, thinned out.
+    """
+
+    surface: Ground
+    known: cKDTree
+    road_m: Array
+
+
+def ground_below(road_m: Array) -> float:
+    """Estimate the height of the ground at a pole, m, in the frame of the site, from the unit's points (N, 3)."""
+    near = road_m[np.hypot(road_m[:, 0], road_m[:, 1]) < GROUND_RADIUS_M, 2]
+    return float(np.quantile(near, GROUND_SHARE)) if len(near) else -USUAL_BELOW_M
+
+
+def upright_points(road_m: Array) -> Array:
+    """Choose the points (n, 3) of a unit, m, that are above the ground as it sees it itself."""
+    if len(road_m) == 0:
+        return road_m
+    surface = estimate_ground(road_m, np.zeros(2), ground_below(road_m))
+    return road_m[road_m[:, 2] - surface.at(road_m[:, :2]) > MIN_HEIGHT_M]
+
+
+def common_ground(view: VehicleView, road_m: Array) -> CommonGround | None:
+    """Find the ground among points of both ends; None where one of them sees none."""
+    below = ground_below(road_m)
+    surface, own = (estimate_ground(xyz, np.zeros(2), below) for xyz in (view.xyz_m, road_m))
+    seen = view.xyz_m[np.abs(view.xyz_m[:, 2] - surface.at(view.xyz_m[:, :2])) < ON_GROUND_M]
+    ground = thin(road_m[np.abs(road_m[:, 2] - own.at(road_m[:, :2])) < ON_GROUND_M], GROUND_VOXEL_M)
+    if len(seen) == 0 or len(ground) == 0:
+        return None
+    return CommonGround(surface, cKDTree(thin(seen, GROUND_VOXEL_M)[:, :2]), ground)
+
+
+def match_ground(ground: CommonGround, correction: Array, within_m: float) -> Evidence | None:
+    """Compare heights of the unit's ground points, corrected by a transform (4, 4), with the vehicle's surface."""
+    at = ground.road_m @ correction[:3, :3].T + correction[:3, 3]
+    away = ground.known.query(at[:, :2], distance_upper_bound=MAX_GAP_M)[0]
+    residual = at[:, 2] - ground.surface.at(at[:, :2])
+    kept = np.isfinite(away) & (np.abs(residual) < within_m)
+    at, residual = at[kept], residual[kept]
+    if len(at) < FEW_PIECES:
+        return None
+    step = STEP_M * np.eye(2)
+    slope = [(ground.surface.at(at[:, :2] + d) - ground.surface.at(at[:, :2] - d)) / (2 * STEP_M) for d in step]
+    normals = np.stack([-slope[0], -slope[1], np.ones(len(at))], axis=1)
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE_M)
+    share = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2)
+    weight = share / (scale**2 + float(share.sum()) * BIAS_M**2)
+    # Slopes show height and tilt alone: what they say about the plane is the noise of the surface.
+    jacobian = np.zeros((len(at), 7))
+    jacobian[:, 2] = 1.0
+    jacobian[:, 3:5] = np.cross(at, normals)[:, :2]
+    return Evidence((jacobian * weight[:, None]).T @ jacobian, (jacobian * weight[:, None]).T @ residual)
+
+
+# Nobody drives faster on roads with LiDARs at the side; a box errs by half a meter.
+MAX_SPEED_MPS, MAX_JUMP_M = 35.0, 1.5
+MIN_BOXES = 3
+# Within so much time of a box the velocity of its track is taken from.
+VELOCITY_SPAN_S = 0.5
+MAX_GAP_S = 0.7
+# Boxes of one object are of different sweeps; what is farther away than any limit is not linked.
+MIN_STEP_S, UNLIKELY_M = 0.01, 1e6
+# Kinds of road users that detectors distinguish.
+GROUPS = {"car": 0, "truck": 0, "bus": 0, "pedestrian": 1, "cyclist": 2, "motorcycle": 2, "bicycle": 2}
+# How far centers of boxes by both ends are apart, measured in synthetic streets and roads with exact poses: the standard
+# deviation of one, and what all of one object have in common, as each end sees another side of it. Along and across the motion
+# of a vehicle, of others that move, and of what stands, which says little.
+SPREAD_M = {
+    "vehicle": ((0.17, 0.09), (0.2, 0.1)),
+    "small": ((0.07, 0.07), (0.12, 0.08)),
+    "standing": ((0.1, 0.1), (0.3, 0.3)),
+}
+# Of boxes with so many points; those with fewer err more.
+USUAL_POINTS, MAX_FACTOR = 100.0, 3.0
+# Two tracks of one object have velocities as similar as boxes over a second show.
+MAX_VELOCITY_APART_MPS = 4.0
+# Boxes so many standard deviations apart count a quarter (Geman, McClure 1987), as they may be of different objects.
+TOO_FAR = 2.5
+MOVING_MPS = 1.0
+# By an error of a unit's pose, and of boxes.
+MAX_APART_M = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTrack:
+    """Places of one road user as one end saw it.
+
+    Attributes
+    ----------
+    t_s : (K,) float64, s
+        Since a common time, by the clock of the end, increasing.
+    xyz_m : (K, 3) float64, m
+        In the frame of the site.
+    velocity_mps : (K, 2) float64
+    points : float
+        Median number of points in its boxes.
+    """
+
+    t_s: Array
+    xyz_m: Array
+    velocity_mps: Array
+    group: int
+    points: float = np.inf
+
+    def at(self, t_s: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Interpolate places (N, 3) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
+        after = np.searchsorted(self.t_s, t_s, side="left").clip(1, len(self.t_s) - 1)
+        begin, gap = self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
+        share = ((t_s - begin) / gap)[:, None]
+        place, velocity = (c[after - 1] + share * (c[after] - c[after - 1]) for c in (self.xyz_m, self.velocity_mps))
+        return place, velocity, (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & (gap <= MAX_GAP_S)
+
+
+def link_boxes(boxes: Sequence[Boxes3D], site_m: Array, start_ns: int) -> list[ObjectTrack]:
+    """Link boxes of successive moments to tracks."""
+    growing: list[list[Array]] = []
+    done: list[list[Array]] = []
+    for found in boxes:
+        rows = _rows_of(found, site_m, start_ns)
+        if len(rows) == 0:
+            continue
+        costs = np.array([_costs(track, rows) for track in growing]).reshape(len(growing), len(rows))
+        pairs = zip(*linear_sum_assignment(np.where(np.isfinite(costs), costs, UNLIKELY_M)))
+        taken = {int(b): int(a) for a, b in pairs if np.isfinite(costs[a, b])}
+        for b, a in taken.items():
+            growing[a].append(rows[b])
+        growing += [[row] for b, row in enumerate(rows) if b not in taken]
+        over_s = rows[:, 0].max() - MAX_GAP_S
+        done += [track for track in growing if track[-1][0] < over_s]
+        growing = [track for track in growing if track[-1][0] >= over_s]
+    return [track_of(np.array(track)) for track in (*done, *growing) if len(track) >= MIN_BOXES]
+
+
+def _rows_of(boxes: Boxes3D, site_m: Array, start_ns: int) -> Array:
+    """Return rows (M, 6) of time, place, group, and number of points."""
+    group = [GROUPS.get(str(category), -1) for category in boxes.category]
+    return np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, group, boxes.points])
+
+
+def _costs(track: list[Array], rows: Array) -> Array:
+    """Compute how far boxes (M,) are from where a track leads, m; infinite where they cannot be one object."""
+    last = track[-1]
+    ahead_s = rows[:, 0] - last[0]
+    expected, limit = last[1:3], MAX_SPEED_MPS * ahead_s + MAX_JUMP_M
+    if len(track) > 1:
+        velocity = (last[1:3] - track[-2][1:3]) / (last[0] - track[-2][0])
+        expected, limit = last[1:3] + velocity * ahead_s[:, None], np.full(len(rows), MAX_JUMP_M)
+    away = np.hypot(*(rows[:, 1:3] - expected).T)
+    return np.where((rows[:, 4] == last[4]) & (ahead_s > MIN_STEP_S) & (away < limit), away, np.inf)
+
+
+def track_of(rows: Array) -> ObjectTrack:
+    """Make a track of rows (K, 6): time, place, group, number of points."""
+    t_s, xyz = rows[:, 0], rows[:, 1:4]
+    near = np.abs(t_s[:, None] - t_s) <= VELOCITY_SPAN_S
+    count = near.sum(axis=1)
+    mean_s = near @ t_s / count
+    off_s = np.where(near, t_s - mean_s[:, None], 0.0)
+    velocity = (off_s @ xyz[:, :2]) / np.maximum((off_s**2).sum(axis=1), 1e-6)[:, None]
+    return ObjectTrack(t_s, xyz, velocity, int(rows[0, 4]), float(np.median(rows[:, 5])))
+
+
+@dataclass(frozen=True, eq=False)
+class CommonObjects:
+    """Tracks of the vehicle, with the vehicle itself, and for each those of the road that may show the same road user.
+
+    Attributes
+    ----------
+    pairs : tuple of (ObjectTrack, tuple of ObjectTrack)
+    """
+
+    pairs: tuple[tuple[ObjectTrack, tuple[ObjectTrack, ...]], ...]
+
+    @classmethod
+    def of(cls, vehicle: Sequence[ObjectTrack], road: Sequence[ObjectTrack]) -> CommonObjects:
+        """Pair tracks of one group that come near each other, at whatever time."""
+        near = [(seen, tuple(other for other in road if _may_be_one(seen, other))) for seen in vehicle]
+        return cls(tuple((seen, others) for seen, others in near if others))
+
+
+def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
+    if first.group != second.group:
+        return False
+    (low, high), (other_low, other_high) = (
+        (track.xyz_m[:, :2].min(axis=0), track.xyz_m[:, :2].max(axis=0)) for track in (first, second)
+    )
+    return bool((low < other_high + MAX_APART_M).all() and (other_low < high + MAX_APART_M).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Places of common objects at common times.
+
+    Attributes
+    ----------
+    pairs : int
+        Of tracks.
+    moving : int
+        Of those, how many move.
+    gain : float
+        How well all fits together: 1 for each place that fits perfectly, 0 for one that does not.
+    rms_m : float, m
+        Robust, of the distances between places.
+    """
+
+    evidence: Evidence
+    pairs: int
+    moving: int
+    gain: float
+    rms_m: float
+
+
+def match_objects(objects: CommonObjects, correction: Array, delay_s: float, within_m: float) -> Matched | None:
+    """Match places of road users with those nearest to them, given a correction (4, 4) and a delay of the road's stamps."""
+    information, gradient = np.zeros((7, 7)), np.zeros(7)
+    away, moving, gain = [], 0, 0.0
+    for seen, others in objects.pairs:
+        best = _best_match(seen, others, correction, delay_s, within_m)
+        if best is None:
+            continue
+        place, velocity, off, points = best
+        away.append(np.hypot(*off.T))
+        moves, turn, sigma, bias = _spread_of(seen, velocity, min(points, seen.points))
+        moving += moves
+        gain += float((1 - away[-1] ** 2 / within_m**2).sum())
+        turned, jacobian = off @ turn.T, turn @ _jacobian(place, velocity)
+        # Boxes that jump say less than their number, all together too.
+        sigma, bias = np.maximum(sigma, turned.std(axis=0)), np.maximum(bias, turned.std(axis=0))
+        share = (1.0 + (turned**2 / (sigma**2 + bias**2)).sum(axis=1) / TOO_FAR**2) ** -2.0
+        weight = share[:, None] / (sigma**2 + share.sum() * bias**2)
+        information += np.einsum("naj,na,nak->jk", jacobian, weight, jacobian)
+        gradient += np.einsum("naj,na,na->j", jacobian, weight, turned)
+    if not away:
+        return None
+    # Of a distance in the plane, the median is 1.18 times the standard deviation along an axis.
+    rms_m = float(np.median(np.concatenate(away))) / 1.18 * np.sqrt(2.0)
+    return Matched(Evidence(information, gradient), len(away), moving, gain, float(rms_m))
+
+
+def _spread_of(seen: ObjectTrack, velocity: Array, points: float) -> tuple[bool, Array, Array, Array]:
+    """Return whether an object moves, the axes (2, 2) along and across its motion, and the sigmas and biases (2,) along them."""
+    forward = velocity.mean(axis=0)
+    speed = float(np.hypot(*forward))
+    moves = speed > MOVING_MPS
+    kind = "standing" if not moves else "vehicle" if seen.group == GROUPS["car"] else "small"
+    sigma, bias = np.array(SPREAD_M[kind]) * np.clip(np.sqrt(USUAL_POINTS / points), 1.0, MAX_FACTOR)
+    x, y = forward / speed if moves else (1.0, 0.0)
+    return moves, np.array([[x, y], [-y, x]]), sigma, bias
+
+
+def _jacobian(place: Array, velocity: Array) -> Array:
+    """Differentiate places (N, 3) along x and y by a correction: (N, 2, 7)."""
+    (x, y, z), out = place.T, np.zeros((len(place), 2, 7))
+    out[:, 0, 0] = out[:, 1, 1] = 1.0
+    out[:, 0, 4], out[:, 0, 5] = z, -y
+    out[:, 1, 3], out[:, 1, 5] = -z, x
+    out[:, :, DELAY] = velocity
+    return out
+
+
+def _best_match(
+    seen: ObjectTrack, road: Sequence[ObjectTrack], correction: Array, delay_s: float, within_m: float
+) -> tuple[Array, Array, Array, float] | None:
+    """Find the track of the road that a vehicle's track is nearest to: places, velocities, offsets from the latter's, and points."""
+    best, best_gain = None, 0.0
+    for other in road:
+        place, velocity, known = other.at(seen.t_s + delay_s)
+        known &= np.hypot(*(velocity - seen.velocity_mps).T) < MAX_VELOCITY_APART_MPS
+        if not known.any():
+            continue
+        place = place @ correction[:3, :3].T + correction[:3, 3]
+        off = (place - seen.xyz_m)[:, :2]
+        known &= np.hypot(*off.T) < within_m
+        gain = float((1 - (off[known] ** 2).sum(axis=1) / within_m**2).sum())
+        if gain > best_gain and known.sum() >= min(MIN_BOXES, len(known)):
+            best, best_gain = (place[known], velocity[known], off[known], other.points), gain
+    return best

@@ -1,0 +1,405 @@
+"""Plane pieces of surfaces in sweeps, pairs of sweeps, and the motion that lays one onto the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from log2sim.datatypes import Log
+from log2sim.errors import RecordError
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    PoseTrack,
+    apply,
+    inverse,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+)
+from log2sim.localization.odometry import EgoSweep, ego_sweep_of, move_points
+
+# Velocities are those of a second: errors of GNSS and IMU make those of shorter times useless, and vehicles speed up and turn
+# for longer.
+MOTION_SPAN_NS = 500_000_000
+
+
+def exp_of(twist: Array) -> Array:
+    """Compute the transform (4, 4) of a twist (6,): the translation as it stands, and the rotation.
+
+    The bend of the path, which the exponential map has, is of second order; `log_of` is the inverse.
+    """
+    angle = float(np.linalg.norm(twist[3:]))
+    half = 0.5 * np.sinc(angle / (2 * np.pi))
+    q = np.concatenate([[np.cos(angle / 2)], half * twist[3:]])
+    return transform(rotation_from_quaternion(q), twist[:3])
+
+
+def log_of(motion: Array) -> Array:
+    """Compute the twists (..., 6) of transforms (..., 4, 4)."""
+    q = quaternion_from_rotation(motion[..., :3, :3])
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    turned = sine > 1e-12
+    factor = np.where(turned, 2 * np.arctan2(sine, q[..., :1]) / np.where(turned, sine, 1.0), 2.0)
+    return np.concatenate([motion[..., :3, 3], factor * q[..., 1:]], axis=-1)
+
+
+def cross_matrix(v: Array) -> Array:
+    """Return the matrices (..., 3, 3) by which vectors (..., 3) are crossed with others."""
+    out = np.zeros((*v.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., j, i], out[..., i, j] = v[..., k], -v[..., k]
+    return out
+
+
+def adjoint_of(dst_T_src: Array) -> Array:
+    """Compute the matrices (..., 6, 6) that take twists in the frame `src` to those in `dst`, for transforms (..., 4, 4)."""
+    rotation = dst_T_src[..., :3, :3]
+    out = np.zeros((*dst_T_src.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., :3, 3:] = cross_matrix(dst_T_src[..., :3, 3]) @ rotation
+    return out
+
+
+def velocities_at(track: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+    """Compute how the ego moves at stamps (K,), by poses `MOTION_SPAN_NS` before and after.
+
+    Returns
+    -------
+    velocity : (K, 6) float64, m/s and rad/s
+        Twists in the ego's frame.
+    known : (K,) bool
+        Whether these poses are known.
+    """
+    (before, known), (at, is_known), (after, will_be_known) = (
+        track.at(t_ns + shift) for shift in (-MOTION_SPAN_NS, 0, MOTION_SPAN_NS)
+    )
+    ego_T_map = inverse(at)
+    velocity = (log_of(ego_T_map @ after) - log_of(ego_T_map @ before)) / (2 * MOTION_SPAN_NS / NS_PER_S)
+    return velocity, known & is_known & will_be_known
+
+
+# Points farther away are too sparse to lie next to each other in sweeps from two places.
+MAX_REACH_M = 60.0
+VOXEL_M, NEIGHBORS = 0.4, 10
+# A piece of a plane is thin (RMS over its points, range noise and all) and no line, as the points of one ring are.
+MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
+# Ground, walls across and walls along count the same, however many points each of them has.
+MAX_FACING, MAX_TRIED = 300, 3000
+MIN_NORMAL_Z = 0.8
+MIN_PIECES = 150
+# Matches within a meter at first, since 3 degrees are 1 m after 20 m of driving; then within what noise and edges leave.
+MATCH_WITHIN_M = (2.0, 1.0, 0.5, 0.3, 0.3)
+MIN_SCALE_M = 0.01
+MAD_TO_SIGMA = 1.4826
+# Pieces so many standard deviations off count half.
+CAUCHY = 2.0
+MIN_OVERLAP = 0.3
+# A direction that no surface holds stays where it was guessed: information of a guess that is right to 0.5 m and 3 degrees.
+GUESS_SIGMA = np.array([0.5, 0.5, 0.5, 0.05, 0.05, 0.05])
+# Points on one surface err together, by the incidence of the beam and the shape of the wall: variance over that of independent
+# points, measured in synthetic streets with exact poses.
+CORRELATION = 20.0
+# Pieces that move or are matched with others by mistake decide where few hold a direction: so many pieces count half. A turn
+# moves pieces at this distance as much as a translation does.
+FEW_PIECES, LEVER_M = 30.0, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Pieces of planes of one sweep.
+
+    Attributes
+    ----------
+    xyz_m, normals : (N, 3) float64, m and unit vectors
+        Middles of pieces of planes and their normals: as many that face up, forward and sideways, if there are.
+    middles : (V, 3) float64, m
+        Of all voxels with points, those of `tree`.
+    """
+
+    xyz_m: Array
+    normals: Array
+    tree: cKDTree
+    middles: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The motion between two sweeps.
+
+    Attributes
+    ----------
+    first_T_second : (4, 4) float64
+    covariance : (6, 6) float64
+        Of a twist (m, rad) of the second sweep in its own frame.
+    overlap : float
+        Share of the pieces of planes that have a match.
+    """
+
+    first_T_second: Array
+    covariance: Array
+    overlap: float
+
+
+def surfaces_of(xyz_m: Array) -> Surfaces | None:
+    """Find the pieces of planes among points (N, 3), m; None with too few."""
+    near = xyz_m[np.einsum("nj,nj->n", xyz_m, xyz_m) < MAX_REACH_M**2]
+    middles = _thin(near)
+    if len(middles) < MIN_PIECES:
+        return None
+    # Made in a third of the time, and asked as fast; what it finds is the same.
+    tree = cKDTree(middles, balanced_tree=False, compact_nodes=False)
+    tried = middles[:: -(-len(middles) // MAX_TRIED)]
+    _, index = tree.query(tried, k=NEIGHBORS)
+    around = middles[index]
+    off = around - around.mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / NEIGHBORS)
+    plane = (spread[:, 0] < MAX_THICKNESS_M**2) & (spread[:, 1] > MIN_WIDTH_M**2) & (spread[:, 1] > 9 * spread[:, 0])
+    normals = np.where(plane[:, None], axes[:, :, 0], np.nan)
+    chosen = _choose(normals)
+    return Surfaces(tried[chosen], normals[chosen], tree, middles) if len(chosen) >= MIN_PIECES else None
+
+
+def _thin(xyz_m: Array) -> Array:
+    """Replace the points (N, 3) of each voxel by their mean."""
+    cell = np.floor(xyz_m / VOXEL_M).astype(np.int64) + (1 << 20)
+    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+    _, place, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(place, xyz_m[:, j]) / count for j in range(3)], axis=1)
+
+
+def _choose(normals: Array) -> Array:
+    """Choose rows (K,) of planes, `MAX_FACING` at most that face up, forward, and sideways."""
+    plane, size = np.isfinite(normals[:, 0]), np.abs(normals)
+    up = plane & (size[:, 2] > MIN_NORMAL_Z)
+    forward = plane & ~up & (size[:, 0] > size[:, 1])
+    rows = []
+    for facing in (up, forward, plane & ~up & ~forward):
+        found = np.flatnonzero(facing)
+        rows.append(found[np.linspace(0, len(found) - 1, min(MAX_FACING, len(found))).astype(np.int64)])
+    return np.concatenate(rows)
+
+
+def register(first: Surfaces, second: Surfaces, guess: Array) -> Registration | None:
+    """Find the motion (4, 4) from a second sweep's frame to the first one's, from a guess; None where they show too little in common.
+
+    Notes
+    -----
+    Point-to-plane ICP (Chen, Medioni, IVC 1992) with the normals of the first sweep and Cauchy weights.
+    """
+    pose = guess
+    match: _Match | None = None
+    for within_m in MATCH_WITHIN_M:
+        match = _match(first, second, inverse(pose), within_m)
+        if match is None:
+            return None
+        step = np.asarray(np.linalg.solve(match.information + np.diag(GUESS_SIGMA**-2.0), -match.gradient), np.float64)
+        pose = np.asarray(pose @ exp_of(step), dtype=np.float64)
+    if match is None or match.count < MIN_OVERLAP * len(first.xyz_m):
+        return None
+    return Registration(pose, _covariance(match.information, match.scale_m), match.count / len(first.xyz_m))
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    """Pieces of one sweep beside points of another: how many, how far apart (robust RMS), and information about a twist."""
+
+    count: int
+    scale_m: float
+    information: Array
+    gradient: Array
+
+
+def _match(first: Surfaces, second: Surfaces, second_T_first: Array, within_m: float) -> _Match | None:
+    """Match pieces of the first sweep with points of the second one; None with too few."""
+    at, normals = apply(second_T_first, first.xyz_m), first.normals @ second_T_first[:3, :3].T
+    away, index = second.tree.query(at, distance_upper_bound=within_m)
+    found = np.flatnonzero(np.isfinite(away))
+    if len(found) < MIN_PIECES // 2:
+        return None
+    (x, y, z), (u, v, w) = second.middles[index[found]].T, normals[found].T
+    residual = u * (x - at[found, 0]) + v * (y - at[found, 1]) + w * (z - at[found, 2])
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE_M)
+    jacobian = np.stack([u, v, w, y * w - z * v, z * u - x * w, x * v - y * u])
+    weighted = jacobian / (scale**2 + (residual / CAUCHY) ** 2)
+    return _Match(len(found), scale, weighted @ jacobian.T, weighted @ residual)
+
+
+def _covariance(information: Array, scale_m: float) -> Array:
+    """Compute the covariance (6, 6) of a twist from the information of independent points, of which a few must not decide."""
+    length = np.diag([1.0, 1.0, 1.0, 1 / LEVER_M, 1 / LEVER_M, 1 / LEVER_M])
+    pieces, directions = np.linalg.eigh(scale_m**2 * length @ information @ length)
+    pieces = np.maximum(pieces, 0.0)
+    trusted = (directions * (pieces**2 / (pieces + FEW_PIECES) / (CORRELATION * scale_m**2))) @ directions.T
+    back = np.linalg.inv(length)
+    return np.asarray(np.linalg.inv(back @ trusted @ back + np.diag(GUESS_SIGMA**-2.0)))
+
+
+# More sweeps make the result no better: the errors of the poses, which last for seconds, remain.
+MAX_SWEEPS = 20
+# Farther apart, sweeps miss how the ego changes its motion: of a long log, those of the parts in which it changes most are taken.
+SPACING_S, MAX_SPACING_S, PARTS = 0.5, 1.0, 2
+# Sweeps are compared with the next and with one of those after it: near ones show much in common, errors of far ones do not add up.
+STEP = 4
+MAX_APART_M = 40.0
+# On a shorter way nothing shows that matters: errors of poses of centimeters are degrees of it.
+MIN_PATH_M = 1.0
+# A turn moves what is seen as much as a translation by its angle times this.
+PAIR_LEVER_M = 20.0
+MIN_PAIRS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two of the sweeps, and the motion between them that their surfaces show."""
+
+    first: int
+    second: int
+    found: Registration
+
+
+@dataclass(frozen=True, eq=False)
+class SweepPairs:
+    """What the sweeps of a LiDAR show of the ego's motion.
+
+    Attributes
+    ----------
+    track : PoseTrack
+        The ego's poses.
+    sensor_m : (3,) float64, m
+        Where the LiDAR is in the ego's frame.
+    t_ns : (K,) int64
+        Stamps of the sweeps.
+    """
+
+    track: PoseTrack
+    sensor_m: Array
+    t_ns: NDArray[np.int64]
+    pairs: tuple[Pair, ...]
+
+
+def pair_sweeps(
+    log: Log, lidar: str, during_ns: tuple[int, int] | None, report: Callable[[int, int], None]
+) -> SweepPairs | None:
+    """Compare sweeps of a LiDAR on the ego with each other.
+
+    Parameters
+    ----------
+    during_ns : (2,) tuple of int or None
+        First and last stamp to look at; None for all.
+    report : callable
+        Called as `report(done, total)`.
+
+    Returns
+    -------
+    SweepPairs or None
+        None where the ego hardly moves, sweeps show too little, or points are given in the map, which hides clock and mount.
+    """
+    track = log.ego
+    if track is None:
+        return None
+    chosen = choose_sweeps(track, log.streams[lidar].t_ns, during_ns)
+    places, surfaces = [], []
+    for done, i in enumerate(chosen.tolist()):
+        report(done, len(chosen))
+        try:
+            record = log.streams[lidar].read(i)
+        except RecordError:
+            continue
+        if record.frame == "map":
+            return None
+        sweep = ego_sweep_of(log, lidar, record)
+        if sweep is not None and (found := _surfaces(sweep, track)) is not None:
+            places.append(sweep.t_ref_ns)
+            surfaces.append(found)
+    if len(surfaces) < 2:
+        return None
+    t_ns = np.array(places, dtype=np.int64)
+    pairs = _compare(surfaces, track.at(t_ns)[0])
+    sensor_m = log.lidars[lidar].mount_T_lidar[:3, 3]
+    return SweepPairs(track, sensor_m, t_ns, tuple(pairs)) if len(pairs) >= MIN_PAIRS else None
+
+
+def choose_sweeps(
+    track: PoseTrack, t_ns: NDArray[np.int64], during_ns: tuple[int, int] | None = None
+) -> NDArray[np.intp]:
+    """Choose rows (K,) of sweeps at stamps (N,): none where the ego hardly moves, of a long log where its motion changes most."""
+    rows = np.arange(len(t_ns))
+    if during_ns is not None:
+        rows = rows[(t_ns >= during_ns[0]) & (t_ns <= during_ns[1])]
+    spaced = _spaced(t_ns, rows)
+    velocity, known = velocities_at(track, t_ns[spaced])
+    spaced, velocity = spaced[known], velocity[known]
+    if len(spaced) == 0 or _path_m(track, t_ns[spaced]) < MIN_PATH_M:
+        return rows[:0]
+    if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
+        return np.sort(np.concatenate(_fastest_changes(spaced, velocity)))
+    usable = rows[(rows >= spaced[0]) & (rows <= spaced[-1])]
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, MAX_SWEEPS).round().astype(np.int64))]
+    return np.asarray(chosen[velocities_at(track, t_ns[chosen])[1]])
+
+
+def _spaced(t_ns: NDArray[np.int64], rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Keep rows whose stamps are `SPACING_S` apart."""
+    if len(rows) == 0:
+        return rows
+    slot = (t_ns[rows] - t_ns[rows[0]]) // round(SPACING_S * NS_PER_S)
+    return np.asarray(rows[np.unique(slot, return_index=True)[1]])
+
+
+def _path_m(track: PoseTrack, t_ns: NDArray[np.int64]) -> float:
+    """Compute how far the ego gets, m, as the diagonal of the box around its places."""
+    places = track.at(t_ns)[0][:, :3, 3]
+    return float(np.linalg.norm(np.ptp(places, axis=0)))
+
+
+def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:
+    """Choose `PARTS` runs of rows in which the velocity varies most, one after the other."""
+    size = MAX_SWEEPS // PARTS
+    scaled = velocity * np.array([1.0, 1.0, 1.0, PAIR_LEVER_M, PAIR_LEVER_M, PAIR_LEVER_M])
+    change = np.array([scaled[k : k + size].var(axis=0).sum() for k in range(len(rows) - size + 1)])
+    parts: list[NDArray[np.intp]] = []
+    for _ in range(PARTS):
+        k = int(np.argmax(change))
+        parts.append(rows[k : k + size])
+        change[max(k - size + 1, 0) : k + size] = -1.0
+        if change.max() < 0:
+            break
+    return parts
+
+
+def _surfaces(sweep: EgoSweep, track: PoseTrack) -> Surfaces | None:
+    """Find the surfaces of a sweep with the ego's motion taken out."""
+    xyz = sweep.xyz_m
+    if sweep.t_ns is not None:
+        ref_T_map = inverse(track.at(sweep.t_ref_ns)[0][0])
+        moved = move_points(xyz, sweep.t_ns, lambda t: (ref_T_map @ track.at(t)[0], track.at(t)[1]))
+        if moved is None:
+            return None
+        xyz = moved
+    return surfaces_of(xyz)
+
+
+def _compare(surfaces: list[Surfaces], map_T_ego: Array) -> list[Pair]:
+    """Register sweeps with the next ones, and with those `STEP` later, from what the former have shown."""
+    near: dict[int, Registration] = {}
+    pairs = []
+    for step in (1, STEP):
+        for i in range(len(surfaces) - step):
+            guess = inverse(map_T_ego[i]) @ map_T_ego[i + step]
+            if np.linalg.norm(guess[:3, 3]) > MAX_APART_M:
+                continue
+            between = [near.get(k) for k in range(i, i + step)]
+            if step > 1 and all(between):
+                guess = reduce(np.matmul, [found.first_T_second for found in between if found is not None])
+            found = register(surfaces[i], surfaces[i + step], guess)
+            if found is not None:
+                pairs.append(Pair(i, i + step, found))
+                if step == 1:
+                    near[i] = found
+    return pairs

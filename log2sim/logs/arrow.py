@@ -1,0 +1,545 @@
+"""Feather and parquet files as NumPy columns, with limits.
+
+Layouts: Apache Arrow, format/File.fbs and format/Message.fbs; FlatBuffers internals for tables and vectors.
+
+`read_columns` reads chosen columns of a whole file, `log2sim.logs.arrow.ParquetRows` single rows of a large parquet
+file. What a feather file declares (rows, decompressed sizes) is checked against `TableLimits` before anything is allocated;
+parquet files are unpacked piece by piece up to the limits. What pyarrow returns is validated before it is used: pyarrow itself
+trusts the offsets of text and lists that it reads.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError, MissingExtra, RecordError
+from log2sim.files.inputs import open_regular, read_bytes
+
+ARROW_MAGIC = b"ARROW1"
+# A block, the place of a record batch in the file: offset (int64), bytes of its message (int32, padded), bytes of its body.
+BLOCK = struct.Struct("<qi4xq")
+BUFFER = struct.Struct("<qq")
+# Of all record batches together; a table has about three a column and batch.
+MAX_BUFFERS = 1_000_000
+
+# Fields by their number.
+FOOTER_DICTIONARIES, FOOTER_BATCHES = 2, 3
+MESSAGE_TYPE, MESSAGE_HEADER = 1, 2
+DICTIONARY_DATA = 1
+BATCH_LENGTH, BATCH_BUFFERS, BATCH_COMPRESSION = 0, 2, 3
+DICTIONARY_BATCH, RECORD_BATCH = 2, 3
+
+
+def declared_size(data: bytes) -> tuple[int, int]:
+    """Return the rows and the unpacked bytes of all record batches of an Arrow file.
+
+    Raises
+    ------
+    ValueError
+        When it is truncated or its structure is damaged.
+    """
+    if len(data) < 24 or data[-6:] != ARROW_MAGIC:
+        raise ValueError("the Arrow file is truncated: it does not end with ARROW1")
+    try:
+        (length,) = struct.unpack_from("<i", data, len(data) - 10)
+        start = len(data) - 10 - length
+        if length <= 0 or start < 8:
+            raise ValueError("the footer of the Arrow file is damaged")
+        return _sum_blocks(data, start)
+    except struct.error:
+        raise ValueError("the structure of the Arrow file is damaged") from None
+
+
+def _sum_blocks(data: bytes, start: int) -> tuple[int, int]:
+    footer = _indirect(data, start)
+    rows = size = buffers = 0
+    for field in (FOOTER_DICTIONARIES, FOOTER_BATCHES):
+        for place in _vector(data, footer, field, BLOCK.size):
+            offset, message_bytes, _ = BLOCK.unpack_from(data, place)
+            batch = _batch(data, offset)
+            places = _vector(data, batch, BATCH_BUFFERS, BUFFER.size)
+            buffers += len(places) + 1
+            if buffers > MAX_BUFFERS:
+                raise ValueError(f"more than the {MAX_BUFFERS} buffers that an Arrow file may have")
+            packed = bool(_field(data, batch, BATCH_COMPRESSION))
+            size += sum(_unpacked_bytes(data, offset + message_bytes, p, packed) for p in places)
+            at = _field(data, batch, BATCH_LENGTH)
+            rows += struct.unpack_from("<q", data, at)[0] if at and field == FOOTER_BATCHES else 0
+    return rows, size
+
+
+def _unpacked_bytes(data: bytes, body: int, place: int, packed: bool) -> int:
+    offset, length = BUFFER.unpack_from(data, place)
+    if offset < 0 or length < 0 or body < 0:
+        raise ValueError("a buffer of the Arrow file is damaged")
+    if not packed or length < 8:
+        return int(length)
+    # Compressed buffers begin with their unpacked size; -1 marks one that is not compressed.
+    (unpacked,) = struct.unpack_from("<q", data, body + offset)
+    if unpacked < -1:
+        raise ValueError("a buffer of the Arrow file has a negative size")
+    return int(length if unpacked == -1 else unpacked)
+
+
+def _batch(data: bytes, offset: int) -> int:
+    """Position of the record batch of a message; that inside of a batch of dictionary entries."""
+    if offset < 8:
+        raise ValueError("the structure of the Arrow file is damaged")
+    (mark,) = struct.unpack_from("<I", data, offset)
+    # Files written before version 0.15 lack the mark.
+    message = _indirect(data, offset + (8 if mark == 0xFFFFFFFF else 4))
+    (kind,) = struct.unpack_from("<B", data, _field(data, message, MESSAGE_TYPE) or len(data))
+    header = _indirect(data, _field(data, message, MESSAGE_HEADER) or len(data))
+    if kind == DICTIONARY_BATCH:
+        return _indirect(data, _field(data, header, DICTIONARY_DATA) or len(data))
+    if kind != RECORD_BATCH:
+        raise ValueError("a record batch of the Arrow file is none")
+    return header
+
+
+def _indirect(data: bytes, place: int) -> int:
+    return place + int(struct.unpack_from("<I", data, place)[0])
+
+
+def _field(data: bytes, table: int, number: int) -> int:
+    """Position of a field of a table; 0 when it is absent."""
+    (back,) = struct.unpack_from("<i", data, table)
+    vtable = table - back
+    if vtable < 0:
+        raise struct.error
+    (size,) = struct.unpack_from("<H", data, vtable)
+    if 4 + 2 * number + 2 > size:
+        return 0
+    (offset,) = struct.unpack_from("<H", data, vtable + 4 + 2 * number)
+    return table + offset if offset else 0
+
+
+def _vector(data: bytes, table: int, number: int, item_bytes: int) -> range:
+    """Positions of the items of a vector of structs."""
+    field = _field(data, table, number)
+    if not field:
+        return range(0)
+    start = _indirect(data, field)
+    (count,) = struct.unpack_from("<I", data, start)
+    if start + 4 + count * item_bytes > len(data):
+        raise struct.error
+    return range(start + 4, start + 4 + count * item_bytes, item_bytes)
+
+
+# Names, ids and categories; arrays of text make room for the longest in every row.
+MAX_TEXT_CHARACTERS = 4096
+
+Kind = Literal["float", "int", "bool", "text", "bytes", "floats", "ints"]
+
+
+def values_of(column: Any, kind: Kind) -> NDArray[Any]:
+    """Convert a validated pyarrow array of N values; `log2sim.logs.arrow.read_columns` describes the kinds.
+
+    Raises
+    ------
+    ValueError
+        When the column holds something else; says what was expected.
+    """
+    if kind not in get_args(Kind):
+        raise TypeError(f"unknown kind '{kind}', expected one of {', '.join(get_args(Kind))}")
+    import pyarrow
+
+    types = pyarrow.types
+    if types.is_dictionary(column.type):
+        column = column.dictionary_decode()
+    if kind in ("floats", "ints"):
+        return _lists(column, "float" if kind == "floats" else "int")
+    if kind in ("float", "int", "bool"):
+        return _numbers(column, kind)
+    if kind == "text":
+        return _text(column)
+    if not (types.is_binary(column.type) or types.is_large_binary(column.type)):
+        raise ValueError(f"is {column.type}, expected bytes")
+    return _objects(column.to_pylist())
+
+
+def _numbers(column: Any, kind: Literal["float", "int", "bool"]) -> NDArray[Any]:
+    import pyarrow
+
+    types = pyarrow.types
+    if kind == "bool":
+        if not types.is_boolean(column.type) or column.null_count:
+            raise ValueError(f"is {column.type} with {column.null_count} missing values, expected true or false")
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    if kind == "int":
+        if not types.is_integer(column.type) or column.null_count:
+            raise ValueError(f"is {column.type} with {column.null_count} missing values, expected whole numbers")
+        numbers: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+        if numbers.dtype == np.uint64 and len(numbers) and numbers.max() > np.iinfo(np.int64).max:
+            raise ValueError("holds a number beyond int64")
+        return numbers.astype(np.int64)
+    if not (types.is_integer(column.type) or types.is_floating(column.type)):
+        raise ValueError(f"is {column.type}, expected numbers")
+    numbers = column.to_numpy(zero_copy_only=False)
+    return numbers.astype(np.float32 if column.type in (pyarrow.float16(), pyarrow.float32()) else np.float64)
+
+
+def _text(column: Any) -> NDArray[Any]:
+    import pyarrow
+
+    types = pyarrow.types
+    if types.is_integer(column.type):
+        return _objects([None if n is None else str(n) for n in column.to_pylist()])
+    if not (types.is_string(column.type) or types.is_large_string(column.type)):
+        raise ValueError(f"is {column.type}, expected text")
+    cells = column.to_pylist()
+    longest = max((len(cell) for cell in cells if cell is not None), default=0)
+    if longest > MAX_TEXT_CHARACTERS:
+        raise ValueError(f"holds a text of {longest} characters, more than the {MAX_TEXT_CHARACTERS} that one may have")
+    return _objects(cells)
+
+
+def _lists(column: Any, kind: Literal["float", "int"]) -> NDArray[Any]:
+    import pyarrow
+
+    types = pyarrow.types
+    if types.is_fixed_size_list(column.type):
+        # `flatten` leaves out the values below missing lists, which are missing themselves.
+        numbers = _numbers(column.flatten(), kind).reshape(-1, column.type.list_size)
+        if not column.null_count:
+            return numbers
+        present = iter(numbers)
+        return _objects([next(present) if t else None for t in column.is_valid().to_pylist()])
+    if not (types.is_list(column.type) or types.is_large_list(column.type)):
+        raise ValueError(f"is {column.type}, expected a list of numbers a row")
+    ends = column.offsets.to_numpy(zero_copy_only=False)
+    # Of a slice of a table only the part that it refers to is converted.
+    first, last = (int(ends[0]), int(ends[-1])) if len(ends) else (0, 0)
+    numbers = _numbers(column.values.slice(first, last - first), kind)
+    there = np.ones(len(column), dtype=bool) if not column.null_count else column.is_valid().to_numpy(False)
+    return _objects([numbers[a - first : b - first] if t else None for a, b, t in zip(ends, ends[1:], there)])
+
+
+def _objects(cells: list[Any]) -> NDArray[Any]:
+    values = np.empty(len(cells), dtype=object)
+    for row, cell in enumerate(cells):
+        values[row] = cell
+    return values
+
+
+PARQUET_MAGIC = b"PAR1"
+# Before this version a file could make pyarrow unpickle (CVE-2023-47248); the extra "parquet" requires it too.
+MIN_PYARROW_VERSION = 17
+# Rows of a parquet file that are unpacked before the limit of bytes is checked again.
+ROWS_AT_A_TIME = 16_384
+
+
+@dataclass(frozen=True)
+class TableLimits:
+    """What a table may have at most.
+
+    Attributes
+    ----------
+    file_bytes : int
+        Of a feather file, which is read as a whole. Parquet files are read in parts.
+    unpacked_bytes : int
+        Of all that is decompressed at a time.
+    """
+
+    rows: int = 20_000_000
+    file_bytes: int = 1024**3
+    unpacked_bytes: int = 2 * 1024**3
+
+
+LIMITS = TableLimits()
+
+
+def read_columns(
+    path: Path,
+    wanted: Mapping[str, Kind],
+    *,
+    optional: Collection[str] = (),
+    error: type[LogError] = LogError,
+    limits: TableLimits = LIMITS,
+) -> dict[str, NDArray[Any]]:
+    """Read columns of a feather or parquet file; its content decides which of the two it is, not its name.
+
+    Parameters
+    ----------
+    wanted : mapping of str to str
+        What each column must hold. "float": numbers, as (N,) float32 if they are float16 or float32, else float64, NaN where
+        one is missing. "int": whole numbers, (N,) int64. "bool": (N,) bool. "text": (N,) object of str, also of whole numbers
+        ("3"). "bytes": (N,) object of bytes. "floats" and "ints": a list of numbers a row, (N, K) where the type says that
+        all have the length K, else (N,) object of arrays. Columns encoded by a dictionary are decoded. Missing text, bytes
+        and lists are None.
+    optional : collection of str
+        Names out of `wanted` that may be absent; they are absent in the result then.
+    error : type
+        What is raised: `LogError` for an index or calibration, `RecordError` for one record.
+
+    Returns
+    -------
+    dict of str to (N, ...) array
+        In the order of `wanted`.
+
+    Raises
+    ------
+    LogError or `error`
+        When the file is missing, too large, damaged, or has no such column; names file, column and what was expected.
+    MissingExtra
+        When pyarrow is not installed.
+    """
+    with translate_errors(path, error):
+        table = _read_table(path, wanted, optional, limits)
+        return {name: _values(table.column(name), name, wanted[name]) for name in wanted if name in table.column_names}
+
+
+def import_pyarrow() -> Any:
+    """Return the module `pyarrow`; raise `MissingExtra` when it is missing or too old."""
+    try:
+        import pyarrow
+    except ImportError:
+        raise MissingExtra("reading feather and parquet files", "parquet") from None
+    if int(pyarrow.__version__.split(".")[0]) < MIN_PYARROW_VERSION:
+        raise MissingExtra(f"pyarrow {pyarrow.__version__} is too old; reading feather and parquet files", "parquet")
+    return pyarrow
+
+
+@contextmanager
+def translate_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
+    """Turn whatever reading `path` raises into `error` that begins with it, in one line."""
+    pyarrow = import_pyarrow()
+    try:
+        yield
+    except (LogError, MissingExtra):
+        raise
+    except FileNotFoundError:
+        raise error(f"{path}: no such file") from None
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError) as problem:
+        lines = str(getattr(problem, "strerror", None) or problem).strip().splitlines()
+        raise error(f"{path}: {lines[0] if lines else type(problem).__name__}") from None
+
+
+def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection[str] = ()) -> list[str]:
+    """Return the names out of `wanted` that a pyarrow schema has.
+
+    Raises
+    ------
+    ValueError
+        When a column is missing or there twice, or when its type is an extension: those run code of whoever registered them.
+    """
+    pyarrow = import_pyarrow()
+    names = list(schema.names)
+    for name in wanted:
+        if name not in names and name not in optional:
+            there = ", ".join(names[:20]) or "none"
+            raise ValueError(f"no column '{name}'; expected {', '.join(wanted)}, found {there}")
+        if names.count(name) > 1:
+            raise ValueError(f"{names.count(name)} columns '{name}', expected one")
+    chosen = [name for name in wanted if name in names]
+    for field in (schema.field(name) for name in chosen):
+        extension = b"ARROW:extension:name" in (field.metadata or {})
+        if extension or isinstance(field.type, pyarrow.BaseExtensionType):
+            raise ValueError(f"column '{field.name}' is of the extension type {field.type}, expected a plain type")
+    return chosen
+
+
+def _read_table(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
+    """Read the wanted columns as a pyarrow table whose offsets were validated."""
+    with open_regular(path) as file:
+        magic = file.read(len(ARROW_MAGIC))
+    if magic.startswith(PARQUET_MAGIC):
+        table = _read_parquet(path, wanted, optional, limits)
+    elif magic == ARROW_MAGIC:
+        table = _read_feather(path, wanted, optional, limits)
+    else:
+        raise ValueError("neither an Arrow (feather, version 2) nor a parquet file")
+    table.validate(full=True)
+    return table
+
+
+def _read_parquet(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
+    """Read columns piece by piece, up to the limit: pyarrow does not check the sizes that the metadata declare."""
+    pyarrow = import_pyarrow()
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        names = checked_schema(file.schema_arrow, wanted, optional)
+        check_rows(file.metadata.num_rows, limits)
+        pieces, size = [], 0
+        for piece in file.iter_batches(batch_size=ROWS_AT_A_TIME, columns=names, use_threads=False):
+            pieces.append(piece)
+            size += piece.nbytes
+            _check_size(size, limits)
+        return pyarrow.Table.from_batches(pieces) if pieces else file.schema_arrow.empty_table().select(names)
+
+
+def check_rows(rows: int, limits: TableLimits) -> None:
+    """Raise `ValueError` when a table declares more rows than it may have, or less than none."""
+    if not 0 <= rows <= limits.rows:
+        raise ValueError(f"{rows} rows, more than the {limits.rows} that a table may have")
+
+
+def _check_size(unpacked_bytes: int, limits: TableLimits) -> None:
+    if unpacked_bytes > limits.unpacked_bytes:
+        raise ValueError(
+            f"unpacks to {unpacked_bytes} bytes, more than the {limits.unpacked_bytes} that a table may have"
+        )
+
+
+def _read_feather(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
+    pyarrow = import_pyarrow()
+    data = read_bytes(path, limits.file_bytes)
+    rows, unpacked = declared_size(data)
+    check_rows(rows, limits)
+    _check_size(unpacked, limits)
+    with pyarrow.ipc.open_file(pyarrow.BufferReader(data)) as whole:
+        names = checked_schema(whole.schema, wanted, optional)
+        fields = [whole.schema.get_field_index(name) for name in names]
+    options = pyarrow.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
+    with pyarrow.ipc.open_file(pyarrow.BufferReader(data), options=options) as file:
+        return file.read_all() if names else pyarrow.table({})
+
+
+def _values(column: Any, name: str, kind: Kind) -> NDArray[Any]:
+    try:
+        return values_of(column.combine_chunks(), kind)
+    except ValueError as problem:
+        raise ValueError(f"column '{name}': {problem}") from None
+
+
+# Decoded rows are kept up to this size; see `ParquetRows`.
+MAX_KEPT_BYTES = 256 * 1024**2
+PARQUET_ROWS_AT_A_TIME = 8
+# Compressed pages are read from the file in parts of this size, not a whole column of a row group at once.
+READ_BYTES = 1024**2
+
+Row = dict[str, Any]
+
+
+class ParquetRows:
+    """Rows of a parquet file, read on request, also from several threads.
+
+    Parameters
+    ----------
+    path : Path
+    wanted : mapping of str to str
+        The columns of a row and what they hold, as for `log2sim.logs.arrow.read_columns`.
+    optional : collection of str
+        Names out of `wanted` that may be absent.
+    limits : TableLimits
+
+    Notes
+    -----
+    To read a row of a parquet file, the rows before it in its row group have to be decoded. Reading therefore continues after
+    the last row that was read, and decoded rows are kept up to `MAX_KEPT_BYTES`: reading in the order of the file decodes it
+    once, reading an earlier row that is not kept starts its row group again. Many writers use one row group for the whole file.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        wanted: Mapping[str, Kind],
+        *,
+        optional: Collection[str] = (),
+        limits: TableLimits = LIMITS,
+    ) -> None:
+        self._path, self._wanted, self._optional, self._limits = path, dict(wanted), optional, limits
+        self._lock = Lock()
+        self._file: Any = None
+        self._names: list[str] = []
+        # First rows of the row groups, and their end.
+        self._starts = np.zeros(1, dtype=np.int64)
+        self._group, self._next = -1, 0
+        self._batches: Iterator[Any] = iter(())
+        self._kept: OrderedDict[int, Row] = OrderedDict()
+        self._kept_bytes = 0
+
+    def __len__(self) -> int:
+        """Return the number of rows; raise `LogError` when the file is missing, damaged or lacks a wanted column."""
+        with self._lock, translate_errors(self._path, LogError):
+            self._open()
+            return int(self._starts[-1])
+
+    def read(self, index: int) -> Row:
+        """Read row `index`: a number, str, bytes or array for each column, None where it is missing.
+
+        Raises
+        ------
+        RecordError
+            When the file is damaged there or lacks a wanted column; names file, row and column.
+        """
+        with self._lock, translate_errors(f"{self._path}, row {index}", RecordError):
+            self._open()
+            if not 0 <= index < self._starts[-1]:
+                raise ValueError(f"no such row; there are {self._starts[-1]}")
+            if index in self._kept:
+                self._kept.move_to_end(index)
+                return self._kept[index]
+            try:
+                return self._read_on_to(index)
+            except BaseException:
+                # The position in the file is not known any more.
+                self._group = -1
+                raise
+
+    def _open(self) -> None:
+        if self._file is not None:
+            return
+        import_pyarrow()
+        from pyarrow.parquet import ParquetFile
+
+        open_regular(self._path).close()  # pyarrow would wait for a pipe
+        file = ParquetFile(self._path, buffer_size=READ_BYTES)
+        self._names = checked_schema(file.schema_arrow, self._wanted, self._optional)
+        groups = [file.metadata.row_group(g).num_rows for g in range(file.metadata.num_row_groups)]
+        check_rows(min(groups, default=0), self._limits)
+        check_rows(sum(groups), self._limits)
+        self._starts = np.concatenate([[0], np.cumsum(np.array(groups, dtype=np.int64))])
+        self._file = file
+
+    def _read_on_to(self, index: int) -> Row:
+        group = int(np.searchsorted(self._starts, index, side="right")) - 1
+        if group != self._group or index < self._next:
+            self._batches = self._file.iter_batches(
+                batch_size=PARQUET_ROWS_AT_A_TIME, row_groups=[group], columns=self._names, use_threads=False
+            )
+            self._group, self._next = group, int(self._starts[group])
+        while True:
+            batch = next(self._batches, None)
+            if batch is None:
+                raise ValueError("its row group holds fewer rows than the file says")
+            if batch.nbytes > self._limits.unpacked_bytes:
+                raise ValueError(
+                    f"unpacks to {batch.nbytes} bytes, more than the {self._limits.unpacked_bytes} allowed"
+                )
+            rows = self._rows(batch)
+            if index in rows:
+                return rows[index]
+
+    def _rows(self, batch: Any) -> dict[int, Row]:
+        """Rows of a batch by their number; they are kept until newer ones need the room."""
+        batch.validate(full=True)
+        columns = {}
+        for name in self._names:
+            try:
+                columns[name] = values_of(batch.column(name), self._wanted[name])
+            except ValueError as problem:
+                raise ValueError(f"column '{name}': {problem}") from None
+        rows = {self._next + k: {name: values[k] for name, values in columns.items()} for k in range(batch.num_rows)}
+        self._next += batch.num_rows
+        for number, row in rows.items():
+            self._kept_bytes += _size(row) - _size(self._kept.pop(number, {}))
+            self._kept[number] = row
+        while self._kept_bytes > MAX_KEPT_BYTES:
+            self._kept_bytes -= _size(self._kept.popitem(last=False)[1])
+        return rows
+
+
+def _size(row: Row) -> int:
+    return sum(v.nbytes if isinstance(v, (np.ndarray, np.generic)) else len(v or b"") for v in row.values())

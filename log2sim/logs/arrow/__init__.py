@@ -1,1 +1,0 @@
-"""Feather and parquet files as NumPy columns, with limits."""

@@ -1,0 +1,377 @@
+"""Checks of stamps, calibrations and labels of a whole log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Labels, Log
+from log2sim.geometry import NS_PER_S, Camera, Mount, fold_radius, nearest_index, undistort
+from log2sim.geometry.transforms import Array
+from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of
+from log2sim.logs.records import MAX_POSITION_M
+
+# As a scenario may state; a freight train is not longer.
+MAX_SIZE_M = 1000.0
+_ROWS = ("t_ns", "track_id", "category", "center_m", "size_m", "yaw_rad", "visible", "kind", "occlusion")
+
+
+def find_possible(labels: Labels) -> NDArray[np.bool_]:
+    """Mark (L,) the boxes of finite numbers that have a size and are on Earth."""
+    sized = ((labels.size_m > 0) & (labels.size_m <= MAX_SIZE_M)).all(axis=1)
+    return np.asarray(sized & (np.abs(labels.center_m) <= MAX_POSITION_M).all(axis=1) & np.isfinite(labels.yaw_rad))
+
+
+def without_impossible_labels(log: Log) -> Log:
+    """Return the log without labels that no object can have, and with a note of how many there were; labels stay unread until they are asked for."""
+
+    @cache
+    def checked() -> tuple[Labels | None, int]:
+        labels = log.labels
+        if labels is None:
+            return None, 0
+        possible = find_possible(labels)
+        if possible.all():
+            return labels, 0
+        rows: dict[str, Any] = {name: getattr(labels, name) for name in _ROWS}
+        kept: dict[str, Any] = {name: None if column is None else column[possible] for name, column in rows.items()}
+        return replace(labels, **kept), int((~possible).sum())
+
+    def notes() -> tuple[str, ...]:
+        count = checked()[1]
+        if not count:
+            return log.notes
+        words = f"{count} label{'s' * (count != 1)} left out: no object is so large or so far away, or it has no size"
+        return *log.notes, words
+
+    return log.changed(labels=lambda: checked()[0], notes=notes)
+
+
+# In image widths: a field of view of 136 degrees without distortion, and lenses for photographs of the moon.
+MIN_FOCAL_WIDTHS, MAX_FOCAL_WIDTHS = 0.2, 20.0
+# From the image to the principal point, in widths and heights: a crop of a larger image seldom leaves it farther outside.
+MAX_PRINCIPAL_POINT_SIZES = 0.5
+# No lens without distortion sees farther off its axis; a pixel beyond shows nothing.
+MAX_RAY_DEGREES = 80.0
+# Longer than any road vehicle with its trailers.
+MAX_MOUNT_DISTANCE_M = 100.0
+# Corners of wide lenses lie outside of the circle that the lens draws, where nothing keeps a fitted polynomial from folding.
+MAX_FOLD_DEGREES = 70.0
+# Fits of rational models reach thousands; the roots of much larger ones are not finite.
+MAX_DISTORTION = 1e6
+MAX_FOLDED_SHARE, MAX_USABLE_FOLDED_SHARE = 0.01, 0.5
+GRID = 32
+
+
+@dataclass(frozen=True)
+class CalibrationProblem:
+    """A value of a calibration that no sensor, or hardly one, can have.
+
+    Attributes
+    ----------
+    message : str
+        Names the sensor, where its calibration is, the field and its value.
+    is_impossible : bool
+        Whether nothing that is measured with it can be right; else it is only doubtful.
+    """
+
+    message: str
+    is_impossible: bool
+
+
+def list_calibration_problems(log: Log) -> list[str]:
+    """List what is wrong with the calibrations of a log, one line each."""
+    return [problem.message for name in log.streams for problem in problems_of(log, name)]
+
+
+def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
+    """Check the calibration of a sensor of a log."""
+    place = log.calibrations.get(name, log.name)
+    camera = log.cameras.get(name)
+    if camera is not None:
+        where = f"{place}, camera '{name}'"
+        yield from _focal_lengths(camera, where)
+        yield from _principal_point(camera, where)
+        yield from _distortion(camera, where)
+        yield from _mount(camera.mount, camera.mount_T_cam, where)
+    elif name in log.lidars:
+        lidar = log.lidars[name]
+        yield from _mount(lidar.mount, lidar.mount_T_lidar, f"{place}, LiDAR '{name}'")
+
+
+def _focal_lengths(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+    for field, value_px in (("fx", camera.K[0, 0]), ("fy", camera.K[1, 1])):
+        widths = float(value_px) / camera.width_px
+        if not MIN_FOCAL_WIDTHS <= widths <= MAX_FOCAL_WIDTHS:
+            yield CalibrationProblem(
+                f"{where}: its focal length {field} is {value_px:.6g} px, {widths:.3g} image widths; expected "
+                f"{MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the size of the images",
+                True,
+            )
+
+
+def _principal_point(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+    limit = np.tan(np.radians(MAX_RAY_DEGREES))
+    for field, axis, size_px in (("cx", 0, camera.width_px), ("cy", 1, camera.height_px)):
+        value_px = float(camera.K[axis, 2])
+        outside_px = max(-value_px, value_px - size_px, 0.0)
+        # Fails for a value that is not a number.
+        if not outside_px <= MAX_PRINCIPAL_POINT_SIZES * size_px:
+            yield CalibrationProblem(
+                f"{where}: its principal point {field} is {value_px:.6g} px, {outside_px:.6g} px outside of images of "
+                f"{camera.width_px}x{camera.height_px} px; check whether the images are cropped or scaled",
+                bool(not outside_px <= limit * camera.K[axis, axis]),
+            )
+
+
+def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+    wrong = [value for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
+    if wrong:
+        yield CalibrationProblem(
+            f"{where}: its distortion has the coefficient {wrong[0]:.6g}, expected numbers up to {MAX_DISTORTION:g}",
+            True,
+        )
+    if wrong or camera.rectified or not np.arctan(fold_radius(camera)) < np.radians(MAX_FOLD_DEGREES):
+        return
+    u, v = ((np.arange(GRID) + 0.5) * size / GRID for size in (camera.width_px, camera.height_px))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    share = float(np.isnan(undistort(camera, pixels)).any(axis=1).mean())
+    if share > MAX_FOLDED_SHARE:
+        values = ", ".join(f"{value:.6g}" for value in camera.distortion)
+        yield CalibrationProblem(
+            f"{where}: its distortion ({camera.distortion_model}: {values}) folds the image at "
+            f"{np.degrees(np.arctan(fold_radius(camera))):.0f} degrees off the axis: {100 * share:.0f} % of the pixels have no ray; "
+            "check the order and signs of the coefficients",
+            share > MAX_USABLE_FOLDED_SHARE,
+        )
+
+
+def _mount(mount: Mount, mount_T_sensor: Array, where: str) -> Iterator[CalibrationProblem]:
+    distance_m = float(np.linalg.norm(mount_T_sensor[:3, 3]))
+    if mount == "ego" and not distance_m <= MAX_MOUNT_DISTANCE_M:
+        x, y, z = mount_T_sensor[:3, 3].tolist()
+        yield CalibrationProblem(
+            f"{where}: its mounting is {distance_m:.6g} m from the ego, at ({x:.6g}, {y:.6g}, {z:.6g}) m; expected at most "
+            f"{MAX_MOUNT_DISTANCE_M:g} m, so check its unit and its frame",
+            True,
+        )
+
+
+# Streams of a second that has no record of another may still belong together: a log may hold one frame and one sweep.
+MAX_APART_NS = NS_PER_S
+# A run that is shorter than the log by less is worth no line: sensors start one after the other.
+MIN_MISSING_NS = NS_PER_S
+MIN_MISSING_SHARE = 0.01
+# Both ends of a stream are off alike when they differ by no more than this share of the offset.
+MAX_END_MISMATCH = 0.2
+MAX_NAMES = 3
+# The first Unix time with ten digits is of 2001; recordings that count from their start last no year.
+MIN_UNIX_S, MAX_RELATIVE_S = 1e9, 3e7
+SECONDS_OF_ZONES = 900
+MAX_ZONE_S = 14 * 3600
+# Seconds between clocks: leap seconds since 2017 (IERS Bulletin C 52 and later), epochs of GPS (1980) and NTP (1900) to Unix.
+CLOCKS_S = {
+    18: "GPS time against UTC",
+    37: "TAI against UTC",
+    19: "TAI against GPS time",
+    315_964_800: "seconds since 1980, as of GPS, against Unix time",
+    315_964_782: "seconds since 1980, as of GPS, against Unix time",
+    2_208_988_800: "seconds since 1900, as of NTP, against Unix time",
+}
+UNITS = {10**3: "units that differ by 1000, such as ms and us", 10**6: "ms against ns", 10**9: "s against ns"}
+
+
+@dataclass(frozen=True)
+class Span:
+    """First and last stamp of something.
+
+    Attributes
+    ----------
+    words : str
+        What it is, such as "ego poses".
+    """
+
+    words: str
+    first_ns: int
+    last_ns: int
+
+    @classmethod
+    def of(cls, words: str, t_ns: NDArray[np.int64]) -> Span:
+        """Return the span of stamps (N,), at least one of them."""
+        return cls(words, int(t_ns.min()), int(t_ns.max()))
+
+    def is_apart(self, other: Span, distance_ns: int = MAX_APART_NS) -> bool:
+        """Whether more than a distance lies between two spans."""
+        return max(self.first_ns, other.first_ns) - min(self.last_ns, other.last_ns) > distance_ns
+
+    def joined(self, other: Span) -> Span:
+        """Return the span of both, with the words of the first."""
+        return Span(self.words, min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns))
+
+
+def list_time_problems(log: Log) -> list[str]:
+    """List what is wrong with the stamps of a log, one line each.
+
+    Only stamps are read, and the labels.
+    """
+    return [*_other_clocks(log), *_reference_problem(log), *_image_label_problems(log), *_label_problems(log)]
+
+
+def say_without_pose(log: Log, t_ns: NDArray[np.int64]) -> str:
+    """Say why no pose of the ego is known at any of some ticks (T,)."""
+    if log.ego is None:
+        return "no ego poses"
+    poses, ticks = Span.of("ego poses", log.ego.t_ns), Span.of("ticks", t_ns)
+    if poses.is_apart(ticks, 0):
+        return say_apart(poses, ticks)
+    return f"no ego pose within {log.ego.max_gap_s:g} s of any tick"
+
+
+def say_apart(one: Span, other: Span) -> str:
+    """Say that two spans do not overlap, by how much, and which clocks would explain it."""
+    difference_s = (one.first_ns - other.first_ns) / NS_PER_S
+    hint = _explain(one, other)
+    reason = f": {hint}?" if hint else ""
+    return (
+        f"the {one.words} are from {_seconds(one.first_ns)} to {_seconds(one.last_ns)} s, the {other.words} from "
+        f"{_seconds(other.first_ns)} to {_seconds(other.last_ns)} s: they do not overlap (the difference is "
+        f"{abs(difference_s):.6g} s{reason})"
+    )
+
+
+def _seconds(t_ns: int) -> str:
+    """Format a stamp in s with ms, exactly."""
+    sign, t_ms = "-" * (t_ns < 0), abs(t_ns) // 10**6
+    return f"{sign}{t_ms // 1000}.{t_ms % 1000:03d}"
+
+
+def _explain(one: Span, other: Span) -> str:
+    """Name the usual mistake that would put two spans apart as they are; "" without one."""
+    early, late = sorted((one, other), key=lambda span: span.first_ns)
+    for factor, words in UNITS.items():
+        if early.first_ns > 0 and abs(late.first_ns / (early.first_ns * factor) - 1) < 1e-3:
+            return words
+    if abs(early.first_ns) < MAX_RELATIVE_S * NS_PER_S and late.first_ns > MIN_UNIX_S * NS_PER_S:
+        return "one counts from its start, the other is Unix time"
+    difference_s = (late.first_ns - early.first_ns) / NS_PER_S
+    offsets = dict(CLOCKS_S)
+    zone_s = round(difference_s / SECONDS_OF_ZONES) * SECONDS_OF_ZONES
+    if 0 < zone_s <= MAX_ZONE_S:
+        offsets[zone_s] = f"{zone_s / 3600:g} h, a time zone"
+    misfit = {seconds: _misfit_ns(early, late, seconds * NS_PER_S) for seconds in offsets}
+    best = min(misfit, key=lambda seconds: misfit[seconds])
+    length_ns = min(early.last_ns - early.first_ns, late.last_ns - late.first_ns)
+    return offsets[best] if misfit[best] <= max(length_ns, MAX_APART_NS) else ""
+
+
+def _misfit_ns(early: Span, late: Span, offset_ns: int) -> int:
+    """Distances of both ends when the later span is moved by an offset."""
+    return abs(late.first_ns - offset_ns - early.first_ns) + abs(late.last_ns - offset_ns - early.last_ns)
+
+
+def _other_clocks(log: Log) -> list[str]:
+    """Report streams and poses whose times are far from those of most others."""
+    groups: list[tuple[list[str], Span]] = []
+    for span in sorted(_spans(log), key=lambda span: span.first_ns):
+        if groups and not groups[-1][1].is_apart(span):
+            groups[-1] = ([*groups[-1][0], span.words], groups[-1][1].joined(span))
+        else:
+            groups.append(([span.words], span))
+    if len(groups) < 2:
+        return []
+    spans = [Span(_listed(words), span.first_ns, span.last_ns) for words, span in groups]
+    most = max(range(len(groups)), key=lambda k: len(groups[k][0]))
+    return [say_apart(span, spans[most]) for k, span in enumerate(spans) if k != most]
+
+
+def _spans(log: Log) -> list[Span]:
+    """Return the spans of the streams that have records, and of the poses of the ego."""
+    spans = [
+        Span.of(f"{'frames' if name in log.cameras else 'sweeps'} of '{name}'", stream.t_ns)
+        for name, stream in log.streams.items()
+        if len(stream.t_ns)
+    ]
+    return spans if log.ego is None else [*spans, Span.of("ego poses", log.ego.t_ns)]
+
+
+def _listed(words: Sequence[str]) -> str:
+    more = len(words) - MAX_NAMES
+    return ", ".join(words[:MAX_NAMES]) + (f" and {more} other stream{'s' * (more > 1)}" if more > 0 else "")
+
+
+def _reference_problem(log: Log) -> list[str]:
+    """Report when the sensor whose records are the ticks begins late or ends early, since a run lasts as long as it does."""
+    streams = {name: s.t_ns for name, s in log.streams.items() if len(s.t_ns)}
+    reference = reference_of(log, [name for name in log.cameras if name in streams]) if streams else ""
+    if reference not in streams or len(streams) < 2:
+        return []
+    others = [Span.of(name, t_ns) for name, t_ns in streams.items() if name != reference]
+    own = Span.of(reference, streams[reference])
+    begin_ns = max(own.first_ns - min(span.first_ns for span in others), 0)
+    end_ns = max(max(span.last_ns for span in others) - own.last_ns, 0)
+    whole_ns = own.last_ns - own.first_ns + begin_ns + end_ns
+    least_ns = max(MIN_MISSING_NS, MIN_MISSING_SHARE * whole_ns)
+    late = sum(own.first_ns - span.first_ns >= least_ns for span in others) * 2 >= len(others) and begin_ns >= least_ns
+    early = sum(span.last_ns - own.last_ns >= least_ns for span in others) * 2 >= len(others) and end_ns >= least_ns
+    if not late and not early:
+        return []
+    parts = [f"begins {begin_ns / NS_PER_S:.1f} s after"] * late + [f"ends {end_ns / NS_PER_S:.1f} s before"] * early
+    kind = "camera" if reference in log.cameras else "LiDAR"
+    return [
+        f"the reference {kind} '{reference}' {' and '.join(parts)} other sensors{_shifted(own, others)}: a run of its ticks lasts "
+        f"{(own.last_ns - own.first_ns) / NS_PER_S:.1f} s of the {whole_ns / NS_PER_S:.1f} s of the log"
+    ]
+
+
+def _shifted(own: Span, others: Sequence[Span]) -> str:
+    """Say that a stream is off the others by the same time at both ends, as by another clock; "" where it is not."""
+    first_ns = own.first_ns - int(np.median([span.first_ns for span in others]))
+    last_ns = own.last_ns - int(np.median([span.last_ns for span in others]))
+    alike = abs(first_ns - last_ns) <= MAX_END_MISMATCH * min(abs(first_ns), abs(last_ns))
+    if not alike or min(abs(first_ns), abs(last_ns)) < MIN_MISSING_NS:
+        return ""
+    return f" (both its ends are {abs(first_ns) / NS_PER_S:.1f} s {'late' if first_ns > 0 else 'early'}, as by another clock)"
+
+
+def _image_label_problems(log: Log) -> list[str]:
+    """Report boxes in images, and regions without labels, whose stamp no frame has."""
+    problems = []
+    for what, by_camera in (("boxes", log.image_labels), ("ignored regions", log.ignored_regions)):
+        for name, rows in by_camera.items():
+            stream = log.streams.get(name)
+            if stream is None or not len(rows.t_ns) or not len(stream.t_ns):
+                continue
+            frames = stream.t_ns
+            off_ns = np.abs((frames[nearest_index(frames, rows.t_ns)] - rows.t_ns).astype(np.float64))
+            lost = off_ns > STAMP_TOLERANCE_NS
+            if not lost.any():
+                continue
+            line = f"{int(lost.sum())} of {len(lost)} {what} in images of '{name}' are at stamps of no frame, first {rows.t_ns[lost].min()}"
+            spans = Span.of(f"{what}", rows.t_ns), Span.of("frames", frames)
+            apart = f": {say_apart(*spans)}" if spans[0].is_apart(spans[1]) else ""
+            nearest = "" if apart or not lost.all() else f"; the nearest is {off_ns.min() / 1e6:.3g} ms off"
+            problems.append(f"{line}{nearest}{apart}")
+    return problems
+
+
+def _label_problems(log: Log) -> list[str]:
+    """Report 3D labels far from all records and poses; where records are missing, as in a partial download, poses suffice."""
+    records = [stream.t_ns for stream in log.streams.values() if len(stream.t_ns)]
+    if log.labels is None or not len(log.labels.t_ns) or not records:
+        return []
+    t_ns = log.labels.t_ns
+    known = np.unique(np.concatenate([*records, *([] if log.ego is None else [log.ego.t_ns])]))
+    far = np.abs((known[nearest_index(known, t_ns)] - t_ns).astype(np.float64)) > MAX_LABEL_DISTANCE_NS
+    if not far.any():
+        return []
+    line = (
+        f"{int(far.sum())} of {len(far)} labeled boxes are more than {MAX_LABEL_DISTANCE_NS / NS_PER_S:g} s off all frames, sweeps and "
+        f"poses, first at stamp {t_ns[far].min()}"
+    )
+    spans = Span.of("labels", t_ns), Span.of("records", np.concatenate(records))
+    return [f"{line}: {say_apart(*spans)}" if spans[0].is_apart(spans[1]) else line]

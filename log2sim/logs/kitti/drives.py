@@ -1,0 +1,354 @@
+"""KITTI raw drives and the layout of its tracking benchmark.
+
+A file label_02.txt in the drive holds its labels in the format of the tracking benchmark, whose sequences are such drives
+frame by frame (sequence 0000 is drive 2011_09_26_0005).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Log, MapFrame, Stream
+from log2sim.errors import LogError
+from log2sim.files.inputs import is_present, require_links_inside
+from log2sim.geometry import Array, Camera, PoseTrack, transform
+from log2sim.logs.excerpt import digest_of
+from log2sim.logs.kitti import labels as drive
+from log2sim.logs.kitti.labels import CAMERA as LABELED_CAMERA
+from log2sim.logs.kitti.labels import DriveLabels, read_labels
+from log2sim.logs.records import first_image_size, image_stream, list_numbered_files
+from log2sim.logs.stamps import strictly_increasing
+
+CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
+PATTERN = "*_drive_*_sync"
+LABELS = "label_02.txt"
+# A scanner begins a sweep where the one before ends; stamps of this share of a sweep are none that a clock's resolution explains.
+MAX_OVERLAP = 0.1
+_NOT_A_TIME = np.iinfo(np.int64).min
+_TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?")
+
+
+class KittiRawReader:
+    """Reader of KITTI raw drives; the root is a drive, its date folder or the parent of date folders."""
+
+    name = "kitti"
+    looks_for = (
+        "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
+    )
+    suffixes = ()
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the folder holds a sequence of this layout."""
+        return bool(self._drives(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
+        return sorted(self._drives(path))
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a sequence."""
+        drive = self._drives(path)[sequence]
+        require_links_inside(drive, drive.parent, path, files=[drive.parent / name for name in CALIBRATION])
+        return _Drive(drive).log()
+
+    def _drives(self, path: Path) -> dict[str, Path]:
+        # A drive given as "." has its name only once it is resolved.
+        path = path.resolve()
+        places = [path, *path.glob(PATTERN), *path.glob(f"*/{PATTERN}")]
+        return {p.name: p for p in places if (p / "oxts" / "data").is_dir() and p.match(PATTERN)}
+
+
+READER = KittiRawReader()
+
+
+@dataclass(frozen=True)
+class _Drive:
+    path: Path
+
+    def log(self) -> Log:
+        rig = self._rig()
+        notes: list[str] = []
+        streams: dict[str, Stream] = {}
+        cameras: dict[str, Camera] = {}
+        for number in rig.projections:
+            self._add_camera(rig, number, cameras, streams, notes)
+        if (self.path / "velodyne_points").is_dir():
+            streams["velodyne"] = self._sweeps(notes)
+        ego_t_ns, poses, map_frame = self._poses(notes)
+        if not streams:
+            raise LogError(f"{self.path}: neither images (image_00 to image_03) nor velodyne_points in it")
+        track = PoseTrack(ego_t_ns, poses)
+        labels = self._labels(rig, track, notes)
+        texts = [drive.read_text(self.path.parent / name) for name in CALIBRATION]
+        return Log(
+            name=self.path.name,
+            format=READER.name,
+            cameras=cameras,
+            lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
+            streams=streams,
+            ego=track,
+            ego_vehicle=drive.EGO_VEHICLE,
+            map=map_frame,
+            labels=labels.boxes_3d,
+            image_labels=labels.boxes_2d,
+            ignored_regions=labels.ignored,
+            reference_camera=next((c for c in REFERENCE_CAMERAS if c in cameras), None),
+            digest=digest_of([*texts, labels.text], sorted(self.path.glob("*/data/*"))),
+            notes=tuple(notes),
+            calibrations={n: str(self.path.parent / CALIBRATION[0 if n in cameras else 1]) for n in streams},
+        )
+
+    def _rig(self) -> drive.Rig:
+        cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
+        c = drive.read_calibration(cam)
+        rect = drive.checked_rotation(drive.calibration_entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
+        projections = {}
+        for k in range(4):
+            if (self.path / f"image_{k:02d}").is_dir():
+                key = f"P_rect_{k:02d}"
+                projections[k] = drive.checked_projection(
+                    drive.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
+                )
+        return drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
+
+    def _add_camera(
+        self, rig: drive.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
+    ) -> None:
+        file = self.path.parent / CALIBRATION[0]
+        width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+        camera = rig.camera(number, round(width), round(height))
+        t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
+        cameras[camera.name] = camera
+        streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
+
+    def _sweeps(self, notes: list[str]) -> Stream:
+        folder = self.path / "velodyne_points"
+        t_ns, files, numbers = self._records(folder.name, (".bin",), notes)
+        begin, end = (_stamps(folder / f"timestamps_{k}.txt") for k in ("start", "end"))
+        for name, stamps in (("start", begin), ("end", end)):
+            if len(stamps) <= numbers.max():
+                raise LogError(f"{folder}/timestamps_{name}.txt: {len(stamps)} lines, record {numbers.max()} has none")
+        wrong = np.flatnonzero((begin[numbers] > t_ns) | (end[numbers] < t_ns))
+        if len(wrong):
+            notes.append(
+                f"{folder.name}: {len(wrong)} of {len(numbers)} sweeps face forward at a stamp before their start or after their end, "
+                f"first number {numbers[wrong[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
+            )
+        begin, end = begin[numbers], end[numbers]
+        early = np.flatnonzero(end[:-1] - begin[1:] > MAX_OVERLAP * (end - begin)[:-1]) + 1
+        if len(early):
+            notes.append(
+                f"{folder.name}: {len(early)} of {len(numbers)} sweeps begin while the one before still turns, first number "
+                f"{numbers[early[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
+            )
+        return drive.sweep_stream(t_ns, begin, end, files)
+
+    def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, MapFrame]:
+        t_ns, files, _ = self._records("oxts", (".txt",), notes)
+        rows = []
+        for file in files:
+            record = drive.parse_oxts(drive.read_text(file), str(file))
+            if len(record) != 1:
+                raise LogError(f"{file}: {len(record)} lines, expected one oxts record")
+            rows.append(record[0])
+        poses, map_frame = drive.poses_from_oxts(np.array(rows))
+        return t_ns, poses, map_frame
+
+    def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
+        path, times = self.path / LABELS, self.path / LABELED_CAMERA / "timestamps.txt"
+        if not is_present(path):
+            return DriveLabels()
+        stamps = _stamps(times)
+
+        def stamp_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+            strange = frame[(frame < 0) | (frame >= len(stamps))]
+            if len(strange):
+                raise LogError(
+                    f"{path}: frame {strange[0]}, but {times} has {len(stamps)} lines; is it of another drive?"
+                )
+            return stamps[frame]
+
+        return read_labels(path, rig, track, stamp_of, notes)
+
+    def _records(
+        self, name: str, suffixes: tuple[str, ...], notes: list[str]
+    ) -> tuple[NDArray[np.int64], list[Path], NDArray[np.intp]]:
+        """Stamps, files and numbers of the records of a stream, in order; a record that is not there is a gap."""
+        folder = self.path / name
+        files = list_numbered_files(folder / "data", suffixes)
+        if not files:
+            raise LogError(f"{folder}/data: no records ({', '.join(suffixes)}); a stream needs at least one")
+        stamps = _stamps(folder / "timestamps.txt")
+        numbers = np.array(list(files))
+        if len(stamps) <= numbers.max():
+            raise LogError(f"{folder}/timestamps.txt: {len(stamps)} lines, record {numbers.max()} has none")
+        missing = len(stamps) - len(numbers)
+        if missing:
+            first = np.setdiff1d(np.arange(len(stamps)), numbers)[0]
+            notes.append(f"{name}: {missing} of {len(stamps)} records are missing, first at stamp {stamps[first]}")
+        keep, problems = strictly_increasing(stamps[numbers], name)
+        notes += problems
+        numbers = numbers[keep]
+        return stamps[numbers], [files[n] for n in numbers.tolist()], numbers
+
+
+def _rigid(path: Path) -> Array:
+    calibration = drive.read_calibration(path)
+    rotation = drive.checked_rotation(drive.calibration_entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
+    return transform(rotation, drive.calibration_entry(calibration, path, (3,), "T"))
+
+
+def _stamps(path: Path) -> NDArray[np.int64]:
+    lines = drive.read_text(path).split("\n")
+    while lines and not lines[-1].strip():
+        lines.pop()
+    stamps = np.zeros(len(lines), dtype=np.int64)
+    for k, line in enumerate(lines):
+        try:
+            if _TIME.fullmatch(line.strip()) is None:
+                raise ValueError  # a date alone, of a line that was cut, would be a time
+            stamps[k] = np.array([line.strip().replace(" ", "T")], dtype="datetime64[ns]").astype(np.int64)[0]
+        except ValueError:
+            stamps[k] = _NOT_A_TIME
+        if stamps[k] == _NOT_A_TIME:
+            raise LogError(f"{path}, line {k + 1}: '{line.strip()[:40]}', expected YYYY-MM-DD HH:MM:SS.nnnnnnnnn")
+    return stamps
+
+
+PERIOD_NS = 100_000_000
+CAMERA_NUMBERS = (2, 3)
+NO_STAMPS = "this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"
+
+
+class KittiTrackingReader:
+    """Reader of the tracking layout; the root is the folder "training" or its parent."""
+
+    name = "kitti-tracking"
+    looks_for = "a folder training/ (or that folder) with calib/NNNN.txt and image_02/NNNN/"
+    suffixes = ()
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the folder holds a sequence of this layout."""
+        return bool(self.sequences(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
+        base = _base(path)
+        return sorted(p.stem for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir())
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a sequence."""
+        require_links_inside(_base(path), path)
+        return _Sequence(_base(path), sequence).log()
+
+
+TRACKING_READER = KittiTrackingReader()
+
+
+def _base(path: Path) -> Path:
+    return path / "training" if (path / "training" / "calib").is_dir() else path
+
+
+@dataclass(frozen=True)
+class _Sequence:
+    base: Path
+    name: str
+
+    def log(self) -> Log:
+        rig = self._rig()
+        cameras, streams = self._cameras(rig)
+        if (self.base / "velodyne" / self.name).is_dir():
+            sweeps = self._files("velodyne", (".bin",))
+            t_ns = _nominal_stamps(sweeps)
+            streams["velodyne"] = drive.sweep_stream(
+                t_ns, t_ns - PERIOD_NS // 2, t_ns + PERIOD_NS // 2, list(sweeps.values())
+            )
+        oxts_file = self.base / "oxts" / f"{self.name}.txt"
+        oxts = drive.read_text(oxts_file)
+        rows = drive.parse_oxts(oxts, str(oxts_file))
+        if not len(rows):
+            raise LogError(f"{oxts_file}: no records; a stream needs at least one")
+        poses, map_frame = drive.poses_from_oxts(rows)
+        track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
+        notes = [NO_STAMPS, *_missing_records(streams, len(rows))]
+        labels = self._labels(rig, track, notes)
+        records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
+        calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
+        return Log(
+            name=f"kitti-tracking-{self.name}",
+            format=TRACKING_READER.name,
+            cameras=cameras,
+            lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
+            streams=streams,
+            ego=track,
+            ego_vehicle=drive.EGO_VEHICLE,
+            map=map_frame,
+            labels=labels.boxes_3d,
+            image_labels=labels.boxes_2d,
+            ignored_regions=labels.ignored,
+            reference_camera="image_02",
+            digest=digest_of([calibration, oxts, labels.text], records),
+            notes=tuple(notes),
+            calibrations=dict.fromkeys(streams, str(self.base / "calib" / f"{self.name}.txt")),
+        )
+
+    def _rig(self) -> drive.Rig:
+        path = self.base / "calib" / f"{self.name}.txt"
+        c = drive.read_calibration(path)
+        projections = {}
+        for k in CAMERA_NUMBERS:
+            if (self.base / f"image_{k:02d}" / self.name).is_dir():
+                projections[k] = drive.checked_projection(
+                    drive.calibration_entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
+                )
+        rect = drive.checked_rotation(
+            drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
+        )
+        links = []
+        for keys in (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam")):
+            m = drive.calibration_entry(c, path, (3, 4), *keys)
+            links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
+        return drive.rig_of(links[0], links[1], rect, projections)
+
+    def _cameras(self, rig: drive.Rig) -> tuple[dict[str, Camera], dict[str, Stream]]:
+        cameras, streams = {}, {}
+        for number in rig.projections:
+            files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
+            size_px = first_image_size(list(files.values()))
+            camera = rig.camera(number, *size_px)
+            cameras[camera.name] = camera
+            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
+        return cameras, streams
+
+    def _files(self, folder: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+        files = list_numbered_files(self.base / folder / self.name, suffixes)
+        if not files:
+            raise LogError(
+                f"{self.base / folder / self.name}: no records ({', '.join(suffixes)}); a stream needs at least one"
+            )
+        return files
+
+    def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
+        path = self.base / "label_02" / f"{self.name}.txt"
+        if not is_present(path):
+            return DriveLabels()
+        return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS, notes)
+
+
+def _missing_records(streams: Mapping[str, Stream], count: int) -> Iterator[str]:
+    """Say which streams lack records of the frames that the IMU counts."""
+    for name, stream in streams.items():
+        missing = np.setdiff1d(np.arange(count), stream.t_ns // PERIOD_NS)
+        if len(missing):
+            yield f"{name}: {len(missing)} of {count} records are missing, first number {missing[0]:06d}"
+
+
+def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:
+    return np.array(list(files), dtype=np.int64) * PERIOD_NS

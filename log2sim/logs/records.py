@@ -1,0 +1,554 @@
+"""Files of a log: images, sweeps, PCD, their sizes known before anything is decoded; damaged data as errors."""
+
+from __future__ import annotations
+
+import io
+import lzma
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Log, Stream, Sweep
+from log2sim.errors import Log2SimError, LogError, RecordError
+from log2sim.files.inputs import read_file
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.logs.stamps import MAX_TIME_S, checked_offset_ns
+
+# Quaternions are stored with three decimals or more.
+QUATERNION_TOLERANCE = 1e-3
+
+# Farther than any place on Earth is from the origin of a map.
+MAX_POSITION_M = 1e9
+
+
+def find_not_unit(q: Array) -> NDArray[np.intp]:
+    """Find the rows of quaternions (N, 4) whose norm is not 1 within `QUATERNION_TOLERANCE`, or not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.flatnonzero(~(np.abs(np.linalg.norm(q, axis=1) - 1) <= QUATERNION_TOLERANCE))
+
+
+MAX_NUMBER = np.iinfo(np.int64).max
+# More digits are no int64, and converting many of them takes long.
+MAX_DIGITS = 19
+
+
+def list_numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Return the files of a folder by the number that is their name (of a frame, or a stamp), in the order of the numbers; others are left out.
+
+    Parameters
+    ----------
+    folder : Path
+        May be absent: there are no files then.
+    suffixes : tuple of str
+        In lower case, such as ".jpg" or ".pkl.gz".
+    """
+    found = {}
+    for path in list_files(folder, suffixes):
+        suffix = next(s for s in suffixes if path.name.lower().endswith(s))
+        word = path.name[: -len(suffix)]
+        if word.isdecimal() and len(word) <= MAX_DIGITS and int(word) <= MAX_NUMBER:
+            found[int(word)] = path
+    return dict(sorted(found.items()))
+
+
+def list_folders(path: Path) -> list[Path]:
+    """Return the folders in a folder, sorted; none where it cannot be read or is none."""
+    try:
+        return sorted(p for p in path.iterdir() if p.is_dir())
+    except OSError:
+        return []
+
+
+def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the files of a folder with one of some suffixes, sorted; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.name.lower().endswith(suffixes))
+
+
+T = TypeVar("T")
+MAX_REASON_CHARACTERS = 300
+
+
+@contextmanager
+def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]:
+    """Turn what is no `Log2SimError` into an `error` of one line that begins with `where`.
+
+    Lack of memory and interrupts pass: they say nothing about the data. NumPy's warnings of numbers that are too large or not
+    finite are silent within, since the checks that follow decide what such numbers mean.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
+    except (Log2SimError, MemoryError):
+        raise
+    except Exception as problem:
+        lines = str(problem).strip().splitlines()
+        name = "" if isinstance(problem, ValueError) else f"{type(problem).__name__}: "
+        reason = f"{name}{lines[0] if lines else ''}"[:MAX_REASON_CHARACTERS].removesuffix(": ")
+        raise error(f"{where}: {reason or type(problem).__name__}") from problem
+
+
+def guard_log(log: Log, where: str) -> Log:
+    """Return the log with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
+
+    Parameters
+    ----------
+    log : Log
+        As a reader returns it.
+    where : str
+        Its path, for errors.
+
+    Raises
+    ------
+    LogError
+        For poses of the ego that are not finite, or farther from the origin of the map than any place on Earth.
+    """
+    _require_possible_poses(log, where)
+    return log.changed(
+        streams={name: _guarded_stream(stream, where) for name, stream in log.streams.items()},
+        labels=_guarded(lambda: log.labels, f"{where}: the labels cannot be read"),
+        notes=_guarded(lambda: log.notes, f"{where}: cannot be read"),
+    )
+
+
+def _require_possible_poses(log: Log, where: str) -> None:
+    if log.ego is None:
+        return
+    wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
+    if len(wrong):
+        position = ", ".join(f"{v:.6g}" for v in log.ego.map_T_ego[wrong[0], :3, 3])
+        raise LogError(
+            f"{where}: the position of the ego at stamp {log.ego.t_ns[wrong[0]]} is {position}, expected finite numbers up to "
+            f"{MAX_POSITION_M:g} m; {len(wrong)} of {len(log.ego.t_ns)} poses are so"
+        )
+
+
+def _guarded_stream(stream: Stream, where: str) -> Stream:
+    """Return a stream whose records are returned or raise `RecordError`."""
+    stamps = _guarded(lambda: stream.t_ns, f"{where}: the stamps of '{stream.name}' cannot be read")
+    encoded = stream.encoded
+    return Stream(
+        stream.name,
+        stamps,
+        _guarded_record(stream, stream.read, where),
+        None if encoded is None else _guarded_record(stream, encoded, where),
+    )
+
+
+def _guarded_record(stream: Stream, read: Callable[[int], T], where: str) -> Callable[[int], T]:
+    def guarded(i: int) -> T:
+        with translate_parser_errors(f"{where}: record {i} of '{stream.name}' cannot be read", RecordError):
+            return read(i)
+
+    return guarded
+
+
+def _guarded(read: Callable[[], Any], where: str) -> Callable[[], Any]:
+    def guarded() -> Any:
+        with translate_parser_errors(where, LogError):
+            return read()
+
+    return guarded
+
+
+MAX_IMAGE_PX = 100_000_000
+MAX_IMAGE_BYTES = 256 * 1024 * 1024
+
+
+def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[np.uint8]:
+    """Read an image file as (H, W, 3) uint8 BGR; raise `RecordError` as `decode_image` does, or when it is missing."""
+    return decode_image(read_bytes(path, t_ns, MAX_IMAGE_BYTES), f"{path} (stamp {t_ns})", (width_px, height_px))
+
+
+def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Decode a JPEG or PNG file as (H, W, 3) uint8 BGR.
+
+    Parameters
+    ----------
+    where : str
+        Names file and stamp in errors.
+    size_px : (int, int)
+        Width and height that the calibration is for.
+
+    Raises
+    ------
+    RecordError
+        When it is truncated, no JPEG or PNG, or of another size.
+    """
+    jpeg = data[:2] == b"\xff\xd8"
+    width, height = image_size(data, where)
+    if (width, height) != size_px:
+        raise RecordError(f"{where}: {width}x{height} px, the calibration is for {size_px[0]}x{size_px[1]}")
+    return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
+
+
+def image_size(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height in px of a JPEG or PNG file from its header; `RecordError` for anything else, also for an impossible size."""
+    width, height = _jpeg_size(data, where) if data[:2] == b"\xff\xd8" else _png_size(data, where)
+    if not 0 < width * height <= MAX_IMAGE_PX:
+        raise RecordError(f"{where}: {width}x{height} px, expected 1 to {MAX_IMAGE_PX} px")
+    return width, height
+
+
+def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px: tuple[int, int]) -> Stream:
+    """Stream of image files.
+
+    Parameters
+    ----------
+    name : str
+        Of the camera.
+    t_ns : (F,) int64
+    files : list of Path
+        F image files.
+    size_px : (int, int)
+        Width and height that the calibration is for.
+    """
+
+    def read(i: int) -> NDArray[np.uint8]:
+        return read_image(files[i], int(t_ns[i]), *size_px)
+
+    def encoded(i: int) -> bytes:
+        return read_bytes(files[i], int(t_ns[i]), MAX_IMAGE_BYTES)
+
+    return Stream(name, t_ns, read, encoded)
+
+
+def first_image_size(files: list[Path]) -> tuple[int, int]:
+    """Width and height in px of image files, from the headers of the first and the last readable one.
+
+    Where these differ, one of them is damaged, and the next that has either size decides.
+    """
+    found = list[tuple[int, int]]()
+    for file in (files[0], *files[:0:-1]):
+        try:
+            found.append(image_size(read_bytes(file, 0, MAX_IMAGE_BYTES), str(file)))
+        except RecordError:
+            continue
+        if found.count(found[-1]) > 1:
+            return found[-1]
+    if not found:
+        raise LogError(f"{files[0].parent}: none of its {len(files)} images can be read")
+    return found[0]
+
+
+def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:
+    """Read the file of one record; `RecordError` when it is missing, no regular file or larger than `limit_bytes`."""
+    missing = "cannot be read: No such file or directory"
+    return read_file(path, limit_bytes, RecordError, where=f"{path} (stamp {t_ns})", missing=missing)
+
+
+def _jpeg_size(data: bytes, where: str) -> tuple[int, int]:
+    import simplejpeg
+
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+    except ValueError as error:
+        raise RecordError(f"{where}: not a readable JPEG: {error}") from None
+    return width, height
+
+
+def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
+    import simplejpeg
+
+    try:
+        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="BGR")
+        return image
+    except ValueError as error:
+        raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
+
+
+def _png_size(data: bytes, where: str) -> tuple[int, int]:
+    if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
+        raise RecordError(f"{where}: neither a JPEG nor a PNG image")
+    if zlib.crc32(data[12:29]) != int.from_bytes(data[29:33], "big"):
+        raise RecordError(f"{where}: the check sum of the PNG header is wrong")
+    return struct.unpack(">II", data[16:24])
+
+
+def _decode_png(data: bytes, where: str) -> NDArray[np.uint8]:
+    import cv2
+
+    # OpenCV returns the upper part of a truncated PNG as if it were whole.
+    if b"IEND" not in data[-64:]:
+        raise RecordError(f"{where}: PNG is truncated")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise RecordError(f"{where}: PNG cannot be decoded")
+    return image.astype(np.uint8, copy=False)
+
+
+MAX_HEADER_BYTES = 16 * 1024
+# Each takes some 80 bytes while it is parsed.
+MAX_ASCII_VALUES = 20_000_000
+TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
+INTENSITY_FIELDS = ("intensity", "reflectivity", "reflectance")
+
+
+def parse_pcd(
+    data: bytes, t_ns: int, limit_points: int
+) -> tuple[NDArray[Any], NDArray[np.int64] | None, NDArray[Any] | None]:
+    """Parse points (N, 3), their times (N,) int64 ns relative to the stamp and their intensities (N,); None without such a field.
+
+    A time field is `t_offset_ns`, `offset` or `t` (relative to the stamp) or `timestamp` (absolute); whole numbers are
+    nanoseconds, floating-point numbers seconds.
+
+    Raises
+    ------
+    ValueError
+        When the header or the data do not follow the format.
+    """
+    header, body = _read_header(data)
+    layout = _layout(header)
+    count = _points(header, limit_points)
+    encoding = header["DATA"][0].lower()
+    if encoding == "binary":
+        if len(body) < count * layout.itemsize:
+            raise ValueError(f"truncated: {len(body)} of {count * layout.itemsize} bytes")
+        rows = np.frombuffer(body, layout, count)
+    elif encoding == "ascii":
+        rows = _parse_ascii(body, layout, count)
+    else:
+        raise ValueError(
+            f"DATA {encoding} is not supported; convert it to binary (pcl_convert_pcd_ascii_binary IN OUT 1)"
+        )
+    xyz = np.stack([rows[k] for k in ("x", "y", "z")], axis=1)
+    field = next((f for f in TIME_FIELDS if f in (layout.names or ())), None)
+    offset_ns = None if field is None else _offset_ns(rows[field], t_ns, absolute=field == "timestamp")
+    strength = find_intensity_field(layout)
+    return xyz, offset_ns, None if strength is None else rows[strength]
+
+
+def find_intensity_field(layout: np.dtype[Any]) -> str | None:
+    """Find the field of the points' intensities, one number each; None where there is none."""
+    named = {name.lower(): name for name in layout.names or () if layout[name].shape == ()}
+    return next((named[name] for name in INTENSITY_FIELDS if name in named), None)
+
+
+def _read_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
+    header: dict[str, list[str]] = {}
+    start = 0
+    while "DATA" not in header:
+        end = data.find(b"\n", start, MAX_HEADER_BYTES)
+        if end < 0:
+            raise ValueError("no PCD header that ends with DATA")
+        words = data[start:end].decode("ascii", "replace").split()
+        if words and not words[0].startswith("#"):
+            header[words[0].upper()] = words[1:]
+        start = end + 1
+    for key in ("FIELDS", "SIZE", "TYPE", "DATA"):
+        if not header.get(key):
+            raise ValueError(f"PCD header lacks {key}")
+    return header, data[start:]
+
+
+def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
+    names, sizes, kinds = header["FIELDS"], header["SIZE"], header["TYPE"]
+    counts = header.get("COUNT", ["1"] * len(names))
+    if not len(names) == len(sizes) == len(kinds) == len(counts) <= 64:
+        raise ValueError("PCD header: FIELDS, SIZE, TYPE and COUNT differ in length")
+    spec: list[tuple[str, str, tuple[int, ...]]] = []
+    for k, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts)):
+        code = {"F": "f", "I": "i", "U": "u"}.get(kind.upper())
+        if (
+            code is None
+            or size not in ("1", "2", "4", "8")
+            or (code == "f" and size in ("1", "2"))
+            or not count.isdigit()
+        ):
+            raise ValueError(f"PCD header: field '{name}' has TYPE {kind} SIZE {size} COUNT {count}")
+        if int(count) > 4096:
+            raise ValueError(f"PCD header: field '{name}' has COUNT {count}")
+        # Padding fields are all called "_", so names are made unique by their index.
+        unique = name if names.index(name) == k and name != "_" else f"_{k}"
+        spec.append((unique, f"<{code}{size}", () if count == "1" else (int(count),)))
+    for axis in ("x", "y", "z"):
+        if axis not in names:
+            raise ValueError(f"PCD header: no field '{axis}'")
+    for name, _, shape in spec:
+        if shape and name in ("x", "y", "z", *TIME_FIELDS):
+            raise ValueError(f"PCD header: field '{name}' has COUNT {shape[0]}, expected 1")
+    return np.dtype(spec)
+
+
+def _points(header: dict[str, list[str]], limit_points: int) -> int:
+    words = header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
+    count = int(words[0])
+    if not 0 <= count <= limit_points:
+        raise ValueError(f"{count} points, more than the {limit_points} that a sweep may have")
+    return count
+
+
+def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]:
+    widths = [int(np.prod(layout[name].shape, dtype=int)) for name in layout.names or ()]
+    if count * sum(widths) > MAX_ASCII_VALUES:
+        raise ValueError(
+            f"{count * sum(widths)} values as text, more than the {MAX_ASCII_VALUES} that are read; convert it to binary"
+        )
+    words = body.split(maxsplit=count * sum(widths))[: count * sum(widths)]
+    if len(words) != count * sum(widths):
+        raise ValueError(f"truncated: {len(words)} of {count * sum(widths)} values")
+    table = np.array(words, dtype="S32").reshape(count, sum(widths))
+    rows = np.zeros(count, layout)
+    for name, width, start in zip(layout.names or (), widths, np.cumsum([0, *widths])):
+        if width == 1 and not name.startswith("_"):
+            rows[name] = table[:, start].astype(layout[name])
+    return rows
+
+
+def _offset_ns(values: NDArray[Any], t_ns: int, *, absolute: bool) -> NDArray[np.int64]:
+    if values.dtype.kind in "iu":
+        return checked_offset_ns(values, t_ns if absolute else 0)
+    seconds = values.astype(np.float64)
+    seconds = np.where(np.isfinite(seconds), seconds, 0.0)
+    if np.abs(seconds).max(initial=0.0) > MAX_TIME_S:
+        raise ValueError(f"a point has the time {np.abs(seconds).max():g} s, expected at most {MAX_TIME_S:g}")
+    return checked_offset_ns(np.round((seconds - (t_ns / NS_PER_S if absolute else 0.0)) * NS_PER_S))
+
+
+MAX_SWEEP_POINTS = 20_000_000
+MAX_SWEEP_BYTES = 1024 * 1024 * 1024
+
+# Headers of points have some hundred bytes; NumPy would read what they declare, up to 4 GiB.
+MAX_NPY_HEADER_BYTES = 10_000
+# More columns than x, y, z and what sensors measure with them.
+MAX_COLUMNS = 64
+# What NumPy and zipfile raise for damaged files.
+PARSER_ERRORS = (
+    ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, OSError, RuntimeError, SyntaxError,
+    struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
+
+# Times of points relative to the stamp of their sweep, ns; None when the file has none.
+Offset = NDArray[np.int64] | None
+# How strong returns are; None when the file does not tell.
+Intensity = NDArray[Any] | None
+
+
+def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
+    """Read a sweep; rows that are not finite are dropped.
+
+    Raises
+    ------
+    RecordError
+        When it is missing, truncated, too large or not of the layout that its suffix promises; names file and stamp.
+    """
+    data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
+    try:
+        xyz, offset_ns, intensity = _parse(path.suffix.lower(), data, t_ns)
+        return sweep_of(xyz, t_ns, offset_ns, frame, intensity=intensity)
+    except PARSER_ERRORS as error:
+        raise RecordError(f"{path} (stamp {t_ns}): not a readable sweep: {error}") from None
+
+
+def sweep_of(
+    xyz_m: NDArray[Any],
+    t_ns: int,
+    offset_ns: Offset,
+    frame: Literal["lidar", "map"],
+    compensated_ns: int | None = None,
+    intensity: Intensity = None,
+) -> Sweep:
+    """Build a `Sweep` of the rows of points (N, 3) that are finite and can be on Earth, with stamps `t_ns` + `offset_ns` (N,).
+
+    Intensities (N,) of any type of numbers become float32; those that cannot be, NaN.
+
+    Raises
+    ------
+    ValueError
+        For times of points farther from the stamp than `checked_offset_ns` allows.
+    """
+    # False for NaN. Mostly all points are possible, which their least and greatest coordinate tell in a tenth of the time.
+    if len(xyz_m) and not (xyz_m.min() >= -MAX_POSITION_M and xyz_m.max() <= MAX_POSITION_M):
+        possible = (np.abs(xyz_m) <= MAX_POSITION_M).all(axis=1)
+        xyz_m = xyz_m[possible]
+        offset_ns = None if offset_ns is None else offset_ns[possible]
+        intensity = None if intensity is None else intensity[possible]
+    point_ns = None if offset_ns is None else t_ns + checked_offset_ns(offset_ns)
+    return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns, None if intensity is None else _strengths(intensity))
+
+
+def _strengths(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Return intensities (N,) as float32, NaN where they are negative or not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        strengths = values.astype(np.float32)
+        return np.where(np.isfinite(strengths) & (strengths >= 0), strengths, np.float32(np.nan))
+
+
+def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:
+    if suffix == ".bin":
+        if len(data) % 16:
+            raise ValueError(f"{len(data)} bytes, expected four float32 (x, y, z, intensity) a point")
+        _check_count(len(data) // 16)
+        rows = np.frombuffer(data, "<f4").reshape(-1, 4)
+        return rows[:, :3], None, rows[:, 3] if rows[:, 3].any() else None
+    if suffix == ".npy":
+        return _sweep_points(_read_npy(io.BytesIO(data), "the array")), None, None
+    if suffix == ".npz":
+        return _parse_npz(data)
+    if suffix == ".pcd":
+        return parse_pcd(data, t_ns, MAX_SWEEP_POINTS)
+    raise ValueError(f"unknown suffix '{suffix}', expected .npz, .npy, .bin or .pcd")
+
+
+def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset, Intensity]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = archive.namelist()
+        if "xyz_m.npy" not in names:
+            raise ValueError(
+                f"no array 'xyz_m' in it, only {', '.join(n.removesuffix('.npy') for n in names[:9]) or 'none'}"
+            )
+        with archive.open("xyz_m.npy") as member:
+            xyz = _sweep_points(_read_npy(member, "xyz_m"))
+        columns = {}
+        for name in ("t_offset_ns", "intensity"):
+            if f"{name}.npy" in names:
+                with archive.open(f"{name}.npy") as member:
+                    columns[name] = _read_npy(member, name)
+    offset, intensity = columns.get("t_offset_ns"), columns.get("intensity")
+    if offset is not None and (offset.dtype.kind not in "iu" or offset.shape != (len(xyz),)):
+        raise ValueError(f"t_offset_ns is {offset.dtype} {offset.shape}, expected whole numbers ({len(xyz)},)")
+    if intensity is not None and intensity.shape != (len(xyz),):
+        raise ValueError(f"intensity has the shape {intensity.shape}, expected ({len(xyz)},)")
+    return xyz, None if offset is None else checked_offset_ns(offset), intensity
+
+
+def _sweep_points(array: NDArray[Any]) -> NDArray[Any]:
+    if array.dtype.kind != "f" or array.ndim != 2 or array.shape[1] < 3:
+        raise ValueError(f"points are {array.dtype} {array.shape}, expected floating point (N, 3)")
+    return array[:, :3]
+
+
+def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
+    """Read one .npy array whose header was checked before its data are allocated; never unpickles."""
+    version = np.lib.format.read_magic(stream)
+    length = stream.read(2 if version == (1, 0) else 4)
+    if int.from_bytes(length, "little") > MAX_NPY_HEADER_BYTES:
+        raise ValueError(f"{what} has a header of more than {MAX_NPY_HEADER_BYTES} bytes")
+    header = io.BytesIO(length + stream.read(int.from_bytes(length, "little")))
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read_header(header)
+    columns = shape[1] if len(shape) == 2 else 1
+    if dtype.kind not in "fiu" or len(shape) not in (1, 2) or not 0 <= columns <= MAX_COLUMNS:
+        raise ValueError(f"{what} is {str(dtype)[:40]} {shape}, expected numbers, (N, 3) or (N,)")
+    _check_count(shape[0])
+    size = shape[0] * columns * dtype.itemsize
+    if size > MAX_SWEEP_BYTES:
+        raise ValueError(f"{what} has {size} bytes, more than the {MAX_SWEEP_BYTES} that it may have")
+    data = stream.read(size)
+    if len(data) != size:
+        raise ValueError(f"{what} is truncated: {len(data)} of {size} bytes")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _check_count(points: int) -> None:
+    if not 0 <= points <= MAX_SWEEP_POINTS:
+        raise ValueError(f"{points} points, more than the {MAX_SWEEP_POINTS} that a sweep may have")

@@ -1,0 +1,388 @@
+"""Cameras, pictures and clouds of a recording, decoded when they are read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Stream, Sweep
+from log2sim.errors import RecordError
+from log2sim.geometry import NS_PER_S, Array, Camera, Mount, inverse, transform
+from log2sim.logs.records import (
+    MAX_IMAGE_PX,
+    MAX_SWEEP_POINTS,
+    decode_image,
+    find_intensity_field,
+    image_size,
+    sweep_of,
+)
+from log2sim.logs.ros import messages
+from log2sim.logs.ros.bag import Bag
+from log2sim.logs.ros.containers import printable
+from log2sim.logs.ros.messages import CameraTopic, Intrinsics, LidarTopic, Stamped, decode
+from log2sim.logs.ros.roles import COMPRESSED
+
+BROWN, FISHEYE = ("plumb_bob", "rational_polynomial", "radtan", ""), ("equidistant", "fisheye", "kannala_brandt4")
+ROTATION_TOLERANCE = 1e-3
+
+
+class CalibrationProblem(ValueError):
+    """A CameraInfo that gives no camera; the text is the reason."""
+
+
+def camera_from_intrinsics(name: str, given: Intrinsics, mount: Mount, mount_T_cam: Array) -> Camera:
+    """Build a camera from the settings."""
+    K = np.array([[given.fx_px, 0.0, given.cx_px], [0.0, given.fy_px, given.cy_px], [0.0, 0.0, 1.0]])
+    size = given.width_px, given.height_px
+    return Camera(name, *size, K, mount, mount_T_cam, given.distortion_model, given.distortion)
+
+
+def camera_from_info(
+    name: str, info: Any, pose: tuple[Mount, Array], *, rectified: bool, stereo: bool = False
+) -> Camera:
+    """Build a camera from a CameraInfo.
+
+    Parameters
+    ----------
+    info : sensor_msgs/CameraInfo
+    pose : (mount, (4, 4) float64)
+        Where the frame of the images is: mount_T_cam.
+    rectified : bool
+        Whether the images are rectified: then P is theirs, their axes are turned by R, and there is no distortion.
+    stereo : bool
+        Whether another camera has the same frame, as the second of a stereo pair has in ROS: then the last column of P holds
+        its position in it.
+
+    Raises
+    ------
+    CalibrationProblem
+        When the camera is not calibrated, or its lens model is none of those that `Camera` has.
+    """
+    mount, mount_T_cam = pose
+    model, distortion = "none", tuple[float, ...]()
+    K, P = _matrix(info, "K", (3, 3)), _matrix(info, "P", (3, 4))
+    if rectified and P[0, 0] > 0 and P[1, 1] > 0 and np.isfinite(P).all():
+        rotation = _matrix(info, "R", (3, 3))
+        if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE:
+            rotation = np.eye(3)
+        mount_T_cam = mount_T_cam @ inverse(transform(rotation, np.zeros(3)))
+        if stereo:
+            mount_T_cam = mount_T_cam @ inverse(transform(np.eye(3), _offset(P)))
+        K = P[:, :3]
+    elif not rectified:
+        model, distortion = _lens(info)
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
+        raise CalibrationProblem(f"its focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px: the camera is not calibrated")
+    K, (width, height) = _reduced(info, K)
+    if not (width > 0 and height > 0):
+        raise CalibrationProblem(f"its size is {width}x{height} px")
+    return Camera(name, width, height, K, mount, mount_T_cam, model, distortion)
+
+
+def _offset(P: Array) -> Array:
+    """Position (3,) of the second camera of a stereo pair in the frame of both: P = K [I | t]."""
+    K = np.triu(P[:, :3])
+    K[2, 2] = 1.0
+    return np.asarray(np.linalg.solve(K, P[:, 3]))
+
+
+def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
+    values = np.asarray(_field(info, "D"), dtype=np.float64).ravel()
+    kind = printable(info.distortion_model).strip().lower()
+    if not values.any():
+        return "none", ()
+    if not np.isfinite(values).all():
+        raise CalibrationProblem("its distortion is not finite")
+    limit = 8 if kind in BROWN else 4
+    if kind not in BROWN + FISHEYE or values[limit:].any():
+        raise CalibrationProblem(
+            f"its distortion model '{kind}' with {len(values)} values is not read; known: {', '.join((*BROWN[:2], FISHEYE[0]))}"
+        )
+    values = values[:limit]
+    if kind in FISHEYE:
+        return "fisheye", tuple(np.append(values, np.zeros(4 - len(values))).tolist())
+    length = next(n for n in (4, 5, 8) if n >= len(values))
+    return "brown", tuple(np.append(values, np.zeros(length - len(values))).tolist())
+
+
+def _reduced(info: Any, K: Array) -> tuple[Array, tuple[int, int]]:
+    """Camera matrix and size of the images, which may be a region of the sensor, binned; both are given for the whole."""
+    binning = np.array([max(1, int(info.binning_x)), max(1, int(info.binning_y))])
+    roi = info.roi
+    size = np.array([int(info.width), int(info.height)])
+    if roi.width and roi.height:
+        size = np.array([int(roi.width), int(roi.height)])
+    K = K.copy()
+    K[:2, 2] -= [int(roi.x_offset), int(roi.y_offset)]
+    K[:2] /= binning[:, None]
+    width, height = (size // binning).tolist()
+    return K, (width, height)
+
+
+def _field(info: Any, name: str) -> Any:
+    """Return D, K, R or P, which ROS 2 writes in lower case."""
+    return getattr(info, name, None) if hasattr(info, name) else getattr(info, name.lower())
+
+
+def _matrix(info: Any, name: str, shape: tuple[int, int]) -> Array:
+    values = np.asarray(_field(info, name), dtype=np.float64)
+    if values.size != shape[0] * shape[1]:
+        raise CalibrationProblem(f"{name} has {values.size} values, expected {shape[0] * shape[1]}")
+    return values.reshape(shape)
+
+
+# Encodings of sensor_msgs/image_encodings.hpp: channels, bytes of each, conversion of OpenCV to BGR.
+# OpenCV names Bayer patterns by their second row and column, ROS by the first pixel.
+ENCODINGS: dict[str, tuple[int, int, str]] = {
+    "bgr8": (3, 1, ""), "8UC3": (3, 1, ""), "rgb8": (3, 1, "COLOR_RGB2BGR"), "bgra8": (4, 1, "COLOR_BGRA2BGR"),
+    "8UC4": (4, 1, "COLOR_BGRA2BGR"), "rgba8": (4, 1, "COLOR_RGBA2BGR"), "mono8": (1, 1, "COLOR_GRAY2BGR"),
+    "8UC1": (1, 1, "COLOR_GRAY2BGR"), "mono16": (1, 2, "COLOR_GRAY2BGR"), "16UC1": (1, 2, "COLOR_GRAY2BGR"),
+    "bgr16": (3, 2, ""), "rgb16": (3, 2, "COLOR_RGB2BGR"), "bgra16": (4, 2, "COLOR_BGRA2BGR"),
+    "rgba16": (4, 2, "COLOR_RGBA2BGR"), "bayer_rggb8": (1, 1, "COLOR_BayerBG2BGR"), "bayer_bggr8": (1, 1, "COLOR_BayerRG2BGR"),
+    "bayer_gbrg8": (1, 1, "COLOR_BayerGR2BGR"), "bayer_grbg8": (1, 1, "COLOR_BayerGB2BGR"),
+    "bayer_rggb16": (1, 2, "COLOR_BayerBG2BGR"), "bayer_bggr16": (1, 2, "COLOR_BayerRG2BGR"),
+    "bayer_gbrg16": (1, 2, "COLOR_BayerGR2BGR"), "bayer_grbg16": (1, 2, "COLOR_BayerGB2BGR"),
+    "yuv422": (2, 1, "COLOR_YUV2BGR_UYVY"), "uyvy": (2, 1, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (2, 1, "COLOR_YUV2BGR_YUYV"), "yuyv": (2, 1, "COLOR_YUV2BGR_YUYV"),
+}  # fmt: skip
+
+
+def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Convert a decoded Image to (H, W, 3) uint8 BGR; of 16 bits the upper 8 are kept.
+
+    Raises
+    ------
+    RecordError
+        For an unknown encoding, fewer bytes than width, height and step promise, or a size that is not that of the calibration.
+    """
+    import cv2
+
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    if (width, height) != size_px or width * height > MAX_IMAGE_PX:
+        raise RecordError(f"{where}: {width}x{height} px, the calibration is for {size_px[0]}x{size_px[1]}")
+    if message.encoding not in ENCODINGS:
+        raise RecordError(f"{where}: encoding '{printable(message.encoding)}' is not one of {', '.join(ENCODINGS)}")
+    channels, depth, conversion = ENCODINGS[message.encoding]
+    line = width * channels * depth
+    data = np.asarray(message.data, dtype=np.uint8)
+    if step < line or len(data) < (height - 1) * step + line:
+        raise RecordError(
+            f"{where}: {len(data)} bytes in lines of {step} for {width}x{height} px of {message.encoding}, "
+            f"expected lines of at least {line}"
+        )
+    if len(data) < height * step:
+        data = np.concatenate([data, np.zeros(height * step - len(data), np.uint8)])
+    pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
+    if depth == 2:
+        pixels = (pixels.view(">u2" if message.is_bigendian else "<u2") >> 8).astype(np.uint8)
+    pixels = pixels.reshape(height, width, channels) if channels > 1 else pixels.reshape(height, width)
+    image = cv2.cvtColor(pixels, getattr(cv2, conversion)) if conversion else pixels
+    return np.asarray(image, dtype=np.uint8)
+
+
+def image_from_compressed(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Decode a CompressedImage; its first bytes decide what it is, as drivers write any text as its format."""
+    return decode_image(encoded_from(message, where), where, size_px)
+
+
+def encoded_from(message: Any, where: str) -> bytes:
+    """Return the JPEG or PNG file in a CompressedImage; `RecordError` for anything else."""
+    data: bytes = np.asarray(message.data, dtype=np.uint8).tobytes()
+    try:
+        image_size(data, where)
+    except RecordError as error:
+        raise RecordError(f"{error} (its format states '{printable(message.format)}')") from None
+    return data
+
+
+# sensor_msgs/PointField: datatypes 1 to 8.
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+TIME_FIELDS = (
+    "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "time_stamp", "offset_time", "time_offset", "t_offset",
+    "point_time", "point_time_offset", "offset_ns", "ts",
+)  # fmt: skip
+UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+# Units are factors of 1000 apart: a sweep that spans a thirtieth to thirty times the period has one unit only.
+MAX_SPAN_RATIO = 30.0
+# Times up to this long count from the stamp of the message; larger ones are those of a clock.
+MAX_RELATIVE_NS = 10e9
+# A clock that is nearer to the stamps than this is the one that the stamps are of.
+MAX_CLOCK_OFFSET_NS = 60e9
+DEFAULT_PERIOD_NS = 1e8
+
+
+def find_time_field(names: list[str], chosen: str = "") -> str | None:
+    """Find the field of the points' times; None where there is none."""
+    if chosen:
+        return chosen if chosen in names else None
+    return next((name for name in names if name.lower() in TIME_FIELDS), None)
+
+
+def sweep_from(message: Any, t_ns: int, period_ns: float, settings: LidarTopic, where: str) -> Sweep:
+    """Build a sweep from a decoded PointCloud2.
+
+    Parameters
+    ----------
+    message : sensor_msgs/PointCloud2
+    t_ns : int
+        Its stamp.
+    period_ns : float
+        Time between two sweeps, by which the unit of the times is recognized.
+    where : str
+        Names the message in errors.
+
+    Raises
+    ------
+    RecordError
+        When fields, sizes and data contradict each other.
+    """
+    points = point_table(message, where)
+    missing = [name for name in "xyz" if name not in (points.dtype.names or ())]
+    if missing:
+        raise RecordError(
+            f"{where}: the points have no field '{missing[0]}', only {', '.join(points.dtype.names or ())}"
+        )
+    xyz = np.stack(
+        [points[name].astype(np.float64 if points[name].dtype.itemsize == 8 else np.float32) for name in "xyz"], 1
+    )
+    # Drivers mark rays without a return by NaN or by zeros.
+    kept = np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)
+    xyz = xyz[kept]
+    name = find_time_field(list(points.dtype.names or ()), settings.time_field)
+    offset = None if name is None else offsets_ns(points[name][kept], t_ns, period_ns, settings)
+    strength = find_intensity_field(points.dtype)
+    return sweep_of(
+        xyz,
+        t_ns,
+        offset,
+        "lidar",
+        t_ns if settings.compensated else None,
+        None if strength is None else points[strength][kept],
+    )
+
+
+def point_table(message: Any, where: str) -> NDArray[Any]:
+    """View the data of a PointCloud2 as a structured array (N,); nothing is copied but padded rows."""
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    row_step = int(message.row_step) or width * step
+    data = np.asarray(message.data, dtype=np.uint8)
+    if height * width > MAX_SWEEP_POINTS:
+        raise RecordError(f"{where}: {height * width} points, more than the {MAX_SWEEP_POINTS} that a sweep may have")
+    dtype = _dtype(message, step, where)
+    needed = (height - 1) * row_step + width * step if height and width else 0
+    if row_step < width * step or len(data) < needed:
+        raise RecordError(
+            f"{where}: {len(data)} bytes for {height} x {width} points of {step} bytes (rows of {row_step}), "
+            f"expected at least {needed}"
+        )
+    if not needed:
+        return np.zeros(0, dtype)
+    if row_step == width * step:
+        return np.frombuffer(data[:needed], dtype)
+    rows = np.lib.stride_tricks.as_strided(data, (height, width * step), (row_step, 1))
+    return np.frombuffer(np.ascontiguousarray(rows), dtype)
+
+
+def _dtype(message: Any, step: int, where: str) -> np.dtype[Any]:
+    order = ">" if message.is_bigendian else "<"
+    names, formats, offsets = [], [], []
+    for point_field in message.fields:
+        code = DATATYPES.get(int(point_field.datatype))
+        count, name = max(1, int(point_field.count)), printable(point_field.name)
+        if code is None or count > step or not name or name in names:
+            continue
+        names.append(name)
+        formats.append(order + code if count == 1 else f"({count},){order}{code}")
+        offsets.append(int(point_field.offset))
+    try:
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    except (ValueError, TypeError) as problem:
+        raise RecordError(f"{where}: the fields of the points do not fit into {step} bytes: {problem}") from None
+
+
+def offsets_ns(values: NDArray[Any], t_ns: int, period_ns: float, settings: LidarTopic) -> NDArray[np.int64] | None:
+    """Compute times (N,) ns of points relative to the stamp of their message; None where no unit makes sense of them.
+
+    Notes
+    -----
+    Drivers give seconds, milliseconds, microseconds or nanoseconds under the same names, from the stamp or of a clock. The unit
+    is the one in which the values span about the time between two sweeps. Values far from zero are of a clock: the stamps' own
+    where it is near to them; otherwise the first of them is put at the stamp.
+    """
+    if not len(values) or values.ndim != 1:
+        return None if values.ndim != 1 else np.zeros(0, dtype=np.int64)
+    low = values.min()
+    span = float(values.max()) - float(low) if values.dtype.kind == "f" else float(int(values.max()) - int(low))
+    unit_ns = UNITS_NS.get(settings.time_unit) or _recognized_unit_ns(span, period_ns)
+    if unit_ns is None or not np.isfinite(span):
+        return None
+    # The difference to the first is exact also for large clock values.
+    forward: NDArray[np.int64] = np.round((values - low).astype(np.float64) * unit_ns).astype(np.int64)
+    first_ns = _nanoseconds(low, unit_ns)
+    if settings.stamp != "auto":
+        return forward if settings.stamp == "start" else forward - forward.max()
+    if abs(first_ns) <= MAX_RELATIVE_NS:
+        return forward + first_ns
+    return forward + (first_ns - t_ns if abs(first_ns - t_ns) <= MAX_CLOCK_OFFSET_NS else 0)
+
+
+def _recognized_unit_ns(span: float, period_ns: float) -> float | None:
+    if span <= 0:
+        return None
+    ratio = {unit: abs(np.log(span * unit / period_ns)) for unit in UNITS_NS.values()}
+    best = min(ratio, key=ratio.__getitem__)
+    return best if ratio[best] <= np.log(MAX_SPAN_RATIO) else None
+
+
+def _nanoseconds(value: Any, unit_ns: float) -> int:
+    """Convert one value; whole numbers of any size exactly."""
+    if isinstance(value, np.integer):
+        return int(value) * round(unit_ns)
+    whole = int(value)
+    return whole * round(unit_ns) + round((float(value) - whole) * unit_ns)
+
+
+def camera_stream(bag: Bag, chosen: CameraTopic, stamped: Stamped, camera: Camera) -> Stream:
+    """Stream of the images of a camera; of compressed ones also as files."""
+    topic, size_px = bag.topics[chosen.topic], (camera.width_px, camera.height_px)
+    compressed = topic.msgtype == COMPRESSED
+
+    def read(i: int) -> NDArray[np.uint8]:
+        row = int(stamped.row[i])
+        convert = image_from_compressed if compressed else image_from
+        return convert(decode(bag, topic, row), bag.where(topic, row), size_px)
+
+    def encoded(i: int) -> bytes:
+        row = int(stamped.row[i])
+        return encoded_from(decode(bag, topic, row), bag.where(topic, row))
+
+    return Stream(camera.name, stamped.t_ns, read, encoded if compressed else None)
+
+
+def lidar_stream(bag: Bag, name: str, chosen: LidarTopic, stamped: Stamped) -> Stream:
+    """Stream of the sweeps of a LiDAR."""
+    topic, offset_ns = bag.topics[chosen.topic], round(chosen.offset_s * NS_PER_S)
+    period_ns = float(np.median(np.diff(stamped.t_ns))) if len(stamped.t_ns) > 1 else DEFAULT_PERIOD_NS
+
+    def read(i: int) -> Sweep:
+        row, t_ns = int(stamped.row[i]), int(stamped.t_ns[i]) - offset_ns
+        where = bag.where(topic, row)
+        if topic.msgtype in messages.TYPES:
+            sweep = messages.sweep_from_livox(bag.read(topic, row), topic.encoding, t_ns, chosen, where)
+        else:
+            sweep = sweep_from(decode(bag, topic, row), t_ns, period_ns, chosen, where)
+        return _later(sweep, offset_ns)
+
+    return Stream(name, stamped.t_ns, read)
+
+
+def _later(sweep: Sweep, offset_ns: int) -> Sweep:
+    """Move all stamps of a sweep."""
+    if not offset_ns:
+        return sweep
+    t_ns = None if sweep.t_ns is None else sweep.t_ns + offset_ns
+    compensated_ns = None if sweep.compensated_ns is None else sweep.compensated_ns + offset_ns
+    return replace(sweep, stamp_ns=sweep.stamp_ns + offset_ns, t_ns=t_ns, compensated_ns=compensated_ns)

@@ -1,0 +1,611 @@
+"""Boxes of the vehicle's and the road's sensors joined: matched, merged side by side, put to one time.
+
+A detector sees the near sides of an object and guesses where the far ones are. So the sides, not the center, have errors of
+their own; those of center and size follow.
+
+A box is four sides with errors of their own (`box_errors`). Besides, all sides of an object move on together between the times
+at which the ends saw it, and all sides of a box are off together where the pose of its sensor is. Generalized least squares
+with the covariance of all three gives the sides at one time: Aitken, "On least squares and linear combination of observations"
+(1935).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import Config
+from log2sim.datatypes import GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
+from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.geometry import NS_PER_S, Array, rectangle_iou, wrap_angle
+from log2sim.perception.boxes import oriented_covariance, rotate
+from log2sim.perception.detect3d.boxes import Rectangles, suppress
+from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.measure import measure_boxes
+from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
+from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
+
+# Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
+# Fitted by `tools/fit_box_errors.py` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
+SIDE_WEIGHTS: dict[str, Array] = {
+    "vehicle": np.array([-1.9, -0.12, -0.05, -0.33, 1.42, -0.51, 0.47]),
+    "two_wheeler": np.array([-1.21, -0.21, -0.13, -0.13, 1.09, -0.1, 0.47]),
+    "pedestrian": np.array([-1.16, -0.13, -0.11, -0.03, 1.5, 0.05, 0.31]),
+}
+YAW_WEIGHTS: dict[str, Array] = {
+    "vehicle": np.array([-0.37, -0.37, -0.22, -0.45]),
+    "two_wheeler": np.array([-1.28, -0.07, 0.04, 0.01]),
+}
+# Scores nearer to 0 or 1 say no more.
+MIN_SCORE, MAX_ERROR_SCORE = 0.02, 0.98
+# No side is known better than the noise of a LiDAR's ranges and the roundness of bodies allow, and no yaw worse than any.
+MIN_SIDE_SIGMA_M, MAX_YAW_SIGMA_RAD = 0.03, np.pi / np.sqrt(12)
+
+
+@dataclass(frozen=True, eq=False)
+class BoxErrors:
+    """Standard deviations of M boxes.
+
+    Attributes
+    ----------
+    side_m : (M, 2, 2) float64
+        Of the lower and the upper end along the length and the width, m.
+    yaw_rad : (M,) float64
+        Up to half turns.
+    """
+
+    side_m: Array
+    yaw_rad: Array
+
+    @property
+    def center_m(self) -> Array:
+        """Standard deviations (M, 2) of the centers along the length and the width, m."""
+        return np.asarray(np.hypot(self.side_m[..., 0], self.side_m[..., 1]) / 2)
+
+
+def estimate_errors(boxes: Boxes3D, sensor_m: Array) -> BoxErrors:
+    """Estimate the errors of boxes (M,) seen from a sensor at (2,) or (3,), m, map frame."""
+    group = [GROUP_OF[str(c)] for c in boxes.category]
+    of_sides = np.array([SIDE_WEIGHTS.get(g, SIDE_WEIGHTS["vehicle"]) for g in group]).reshape(-1, 1, 1, 7)
+    of_yaw = np.array([YAW_WEIGHTS.get(g, np.zeros(4)) for g in group]).reshape(-1, 4)
+    side = np.exp((of_sides * side_terms(boxes, sensor_m)).sum(axis=-1))
+    yaw = np.exp((of_yaw * yaw_terms(boxes, sensor_m)).sum(axis=-1))
+    return BoxErrors(np.maximum(side, MIN_SIDE_SIGMA_M), np.minimum(yaw, MAX_YAW_SIGMA_RAD))
+
+
+def yaw_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
+    """Return 1, log(1 + points), distance in units of 10 m, and the log-odds of the score (M, 4) of boxes."""
+    range_m = np.hypot(*(boxes.center_m[:, :2] - sensor_m[:2]).T)
+    sure = log_odds_of(np.clip(boxes.score, MIN_SCORE, MAX_ERROR_SCORE))
+    return np.column_stack([np.ones(len(boxes)), np.log1p(boxes.points), range_m / 10.0, sure])
+
+
+def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
+    """Return the terms (M, 2, 2, 7) of the errors of the lower and upper ends of boxes along length and width.
+
+    Those of `yaw_terms`, the logarithm of the extent along the axis in m, and the sine of the angle at which the side is seen:
+    from the front, else 0, and from behind, else 0.
+    """
+    half = boxes.size_m[:, :2] / 2
+    sensor = rotate(sensor_m[:2] - boxes.center_m[:, :2], -boxes.yaw_rad)
+    facing = np.zeros((len(boxes), 2, 2))
+    for end, sign in enumerate((-1.0, 1.0)):
+        beyond = sign * sensor - half
+        facing[..., end] = beyond / np.hypot(beyond, sensor[:, ::-1])
+    shared = np.broadcast_to(yaw_terms(boxes, sensor_m)[:, None, None], (len(boxes), 2, 2, 4))
+    extent = np.broadcast_to(np.log(2 * half)[..., None], facing.shape)
+    seen = [extent, np.maximum(facing, 0.0), np.maximum(-facing, 0.0)]
+    return np.concatenate([shared, np.stack(seen, axis=-1)], axis=-1)
+
+
+# Fewer points are too far apart to say where a side ends: in random scenes they made boxes worse.
+MIN_REFINED_POINTS = 20
+
+
+def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
+    """Move and turn boxes (M,) to the sides that points of a viewpoint show; they grow to hold them."""
+    mine = np.flatnonzero(boxes.points >= MIN_REFINED_POINTS)
+    rows = measure_boxes(boxes.take(mine), view)
+    size, yaw, center = boxes.size_m.copy(), boxes.yaw_rad.copy(), boxes.center_m.copy()
+    # The yaw of points is known up to half turns.
+    turned = np.cos(rows.yaw_rad - yaw[mine]) < 0
+    yaw[mine] = rows.yaw_rad + np.where(turned, np.pi, 0.0)
+    center[mine, :2] = rows.center_m[:, :2]
+    size[mine, :2] = np.fmax(size[mine, :2], rows.high_m - rows.low_m)
+    return replace(boxes, center_m=center, size_m=size, yaw_rad=yaw)
+
+
+# Boxes of one class with such an IoU are one object (Chen, "Vehicle-Road Cooperation", gives no value; half of what is
+# asked of a detection is usual for boxes of two detectors).
+MIN_CLASS_IOU = 0.3
+# Road users do not share ground: boxes of one group that overlap by more are one object, whatever their errors.
+MIN_GROUP_IOU = 0.1
+# Standard deviation of where the road's sensors are after registration, m, and of how they are turned, rad.
+POSE_SIGMA_M, POSE_SIGMA_RAD = 0.1, np.deg2rad(0.3)
+NOT_ALLOWED = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBoxes:
+    """Boxes with their errors.
+
+    Attributes
+    ----------
+    boxes : M Boxes3D
+    sensor_m : (3,) float64, optional
+        Where they are all seen from, m, map frame.
+    """
+
+    boxes: Boxes3D
+    errors: BoxErrors
+    sensor_m: Array | None = None
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.boxes)
+
+    @classmethod
+    def of(cls, boxes: Boxes3D, sensor_m: Array) -> Self:
+        """Estimate the errors of boxes (M,) that were seen from a sensor at (3,), m, map frame."""
+        return cls(boxes, estimate_errors(boxes, sensor_m), sensor_m)
+
+    def take(self, index: NDArray[Any]) -> SeenBoxes:
+        """Take the boxes at `index`, integers or a mask."""
+        errors = BoxErrors(self.errors.side_m[index], self.errors.yaw_rad[index])
+        return SeenBoxes(self.boxes.take(index), errors, self.sensor_m)
+
+    @property
+    def rectangles(self) -> Array:
+        """The boxes in the plane (M, 5): x, y, length, width, yaw."""
+        b = self.boxes
+        return np.column_stack([b.center_m[:, :2], b.size_m[:, :2], b.yaw_rad])
+
+
+Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Rows of the one and of the other end that belong together."""
+
+
+def match_by_overlap(a: SeenBoxes, b: SeenBoxes) -> Pairs:
+    """Match boxes of one class by their IoU in the ground plane, the pairs with the greatest sum."""
+    i, j = _touching(a, b)
+    iou = rectangle_iou(a.take(i).rectangles, b.take(j).rectangles)
+    allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[i] == b.boxes.category[j])
+    return _assign((len(a), len(b)), (i[allowed], j[allowed]), 1 - iou[allowed])
+
+
+def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
+    """Match boxes of one group by the distance of their centers in relation to its standard deviation.
+
+    Boxes that hardly overlap are matched if they are as near as their errors, those of the poses, and the motion between
+    their times allow; never those whose centers are farther apart than they are long.
+    """
+    i, j = _touching(a, b)
+    one, other = a.take(i), b.take(j)
+    away = one.boxes.center_m[:, :2] - other.boxes.center_m[:, :2]
+    c = center_covariance(one) + center_covariance(other) + POSE_SIGMA_M**2 * np.eye(2) + motion_covariance(one, other)
+    squared = np.einsum("pi,pi->p", away, np.linalg.solve(c, away[..., None])[..., 0])
+    reach = (one.boxes.size_m[:, 0] + other.boxes.size_m[:, 0]) / 2
+    near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
+    overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
+    allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
+    return _assign((len(a), len(b)), (i[allowed], j[allowed]), np.minimum(squared, CHI2_2DOF_99)[allowed])
+
+
+def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
+    """Find the pairs of boxes that may overlap: circles around them do."""
+    away = a.boxes.center_m[:, None, :2] - b.boxes.center_m[:, :2]
+    radius_a, radius_b = (np.hypot(*seen.boxes.size_m[:, :2].T) / 2 for seen in (a, b))
+    i, j = np.nonzero(np.hypot(away[..., 0], away[..., 1]) <= radius_a[:, None] + radius_b)
+    return i, j
+
+
+def _groups(boxes: Boxes3D) -> NDArray[np.str_]:
+    return np.array([GROUP_OF[str(c)] for c in boxes.category], dtype="<U16")
+
+
+def center_covariance(seen: SeenBoxes) -> Array:
+    """Return the covariances (M, 2, 2) of the centers of boxes, m2, map frame."""
+    return oriented_covariance(seen.errors.center_m, seen.boxes.yaw_rad)
+
+
+def motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
+    """Return the covariances (P, 2, 2) of what objects move between the times of boxes a and b, row by row the same objects.
+
+    Road users move along their axis, but for those who walk.
+    """
+    moved_m = first_speeds(a.boxes) * np.abs(a.boxes.t_ns - b.boxes.t_ns) / NS_PER_S
+    across_m = np.where(is_walking(a.boxes), moved_m, 0.0)
+    return oriented_covariance(np.stack([moved_m, across_m], axis=-1), a.boxes.yaw_rad)
+
+
+def first_speeds(boxes: Boxes3D) -> Array:
+    """Return the standard deviations (M,) of the speeds of objects of which no more is known than their group, m/s."""
+    return np.array([FIRST_SPEED_MPS[GROUP_OF[str(c)]] for c in boxes.category], dtype=np.float64)
+
+
+def is_walking(boxes: Boxes3D) -> NDArray[np.bool_]:
+    """Mark the boxes (M,) of objects that move in any direction, and whose axes say little."""
+    return np.array([GROUP_OF[str(c)] in ("pedestrian", "other") for c in boxes.category], dtype=bool)
+
+
+def _assign(shape: tuple[int, int], pairs: Pairs, cost: Array) -> Pairs:
+    """Choose of allowed pairs of M and N boxes those with the least sum of costs (P,)."""
+    from scipy.optimize import linear_sum_assignment
+
+    every = np.full(shape, NOT_ALLOWED)
+    every[pairs] = cost
+    i, j = linear_sum_assignment(every)
+    kept = every[i, j] < NOT_ALLOWED
+    return i[kept], j[kept]
+
+
+ROUNDS = 4
+# Pairs that are off by more standard deviations lose weight: boxes of different objects, or of a part of one.
+CAUCHY_SIGMAS = 2.0
+
+
+def take_off_offset(a: SeenBoxes, b: SeenBoxes, b_all: SeenBoxes) -> SeenBoxes:
+    """Move all boxes of the road to where pairs of boxes (P,) that belong together show that they are.
+
+    Parameters
+    ----------
+    a, b : P SeenBoxes
+        Of the vehicle and of the road, row by row the same objects.
+    b_all : N SeenBoxes
+        Of the road.
+
+    Notes
+    -----
+    A shift and a turn about the sensor by weighted least squares. Their prior is what registration leaves: a single pair says
+    little, and many move the boxes where they agree to. Cauchy's weights make single wrong pairs harmless (Holland & Welsch,
+    "Robust regression using iteratively reweighted least-squares", 1977).
+    """
+    if not len(a) or b_all.sensor_m is None:
+        return b_all
+    pivot = b_all.sensor_m[:2]
+    shift, turn = _estimate(a, b, pivot)
+    boxes = b_all.boxes
+    away = boxes.center_m[:, :2] - pivot
+    moved = boxes.center_m.copy()
+    moved[:, :2] += shift + turn * np.column_stack([-away[:, 1], away[:, 0]])
+    return replace(b_all, boxes=replace(boxes, center_m=moved, yaw_rad=boxes.yaw_rad + turn))
+
+
+def _estimate(a: SeenBoxes, b: SeenBoxes, pivot: Array) -> tuple[Array, float]:
+    """Estimate shift (2,), m, and turn, rad, of the road's boxes b."""
+    away = b.boxes.center_m[:, :2] - pivot
+    difference = a.boxes.center_m[:, :2] - b.boxes.center_m[:, :2]
+    precision = np.linalg.inv(center_covariance(a) + center_covariance(b) + motion_covariance(a, b))
+    design = np.zeros((len(a), 2, 3))
+    design[:, 0, 0] = design[:, 1, 1] = 1.0
+    design[:, 0, 2], design[:, 1, 2] = -away[:, 1], away[:, 0]
+    turned = wrap_angle(2 * (a.boxes.yaw_rad - b.boxes.yaw_rad)) / 2
+    of_yaw = np.where(is_walking(a.boxes), 0.0, 1 / (a.errors.yaw_rad**2 + b.errors.yaw_rad**2))
+    prior = np.diag([POSE_SIGMA_M**-2, POSE_SIGMA_M**-2, POSE_SIGMA_RAD**-2])
+    x = np.zeros(3)
+    for _ in range(ROUNDS):
+        rest, rest_yaw = difference - design @ x, turned - x[2]
+        squared = np.einsum("pi,pij,pj->p", rest, precision, rest) + of_yaw * rest_yaw**2
+        weight = 1 / (1 + squared / CAUCHY_SIGMAS**2)
+        weighted = weight[:, None, None] * precision
+        normal = prior + np.einsum("pik,pij,pjl->kl", design, weighted, design)
+        right = np.einsum("pik,pij,pj->k", design, weighted, difference)
+        normal[2, 2] += (weight * of_yaw).sum()
+        right[2] += (weight * of_yaw * turned).sum()
+        x = np.linalg.solve(normal, right)
+    return x[:2], float(x[2])
+
+
+# Lower and upper side of the one box, then of the other.
+_SIDES = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+_OF_OTHER = np.array([0.0, 0.0, 1.0, 1.0])
+# Scores nearer to 1 are not believed; nor are headings.
+MAX_SCORE = 0.999
+# Axes that differ by more are those of a length and of a width.
+MAX_TURN_RAD = np.pi / 4
+MIN_SIZE_M = 0.2
+# Boxes whose four sides and axes differ by more contradict each other: quantile of the chi-square distribution at 99.9 % with
+# two degrees of freedom for each of the two axes, and one for the yaw.
+CHI2_5DOF_999 = 20.5
+
+# What was too far off to match at first does once others have shown the offset.
+OFFSET_ROUNDS = 2
+
+Merge = Callable[[SeenBoxes, SeenBoxes], SeenBoxes]
+
+
+@dataclass(frozen=True)
+class Method:
+    """How boxes of two ends are joined.
+
+    Attributes
+    ----------
+    match : callable
+        Of two sets of boxes, which belong together.
+    merge : callable
+        Of two sets of P boxes that belong together row by row, the joined ones.
+    refines : bool
+        Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
+        pose.
+    """
+
+    match: Callable[[SeenBoxes, SeenBoxes], Pairs]
+    merge: Merge
+    refines: bool
+
+
+def fuse_boxes(a: SeenBoxes, b: SeenBoxes, method: Method) -> SeenBoxes:
+    """Join the boxes of two ends (M,), (N,); those that only one of them sees stay as they are.
+
+    Boxes that stand where a stronger one stands, and still were no match, are left out.
+    """
+    if not len(a) or not len(b):
+        return a if len(a) else b
+    i, j = method.match(a, b)
+    if method.refines:
+        for _ in range(OFFSET_ROUNDS):
+            b = take_off_offset(a.take(i), b.take(j), b)
+            i, j = method.match(a, b)
+    rest_a, rest_b = (np.setdiff1d(np.arange(len(seen)), taken) for seen, taken in ((a, i), (b, j)))
+    parts = [method.merge(a.take(i), b.take(j)), a.take(rest_a), b.take(rest_b)]
+    out = join([part for part in parts if len(part)])
+    names = tuple(GROUPS)
+    group = np.array([names.index(GROUP_OF[str(c)]) for c in out.boxes.category], dtype=np.intp)
+    flat = Rectangles(out.boxes.center_m[:, :2], out.boxes.size_m[:, :2], out.boxes.yaw_rad)
+    return out.take(suppress(flat, out.boxes.score, group))
+
+
+def join(parts: list[SeenBoxes]) -> SeenBoxes:
+    """Concatenate at least one set of boxes."""
+    errors = BoxErrors(*(np.concatenate([getattr(p.errors, k) for p in parts]) for k in ("side_m", "yaw_rad")))
+    return SeenBoxes(Boxes3D.join([p.boxes for p in parts]), errors)
+
+
+def merge_by_covariance(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
+    """Merge boxes (P,) of two ends row by row, each side by its variance; b are those of the road.
+
+    Pairs that contradict each other, in their axes or their sides, take the box whose sides are better known as a whole.
+    """
+    axes, apart_rad = _join_axes(a, b)
+    first, second = (_in_axes(seen, axes, a.boxes.center_m[:, :2]) for seen in (a, b))
+    # The time of those points that say most, which later stages measure again.
+    t_ns = np.where(b.boxes.points > a.boxes.points, b.boxes.t_ns, a.boxes.t_ns)
+    late_s = np.stack([(t - t_ns) / NS_PER_S for t in (a.boxes.t_ns, a.boxes.t_ns, b.boxes.t_ns, b.boxes.t_ns)], axis=1)
+    speed = first_speeds(a.boxes)[:, None]
+    moves = np.concatenate([speed, np.where(is_walking(a.boxes)[:, None], speed, 0.0)], axis=1)
+    pose_m = _pose_sigma(first, second, late_s, moves)
+    sides, covariance, misfit = _solve(first, second, late_s, moves, pose_m)
+    low, high = sides[..., 0], sides[..., 1]
+    center = rotate((low + high) / 2, axes.boxes.yaw_rad) + a.boxes.center_m[:, :2]
+    weight = _share_of_second(a, b)
+    z, height = (u + weight * (v - u) for u, v in zip(_vertical(a.boxes), _vertical(b.boxes)))
+    merged = replace(
+        axes.boxes,
+        t_ns=t_ns,
+        center_m=np.column_stack([center, z]),
+        size_m=np.column_stack([np.maximum(high - low, MIN_SIZE_M), height]),
+    )
+    whole = _take_better(a, b)
+    misfit = misfit + apart_rad**2 / (a.errors.yaw_rad**2 + b.errors.yaw_rad**2)
+    contradict = (np.abs(apart_rad) > MAX_TURN_RAD) | (misfit > CHI2_5DOF_999)
+    variance = np.stack([covariance[..., 0, 0], covariance[..., 1, 1]], axis=-1)
+    errors = BoxErrors(
+        np.where(contradict[:, None, None], whole.errors.side_m, np.sqrt(variance)),
+        np.where(contradict, whole.errors.yaw_rad, axes.errors.yaw_rad),
+    )
+    return SeenBoxes(_with_both(_choose(contradict, whole.boxes, merged), a.boxes, b.boxes), errors)
+
+
+def merge_by_points(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
+    """Merge boxes (P,) of two ends row by row: the mean center, weighted by points, and the rest from the one with more points."""
+    more = (b.boxes.points > a.boxes.points)[:, None]
+    share = (b.boxes.points / np.maximum(a.boxes.points + b.boxes.points, 1))[:, None]
+    chosen = _choose(more[:, 0], b.boxes, a.boxes)
+    center = a.boxes.center_m + share * (b.boxes.center_m - a.boxes.center_m)
+    errors = BoxErrors(
+        np.where(more[..., None], b.errors.side_m, a.errors.side_m),
+        np.where(more[:, 0], b.errors.yaw_rad, a.errors.yaw_rad),
+    )
+    merged = replace(chosen, center_m=center, t_ns=_mean_time(a.boxes, b.boxes))
+    return SeenBoxes(_with_both(merged, a.boxes, b.boxes), errors)
+
+
+METHODS = {
+    "covariance": Method(match_by_covariance, merge_by_covariance, True),
+    "overlap": Method(match_by_overlap, merge_by_points, False),
+}
+"""Overlap alone is the feature-level fusion of Chen, "Intelligent Perception System for Vehicle-Road Cooperation"."""
+
+
+def _mean_time(a: Boxes3D, b: Boxes3D) -> NDArray[np.int64]:
+    """Return the mean times (P,) of the points in both boxes, ns."""
+    share = b.points / np.maximum(a.points + b.points, 1)
+    return np.asarray(a.t_ns + np.round(share * (b.t_ns - a.t_ns)).astype(np.int64))
+
+
+def _vertical(boxes: Boxes3D) -> tuple[Array, Array]:
+    return boxes.center_m[:, 2], boxes.size_m[:, 2]
+
+
+def _share_of_second(a: SeenBoxes, b: SeenBoxes) -> Array:
+    """Return the share (P,) of the second box in what has no error of its own, by the variance of the sides."""
+    va, vb = ((seen.errors.side_m**2).sum(axis=(1, 2)) for seen in (a, b))
+    return np.asarray(va / (va + vb))
+
+
+def _take_better(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
+    """Take of each pair the box whose sides are better known."""
+    second = _share_of_second(a, b) > 0.5
+    errors = BoxErrors(
+        np.where(second[:, None, None], b.errors.side_m, a.errors.side_m),
+        np.where(second, b.errors.yaw_rad, a.errors.yaw_rad),
+    )
+    return SeenBoxes(_choose(second, b.boxes, a.boxes), errors)
+
+
+def _choose(mask: NDArray[np.bool_], one: Boxes3D, other: Boxes3D) -> Boxes3D:
+    """Take rows (P,) of the one where the mask is set, else of the other."""
+    return Boxes3D.join([one, other]).take(np.where(mask, 0, len(one)) + np.arange(len(one)))
+
+
+def _with_both(boxes: Boxes3D, a: Boxes3D, b: Boxes3D) -> Boxes3D:
+    """Return joined boxes (P,) with the points of both, scores as independent evidence, and the category of the surer one."""
+    score = np.minimum(1 - (1 - a.score) * (1 - b.score), MAX_SCORE)
+    category = np.where(b.score > a.score, b.category, a.category)
+    seen_by = None if a.seen_by is None or b.seen_by is None else a.seen_by | b.seen_by
+    return replace(boxes, score=score, category=category, points=a.points + b.points, seen_by=seen_by)
+
+
+def _join_axes(a: SeenBoxes, b: SeenBoxes) -> tuple[SeenBoxes, Array]:
+    """Return boxes (P,) with the mean axis and heading of both, and the angles (P,) between their axes.
+
+    The axes of pedestrians say little: the surer one is taken, and none is said to be off.
+    """
+    better, walking = _take_better(a, b), is_walking(a.boxes)
+    apart = wrap_angle(2 * (b.boxes.yaw_rad - a.boxes.yaw_rad)) / 2
+    va, vb = a.errors.yaw_rad**2, b.errors.yaw_rad**2
+    axis = np.where(walking, better.boxes.yaw_rad, a.boxes.yaw_rad + va / (va + vb) * apart)
+    ahead = sum(
+        np.sign(np.cos(seen.boxes.yaw_rad - axis)) * log_odds_of(np.clip(seen.boxes.heading_score, 0.5, MAX_SCORE))
+        for seen in (a, b)
+    )
+    ahead = np.where(walking, log_odds_of(np.clip(better.boxes.heading_score, 0.5, MAX_SCORE)), ahead)
+    yaw = wrap_angle(axis + np.where(ahead < 0, np.pi, 0.0))
+    heading = np.minimum(probability_of(np.abs(ahead)), MAX_SCORE)
+    boxes = replace(better.boxes, yaw_rad=np.asarray(yaw), heading_score=heading)
+    errors = BoxErrors(better.errors.side_m, np.sqrt(va * vb / (va + vb)))
+    return SeenBoxes(boxes, errors), np.where(walking, 0.0, apart)
+
+
+def _in_axes(seen: SeenBoxes, axes: SeenBoxes, origin: Array) -> tuple[Array, Array]:
+    """Return the sides (P, 2, 2) of boxes along the axes of others, relative to origins (P, 2), and their standard deviations."""
+    center = rotate(seen.boxes.center_m[:, :2] - origin, -axes.boxes.yaw_rad)
+    half = seen.boxes.size_m[:, :2] / 2
+    turned = np.cos(seen.boxes.yaw_rad - axes.boxes.yaw_rad) < 0
+    sigma = np.where(turned[:, None, None], seen.errors.side_m[..., ::-1], seen.errors.side_m)
+    return np.stack([center - half, center + half], axis=-1), sigma
+
+
+def _covariance(first: Array, second: Array, late_s: Array, moves: Array, pose_m: Array | float) -> Array:
+    """Return the covariances (P, 2, 4, 4) of the four sides along both axes."""
+    out = np.zeros((*first.shape[:2], 4, 4))
+    out[..., np.arange(4), np.arange(4)] = np.concatenate([first, second], axis=-1) ** 2
+    late = late_s[:, None, :, None] * late_s[:, None, None, :]
+    out += (moves**2)[..., None, None] * late
+    out += np.asarray(pose_m) ** 2 * np.outer(_OF_OTHER, _OF_OTHER)
+    return out
+
+
+def _pose_sigma(first: tuple[Array, Array], second: tuple[Array, Array], late_s: Array, moves: Array) -> float:
+    """Estimate how far the road's sensors are off: what the distances of all pairs show beyond the errors of their boxes.
+
+    The moment estimator of DerSimonian & Laird, "Meta-analysis in clinical trials" (1986), of all axes with equal weights.
+    """
+    away = second[0].mean(axis=-1) - first[0].mean(axis=-1)
+    c = _covariance(first[1], second[1], late_s, moves, 0.0)
+    difference = np.array([-0.5, -0.5, 0.5, 0.5])
+    expected = np.einsum("i,paij,j->pa", difference, c, difference)
+    weight = 1 / (expected + POSE_SIGMA_M**2)
+    beyond = float((weight * (away**2 - expected)).sum() / weight.sum()) if weight.size else 0.0
+    return float(np.sqrt(max(beyond, POSE_SIGMA_M**2)))
+
+
+def _solve(
+    first: tuple[Array, Array], second: tuple[Array, Array], late_s: Array, moves: Array, pose_m: float
+) -> tuple[Array, Array, Array]:
+    """Solve for lower and upper sides (P, 2, 2): with their covariances (P, 2, 2, 2) and the squared misfit (P,), 4 degrees."""
+    observed = np.concatenate([first[0], second[0]], axis=-1)[..., None]
+    weight = np.linalg.inv(_covariance(first[1], second[1], late_s, moves, pose_m))
+    covariance = np.linalg.inv(_SIDES.T @ weight @ _SIDES)
+    sides = covariance @ _SIDES.T @ weight @ observed
+    rest = observed - _SIDES @ sides
+    misfit = (np.swapaxes(rest, -1, -2) @ weight @ rest)[..., 0, 0].sum(axis=1)
+    return sides[..., 0], covariance, misfit
+
+
+AUTO = "auto"
+
+
+@dataclass(frozen=True, eq=False)
+class EndsDetector:
+    """Detector of road users in the clouds of both ends.
+
+    Attributes
+    ----------
+    vehicle, road : LidarDetector
+        For the clouds of each end.
+    method : Method, optional
+        How boxes of the ends are joined; without it each end keeps its own.
+    """
+
+    vehicle: LidarDetector
+    road: LidarDetector
+    method: Method | None
+
+    @property
+    def name(self) -> str:
+        """Names of both detectors, the vehicle's first; one where they are the same."""
+        names = dict.fromkeys((self.vehicle.name, self.road.name))
+        return "|".join(names)
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        """Detect road users in the cloud of each viewpoint and join them; `earlier` clouds are those of the same viewpoint."""
+        parts = [self._search(view, earlier) for view in cloud.views]
+        if self.method is None:
+            out = join(parts).boxes
+        else:
+            method = self.method
+            out = reduce(lambda a, b: fuse_boxes(a, b, method), parts).boxes
+        return out.take(np.argsort(-out.score, kind="stable"))
+
+    def _search(self, view: Cloud, earlier: Sequence[Cloud]) -> SeenBoxes:
+        """Search the cloud of one viewpoint."""
+        detector = self.road if view.end == ROAD else self.vehicle
+        before = [other for cloud in earlier for other in cloud.views if _is_same_view(view, other)]
+        found = detector.detect(view, before)
+        if self.method is not None and self.method.refines:
+            found = refine_boxes(found, view)
+        found = replace(found, seen_by=seen_from(view.end, len(found)))
+        return SeenBoxes.of(found, view.sensor.astype(np.float64) + view.origin)
+
+
+def _is_same_view(one: Cloud, other: Cloud) -> bool:
+    """Return whether two clouds are of the same end and, at the road, of the same place."""
+    moved: Array = one.sensor + one.origin - other.sensor - other.origin
+    return one.end == other.end and (one.end != ROAD or float(np.linalg.norm(moved)) < 1.0)
+
+
+def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None) -> LidarDetector:
+    """Make the detector in LiDAR sweeps of a log, one for each end where these are searched apart.
+
+    Parameters
+    ----------
+    given : LidarDetector, optional
+        Takes the place of the one that the settings name.
+
+    Raises
+    ------
+    ConfigError, MissingExtra
+        See `create_lidar_detector`.
+    """
+    name, level = config.detect.in_sweeps, fusion_level(log, config).level
+    vehicle = given or create_lidar_detector(name, log, config.lidar)
+    if level in (None, FusionLevel.POINTS):
+        return vehicle
+    chosen = config.cooperation.road_detector
+    road_name = detector_by_mounting(log, name) if chosen == AUTO else chosen
+    road = vehicle if road_name == name else create_lidar_detector(road_name, log, config.lidar)
+    return EndsDetector(vehicle, road, METHODS[config.cooperation.matching] if level is FusionLevel.BOXES else None)
+
+
+def detector_by_mounting(log: Log, name: str) -> str:
+    """Return the shipped detector that fits how the road's LiDARs look down; a detector of the user's own is for both ends."""
+    if name not in (VEHICLE_NETWORK, ROADSIDE_NETWORK):
+        return name
+    return network_for(lidar for lidar in log.lidars.values() if end_of(lidar) == ROAD)

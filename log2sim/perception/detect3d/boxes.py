@@ -1,0 +1,578 @@
+"""Boxes from the maps of a network, by centers or by votes, and the suppression of weaker ones.
+
+Zou, Guo, Chen and Yuan (2021) segment the cells of a roadside LiDAR's grid, let each cell of an object point to its center,
+and cluster the votes by mean shift with a Gaussian kernel; majority decides the class of a cluster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
+from log2sim.geometry import Array, wrap_angle
+from log2sim.perception.detect3d.network import NetworkInfo
+
+# Road users do not share ground; estimates of neighbors overlap by a little where sizes and headings are off.
+MAX_IOU = 0.2
+# A person inside a car, or a rider counted as a person too: most of the smaller box is on the larger one's ground.
+MAX_OVERLAP_OF_SMALLER = 0.5
+# Slender boxes of one object that cross share little area. Objects of one group keep half a width between their centers.
+MIN_DISTANCE_WIDTHS = 0.5
+# One rectangle of a pair is made smaller by this, so that no edges lie on each other: more than rounding, less than
+# anything measured.
+SHRUNK_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Rectangles:
+    """Oriented rectangles in the ground plane.
+
+    Attributes
+    ----------
+    xy_m : (M, 2) float64
+        Centers.
+    size_m : (M, 2) float64
+        Length, width.
+    yaw_rad : (M,) float64
+    """
+
+    xy_m: Array
+    size_m: Array
+    yaw_rad: Array
+
+    def take(self, index: NDArray[Any]) -> Rectangles:
+        """Take the rectangles at `index`, integers or a mask."""
+        return Rectangles(self.xy_m[index], self.size_m[index], self.yaw_rad[index])
+
+
+def suppress(boxes: Rectangles, score: Array, group: NDArray[np.intp], *, across: bool = True) -> NDArray[np.intp]:
+    """Choose the boxes that no stronger chosen one excludes.
+
+    Parameters
+    ----------
+    boxes : M Rectangles
+    score : (M,) float64
+    group : (M,) int
+        Boxes of one group exclude each other by IoU and by the distance of their centers, others by the part of the
+        smaller one that they share.
+    across : bool
+        Whether boxes of different groups exclude each other at all.
+
+    Returns
+    -------
+    (K,) int
+        Indices of the chosen boxes, best score first; ties by place, so that the order of the input does not matter.
+    """
+    order = np.lexsort((boxes.xy_m[:, 1], boxes.xy_m[:, 0], -score))
+    first, second = excluding_pairs(boxes.take(order), group[order], across=across)
+    kept = np.ones(len(order), dtype=bool)
+    for i, j in zip(first.tolist(), second.tolist(), strict=True):  # ordered by the stronger box
+        if kept[i]:
+            kept[j] = False
+    return np.asarray(order[kept], dtype=np.intp)
+
+
+def excluding_pairs(
+    boxes: Rectangles, group: NDArray[np.intp], *, across: bool = True
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the pairs i < j of boxes that exclude each other, ordered by i; the boxes are ordered by score."""
+    from scipy.spatial import cKDTree
+
+    reach = np.hypot(*boxes.size_m.T) / 2
+    if len(reach) < 2:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    pairs = cKDTree(boxes.xy_m).query_pairs(2 * reach.max(), output_type="ndarray")
+    i, j = pairs.min(axis=1), pairs.max(axis=1)
+    away = np.hypot(*(boxes.xy_m.take(i, axis=0) - boxes.xy_m.take(j, axis=0)).T)
+    same = group.take(i) == group.take(j)
+    near = np.flatnonzero((away < reach.take(i) + reach.take(j)) & (same | across))
+    i, j, away, same = i.take(near), j.take(near), away.take(near), same.take(near)
+    excluded = same & (away < MIN_DISTANCE_WIDTHS * (boxes.size_m[i, 1] + boxes.size_m[j, 1]) / 2)
+    # Areas are asked for last: most pairs are decided by now.
+    left = np.flatnonzero(~excluded)
+    shared = shared_area(boxes.take(i[left]), boxes.take(j[left]))
+    area = boxes.size_m.prod(axis=1)
+    area_i, area_j = area[i[left]], area[j[left]]
+    excluded[left] = np.where(
+        same[left],
+        shared > MAX_IOU * (area_i + area_j - shared),
+        shared > MAX_OVERLAP_OF_SMALLER * np.minimum(area_i, area_j),
+    )
+    i, j = i[excluded], j[excluded]
+    order = np.lexsort((j, i))
+    return i[order], j[order]
+
+
+def shared_area(a: Rectangles, b: Rectangles) -> Array:
+    """Compute the area (P,), m^2, that rectangles share in pairs.
+
+    Notes
+    -----
+    The boundary of the shared area consists of the parts of each rectangle's edges inside the other one; by Green's
+    theorem the cross products of their ends add up to twice the area. A tenth of the time of `geometry.overlap_area`,
+    and exact to `SHRUNK_M` times the circumference.
+    """
+    b = Rectangles(b.xy_m - a.xy_m, np.maximum(b.size_m - SHRUNK_M, 0.0), b.yaw_rad)
+    a = Rectangles(np.zeros_like(a.xy_m), a.size_m, a.yaw_rad)
+    twice = _edges_inside(a, b) + _edges_inside(b, a)
+    return np.asarray(np.maximum(twice / 2, 0.0))
+
+
+def _edges_inside(own: Rectangles, other: Rectangles) -> Array:
+    """Add up the cross products (P,) of the ends of each rectangle's edges inside another one."""
+    c, s = np.cos(own.yaw_rad), np.sin(own.yaw_rad)
+    along = np.stack([c, s], axis=1) * (own.size_m[:, :1] / 2)
+    across = np.stack([-s, c], axis=1) * (own.size_m[:, 1:2] / 2)
+    corners = own.xy_m[:, None] + np.stack([along + across, across - along, -along - across, along - across], axis=1)
+    step = np.roll(corners, -1, axis=1) - corners
+    # Start and direction of the edges (P, 4, 2) along the axes of the other rectangle.
+    c, s = np.cos(other.yaw_rad), np.sin(other.yaw_rad)
+    axes = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
+    start, turned = (corners - other.xy_m[:, None]) @ axes, step @ axes
+    half = other.size_m[:, None] / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (-half - start) / turned, (half - start) / turned
+    parallel = turned == 0
+    inside = np.abs(start) < half
+    enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(*ends)).max(axis=2)
+    leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(*ends)).min(axis=2)
+    enter, leave = np.maximum(enter, 0.0), np.minimum(leave, 1.0)
+    length = np.maximum(leave - enter, 0.0)
+    # The cross product of two points of one edge is that of its corner and its step, times the share of the edge.
+    cross = corners[..., 0] * step[..., 1] - corners[..., 1] * step[..., 0]
+    return np.asarray((cross * length).sum(axis=1))
+
+
+# Limits of what a network may say of a box: beyond them it is of no use, and exponentials overflow.
+MIN_SIDE_M, MAX_SIDE_M = 0.1, 30.0
+MAX_OFFSET_M = 15.0
+MIN_CENTER_HEIGHT_M, MAX_CENTER_HEIGHT_M = -1.0, 5.0
+MAX_LOGIT = 30.0
+# Cells on each side of a center whose boxes are averaged: 0.5 m, within which boxes are taught for all but the slimmest.
+AROUND_CELLS = 1
+# Centers this part of a width apart may be of one object.
+SAME_CENTER_WIDTHS = 0.5
+# Cells whose heat is a smaller part of the center's are of the background, where no box is taught.
+MIN_HEAT_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class LevelBoxes:
+    """M boxes; x and y along the map's axes, z above the ground.
+
+    Attributes
+    ----------
+    center_m, size_m : (M, 3) float64
+    yaw_rad : (M,) float64
+    heading_score : (M,) float64
+        Probability in [0.5, 1] that front and back are not swapped.
+    group : (M,) int
+        Index into the network's groups.
+    category : (M,) str
+    heat, quality : (M,) float64
+        Logits of the object being there, and of the expected IoU.
+    """
+
+    center_m: Array
+    size_m: Array
+    yaw_rad: Array
+    heading_score: Array
+    group: NDArray[np.intp]
+    category: NDArray[np.str_]
+    heat: Array
+    quality: Array
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.group)
+
+    def take(self, index: NDArray[Any]) -> LevelBoxes:
+        """Take the boxes at `index`, integers or a mask."""
+        return LevelBoxes(**{k: v[index] for k, v in vars(self).items()})
+
+    @property
+    def rectangles(self) -> Rectangles:
+        """The boxes seen from above."""
+        return Rectangles(self.center_m[:, :2], self.size_m[:, :2], self.yaw_rad)
+
+    def terms(self, points: NDArray[Any], range_m: Array) -> Array:
+        """Return what the score is computed from: (5, M), the terms of `NetworkInfo.calibration`.
+
+        Parameters
+        ----------
+        points : (M,) int or float
+            Number of points in each box.
+        range_m : (M,) float64
+            Distance of the centers from the sensor in the plane.
+        """
+        return np.stack([np.ones(len(self)), self.heat, self.quality, np.log1p(points), range_m / 10.0])
+
+    def score(self, info: NetworkInfo, terms: Array) -> Array:
+        """Compute the probability (M,) that each box is right from the first terms of the calibration, (up to 5, M)."""
+        weights = np.array([info.calibration[group] for group in info.groups])[self.group, : len(terms)]
+        return sigmoid((weights.T * terms).sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class MapCells:
+    """Values of the maps at K cells, or means of several cells each: all channels are such that means make sense.
+
+    Attributes
+    ----------
+    middle_m : (K, 2) float64
+        Middles of the cells.
+    values : (C, K) float64
+        All channels.
+    """
+
+    middle_m: Array
+    values: Array
+
+    @classmethod
+    def at(cls, maps: NDArray[np.float32], flat: NDArray[np.intp], info: NetworkInfo, low: Array) -> MapCells:
+        """Gather the cells at flat indices (K,) of maps (C, h, w) whose lower corner is at `low` (2,), m."""
+        i, j = np.divmod(flat, maps.shape[2])
+        middle = np.asarray(low) + (np.stack([i, j], axis=1) + 0.5) * (info.stride * info.cell_m)
+        return cls(middle, maps.reshape(len(maps), -1).take(flat, axis=1).astype(np.float64))
+
+    def means(self, weight: Array) -> MapCells:
+        """Average cells that follow each other by weights (K, n), K n of them; NaN where none has a weight.
+
+        Cells with a value that is not finite count for nothing.
+        """
+        rows = np.concatenate([self.middle_m.T, self.values])
+        rows = rows.reshape(len(rows), *weight.shape)
+        weight = np.where(np.isfinite(rows).all(axis=0), weight, 0.0)
+        with np.errstate(invalid="ignore"):
+            mean = np.einsum("rkn,kn->rk", np.where(weight > 0, rows, 0.0), weight) / weight.sum(axis=1)
+        return MapCells(mean[:2].T, mean[2:])
+
+
+def cells_around(
+    maps: NDArray[np.float32], flat: NDArray[np.intp], group: NDArray[np.intp], info: NetworkInfo, low: Array
+) -> MapCells:
+    """Average the cells around each of some cells (K,) whose boxes are centered where that of the cell itself is.
+
+    Cells are weighted by their heat for the group (K,). `maps`, `flat` and `low` are as for `MapCells.at`.
+    """
+    h, w = maps.shape[1:]
+    step = np.arange(-AROUND_CELLS, AROUND_CELLS + 1)
+    di, dj = (d.ravel() for d in np.meshgrid(step, step, indexing="ij"))
+    i, j = flat[:, None] // w + di, flat[:, None] % w + dj
+    inside = (i >= 0) & (i < h) & (j >= 0) & (j < w)
+    cells = MapCells.at(maps, np.where(inside, i * w + j, 0).ravel(), info, low)
+    own = slice(len(di) // 2, len(di) // 2 + 1)
+    x, y, _, _, width, _ = cells.values[info.channels.box].reshape(6, *i.shape)
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y = (v + middle.reshape(i.shape) for v, middle in zip((x, y), cells.middle_m.T, strict=True))
+        same = np.hypot(x - x[:, own], y - y[:, own]) < SAME_CENTER_WIDTHS * np.exp(width[:, own])
+    heat = sigmoid(cells.values[info.channels.heat].reshape(len(info.groups), *i.shape)[group, np.arange(len(flat))])
+    return cells.means(np.where(inside & same & (heat >= MIN_HEAT_SHARE * heat[:, own]), heat, 0.0))
+
+
+def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: NetworkInfo) -> LevelBoxes:
+    """Decode the box that each cell (K,) regresses for its group (K,); boxes that are not finite are left out.
+
+    Parameters
+    ----------
+    heat : (K,) float64
+        Logit of the object being there.
+    """
+    channels, values = info.channels, cells.values
+    box = values[channels.box]
+    offset = np.clip(box[:2].T, -MAX_OFFSET_M, MAX_OFFSET_M)
+    height = np.clip(box[2:3].T, MIN_CENTER_HEIGHT_M, MAX_CENTER_HEIGHT_M)
+    size = np.exp(np.clip(box[3:6].T, np.log(MIN_SIDE_M), np.log(MAX_SIDE_M)))
+    yaw, heading_score = headings(values[channels.axis], values[channels.direction])
+    found = LevelBoxes(
+        np.concatenate([cells.middle_m + offset, height], axis=1),
+        size,
+        yaw,
+        heading_score,
+        group,
+        categories_of(category_logits(values, info), group, info),
+        np.clip(heat, -MAX_LOGIT, MAX_LOGIT),
+        np.clip(values[channels.quality], -MAX_LOGIT, MAX_LOGIT),
+    )
+    columns = [found.center_m.T, found.size_m.T, found.yaw_rad, found.heading_score, found.heat, found.quality]
+    return found.take(np.flatnonzero(np.isfinite(np.vstack(columns)).all(axis=0)))
+
+
+def headings(axis: Array, direction: Array) -> tuple[Array, Array]:
+    """Compute yaw over the full circle from its axis and its direction.
+
+    Parameters
+    ----------
+    axis : (2, K)
+        Sine and cosine of twice the yaw, which do not tell front from back.
+    direction : (2, K)
+        Sine and cosine of the yaw, averaged over what the yaw may be: 2 p - 1 times the unit vector where the front is
+        there with probability p.
+
+    Returns
+    -------
+    yaw_rad : (K,) float64
+    heading_score : (K,) float64
+        Probability in [0.5, 1] that front and back are not swapped.
+    """
+    yaw = np.arctan2(axis[0], axis[1]) / 2
+    along = direction[0] * np.sin(yaw) + direction[1] * np.cos(yaw)
+    turned = np.asarray(wrap_angle(np.where(along < 0, yaw + np.pi, yaw)), dtype=np.float64)
+    return turned, (1 + np.minimum(np.abs(along), 1.0)) / 2
+
+
+def category_logits(values: Array, info: NetworkInfo) -> Mapping[str, Array]:
+    """Take the logits (categories, K) of each group that has several categories out of values (C, K)."""
+    return {group: values[place] for group, place in info.channels.category.items()}
+
+
+def categories_of(logits: Mapping[str, Array], group: NDArray[np.intp], info: NetworkInfo) -> NDArray[np.str_]:
+    """Choose the most probable category (K,) within the group (K,) of each box."""
+    out = np.empty(len(group), dtype="<U16")
+    for k, name in enumerate(info.groups):
+        rows = np.flatnonzero(group == k)
+        names = np.array(info.categories[name], dtype="<U16")
+        out[rows] = names[logits[name][:, rows].argmax(axis=0)] if name in logits else names[0]
+    return out
+
+
+def sigmoid(logit: Array) -> Array:
+    """Compute probabilities from logits."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(logit, -MAX_LOGIT, MAX_LOGIT))), dtype=np.float64)
+
+
+# Fainter peaks are so hardly ever objects that average precision is the same without them.
+MIN_HEAT = 0.1
+# More than the road users that one sensor sees.
+MAX_PEAKS = 300
+
+
+def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> LevelBoxes:
+    """Decode the boxes at the peaks of the heat, strongest first, not yet scored nor suppressed.
+
+    Parameters
+    ----------
+    maps : (C, h, w) float32
+        Output of the network.
+    low : (2,) float64, m
+        Lower corner of the maps.
+
+    Notes
+    -----
+    Zhou, Wang and Kraehenbuehl (2019), "Objects as Points": a cell of the greatest heat among its eight neighbors is an
+    object's center. Networks are taught an object's box in the cells around its center too; the mean over those that mean
+    the same object errs less than the box of a single cell.
+    """
+    group, flat = peaks(maps[info.channels.heat])
+    cells = cells_around(maps, flat, group, info, low)
+    heat = maps.reshape(len(maps), -1)[info.channels.heat][group, flat].astype(np.float64)
+    return boxes_of_cells(cells, group, heat, info)
+
+
+def peaks(heat: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find cells that no neighbor exceeds in maps of logits (G, h, w).
+
+    Returns
+    -------
+    group, flat : (K,) int
+        Map and flat index in it, greatest logit first.
+    """
+    import cv2
+
+    least = np.float32(np.log(MIN_HEAT / (1 - MIN_HEAT)))
+    kernel = np.ones((3, 3), np.uint8)
+    groups, cells = [], []
+    for k, logits in enumerate(heat):
+        flat = np.flatnonzero((logits >= least) & (logits >= cv2.dilate(logits, kernel)))
+        groups.append(np.full(len(flat), k, dtype=np.intp))
+        cells.append(flat)
+    group, flat = np.concatenate(groups), np.concatenate(cells)
+    order = np.argsort(-heat.reshape(len(heat), -1)[group, flat], kind="stable")[:MAX_PEAKS]
+    return group[order], flat[order]
+
+
+# Cells of the ground and its roughness; the lowest hoods and saddles are higher.
+MIN_TOP_M = 0.3
+# Cells of the grid of votes in a bandwidth: fine enough that a step of mean shift is not lost to rounding.
+CELLS_PER_BANDWIDTH = 2
+KERNEL_BANDWIDTHS = 3
+MAX_STEPS = 50
+# Heights are regressed with errors of a few percent; limits of categories are generous already.
+HEIGHT_TOLERANCE = 1.25
+MIN_SCORE = 0.5
+"""Least mean probability of a cluster's class: without it the class would not be that of the majority."""
+
+
+def decode_votes(maps: NDArray[np.float32], grid: NDArray[np.float32], info: NetworkInfo, low: Array) -> LevelBoxes:
+    """Decode one box for each cluster of votes; the logit of its mean class probability stands for heat.
+
+    Parameters
+    ----------
+    maps : (C, h, w) float32
+        Output of the network.
+    grid : (12, H, W) float32
+        Its input, by whose greatest heights cells of the ground and empty ones are left out.
+    low : (2,) float64, m
+        Lower corner of both.
+
+    Notes
+    -----
+    The box is that which the network regresses around the middle of the cluster: only there is it taught, and the mean
+    over all cells of the cluster is much worse.
+    """
+    flat, probability = foreground(maps, grid, info)
+    cells = MapCells.at(maps, flat, info, low)
+    vote = cells.middle_m + np.clip(cells.values[info.channels.vote].T, -MAX_OFFSET_M, MAX_OFFSET_M)
+    valid = np.flatnonzero(np.isfinite(cells.values).all(axis=0))
+    vote, probability = vote[valid], probability[:, valid]
+    label = cluster(vote, probability.argmax(axis=0), bandwidths_m(info))
+    center, group, mean = summarize(vote, probability, label)
+    i, j = np.floor((center - low) / (info.stride * info.cell_m)).astype(np.intp).T
+    h, w = maps.shape[1:]
+    middle = np.clip(i, 0, h - 1) * w + np.clip(j, 0, w - 1)
+    logit = np.log(mean) - np.log1p(-np.minimum(mean, 1 - 1e-12))
+    found = boxes_of_cells(cells_around(maps, middle, group, info, low), group, logit, info)
+    return found.take(usual_height(found, info))
+
+
+def foreground(
+    maps: NDArray[np.float32], grid: NDArray[np.float32], info: NetworkInfo
+) -> tuple[NDArray[np.intp], Array]:
+    """Find cells of road users: flat indices (n,) and the probability (G, n) of each group."""
+    segment = maps[info.channels.segment].reshape(len(info.groups) + 1, -1)
+    step = info.stride
+    corners = [grid[0, i::step, j::step] for i in range(step) for j in range(step)]
+    high = np.flatnonzero(np.maximum.reduce(corners) > MIN_TOP_M / 2)
+    seen = segment.take(high, axis=1)
+    flat = high[seen[1:].max(axis=0) > seen[0]]
+    logits = segment[:, flat].astype(np.float64)
+    weight = np.exp(logits - logits.max(axis=0))
+    return flat, weight[1:] / weight.sum(axis=0)
+
+
+def bandwidths_m(info: NetworkInfo) -> Array:
+    """Choose the bandwidth of each group (G,), m: half the typical width of its narrowest category.
+
+    Notes
+    -----
+    Centers of two objects side by side are at least a width apart; the paper does not give its bandwidth.
+    """
+    return np.array([min(TYPICAL_SIZE_M[name][1] for name in info.categories[group]) / 2 for group in info.groups])
+
+
+def cluster(vote: Array, group: NDArray[np.intp], bandwidth_m: Array) -> NDArray[np.intp]:
+    """Cluster votes (n, 2), m, by mean shift, each group (n,) with its own bandwidth (G,), then across groups.
+
+    Returns
+    -------
+    (n,) int
+        Clusters, numbered from 0.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    modes, widths, of_vote, total = [], [], np.zeros(len(vote), np.intp), 0
+    for k, width in enumerate(bandwidth_m):
+        rows = np.flatnonzero(group == k)
+        if len(rows):
+            found, index = mean_shift(vote[rows], float(width))
+            of_vote[rows] = index + total
+            total += len(found)
+            modes.append(found)
+            widths.append(np.full(len(found), width))
+    if total < 2:
+        return of_vote
+    mode, reach = np.concatenate(modes), np.concatenate(widths)
+    pairs = cKDTree(mode).query_pairs(reach.max(), output_type="ndarray")
+    i, j = pairs.T
+    near = np.hypot(*(mode[i] - mode[j]).T) < np.minimum(reach[i], reach[j])
+    links = coo_array((np.ones(near.sum()), (i[near], j[near])), shape=(total, total))
+    joined = connected_components(links, directed=False)[1]
+    return np.asarray(joined[of_vote], dtype=np.intp)
+
+
+def mean_shift(vote: Array, bandwidth_m: float) -> tuple[Array, NDArray[np.intp]]:
+    """Let votes (n, 2), m, climb to the modes of their density.
+
+    Returns
+    -------
+    modes : (K, 2) float64, m
+    index : (n,) int
+        The mode of each vote.
+
+    Notes
+    -----
+    Kernel-weighted means are computed once, on a grid: three blurs instead of a sum over neighbors at every step, in time
+    that does not depend on how dense the votes are. Every cell then points to the cell of its mean.
+    """
+    import cv2
+
+    side = bandwidth_m / CELLS_PER_BANDWIDTH
+    radius = KERNEL_BANDWIDTHS * CELLS_PER_BANDWIDTH
+    corner = vote.min(axis=0) - radius * side
+    place = (vote - corner) / side
+    shape = tuple((place.max(axis=0) + radius + 1).astype(int))
+    start = place[:, 0].astype(np.intp) * shape[1] + place[:, 1].astype(np.intp)
+    maps = [np.bincount(start, weights, minlength=shape[0] * shape[1]) for weights in (None, *place.T)]
+    density, x, y = (
+        cv2.GaussianBlur(
+            m.reshape(shape).astype(np.float32), (2 * radius + 1, 2 * radius + 1), CELLS_PER_BANDWIDTH,
+            borderType=cv2.BORDER_CONSTANT,
+        ).ravel()
+        for m in maps
+    )  # fmt: skip
+    cell, index = np.unique(start, return_inverse=True)
+    for _ in range(MAX_STEPS):
+        mean = np.stack([x[cell], y[cell]], axis=1).astype(np.float64) / density[cell, None]
+        following = mean[:, 0].astype(np.intp) * shape[1] + mean[:, 1].astype(np.intp)
+        if np.array_equal(following, cell):
+            break
+        cell = following
+    ends, inverse = np.unique(cell, return_inverse=True)
+    mode = np.stack([x[ends], y[ends]], axis=1).astype(np.float64) / density[ends, None]
+    return mode * side + corner, inverse[index]
+
+
+def summarize(vote: Array, probability: Array, label: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
+    """Find center, class and class probability of each of K clusters.
+
+    Parameters
+    ----------
+    vote : (n, 2) float64, m
+    probability : (G, n) float64
+    label : (n,) int
+        Cluster of each vote.
+
+    Returns
+    -------
+    center : (K, 2) float64, m
+        Mean vote of the cells of the cluster's class, weighted by its probability.
+    group : (K,) int
+        The class that most cells have, each counted by its probability.
+    mean : (K,) float64
+        Mean probability of that class over all cells.
+    """
+    count = int(label.max(initial=-1)) + 1
+    best = probability.argmax(axis=0)
+    support = [np.bincount(label, p * (best == k), minlength=count) for k, p in enumerate(probability)]
+    group = np.argmax(support, axis=0)
+    of_class = probability[group[label], np.arange(len(label))]
+    mean = np.bincount(label, of_class, minlength=count) / np.bincount(label, minlength=count)
+    weight = np.where(best == group[label], of_class, 0.0)
+    total = np.bincount(label, weight, minlength=count)
+    center = np.stack([np.bincount(label, weight * v, minlength=count) / total for v in vote.T], axis=1)
+    return center, group, mean
+
+
+def usual_height(found: LevelBoxes, info: NetworkInfo) -> NDArray[np.bool_]:
+    """Mark the boxes (M,) whose height is between the limits of their group."""
+    limits = [(min(MIN_SIZE_M[n][2] for n in GROUPS[g]), max(MAX_SIZE_M[n][2] for n in GROUPS[g])) for g in info.groups]
+    low, high = np.array(limits)[found.group].T
+    height = found.size_m[:, 2]
+    return np.asarray((height >= low / HEIGHT_TOLERANCE) & (height <= high * HEIGHT_TOLERANCE))

@@ -1,1 +1,0 @@
-"""Checks of records as they are read: pictures and sweeps that are repeated, show nothing, or are missing."""

@@ -1,0 +1,617 @@
+"""Records read and checked: which pictures show nothing or repeat, which sweeps repeat, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Fault, Log, Sweep
+from log2sim.geometry import NS_PER_S, Array, Camera
+from log2sim.perception.sync import Schedule
+
+Motion = Literal["drives", "stands", "unclear"]
+
+# Positions of a standing ego scatter, drift by centimeters a second, and its yaw by GNSS alone is any; only net motion over
+# a second tells that it drives. What brakes to a stop has been this near to its place for a second only after it stands.
+WINDOW_S = 1.0
+MIN_DRIVEN_M = 1.0
+MAX_STANDING_M = 0.05
+
+
+def motion_of(log: Log, name: str, since_ns: int, t_ns: int) -> Motion:
+    """Return whether a sensor has moved by a meter, or by no more than poses scatter, within a second or since an earlier stamp."""
+    sensor = log.cameras.get(name) or log.lidars[name]
+    if sensor.mount == "map":
+        return "stands"
+    if log.ego is None:
+        return "unclear"
+    wanted_ns = min(since_ns, t_ns - round(WINDOW_S * NS_PER_S))
+    before_ns = max(wanted_ns, int(log.ego.t_ns[0]))
+    poses, known = log.map_T_sensor(name, np.array([before_ns, t_ns]))
+    if not known.all():
+        return "unclear"
+    moved_m = float(np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]))
+    if moved_m >= MIN_DRIVEN_M:
+        return "drives"
+    return "stands" if moved_m < MAX_STANDING_M and before_ns == wanted_ns else "unclear"
+
+
+# Faults of one sensor nearer to each other than this are reported as one, and more than so many all together.
+JOINED_S = 1.0
+MAX_SPANS = 3
+# Busy recorders drop a record now and then. Longer than this, and than so many periods, a stream is interrupted.
+MIN_GAP_S = 0.5
+MIN_GAP_PERIODS = 3.0
+# Fewer records have no usual period.
+MIN_STAMPS = 3
+
+
+@dataclass(frozen=True)
+class Span:
+    """Records of one stream that are at fault.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Stamps of the first and the last.
+    count, total : int
+        Records at fault, and all from the first to the last of them.
+    """
+
+    start_ns: int
+    end_ns: int
+    count: int
+    total: int
+
+
+def spans_of(t_ns: NDArray[np.int64], at_fault: NDArray[np.bool_]) -> list[Span]:
+    """Join records (F,) at fault, rising in time, to spans: those near each other, or all where they are many."""
+    rows = np.flatnonzero(at_fault)
+    if len(rows) == 0:
+        return []
+    cuts = np.flatnonzero(np.diff(t_ns[rows]) > JOINED_S * NS_PER_S) + 1
+    parts = np.split(rows, cuts if len(cuts) < MAX_SPANS else cuts[:0])
+    return [Span(int(t_ns[p[0]]), int(t_ns[p[-1]]), len(p), int(p[-1] - p[0] + 1)) for p in parts]
+
+
+def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+    """Find the gaps of a stream (F,) between two stamps that are much longer than its period: stamps where they start and end."""
+    if len(t_ns) < MIN_STAMPS:
+        return []
+    shortest_ns = max(MIN_GAP_PERIODS * float(np.median(np.diff(t_ns))), MIN_GAP_S * NS_PER_S)
+    around = np.concatenate([[start_ns], t_ns[(t_ns > start_ns) & (t_ns < end_ns)], [end_ns]])
+    return [(int(around[k]), int(around[k + 1])) for k in np.flatnonzero(np.diff(around) > shortest_ns)]
+
+
+Gap = tuple[int, int]
+
+
+def missing_records(log: Log, schedule: Schedule) -> Iterator[Fault]:
+    """List the interruptions of the streams that a run uses, from its first to its last tick."""
+    start_ns, end_ns = int(schedule.t_ns[0]), int(schedule.t_ns[-1])
+    for name in dict.fromkeys([*schedule.frames, *schedule.sweeps]):
+        gaps = gaps_of(log.streams[name].t_ns, start_ns, end_ns)
+        for some in [gaps] if len(gaps) > MAX_SPANS else [[gap] for gap in gaps]:
+            yield _interruption(log, name, some, start_ns, end_ns)
+
+
+def _interruption(log: Log, name: str, gaps: list[Gap], start_ns: int, end_ns: int) -> Fault:
+    kind, what = ("missing_images", "pictures") if name in log.cameras else ("missing_sweeps", "sweeps")
+    first, last = gaps[0][0], gaps[-1][1]
+    longest_s = max(b - a for a, b in gaps) / NS_PER_S
+    a_s, b_s = (first - start_ns) / NS_PER_S, (last - start_ns) / NS_PER_S
+    if len(gaps) > 1:
+        message = f"no {what} in {len(gaps)} stretches of up to {longest_s:.2f} s, from {a_s:.2f} to {b_s:.2f} s"
+    elif first == start_ns and last == end_ns:
+        message = f"no {what} at all from the first to the last tick"
+    elif first == start_ns:
+        message = f"no {what} in the first {longest_s:.2f} s"
+    elif last == end_ns:
+        message = f"no {what} in the last {longest_s:.2f} s, after {a_s:.2f} s"
+    else:
+        message = f"no {what} for {longest_s:.2f} s, from {a_s:.2f} to {b_s:.2f} s"
+    values = {"gaps": float(len(gaps)), "longest_s": longest_s}
+    return Fault(kind, name, message, "kept", first, last, values)
+
+
+# Cells along the longer side. A cell of a camera for vehicles covers about a hundred pixels, whose noise averages out.
+CELLS = 128
+# The last reduction averages at least this many by this many values, rounded to whole gray levels by those before it.
+FINE_FACTOR = 4
+# Of the differences of all cells the 95 % quantile tells whether two pictures differ: stamps written into a picture and few
+# moving objects do not change it, noise of every cell does.
+CHANGE_QUANTILE = 0.95
+# Cells of a coarser copy along each side of a fine one, for what is larger than noise.
+COARSE_FACTOR = 4
+# Of sums over independent noise the variance falls with the number of cells, within a factor of 2 by chance and by the
+# blocks of 8 pixels in which JPEG codes.
+MAX_NOISE_RATIO = 2.0
+# Standard deviation of rounding to 8 bits; a street in fog that hides everything beyond 15 m has more structure.
+MIN_STRUCTURE_LEVELS = 0.29
+# One cell of thousands is this many standard deviations off once in 10^5 pictures of noise; a lamp at night is more.
+OUTSTANDING_SIGMAS = 6.0
+MIN_OUTSTANDING_LEVELS = 4.0
+# Coefficients of the Laplacian, whose sum of squares scales its variance on independent noise.
+LAPLACIAN_NORM = 20.0
+
+Thumbnail = NDArray[np.float32]
+
+
+def shrink(image: NDArray[np.uint8]) -> Thumbnail:
+    """Return the gray means of the cells of an image (H, W, 3) BGR: (h, w) float32, levels from 0 to 255."""
+    # Halving is many times as fast as any other reduction; what it rounds averages out in the last one.
+    while max(image.shape) >= 2 * FINE_FACTOR * CELLS:
+        height, width = (n - n % 2 for n in image.shape[:2])
+        image = cv2.resize(image[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+    height, width = image.shape[:2]
+    scale = min(CELLS / max(height, width), 1.0)
+    cells = (max(round(width * scale), 1), max(round(height * scale), 1))
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    return np.asarray(cv2.resize(gray, cells, interpolation=cv2.INTER_AREA))
+
+
+def measure_change(before: Thumbnail, after: Thumbnail) -> float:
+    """Return by how many gray levels two pictures differ: the 95 % quantile over the cells."""
+    return quantile_of_change(np.abs(after - before))
+
+
+def quantile_of_change(change: NDArray[np.float32]) -> float:
+    """Return the quantile of changes of cells that tells whether two pictures differ, levels; 0 without cells."""
+    values = change.ravel()
+    if not len(values):
+        return 0.0
+    k = int(CHANGE_QUANTILE * (len(values) - 1))
+    return float(np.partition(values, k)[k])
+
+
+def changed_share(before: Thumbnail, after: Thumbnail) -> float:
+    """Return the share of the cells that changed at all, by however little."""
+    return float((before != after).mean())
+
+
+def shows_nothing(thumbnail: Thumbnail) -> bool:
+    """Return whether a picture holds nothing but noise and a smooth shade: black, of one color, saturated, or covered.
+
+    Notes
+    -----
+    What a scene shows is as strong in a coarse copy as in a fine one, since images of scenes have the same contrast at every
+    scale (Field, J. Opt. Soc. Am. A 4, 1987); independent noise falls with the number of cells averaged. Second
+    differences leave out the shade of a covered lens. A scene at night has at least one cell that stands out, a lamp.
+    """
+    coarse = _averaged(thumbnail)
+    if min(coarse.shape) < 3:
+        return bool(np.ptp(thumbnail) < MIN_STRUCTURE_LEVELS)
+    fine_detail, coarse_detail = _second_differences(thumbnail), _second_differences(coarse)
+    noise = float((fine_detail**2).mean()) / COARSE_FACTOR**2
+    if float((coarse_detail**2).mean()) > max(MAX_NOISE_RATIO * noise, MIN_STRUCTURE_LEVELS**2):
+        return False
+    size = np.abs(fine_detail)
+    sigma = float(np.median(size)) / 0.6745
+    return bool(size.max() <= OUTSTANDING_SIGMAS * sigma + MIN_OUTSTANDING_LEVELS)
+
+
+def _averaged(thumbnail: Thumbnail) -> Thumbnail:
+    height, width = (n - n % COARSE_FACTOR for n in thumbnail.shape)
+    blocks = thumbnail[:height, :width].reshape(
+        height // COARSE_FACTOR, COARSE_FACTOR, width // COARSE_FACTOR, COARSE_FACTOR
+    )
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _second_differences(thumbnail: Thumbnail) -> Array:
+    """Return the Laplacian at the inner cells, scaled to the standard deviation of independent noise."""
+    inner = thumbnail[1:-1, 1:-1]
+    around = thumbnail[:-2, 1:-1] + thumbnail[2:, 1:-1] + thumbnail[1:-1, :-2] + thumbnail[1:-1, 2:]
+    return np.asarray((around - 4 * inner) / np.sqrt(LAPLACIAN_NORM), dtype=np.float64)
+
+
+# What is not ground is assumed as far away as this, so that no more motion is expected than there is at least; houses and
+# trees along a road are nearer.
+FAR_M = 50.0
+MIN_DEPTH_M = 0.1
+
+
+def expect_change(
+    picture: Thumbnail, camera: Camera, map_T_before: Array, map_T_after: Array, ground_z_m: float
+) -> float:
+    """Return by how many gray levels a picture changes where nothing but its camera moves: the 95 % quantile over the cells.
+
+    Parameters
+    ----------
+    picture : (h, w) float32
+        The earlier picture.
+    camera : Camera
+        Its lens distortion is left out; it changes where things are in a picture, not how far they move.
+    map_T_before, map_T_after : (4, 4) float64
+        Poses of the camera.
+    ground_z_m : float
+        Height of flat ground in the map.
+
+    Notes
+    -----
+    Every cell of the later picture is followed to the ground or to `FAR_M`, and from there to the earlier picture. A picture
+    without texture, as in fog, is expected not to change.
+    """
+    height, width = picture.shape
+    K = np.diag([width / camera.width_px, height / camera.height_px, 1.0]) @ camera.K
+    v, u = np.mgrid[0.5:height, 0.5:width]
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ (map_T_after[:3, :3] @ np.linalg.inv(K)).T
+    above_m = map_T_after[2, 3] - ground_z_m
+    far = FAR_M / np.linalg.norm(rays, axis=1)
+    down = rays[:, 2] * far < -above_m
+    reach = np.where(down, np.divide(-above_m, rays[:, 2], out=far.copy(), where=down), far)
+    points = rays * reach[:, None] + (map_T_after[:3, 3] - map_T_before[:3, 3])
+    seen = points @ (K @ map_T_before[:3, :3].T).T
+    front = seen[:, 2] > MIN_DEPTH_M
+    at = np.full((len(points), 2), -10.0)
+    np.divide(seen[:, :2], seen[:, 2:], out=at, where=front[:, None])
+    inside = ((at >= 0) & (at <= [width, height])).all(axis=1)
+    flow = (at - 0.5).astype(np.float32).reshape(height, width, 2)
+    moved = cv2.remap(picture, flow[..., 0], flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return quantile_of_change(np.abs(moved - picture).ravel()[inside])
+
+
+# Points are the same within a cell. Ranges of LiDARs scatter by 1 cm and more and their azimuths by several, so that hardly a
+# point of another sweep is in the same cell, even where nothing moves; copies rounded to millimeters mostly are.
+CELL_M = 0.01
+# Hashes of a sketch; the share of common points errs by 1 / sqrt(this), 3 %.
+SKETCH_SIZE = 1024
+# Rays that hit flat ground do so at the same distance wherever the ego is, and those that hit the ego itself always do.
+MIN_HEIGHT_M, MIN_DISTANCE_M = 0.3, 3.0
+AXIS_BITS = 21
+
+
+@dataclass(frozen=True, eq=False)
+class SweepSketch:
+    """What is kept of a sweep to compare it with others.
+
+    Attributes
+    ----------
+    points, obstacles : int
+        How many points it has, and how many of them are above the ground and beyond the ego.
+    hashes : (K,) uint64
+        The smallest hashes of the cells of its obstacle points, sorted, at most `SKETCH_SIZE`.
+    """
+
+    points: int
+    obstacles: int
+    hashes: NDArray[np.uint64]
+
+
+def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
+    """Return the sketch of a sweep of a LiDAR."""
+    xyz = sweep.xyz_m
+    obstacles = xyz[_is_obstacle(log, name, sweep)]
+    return SweepSketch(len(xyz), len(obstacles), _smallest(_hash_cells(obstacles)))
+
+
+def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the smallest of hashes (N,) that differ, sorted, at most `SKETCH_SIZE`."""
+    few = 4 * SKETCH_SIZE  # points share cells, mostly two at a time
+    chosen = np.unique(np.partition(hashes, few)[:few] if len(hashes) > few else hashes)
+    return chosen[:SKETCH_SIZE] if len(chosen) >= SKETCH_SIZE else np.unique(hashes)[:SKETCH_SIZE]
+
+
+def _is_obstacle(log: Log, name: str, sweep: Sweep) -> NDArray[np.bool_]:
+    """Mark the points (N,) well above flat ground under the ego, and not on the ego; all of a LiDAR that stands."""
+    xyz, lidar = sweep.xyz_m, log.lidars[name]
+    if lidar.mount == "map":
+        return np.ones(len(xyz), dtype=bool)
+    above_ground_m = float(lidar.mount_T_lidar[2, 3]) - log.ground_z_ego_m
+    if sweep.frame == "lidar":
+        up, position = lidar.mount_T_lidar[2, :3], np.zeros(3)
+    else:
+        map_T_lidar, known = log.map_T_sensor(name, sweep.stamp_ns)
+        up, position = np.array([0.0, 0.0, 1.0]), map_T_lidar[0][:3, 3] if known[0] else np.median(xyz, axis=0)
+    kind = xyz.dtype.type
+    height = xyz @ up.astype(kind) + kind(above_ground_m - up @ position)
+    x, y = (xyz[:, axis] - kind(position[axis]) for axis in range(2))
+    return np.asarray((height > MIN_HEIGHT_M) & (x * x + y * y > MIN_DISTANCE_M**2))
+
+
+def _hash_cells(xyz: NDArray[np.floating]) -> NDArray[np.uint64]:
+    """Return a hash (N,) of the cell of each point (N, 3).
+
+    Notes
+    -----
+    The finalizer of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) spreads neighboring cells evenly.
+    """
+    i = np.floor(xyz / CELL_M).astype(np.int64).astype(np.uint64) & np.uint64((1 << AXIS_BITS) - 1)
+    z = (i[:, 0] << np.uint64(2 * AXIS_BITS)) | (i[:, 1] << np.uint64(AXIS_BITS)) | i[:, 2]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.asarray(z ^ (z >> np.uint64(31)))
+
+
+def common_share(a: SweepSketch, b: SweepSketch) -> float:
+    """Estimate the share of the obstacle points of two sweeps that both have; 0 without any.
+
+    Notes
+    -----
+    The smallest hashes are a sample of all cells, the same for both (Broder, "On the resemblance and containment of
+    documents", 1997). With the Jaccard index J of two sets of one size the share is 2 J / (1 + J).
+    """
+    either = np.union1d(a.hashes, b.hashes)[: max(len(a.hashes), len(b.hashes))]
+    if len(either) == 0:
+        return 0.0
+    both = np.isin(either, a.hashes, assume_unique=True) & np.isin(either, b.hashes, assume_unique=True)
+    jaccard = float(both.mean())
+    return 2 * jaccard / (1 + jaccard)
+
+
+PictureState = Literal["live", "black", "frozen"]
+
+# A copy that was compressed again differs by less than a gray level; motion that should change a picture by five
+# differs clearly from that.
+MIN_EXPECTED_LEVELS = 5.0
+MAX_CHANGED_SHARE = 0.2
+MAX_COPY_LEVELS = MAX_CHANGED_SHARE * MIN_EXPECTED_LEVELS
+# A single step of the poses without motion in the picture may be a jump of the poses.
+MIN_STEPS_WITHOUT_CHANGE = 2
+# Pictures from one place tell whether a camera has noise: that so many pairs all differ in half of their cells, and the next
+# not in a single one of thousands, is no chance.
+MIN_STILL_PAIRS = 5
+MIN_NOISY_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A picture, and the stamp of the first in a row that are identical to it."""
+
+    t_ns: int
+    since_ns: int
+    thumbnail: Thumbnail
+
+
+@dataclass(eq=False)
+class CameraWatch:
+    """Judge the pictures of one camera in the order of their stamps.
+
+    Attributes
+    ----------
+    log : Log
+        Its poses tell how the camera moves.
+    name : str
+        Of the camera.
+    states : dict of int to {"live", "black", "frozen"}
+        What was found, by stamp, rising.
+    """
+
+    log: Log
+    name: str
+    states: dict[int, PictureState] = field(default_factory=dict)
+    _last: _Picture | None = None
+    _frozen: bool = False
+    _steps_without_change: int = 0
+    _still_shares: list[float] = field(default_factory=list)
+
+    def judge(self, t_ns: int, thumbnail: Thumbnail, *, found: bool = False) -> PictureState:
+        """Say whether a picture shows what is before the camera at its stamp, and remember it.
+
+        Parameters
+        ----------
+        thumbnail : (h, w) float32
+        found : bool
+            Whether a detector found something in it: then it does show something.
+
+        Notes
+        -----
+        Identical pictures are harmless as long as the camera has not moved since the first of them enough to change them: they
+        show what it sees of all that stands. Pictures that are nearly identical are copies where the poses say at every step
+        that they cannot be; poses that drift or scatter while the ego stands do not.
+        """
+        last = self._last
+        if not found and shows_nothing(thumbnail):
+            state: PictureState = "black"
+        elif last is None or last.thumbnail.shape != thumbnail.shape:
+            state, self._last = "live", _Picture(t_ns, t_ns, thumbnail)
+        else:
+            self._frozen = self._is_copy(last, t_ns, thumbnail)
+            same = not changed_share(last.thumbnail, thumbnail)
+            state = "frozen" if self._frozen else "live"
+            self._last = _Picture(t_ns, last.since_ns if same else t_ns, thumbnail)
+        self.states[t_ns] = state
+        return state
+
+    def assume_unchanged(self, t_ns: int) -> PictureState:
+        """Return the state of a picture that was not looked at: that of the one before it."""
+        self.states[t_ns] = next(reversed(self.states.values()), "live")
+        return self.states[t_ns]
+
+    def _is_copy(self, last: _Picture, t_ns: int, thumbnail: Thumbnail) -> bool:
+        """Compare a picture with the one before it."""
+        change = measure_change(last.thumbnail, thumbnail)
+        share = changed_share(last.thumbnail, thumbnail)
+        if change > MAX_CHANGED_SHARE * float(last.thumbnail.max() - last.thumbnail.min()):
+            self._steps_without_change = 0
+            return False  # no motion changes it by five times as much
+        if self._frozen and change < MAX_COPY_LEVELS:
+            return True
+        before_ns = last.since_ns if share == 0 else last.t_ns
+        motion = motion_of(self.log, self.name, before_ns, t_ns)
+        expected = self._expected(before_ns, t_ns, last.thumbnail) if motion == "drives" else 0.0
+        noisy = len(self._still_shares) >= MIN_STILL_PAIRS and min(self._still_shares) > MIN_NOISY_SHARE
+        if share == 0 and (expected >= MAX_COPY_LEVELS or noisy):
+            return True
+        if motion == "stands":
+            self._still_shares.append(share)
+        without_change = expected >= MIN_EXPECTED_LEVELS and change < MAX_CHANGED_SHARE * expected
+        self._steps_without_change = self._steps_without_change + 1 if without_change else 0
+        return self._steps_without_change >= MIN_STEPS_WITHOUT_CHANGE
+
+    def _expected(self, before_ns: int, after_ns: int, thumbnail: Thumbnail) -> float:
+        """Return by how many levels a picture should change between two stamps; 0 where the poses are not known."""
+        log, ego = self.log, self.log.ego
+        poses, known = log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
+        if ego is None or not known.all():
+            return 0.0
+        map_T_ego = ego.at(after_ns)[0][0]
+        ground_z_m = float((map_T_ego @ [0.0, 0.0, log.ground_z_ego_m, 1.0])[2])
+        return expect_change(thumbnail, log.cameras[self.name], poses[0], poses[1], ground_z_m)
+
+
+# A sweep that has this share of its obstacle points in common with another is a copy of it: rounded to millimeters one has
+# nine in ten on each axis, and noise of a LiDAR leaves one in ten where nothing moves.
+MIN_COPIED_SHARE = 0.6
+# Where nothing tells how much sweeps of this LiDAR usually have in common, only exact copies count.
+MIN_IDENTICAL_SHARE = 0.95
+# Motion of the LiDAR by ten cells moves all points of structures to other cells.
+MIN_MOTION_M = 10 * CELL_M
+# So many pairs of sweeps tell how much they usually have in common.
+MIN_PAIRS = 5
+MAX_USUAL_SHARE = 0.3
+# Fewer obstacle points do not tell copies from chance.
+MIN_OBSTACLES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """A sweep, and the stamp of the first in a row that have their points in common with it."""
+
+    since_ns: int
+    sketch: SweepSketch
+
+
+@dataclass(eq=False)
+class LidarWatch:
+    """Judge the sweeps of one LiDAR in the order of their stamps.
+
+    Attributes
+    ----------
+    log : Log
+        Its poses tell how the LiDAR moves.
+    name : str
+        Of the LiDAR.
+    repeated : dict of int to bool
+        Whether a sweep repeats an earlier one, by stamp, ns.
+    points : dict of int to int
+        Number of points, by stamp.
+    """
+
+    log: Log
+    name: str
+    repeated: dict[int, bool] = field(default_factory=dict)
+    points: dict[int, int] = field(default_factory=dict)
+    _last: _Sweep | None = None
+    _shares: dict[Motion, list[float]] = field(default_factory=lambda: {"stands": [], "drives": [], "unclear": []})
+
+    def is_repeated(self, t_ns: int, sketch: SweepSketch) -> bool:
+        """Return whether a sweep repeats the one before it, and remember it.
+
+        Notes
+        -----
+        A LiDAR that stands in a synthetic world without noise gives the same points again and again, and rightly so. Hence a
+        sweep is a copy where the LiDAR moved meanwhile, or where its sweeps are known to differ even from one place.
+        """
+        self.points[t_ns] = sketch.points
+        last, same, copy = self._last, False, False
+        if last is not None and min(sketch.obstacles, last.sketch.obstacles) >= MIN_OBSTACLES:
+            share = common_share(last.sketch, sketch)
+            same = share >= MIN_COPIED_SHARE
+            motion = self._motion(last.since_ns, t_ns)
+            copy = (motion == "drives" and share >= MIN_IDENTICAL_SHARE) or (same and self._usually_differ(motion))
+            if not copy:
+                self._shares[motion].append(share)
+        self._last = _Sweep(last.since_ns if same and last is not None else t_ns, sketch)
+        self.repeated[t_ns] = copy
+        return copy
+
+    def _usually_differ(self, motion: Motion) -> bool:
+        """Return whether sweeps are known to have few points in common: even from one place, or while the LiDAR drives as now."""
+        kinds: tuple[Motion, ...] = ("stands", "drives") if motion == "drives" else ("stands",)
+        known = [self._shares[kind] for kind in kinds if len(self._shares[kind]) >= MIN_PAIRS]
+        return any(float(np.median(shares)) < MAX_USUAL_SHARE for shares in known)
+
+    def _motion(self, before_ns: int, after_ns: int) -> Motion:
+        """Return how the LiDAR moved between two stamps; it drives where all points of structures are in other cells."""
+        motion = motion_of(self.log, self.name, before_ns, after_ns)
+        if motion != "drives":
+            return motion
+        poses, _ = self.log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
+        return "drives" if np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]) > MIN_MOTION_M else "unclear"
+
+
+# What sweeps of this LiDAR usually have: this quantile of the numbers of points, so that many with none do not lower it.
+USUAL_QUANTILE = 0.9
+# Next to no points: the ground alone gives most points of a sweep, so no change of the scenery takes nine of ten away.
+MAX_SPARSE_SHARE = 0.1
+# With fewer points than this a LiDAR shows no object farther than some meters.
+MIN_USUAL_POINTS = 100
+
+
+class RecordWatch:
+    """Judge pictures and sweeps as they are read.
+
+    Attributes
+    ----------
+    cameras : dict of str to CameraWatch
+    lidars : dict of str to LidarWatch
+    """
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self.cameras = {name: CameraWatch(log, name) for name in log.cameras}
+        self.lidars = {name: LidarWatch(log, name) for name in log.lidars}
+
+    def faults(self, schedule: Schedule) -> tuple[Fault, ...]:
+        """List what was found, a fault for each span of each sensor."""
+        t0_ns = int(schedule.t_ns[0])
+        found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, t0_ns)]
+        found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, t0_ns)]
+        return (*found, *missing_records(self._log, schedule))
+
+
+def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Fault]:
+    stamps = np.array(sorted(watch.states), dtype=np.int64)
+    states = np.array([watch.states[t] for t in stamps.tolist()])
+    for span in spans_of(stamps, states == "frozen"):
+        message = f"pictures repeat an earlier one: {_when(span, t0_ns)}; they are not used"
+        yield Fault("frozen_images", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
+    for span in spans_of(stamps, states == "black"):
+        message = f"pictures show nothing (black, covered, of one color): {_when(span, t0_ns)}; they are not used"
+        yield Fault("black_images", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
+
+
+def _lidar_faults(watch: LidarWatch, t0_ns: int) -> Iterator[Fault]:
+    stamps = np.array(sorted(watch.points), dtype=np.int64)
+    if len(stamps) == 0:
+        return
+    repeated = np.array([watch.repeated[t] for t in stamps.tolist()])
+    for span in spans_of(stamps, repeated):
+        message = f"sweeps repeat an earlier one: {_when(span, t0_ns)}; they are not used"
+        yield Fault("repeated_sweeps", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
+    yield from _sparse_sweeps(watch.name, stamps, np.array([watch.points[t] for t in stamps.tolist()]), t0_ns)
+
+
+def _sparse_sweeps(name: str, t_ns: NDArray[np.int64], points: NDArray[np.int64], t0_ns: int) -> Iterator[Fault]:
+    """Mark the sweeps (F,) with next to no points, judged by what this LiDAR usually gives."""
+    usual = float(np.quantile(points, USUAL_QUANTILE))
+    if usual < MIN_USUAL_POINTS:
+        message = f"sweeps have next to no points, at most {points.max()}"
+        values = {"count": float(len(points)), "most_points": float(points.max())}
+        yield Fault("sparse_sweeps", name, message, "kept", int(t_ns[0]), int(t_ns[-1]), values)
+        return
+    for span in spans_of(t_ns, points < MAX_SPARSE_SHARE * usual):
+        inside = (t_ns >= span.start_ns) & (t_ns <= span.end_ns) & (points < MAX_SPARSE_SHARE * usual)
+        most = int(points[inside].max())
+        message = f"sweeps have at most {most} points where {usual:.0f} are usual: {_when(span, t0_ns)}"
+        values = _counts(span) | {"most_points": float(most), "usual_points": usual}
+        yield Fault("sparse_sweeps", name, message, "kept", span.start_ns, span.end_ns, values)
+
+
+def _when(span: Span, t0_ns: int) -> str:
+    """Say how many records a span holds, and when: "12 from 2.00 to 3.10 s"."""
+    start_s, end_s = ((t - t0_ns) / NS_PER_S for t in (span.start_ns, span.end_ns))
+    if span.total == 1:
+        return f"1 at {start_s:.2f} s"
+    counted = f"{span.count}" if span.count == span.total else f"{span.count} of {span.total}"
+    return f"{counted} from {start_s:.2f} to {end_s:.2f} s"
+
+
+def _counts(span: Span) -> dict[str, float]:
+    return {"count": float(span.count)}

@@ -1,0 +1,383 @@
+"""A map of the ground of a whole log: sweeps give its height and intensity, pictures its color."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import MapConfig
+from log2sim.datatypes import Log, Scenario
+from log2sim.errors import LogError
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.localization.pose_refinement import refine_poses
+from log2sim.perception.frames import RecordReader, look_again, work_ahead
+from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
+from log2sim.road.pictures import ColorRaster, Image, StandingPictures, View, find_hidden, sample_nearest, warp_onto
+from log2sim.road.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
+from log2sim.road.surface import (
+    GroundPoints,
+    PointCollector,
+    PreparedSweep,
+    Surface,
+    estimate_surface,
+    map_intensity,
+    upsample,
+)
+
+# A camera 1.5 m above the road resolves it to 5 cm with 1000 px of focal length up to 9 m away: every place is seen so at least
+# three times from pictures 2 m apart.
+PICTURE_STEP_M = 2.0
+# Rings of a sweep are 0.1 to 1 m apart on the ground: small steps of the ego fill the gaps between them.
+SWEEP_STEP_M = 0.1
+# So many points for each meter of the way are a return a centimeter on rings of 60 m, on 30 rings: more make no finer map. Of a
+# sweep of 120,000 points one is taken each 0.6 m, as at 6 m/s anyway.
+POINTS_A_METER = 200_000
+# What stands still, the same sensor shows again; several records of it average the noise and let moving shadows pass.
+STANDING_RECORDS = 7
+MAX_PICTURES, MAX_SWEEPS = 400, 160
+# Of this long only few ground pixels and points are finer than lane markings.
+MARGIN_M = 40.0
+# A roadside sensor 6 m above the road has a pixel of 0.5 m length at this distance, with 1500 px of focal length.
+ROADSIDE_MARGIN_M = 70.0
+
+
+def choose_records(
+    log: Log, scenario: Scenario, steps_m: Mapping[str, float], most: int
+) -> dict[str, NDArray[np.int64]]:
+    """Choose the records of sensors by name: where the ego is a step, m, farther on, at most `most` of all sensors together."""
+    steps_m = {name: step_m for name, step_m in steps_m.items() if name in log.streams}
+    most = max(most // max(len(steps_m), 1), STANDING_RECORDS)
+    return {name: _choose(log, scenario, name, step_m, most) for name, step_m in steps_m.items()}
+
+
+def sweep_step_m(points: int) -> float:
+    """Return how far the ego goes, m, between sweeps of a number of points that are taken."""
+    return max(SWEEP_STEP_M, points / POINTS_A_METER)
+
+
+def _choose(log: Log, scenario: Scenario, name: str, step_m: float, most: int) -> NDArray[np.int64]:
+    t_ns = log.streams[name].t_ns
+    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    pose, known = log.map_T_sensor(name, t_ns)
+    usable = np.flatnonzero(known & (t_ns >= scenario.t0_ns) & (t_ns <= end_ns))
+    if not len(usable):
+        return usable.astype(np.int64)
+    place = pose[usable, :3, 3]
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
+    # Noise of the poses of a sensor at rest is no way; it must come away from where it was last taken.
+    step = max(step_m, gone[-1] / most)
+    chosen, last = [0], 0
+    for k in range(1, len(usable)):
+        if np.linalg.norm(place[k] - place[last]) >= step:
+            chosen.append(k)
+            last = k
+    if len(chosen) < STANDING_RECORDS:
+        chosen = np.unique(np.linspace(0, len(usable) - 1, STANDING_RECORDS).round().astype(int)).tolist()
+    return usable[chosen[:most]].astype(np.int64)
+
+
+def path_of(log: Log, scenario: Scenario) -> Array:
+    """Places (K, 3), m, on the ground that the ego passed, about every half meter; none without known poses."""
+    if log.ego is None:
+        return np.zeros((0, 3))
+    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    t_ns = log.ego.t_ns[(log.ego.t_ns >= scenario.t0_ns) & (log.ego.t_ns <= end_ns)]
+    t_ns = t_ns if len(t_ns) else np.array([scenario.t0_ns], dtype=np.int64)
+    map_T_ego, known = log.ego.at(t_ns)
+    ground = map_T_ego[known] @ np.array([0.0, 0.0, log.ground_z_ego_m, 1.0])
+    if not len(ground):
+        return np.zeros((0, 3))
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ground[:, :3], axis=0), axis=1))])
+    at = np.linspace(0, gone[-1], max(int(gone[-1] / 0.5), 1) + 1)
+    return np.column_stack([np.interp(at, gone, ground[:, k]) for k in range(3)])
+
+
+def roadside_places(log: Log, scenario: Scenario) -> Array:
+    """Places (K, 3), m, of the sensors that are fixed in the map, on the ground."""
+    names = [name for name, camera in log.cameras.items() if camera.mount == "map"]
+    names += [name for name, lidar in log.lidars.items() if lidar.mount == "map"]
+    poses = [log.map_T_sensor(name, scenario.t0_ns)[0][0, :3, 3] for name in names]
+    ground_z = cloud_origin(log, scenario.t0_ns)[1] if log.ego is None else None
+    return np.array([[x, y, z if ground_z is None else ground_z] for x, y, z in poses]).reshape(-1, 3)
+
+
+def extent_of(path: Array, roadside: Array) -> Extent:
+    """Return the extent of a map, m, around places (K, 3) of the ego and of roadside sensors.
+
+    Raises
+    ------
+    LogError
+        Where there are neither, as in a log without poses.
+    """
+    low, high = [], []
+    for places, margin in ((path, MARGIN_M), (roadside, ROADSIDE_MARGIN_M)):
+        if len(places):
+            low.append(places[:, :2].min(axis=0) - margin)
+            high.append(places[:, :2].max(axis=0) + margin)
+    if not low:
+        raise LogError("no pose of any sensor is known, so pictures and sweeps have no place in a map of the ground")
+    (x0, y0), (x1, y1) = np.min(low, axis=0), np.max(high, axis=0)
+    # Whole meters, so that maps of one log lie on the same cells whichever part of it they show.
+    return float(np.floor(x0)), float(np.ceil(x1)), float(np.floor(y0)), float(np.ceil(y1))
+
+
+# Cells of heights along the edge of a cell of colors: curbs are 10 cm wide, and ten points lie on such a cell in a usual log.
+HEIGHT_CELL_M = 0.1
+# Half the width of a car: where the middle of the ego went, there is road this far to both sides.
+ROAD_HALF_WIDTH_M = 1.0
+# A sweep shows what hid the ground in a picture if both were taken within this time.
+MAX_APART_S = 0.15
+# LiDARs on roofs do not see the ground nearer than this around the vehicle.
+BLIND_M = 6.0
+# Rings of a LiDAR are up to this far apart on ground that its pictures still show finely.
+MAX_AWAY_M = 2.0
+# Of a LiDAR, to see how many points it gives.
+PROBED_SWEEPS = 3
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """What sweeps show: the points on the ground, its surface, that on which pictures are laid, and by stamp what hides it."""
+
+    points: GroundPoints
+    surface: Surface
+    laid: Surface
+    hiding: Mapping[int, Array]
+
+
+class GroundMapBuilder:
+    """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
+
+    Parameters
+    ----------
+    log : Log
+        With refined poses, see `refine_poses`.
+    scenario : Scenario
+        Its agents hide the ground: moving ones where they are at the time of a record, standing ones always.
+    settings : MapConfig
+    reader : RecordReader, optional
+        Reads the sweeps and counts those that cannot be read.
+    progress : callable, optional
+        Called as `progress(done, total)` while sweeps are read.
+
+    Attributes
+    ----------
+    notes : list of str
+        What could not be mapped, and why.
+
+    Raises
+    ------
+    LogError
+        When no pose is known.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        scenario: Scenario,
+        settings: MapConfig,
+        reader: RecordReader | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self._log, self._scenario = log, scenario
+        self._reader, self._progress = reader or RecordReader(log), progress or (lambda done, total: None)
+        self._path = path_of(log, scenario)
+        roadside = roadside_places(log, scenario)
+        extent = extent_of(self._path, roadside)
+        cell_m = coarsened_cell_m(extent, settings.cell_m)
+        self.notes: list[str] = []
+        if cell_m > settings.cell_m:
+            size = f"{extent[1] - extent[0]:.0f} x {extent[3] - extent[2]:.0f} m"
+            self.notes.append(f"the log covers {size}: cells of {cell_m:g} m instead of {settings.cell_m:g} m")
+        self.raster = Raster.covering(extent, cell_m)
+        places = self._path if len(self._path) else roadside
+        self._anchors, self._z0_m = places, float(np.median(places[:, 2]))
+        self._sweeps = choose_records(log, scenario, {k: self._sweep_step_m(k) for k in log.lidars}, MAX_SWEEPS)
+        self._frames = choose_records(log, scenario, dict.fromkeys(self._cameras(), PICTURE_STEP_M), MAX_PICTURES)
+        stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
+        self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
+        self._standing: dict[str, tuple[View, StandingPictures]] = {}
+        self._colors = ColorRaster(self.raster) if any(len(i) for i in self._frames.values()) else None
+
+    def frames(self) -> Mapping[str, NDArray[np.int64]]:
+        """Return the indices of the frames that the map is made of, by camera."""
+        return self._frames
+
+    def add(self, camera: str, index: int, image_bgr: Image) -> None:
+        """Add a picture (H, W, 3)."""
+        t_ns = int(self._log.streams[camera].t_ns[index])
+        map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
+        if self._colors is None or not known[0]:
+            return
+        view = View(self._log, self._log.cameras[camera], t_ns, map_T_cam[0])
+        users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
+        if view.camera.mount == "map":
+            self._standing.setdefault(camera, (view, StandingPictures()))[1].add(image_bgr, users)
+        else:
+            self._lay(self._colors, view, image_bgr, users)
+
+    def _lay(self, colors: ColorRaster, view: View, image: Image, users: NDArray[np.uint8]) -> None:
+        """Lay a picture on the ground but where its mask shows road users, or where something stands before the ground."""
+        warp = warp_onto(view, self._ground.laid, self._z0_m, self.raster)
+        if warp is None:
+            return
+        kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
+        kept &= self._likely_ground[warp.rows, warp.columns] > 0
+        if view.camera.mount == "ego":
+            ego = draw_footprints([self._users.ego_at(view.t_ns)], self.raster)
+            kept &= ego[warp.rows, warp.columns] == 0
+        warp = warp.take(kept)
+        hiding = self._hiding_at(view.t_ns) if view.camera.mount == "ego" else None
+        if hiding is not None:
+            warp = warp.take(~find_hidden(view, warp, hiding))
+        colors.add(view.camera.name, image, warp)
+
+    def build(self) -> GroundMap:
+        """Return the map of all that was added, as far as anything is known; once, since what it is made of is let go."""
+        shape = self.raster.shape
+        if self._colors is None:
+            self.notes.append("no color: there is no picture with a known pose")
+            color, alpha = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
+        else:
+            for view, pictures in self._standing.values():
+                self._lay(self._colors, view, *pictures.median())
+            self._standing.clear()
+            color, alpha = self._colors.image()
+            self._colors = None
+        standing = draw_footprints([self._users.standing()], self.raster) > 0
+        alpha[standing], color[standing] = 0, 0
+        height, intensity = self._measured()
+        for name in ("_ground", "_likely_ground"):
+            self.__dict__.pop(name, None)
+        for layer in (height, intensity):
+            layer[standing] = np.nan
+        whole = GroundMap(
+            color, alpha, height, intensity, self.raster.resolution_m, self.raster.extent_m, tuple(self.notes)
+        )
+        return whole.around(whole.known)
+
+    def _sweep_step_m(self, lidar: str) -> float:
+        """Return how far apart sweeps are taken, m, by how many points the first that can be read has."""
+        t_ns = self._log.streams[lidar].t_ns if lidar in self._log.streams else np.zeros(0, np.int64)
+        for index in np.flatnonzero(t_ns >= self._scenario.t0_ns)[:PROBED_SWEEPS].tolist():
+            sweep = self._reader.get(lidar, index)
+            if sweep is not None:
+                return sweep_step_m(len(sweep.xyz_m))
+        return sweep_step_m(0)
+
+    def _cameras(self) -> list[str]:
+        """Cameras that the scenario was made with; all of the log where it names none."""
+        used = [str(c["name"]) for c in self._scenario.cameras if c.get("used") and c["name"] in self._log.cameras]
+        return used or list(self._log.cameras)
+
+    @cached_property
+    def _ground(self) -> _Ground:
+        """Read the sweeps, when the first picture comes."""
+        factor = max(round(HEIGHT_CELL_M / self.raster.resolution_m), 1)
+        coarse = self.raster.coarser(factor)
+        chosen = [(name, int(i)) for name, indices in self._sweeps.items() for i in indices]
+        chosen.sort(key=lambda key: int(self._log.streams[key[0]].t_ns[key[1]]))
+        collector = PointCollector(self._log, coarse, len(chosen), self._z0_m)
+
+        def prepare(key: tuple[str, int]) -> PreparedSweep | None:
+            name, sweep, t_ns = key[0], self._reader.get(*key), int(self._log.streams[key[0]].t_ns[key[1]])
+            if sweep is None or self._reader.watch.lidars[name].repeated.get(t_ns, False):
+                return None
+            hidden = draw_footprints([self._users.at(t_ns), self._users.ego_at(t_ns)], coarse)
+            return collector.prepare(name, sweep, hidden)
+
+        for done, prepared in enumerate(work_ahead(prepare, chosen)):
+            collector.take(prepared)
+            self._progress(done + 1, len(chosen))
+        points = collector.points()
+        if not len(points.z):
+            self.notes.append(
+                "no height and no intensity: there is no sweep with ground; pictures are laid on flat ground"
+            )
+        elif not np.isfinite(points.intensity).any():
+            self.notes.append("no intensity: the sweeps of this log have none")
+        surface = estimate_surface(points, coarse, self._anchors, self._z0_m)
+        return _Ground(points, surface, surface.smoothed(), collector.hiding)
+
+    @cached_property
+    def _likely_ground(self) -> NDArray[np.uint8]:
+        """Mask (R, C), 1 where there may be ground: everywhere without sweeps, else near what they show or the ego passed.
+
+        Behind that stand houses, which pictures would smear over the map.
+        """
+        surface = self._ground.surface
+        if not surface.known.any():
+            return np.ones(self.raster.shape, dtype=np.uint8)
+        blind = self._road(surface.raster, BLIND_M)
+        away = cv2.distanceTransform((~surface.known & ~blind).astype(np.uint8), cv2.DIST_L2, 3)
+        near = (away * surface.raster.resolution_m <= MAX_AWAY_M).astype(np.uint8)
+        factor = round(surface.raster.resolution_m / self.raster.resolution_m)
+        return np.repeat(np.repeat(near, factor, axis=0), factor, axis=1)
+
+    def _hiding_at(self, t_ns: int) -> Array | None:
+        """Return points (H, 3), m, map frame, of what stood above the ground at a time; None where no sweep is near."""
+        stamps = np.array(sorted(self._ground.hiding), dtype=np.int64)
+        near = stamps[np.abs(stamps - t_ns) <= MAX_APART_S * NS_PER_S]
+        return np.concatenate([self._ground.hiding[t] for t in near.tolist()]) if len(near) else None
+
+    def _measured(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Height, m, and intensity on the cells of the map (R, C), NaN where no sweep tells."""
+        ground, shape = self._ground, self.raster.shape
+        factor = round(ground.surface.raster.resolution_m / self.raster.resolution_m)
+        height = upsample(ground.surface.z_m, factor, shape) + np.float32(self._z0_m)
+        known = np.repeat(np.repeat(ground.surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
+        height[~known] = np.nan
+        intensity = map_intensity(ground.points, ground.surface, self.raster, self._road(ground.surface.raster))
+        return height, intensity
+
+    def _road(self, raster: Raster, half_width_m: float = ROAD_HALF_WIDTH_M) -> NDArray[np.bool_]:
+        """Mask (R, C) of the cells that the ego drove over, or past at a distance."""
+        mask = np.zeros(raster.shape, dtype=np.uint8)
+        if len(self._path):
+            rows, columns = raster.cells_of(self._path[:, :2])
+            line = np.rint(np.stack([columns, rows], axis=1)).astype(np.int32)
+            cv2.polylines(mask, [line], False, 1, max(round(2 * half_width_m / raster.resolution_m), 1))
+        return mask > 0
+
+
+def map_ground(
+    log: Log,
+    scenario: Scenario,
+    settings: MapConfig | None = None,
+    reader: RecordReader | None = None,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    *,
+    refine: bool = True,
+) -> GroundMap:
+    """Map the ground of a log.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its agents are left out of the map; its span of time is what is mapped.
+    reader : RecordReader, optional
+        Counts the records that cannot be read.
+    progress : callable, optional
+        Called as `progress(stage, done, total)`.
+    refine : bool
+        Whether the poses are refined first, see `refine_poses`.
+
+    Raises
+    ------
+    LogError
+        When no pose is known, or no record that is wanted can be read.
+    """
+    reader, settings = reader or RecordReader(log), settings or MapConfig()
+    if refine:
+        log = refine_poses(log, scenario, reader)
+    builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
+    look_again(log, reader, [builder], partial(progress, "map: pictures"))
+    reader.require_some()
+    return builder.build()

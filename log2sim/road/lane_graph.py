@@ -1,0 +1,510 @@
+"""Lanes, inferred from markings where there are some, from the paths of vehicles elsewhere."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
+from log2sim.geometry import Array, wrap_angle
+from log2sim.road.polyline import MAX_TURN_RAD, MIN_PATH_M, DrivenPath, Match, Polyline, collect_paths
+from log2sim.road.routes import (
+    BESIDE_M,
+    CLEARANCE_M,
+    JOIN_M,
+    LANE_M,
+    MAX_LANE_M,
+    Beside,
+    Route,
+    continued,
+    find_beside,
+    match_path,
+    merge_paths,
+    without_lane_changes,
+)
+from log2sim.road.sections import (
+    Connection,
+    Strip,
+    Union,
+    connect,
+    continuations,
+    cut_sections,
+    find_conflicts,
+    find_transitions,
+    is_lane_change,
+    join_conflicts,
+    lay_out,
+)
+from log2sim.road.strips import PARALLEL_RAD, LaneStrip, find_strips, list_road_lines
+
+TOLERANCE_M = 0.004
+"""How far interpolation may be from a point that is left out: below the centimeter to which lanes are exact."""
+
+MAX_STEP_M = 20.0
+"""Longest chord, so that heights and widths are sampled too."""
+
+
+def thin(lane: MapLane) -> MapLane:
+    """Drop the points of a lane that linear interpolation restores, with their widths."""
+    kept = _kept_rows(np.column_stack([lane.points_m, lane.width_m]))
+    return replace(lane, points_m=lane.points_m[kept], width_m=lane.width_m[kept])
+
+
+def _kept_rows(columns: Array) -> NDArray[np.intp]:
+    """Return the rows to keep of x, y, z, width (N, 4), by repeated splitting (Ramer 1972, Douglas and Peucker 1973)."""
+    kept, stack = {0, len(columns) - 1}, [(0, len(columns) - 1)]
+    while stack:
+        a, b = stack.pop()
+        if b - a < 2:
+            continue
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(columns[a : b + 1, :2], axis=0).T))])
+        share = (way / way[-1])[:, None]
+        off = np.abs(columns[a : b + 1] - (columns[a] + share * (columns[b] - columns[a]))).max(axis=1)
+        k = a + int(off.argmax())
+        if off.max() <= TOLERANCE_M:
+            if way[-1] <= MAX_STEP_M:
+                continue
+            k = a + int(np.searchsorted(way, way[-1] / 2))
+        if k in (a, b):
+            k = (a + b) // 2
+        kept.add(k)
+        stack += [(a, k), (k, b)]
+    return np.array(sorted(kept))
+
+
+NEAR_M = 0.7
+"""A line this near to the edge of a lane is its edge: vehicles, and so lanes along their paths, keep half a meter off the middle."""
+
+MIN_SHARE = 0.5
+"""Of a lane's length that a line has to accompany."""
+
+
+def name_lines(lanes: Sequence[MapLane], markings: Sequence[Marking], borders: Sequence[RoadBorder]) -> list[MapLane]:
+    """Return lanes outside of junctions with the lines at their edges, where none are named; lanes side by side share one."""
+    items = list_road_lines(markings, borders)
+    lines = [Polyline.through(item.points_m) for item in items]
+    names = [item.id for item in items]
+    return [lane if lane.junction is not None else _named(lane, lines, names) for lane in lanes]
+
+
+def _named(lane: MapLane, lines: Sequence[Polyline], names: Sequence[str]) -> MapLane:
+    own = Polyline(lane.points_m)
+    s = np.linspace(0.0, own.length_m, max(int(np.ceil(own.length_m)), 4) + 1)
+    points, heading = own.at(s)[:, :2], own.heading_at(s)
+    half = np.interp(s, own.s_m, lane.width_m) / 2
+    best: dict[str, tuple[float, str | None]] = {}
+    low, high = own.bounds_m
+    for line, name in zip(lines, names):
+        if np.any(line.bounds_m[0] - half.max() - NEAR_M > high) or np.any(
+            line.bounds_m[1] + half.max() + NEAR_M < low
+        ):
+            continue
+        for turned in (0.0, np.pi):
+            at = line.project(points, heading + turned)
+            aside = -at.aside_m if turned == 0.0 else at.aside_m
+            along = at.inside & (np.abs(wrap_angle(at.turn_rad)) <= PARALLEL_RAD)
+            for side, sign in (("left", 1), ("right", -1)):
+                near = along & (np.abs(sign * aside - half) <= NEAR_M)
+                if near.mean() >= MIN_SHARE and near.mean() > best.get(side, (0.0, None))[0]:
+                    best[side] = (float(near.mean()), name)
+    left, right = (best.get(side, (0.0, None))[1] for side in ("left", "right"))
+    return replace(lane, left=lane.left or left, right=lane.right or right)
+
+
+OVERLAP_M = 10.0
+"""A lane of its own overlaps the lanes that a path leaves by as much; two stretches nearer than twice of it become one."""
+
+BEYOND_M = 0.3
+"""So far beyond the end of a lane a vehicle is still on it: less than half a step between two samples of its path."""
+
+
+def find_covered(lanes: Sequence[MapLane], line: Polyline, aside_m: float | None = None) -> NDArray[np.bool_]:
+    """Return whether each vertex (N,) of a path is within the width of some lane, or `aside_m` of its middle, along it."""
+    xy, heading = line.points_m[:, :2], line.heading_rad
+    covered = np.zeros(len(xy), dtype=bool)
+    low, high = line.bounds_m
+    for lane in lanes:
+        reach = max(float(lane.width_m.max()) / 2, aside_m or 0.0)
+        if np.any(lane.points_m[:, :2].min(axis=0) - reach > high) or np.any(
+            lane.points_m[:, :2].max(axis=0) + reach < low
+        ):
+            continue
+        middle = Polyline.through(lane.points_m)
+        at = middle.project(xy, heading)
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane.points_m[:, :2], axis=0).T))])
+        half = np.maximum(np.interp(at.s_m, way, lane.width_m) / 2, aside_m or 0.0)
+        along = (at.s_m >= -BEYOND_M) & (at.s_m <= middle.length_m + BEYOND_M)
+        covered |= along & (np.abs(at.aside_m) <= half) & (np.abs(at.turn_rad) <= MAX_TURN_RAD)
+    return covered
+
+
+def find_uncovered(lanes: Sequence[MapLane], path: DrivenPath) -> Iterator[tuple[Array, float]]:
+    """Yield points (N, 3) and a width for each stretch of a path outside all lanes, `OVERLAP_M` longer on either side."""
+    s = path.line.s_m
+    off = np.flatnonzero(~find_covered(lanes, path.line, BESIDE_M if path.rank == 2 else None))
+    if not len(off):
+        return
+    width = min(max(LANE_M, path.width_m + CLEARANCE_M), MAX_LANE_M)
+    for run in np.split(off, np.flatnonzero(np.diff(s[off]) > 2 * OVERLAP_M) + 1):
+        rows = np.flatnonzero((s >= s[run[0]] - OVERLAP_M) & (s <= s[run[-1]] + OVERLAP_M))
+        if len(rows) >= 2 and s[rows[-1]] - s[rows[0]] >= MIN_PATH_M:
+            yield path.line.points_m[rows], width
+
+
+ONCOMING_M = 15.0
+"""Traffic that comes towards a vehicle within this distance is on the same road: two lanes each way and a strip between."""
+
+DRIVEN, OUTER, INNER, UNKNOWN = 0.98, 0.9, 0.7, 0.5
+"""Probabilities of a direction: somebody drives that way; the lane beside it, away from oncoming traffic, must lead the same way;
+the one towards oncoming traffic may lead either way; nothing is known. Not measured, but for the order."""
+
+
+SURE = 0.65
+"""Directions of lanes that somebody drives or that lie next to such a one, not those told across two lines."""
+
+
+def find_side_of_traffic(paths: Sequence[DrivenPath]) -> int:
+    """Return 1 where oncoming traffic passes to the left (right-hand traffic), -1 where to the right, 0 if none is seen."""
+    votes = 0.0
+    for k, one in enumerate(paths):
+        for two in paths[k + 1 :]:
+            low, high = one.line.bounds_m
+            if np.any(two.line.bounds_m[0] - ONCOMING_M > high) or np.any(two.line.bounds_m[1] + ONCOMING_M < low):
+                continue
+            at = one.line.project(two.line.points_m[:, :2], two.line.heading_rad + np.pi)
+            meets = at.inside & (np.abs(at.aside_m) <= ONCOMING_M) & (np.abs(at.turn_rad) <= MAX_TURN_RAD / 2)
+            votes += float(np.sign(at.aside_m[meets]).sum())
+    return int(np.sign(votes))
+
+
+def direct_strips(
+    strips: Sequence[LaneStrip], paths: Sequence[DrivenPath], sides: Mapping[str, Marking | RoadBorder]
+) -> list[LaneStrip]:
+    """Turn strips the way that they lead, with the probability of it."""
+    found = [_driven(strip, paths) for strip in strips]
+    traffic = find_side_of_traffic(paths) or 1
+    beside = find_beside([strip.line for strip in found])
+    for _ in range(len(found)):
+        known = [strip.directed > UNKNOWN for strip in found]
+        news = {}
+        for pair in beside:
+            if known[pair.route] and not known[pair.other] and pair.other not in news:
+                alone = not _has_more(beside, pair)
+                news[pair.other] = _from_neighbor(found[pair.route], found[pair.other], pair, (traffic, alone), sides)
+        if not news:
+            break
+        turned = {k: strip.line is not found[k].line for k, strip in news.items()}
+        found = [news.get(k, strip) for k, strip in enumerate(found)]
+        if any(turned.values()):
+            beside = find_beside([strip.line for strip in found])
+    medians = _find_medians(found, beside, sides)
+    return [strip for k, strip in enumerate(found) if k not in medians]
+
+
+def _find_medians(
+    strips: Sequence[LaneStrip], beside: Sequence[Beside], sides: Mapping[str, Marking | RoadBorder]
+) -> set[int]:
+    """Return strips that nobody drives, behind solid lines, between lanes that surely lead opposite ways."""
+    ways: dict[int, set[tuple[bool, bool]]] = {}
+    for pair in beside:
+        if strips[pair.other].directed >= SURE:
+            ways.setdefault(pair.route, set()).add((bool(pair.aside_m[0] > 0), pair.same_way))
+    found = set()
+    for k, strip in enumerate(strips):
+        lines = [sides.get(name) for name in (strip.left, strip.right)]
+        closed = all(isinstance(line, RoadBorder) or (line is not None and line.kind == "solid") for line in lines)
+        apart = {(True, True), (False, False)}, {(True, False), (False, True)}
+        if closed and strip.directed < DRIVEN and ways.get(k, set()) in apart:
+            found.add(k)
+    return found
+
+
+def _driven(strip: LaneStrip, paths: Sequence[DrivenPath]) -> LaneStrip:
+    """Turn a strip the way that most vehicles drive it, by the lengths of their paths on it."""
+    along = 0
+    for path in paths:
+        for sign, turned in ((1, 0.0), (-1, np.pi)):
+            at = strip.line.project(path.line.points_m[:, :2], path.line.heading_rad + turned)
+            half = np.interp(at.s_m, strip.width_s_m, strip.width_m) / 2
+            inside = at.inside & (np.abs(at.aside_m) <= half) & (np.abs(wrap_angle(at.turn_rad)) <= MAX_TURN_RAD)
+            along += sign * int(inside.sum())
+    if along == 0:
+        return strip
+    return replace(strip if along > 0 else strip.reversed(), directed=DRIVEN)
+
+
+def _has_more(beside: Sequence[Beside], pair: Beside) -> bool:
+    """Whether a road has more lanes than two strips side by side."""
+    both = {pair.route, pair.other}
+    return any(other.route in both and other.other not in both for other in beside)
+
+
+def _from_neighbor(
+    known: LaneStrip, strip: LaneStrip, pair: Beside, road: tuple[int, bool], sides: Mapping[str, Marking | RoadBorder]
+) -> LaneStrip:
+    """Turn a strip by the one beside it: outside of it the same way, towards oncoming traffic by the line between them.
+
+    `road` is the side of traffic, and whether there are just these two: a dashed line in the middle of a road with two lanes
+    parts its directions, one between more lanes those of one direction.
+    """
+    traffic, alone = road
+    inner = pair.aside_m[0] * traffic > 0
+    between = sides.get(known.left if pair.aside_m[0] > 0 else known.right)
+    same, probability = True, OUTER
+    if inner:
+        dashed = isinstance(between, Marking) and between.kind == "dashed" and between.color != "yellow"
+        same, probability = dashed and not alone, INNER
+    turned = strip if pair.same_way == same else strip.reversed()
+    return replace(turned, directed=probability * known.directed)
+
+
+PATH_PROBABILITY = 0.6
+"""That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles."""
+
+MIN_AHEAD_M = 0.05
+"""A point nearer than this to where a lane begins, or behind it, is left out."""
+
+MAX_CONFIDENCE = 0.95
+"""Paths alone never prove a lane."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """Sections and connections, and what they came from."""
+
+    routes: Sequence[Route]
+    strips: Sequence[Strip]
+    connections: Sequence[Connection]
+    drivers: Sequence[Sequence[str]]
+    crossing: frozenset[int]
+
+
+def infer_lanes(
+    markings: Sequence[Marking], borders: Sequence[RoadBorder], scenario: Scenario
+) -> tuple[tuple[MapLane, ...], tuple[str, ...]]:
+    """Infer the lanes of a scenario, linked to each other, and notes on what is missing.
+
+    Lanes lie between markings and borders that run side by side, in the direction of the traffic on them; where there are none
+    they follow the paths of vehicles, those of two-wheelers only where nobody else drove. The paths of several vehicles
+    in one lane make one lane; it branches where they part, merges where they meet, and where they cross is a junction. Every
+    path lies within the width of some lane.
+
+    Notes
+    -----
+    Routes are merged from paths (`merge_paths`), cut where they conflict (`find_conflicts`) into sections that lie side by side
+    (`lay_out`), and the ways of the vehicles from one section to the next become connections (`connect`).
+    """
+    driven = collect_paths(scenario)
+    marked = _marked_routes(markings, borders, driven)
+    notes = []
+    if not marked:
+        notes.append(
+            "no lanes between markings: "
+            + ("no two lines run side by side" if markings or borders else "none were found")
+        )
+    if not driven:
+        notes.append("no lanes from paths: no vehicle moves")
+    if not driven and not marked:
+        return (), tuple(notes)
+    paths = without_lane_changes(driven)
+    graph = _graph(merge_paths(paths, marked), paths)
+    lanes = _as_lanes(graph, {path.agent: path.confidence for path in driven})
+    lanes = [*lanes, *_free_lanes(lanes, driven)]
+    return _with_opposites(name_lines(lanes, markings, borders)), tuple(notes)
+
+
+def _marked_routes(
+    markings: Sequence[Marking], borders: Sequence[RoadBorder], paths: Sequence[DrivenPath]
+) -> list[Route]:
+    """Return routes along the strips between lines, in the direction of traffic."""
+    sides: dict[str, Marking | RoadBorder] = {marking.id: marking for marking in markings}
+    sides |= {border.id: border for border in borders}
+    strips = direct_strips(find_strips(markings, borders), paths, sides)
+    return [
+        Route(
+            strip.line,
+            strip.width_m,
+            strip.width_s_m,
+            (True, True),
+            (0.0, strip.line.length_m),
+            strip.left,
+            strip.right,
+            strip.confidence * strip.directed,
+        )
+        for strip in strips
+    ]
+
+
+def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
+    seen = [match_path(routes, path) for path in paths]
+    whole = [continued(routes, path, match) for path, match in zip(paths, seen)]
+    matches = [match_path(routes, path) for path in whole]
+    beside = find_beside([route.line for route in routes])
+    areas = join_conflicts(routes, find_conflicts(routes, whole, matches), beside)
+    sections = cut_sections(routes, areas, beside, _passed_ends(routes, whole, matches))
+    strips = lay_out(routes, sections, beside)
+    drivers: list[list[str]] = [[] for _ in strips]
+    for path, match in zip(paths, seen):
+        for k, strip in enumerate(strips):
+            rows = [slice(run.first, run.last + 1) for run in match.runs if run.route == strip.section.route]
+            s = np.concatenate([match.s_m[r] for r in rows]) if rows else np.zeros(0)
+            if np.any((s > strip.section.first_m) & (s < strip.section.last_m)) and path.agent not in drivers[k]:
+                drivers[k].append(path.agent)
+    return _Graph(routes, strips, connect(routes, strips, whole, matches), drivers, areas.crossing)
+
+
+def _passed_ends(
+    routes: Sequence[Route], paths: Sequence[DrivenPath], matches: Sequence[Match]
+) -> set[tuple[int, bool]]:
+    """Return the routes whose start (True) or end (False) some path passes, coming from or going to another."""
+    passed = set()
+    for path, match in zip(paths, matches):
+        for one, two in find_transitions(match):
+            if is_lane_change(routes, path, one, two):
+                continue
+            if match.s_m[two.first] < JOIN_M:
+                passed.add((two.route, True))
+            if routes[one.route].line.length_m - match.s_m[one.last] < JOIN_M:
+                passed.add((one.route, False))
+    return passed
+
+
+def _as_lanes(graph: _Graph, confidence_of: dict[str, float]) -> list[MapLane]:
+    """Return sections and connections as lanes with their links."""
+    first = len(graph.strips)
+    links = [(c.origin, first + k) for k, c in enumerate(graph.connections)]
+    links += [(first + k, c.target) for k, c in enumerate(graph.connections)]
+    links += continuations(graph.strips)
+    names = [f"lane-{k + 1}" for k in range(first + len(graph.connections))]
+    after: list[list[str]] = [[] for _ in names]
+    before: list[list[str]] = [[] for _ in names]
+    for a, b in links:
+        after[a].append(names[b])
+        before[b].append(names[a])
+    junction_of = _junctions(graph)
+    lanes = []
+    for k, strip in enumerate(graph.strips):
+        route = graph.routes[strip.section.route]
+        marked = _is_marked(route, strip)
+        by_paths = _confidence(graph.drivers[k], confidence_of)
+        origin = ("both" if graph.drivers[k] else "markings") if marked else "paths"
+        both = 1 - (1 - by_paths) * (1 - route.confidence) if marked else by_paths
+        left, right = (None if other is None else names[other] for other in (strip.left, strip.right))
+        lanes.append(
+            MapLane(
+                names[k],
+                strip.line.points_m,
+                strip.width_m,
+                route.left if marked else None,
+                route.right if marked else None,
+                tuple(before[k]),
+                tuple(after[k]),
+                left,
+                right,
+                inferred_from=origin,
+                confidence=round(both, 3),
+            )
+        )
+    for k, way in enumerate(graph.connections, start=first):
+        lanes.append(
+            MapLane(
+                names[k],
+                way.line.points_m,
+                way.width_m,
+                predecessors=tuple(before[k]),
+                successors=tuple(after[k]),
+                junction=junction_of.get(way.area),
+                inferred_from="paths",
+                confidence=_confidence(way.agents, confidence_of),
+            )
+        )
+    return [thin(lane) for lane in _meeting(lanes, links)]
+
+
+def _is_marked(route: Route, strip: Strip) -> bool:
+    """Whether markings make the route along at least half of a section."""
+    if route.marked_m is None:
+        return False
+    first, last = strip.section.first_m, strip.section.last_m
+    return min(last, route.marked_m[1]) - max(first, route.marked_m[0]) >= (last - first) / 2
+
+
+def _junctions(graph: _Graph) -> dict[int, str]:
+    """Name the areas in which lanes cross, branch or merge, or in which several leave one road side by side: these are one."""
+    union = Union(1 + max((c.area for c in graph.connections), default=0))
+    known = {c.area for c in graph.connections}
+    for strip in graph.strips:
+        if strip.right is not None:
+            other = graph.strips[strip.right].section
+            for one, two in ((strip.section.start, other.start), (strip.section.end, other.end)):
+                if one in known and two in known:
+                    union.unite(one, two)
+    ways = Counter(union.root(c.area) for c in graph.connections)
+    crossing = {union.root(area) for area in graph.crossing & known}
+    order = list(dict.fromkeys(union.root(c.area) for c in graph.connections))
+    names = {area: f"junction-{k + 1}" for k, area in enumerate(a for a in order if ways[a] > 1 or a in crossing)}
+    return {area: names[union.root(area)] for area in known if union.root(area) in names}
+
+
+def _confidence(agents: Sequence[str], confidence_of: dict[str, float]) -> float:
+    missing = float(np.prod([1 - PATH_PROBABILITY * confidence_of.get(agent, 0.0) for agent in agents]))
+    return round(min(1 - missing, MAX_CONFIDENCE), 3)
+
+
+def _meeting(lanes: Sequence[MapLane], links: Sequence[tuple[int, int]]) -> list[MapLane]:
+    """Let linked lanes meet in exactly the same point."""
+    found = list(lanes)
+    for a, b in links:
+        points, lane = found[b].points_m.copy(), found[b]
+        points[0] = found[a].points_m[-1]
+        ahead = (points[1:, :2] - points[0, :2]) @ _direction(lane)
+        kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > MIN_AHEAD_M))])
+        if len(kept) > 1:
+            found[b] = replace(lane, points_m=points[kept], width_m=lane.width_m[kept])
+    return found
+
+
+def _direction(lane: MapLane) -> Array:
+    heading = Polyline(lane.points_m).heading_rad[0]
+    return np.array([np.cos(heading), np.sin(heading)])
+
+
+def add_missing_lanes(lanes: Sequence[MapLane], scenario: Scenario) -> tuple[MapLane, ...]:
+    """Return lanes and, where paths of a scenario's vehicles leave them, more without links."""
+    return (*lanes, *_free_lanes(lanes, collect_paths(scenario)))
+
+
+def _free_lanes(lanes: Sequence[MapLane], paths: Sequence[DrivenPath]) -> list[MapLane]:
+    """Return lanes without links over what is left of paths outside the lanes."""
+    found: list[MapLane] = []
+    taken = {lane.id for lane in lanes}
+    for path in paths:
+        for points, width in find_uncovered([*lanes, *found], path):
+            line = Polyline.through(points)
+            name = next(n for k in count(len(lanes) + len(found) + 1) if (n := f"lane-{k}") not in taken)
+            taken.add(name)
+            confidence = round(min(PATH_PROBABILITY * path.confidence, MAX_CONFIDENCE), 3)
+            full = np.full(len(line.points_m), width)
+            found.append(thin(MapLane(name, line.points_m, full, inferred_from="paths", confidence=confidence)))
+    return found
+
+
+def _with_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
+    """Name for each lane the one beside it that leads the other way, along at least half of it."""
+    flat = [k for k, lane in enumerate(lanes) if lane.junction is None]
+    lines = [Polyline.through(lanes[k].points_m) for k in flat]
+    best: dict[int, tuple[float, int]] = {}
+    for pair in find_beside(lines):
+        length = float(pair.s_m[-1] - pair.s_m[0])
+        if not pair.same_way and length >= lines[pair.route].length_m / 2:
+            best[pair.route] = max(best.get(pair.route, (0.0, -1)), (length, pair.other))
+    found = list(lanes)
+    for k, (_, other) in best.items():
+        if best.get(other, (0.0, -1))[1] == k:
+            found[flat[k]] = replace(found[flat[k]], opposite=lanes[flat[other]].id)
+    return tuple(found)

@@ -1,0 +1,531 @@
+"""Lane markings in one picture: the ground is laid out flat, by a known camera or by its vanishing point.
+
+Lane lines run beside each other. Edges of vehicles, walls and masts that stand upright point away from the camera when
+they are laid out flat, so they do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Marking, RoadBorder
+from log2sim.geometry import Array, Camera, apply, inverse, project
+from log2sim.road.ground_map import GroundMap
+from log2sim.road.markings import list_markings
+from log2sim.road.mosaic import render_birdseye
+from log2sim.road.pictures import GroundView, Image
+from log2sim.road.ridges import log_color
+
+WIDTH_PX = 960  # pictures are made smaller, so that grain is no line
+MIN_LENGTH = 0.02  # of the width
+ROWS = (0.1, 0.75)  # of the height, in which horizons of cameras that look along roads lie
+COLUMNS = (0.15, 0.85)
+LEAST_SLOPE_RAD = np.deg2rad(8)  # lines across the road
+ANGLE_SIGMA_RAD = np.deg2rad(1.0)
+LONGEST = 0.15  # of the width: what counts at most, so that no rail decides alone
+TRIALS = 4000
+MIN_SUPPORT = 0.1  # of the width, on either side
+
+
+def find_vanishing_point(image_bgr: NDArray[np.uint8], *, rng: np.random.Generator) -> tuple[float, float] | None:
+    """Find the pixel (u, v) in which lines along the road meet; None where too few do.
+
+    Notes
+    -----
+    Straight segments (von Gioi et al., "LSD: a fast line segment detector with a false detection control", PAMI 2010)
+    that lean to the left and to the right are intersected in random pairs. The point is taken to which most length of
+    both sides points: the lesser side counts.
+    """
+    scale = WIDTH_PX / image_bgr.shape[1]
+    small = cv2.resize(image_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    height, width = small.shape[:2]
+    segments = _segments(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8))
+    left, right = _sides(segments, width, height)
+    if not len(left) or not len(right):
+        return None
+    pairs = rng.integers(0, (len(left), len(right)), (TRIALS, 2))
+    points = _meet(left[pairs[:, 0]], right[pairs[:, 1]])
+    low, high = np.array([COLUMNS[0] * width, ROWS[0] * height]), np.array([COLUMNS[1] * width, ROWS[1] * height])
+    points = points[np.all((points > low) & (points < high), axis=1)]
+    if not len(points):
+        return None
+    support = np.array([_support(side, points, LONGEST * width) for side in (left, right)]).min(axis=0)
+    best = int(np.argmax(support))
+    if support[best] < MIN_SUPPORT * width:
+        return None
+    u, v = _refine(np.concatenate([left, right]), points[best])
+    return float(u / scale), float(v / scale)
+
+
+def _segments(gray: NDArray[np.uint8]) -> Array:
+    """Detect straight segments (N, 4): both ends, the upper one first."""
+    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(gray)[0]
+    if found is None:
+        return np.zeros((0, 4))
+    lines = np.asarray(found, np.float64).reshape(-1, 4)
+    upside = lines[:, 1] > lines[:, 3]
+    lines[upside] = lines[upside][:, [2, 3, 0, 1]]
+    return lines
+
+
+def _sides(segments: Array, width: int, height: int) -> tuple[Array, Array]:
+    """Part segments into those that lean to the right, as left of a road, and to the left."""
+    d = segments[:, 2:] - segments[:, :2]
+    length = np.linalg.norm(d, axis=1)
+    steep = np.abs(d[:, 1]) > np.sin(LEAST_SLOPE_RAD) * length
+    chosen = steep & (length > MIN_LENGTH * width) & (segments[:, 3] > ROWS[0] * height)
+    upright = np.abs(d[:, 0]) < 0.05 * length  # masts
+    return segments[chosen & ~upright & (d[:, 0] < 0)], segments[chosen & ~upright & (d[:, 0] > 0)]
+
+
+def _line(segments: Array) -> Array:
+    """Return the lines (N, 3) through segments, homogeneous, with unit normals."""
+    a = np.column_stack([segments[:, :2], np.ones(len(segments))])
+    b = np.column_stack([segments[:, 2:], np.ones(len(segments))])
+    lines = np.cross(a, b)
+    return np.asarray(lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True))
+
+
+def _meet(a: Array, b: Array) -> Array:
+    meeting = np.cross(_line(a), _line(b))
+    with np.errstate(all="ignore"):
+        return np.asarray(meeting[:, :2] / meeting[:, 2:])
+
+
+def _weights(segments: Array, points: Array, longest_px: float) -> Array:
+    """How much each segment points to each point, (N, P), px; only those below it."""
+    middle = (segments[:, :2] + segments[:, 2:]) / 2
+    d = segments[:, 2:] - segments[:, :2]
+    to = points[None] - middle[:, None]
+    cross = d[:, None, 0] * to[..., 1] - d[:, None, 1] * to[..., 0]
+    length = np.linalg.norm(d, axis=1)
+    sine = cross / np.maximum(length[:, None] * np.linalg.norm(to, axis=2), 1e-9)
+    below = segments[:, 1][:, None] > points[None, :, 1] - 2
+    return np.asarray(below * np.minimum(length, longest_px)[:, None] * np.exp(-0.5 * (sine / ANGLE_SIGMA_RAD) ** 2))
+
+
+def _support(segments: Array, points: Array, longest_px: float) -> Array:
+    return np.asarray(_weights(segments, points, longest_px).sum(axis=0))
+
+
+def _refine(segments: Array, point: Array) -> Array:
+    """Move a point to where the segments that point to it meet best, by their distances as angles."""
+    for _ in range(5):
+        weight = _weights(segments, point[None], np.inf)[:, 0]
+        lines = _line(segments)
+        reach = np.linalg.norm((segments[:, :2] + segments[:, 2:]) / 2 - point, axis=1)
+        w = weight / np.maximum(reach, 1.0) ** 2
+        normal = np.einsum("n,ni,nj->ij", w, lines[:, :2], lines[:, :2])
+        right = -np.einsum("n,ni,n->i", w, lines[:, :2], lines[:, 2])
+        if np.linalg.cond(normal) > 1e6:
+            break
+        point = np.linalg.solve(normal, right)
+    return point
+
+
+SURFACE_NEAR_M, BESIDE_M = 12.0, 3.0  # from the camera: ground that is mostly road in pictures that look along one
+# Paint and joints are narrower; vehicles are wider.
+NARROW_M = 0.7
+# Logarithms: other surfaces, wear and far haze; shadows of vehicles and their lower parts are darker by far.
+DARKER, BRIGHTER, COLORED = 0.6, 0.4, 0.12
+MIN_SHARE = 0.02  # of what is seen: with less, the color near the camera is not that of a road
+AROUND_M = 0.3
+
+
+def keep_road(ground: GroundMap, camera_x_m: float, camera_y_m: float) -> GroundMap:
+    """Hide what has not the color of the ground in front of the camera; all is kept where that is no wide surface."""
+    seen = ground.alpha > 0
+    bright, yellow = (_without_narrow(a, ground.resolution_m) for a in log_color(ground.color_bgr))
+    near = np.zeros(seen.shape, bool)
+    x0, _, _, y1 = ground.extent_m
+    rows = slice(*(max(round((y1 - camera_y_m + side * BESIDE_M) / ground.resolution_m), 0) for side in (-1, 1)))
+    first = max(round((camera_x_m - x0) / ground.resolution_m), 0)
+    near[rows, first : first + round(SURFACE_NEAR_M / ground.resolution_m)] = True
+    near &= seen
+    if not near.any():
+        return ground
+    level, tint = float(np.median(bright[near])), float(np.median(yellow[near]))
+    road = seen & (bright > level - DARKER) & (bright < level + BRIGHTER) & (np.abs(yellow - tint) < COLORED)
+    if np.count_nonzero(road) < MIN_SHARE * np.count_nonzero(seen):
+        return ground
+    size = (2 * round(AROUND_M / ground.resolution_m) + 1,) * 2
+    whole = cv2.morphologyEx(road.astype(np.uint8), cv2.MORPH_OPEN, np.ones(size, np.uint8))
+    wider = cv2.dilate(whole, np.ones((size[0] // 2 | 1,) * 2, np.uint8))
+    return replace(ground, alpha=np.where(wider > 0, ground.alpha, 0).astype(np.uint8))
+
+
+def _without_narrow(values: NDArray[np.float32], cell_m: float) -> NDArray[np.float32]:
+    """Remove what is narrow across the road, which runs along the rows: bright lines first, then dark ones."""
+    across = np.ones((2 * round(NARROW_M / cell_m / 2) + 1, 1), np.uint8)
+    soft = cv2.blur(values, (5, 5))
+    return np.asarray(
+        cv2.morphologyEx(cv2.morphologyEx(soft, cv2.MORPH_OPEN, across), cv2.MORPH_CLOSE, across), np.float32
+    )
+
+
+TOLERANCE_M, TOLERANCE_PER_M = 0.12, 0.01  # of a line's course: its own error, and that of a ground that is not flat
+SAME_LINE_M = 0.6  # double lines are one lane line
+MAX_SLOPE = 0.35  # of lines that run along the road where the camera is
+STEP_M = 0.5
+BEND_SIGMA_PER_M = 0.01  # half the curvature of a radius of 50 m; a line counts as one observation, however long it is
+MIN_WEIGHT = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class RoadShape:
+    """y = offset + slope x + bend x**2 of all lane lines, each with its own offset.
+
+    Attributes
+    ----------
+    slope, bend : float
+        bend in 1/m.
+    """
+
+    slope: float
+    bend: float
+
+    def course(self, x: Array) -> Array:
+        """Return y (N,) of the line through the origin."""
+        return np.asarray(self.slope * x + self.bend * x**2)
+
+
+@dataclass(frozen=True, eq=False)
+class LaneLine:
+    """Markings that are one line beside a lane, and its course from end to end of what can be seen.
+
+    Attributes
+    ----------
+    offset_m : float
+        To the left of the camera.
+    points_m : (N, 3) float64, m
+        Beyond the markings by the course of the others.
+    """
+
+    offset_m: float
+    markings: tuple[Marking, ...]
+    points_m: Array
+
+
+def find_shape(markings: list[Marking], weights: Array) -> tuple[RoadShape, list[int]] | None:
+    """Find the course that most lane lines follow, by weight, and the indices of those that do.
+
+    Parameters
+    ----------
+    markings : list of Marking
+        Lane lines.
+    weights : (N,) float64
+        What each counts.
+    """
+    points = [_even(marking.points_m) for marking in markings]
+    best: tuple[float, RoadShape, list[int]] | None = None
+    for seed in range(len(markings)):
+        shape = _fit([points[seed]], weights[[seed]])
+        for _ in range(2):
+            member = [k for k in range(len(markings)) if _follows(points[k], shape)]
+            if not member:
+                break
+            shape = _fit([points[k] for k in member], weights[member])
+        member = [k for k in range(len(markings)) if _follows(points[k], shape)]
+        # Lines at several offsets tell more than one alone, which upright things give, too.
+        offsets = _groups([_offset(points[k], shape) for k in member])
+        score = sum(min(float(weights[[member[i] for i in group]].sum()), 1.0) for group in offsets)
+        if abs(shape.slope) <= MAX_SLOPE and member and (best is None or score > best[0]):
+            best = (score, shape, member)
+    return None if best is None or best[0] < MIN_WEIGHT else (best[1], best[2])
+
+
+def join_lines(markings: list[Marking], shape: RoadShape, near_m: float, far_m: float) -> list[LaneLine]:
+    """Join markings at one offset to lane lines, and continue these by the course of all."""
+    points = [_even(marking.points_m) for marking in markings]
+    offsets = [_offset(p, shape) for p in points]
+    lines = []
+    for group in _groups(offsets):
+        order = sorted(group, key=lambda k: points[k][:, 0].min())
+        own = np.concatenate([points[k] for k in order])
+        own = own[np.argsort(own[:, 0], kind="stable")]
+        lines.append(
+            LaneLine(
+                float(np.mean([offsets[k] for k in group])),
+                tuple(markings[k] for k in order),
+                _continued(own, shape, near_m, far_m),
+            )
+        )
+    return sorted(lines, key=lambda line: -line.offset_m)
+
+
+def _continued(points: Array, shape: RoadShape, near_m: float, far_m: float) -> Array:
+    """Continue a line to both ends, beside the course where it was seen last."""
+    x = np.arange(min(near_m, points[0, 0]), max(far_m, points[-1, 0]) + STEP_M, STEP_M)
+    beside = points[:, 1] - shape.course(points[:, 0])
+    # Medians of the nearest 5 m, as single points would shift all that lies beyond.
+    first, last = (float(np.median(part)) for part in (beside[: 1 + int(5 / STEP_M)], beside[-1 - int(5 / STEP_M) :]))
+    y = shape.course(x) + np.interp(x, points[:, 0], beside, left=first, right=last)
+    return np.column_stack([x, y, np.full(len(x), float(np.median(points[:, 2])))])
+
+
+def _even(points: Array) -> Array:
+    """Points at equal steps along x."""
+    order = np.argsort(points[:, 0], kind="stable")
+    low, high = points[order[0], 0], points[order[-1], 0]
+    x = np.linspace(low, high, max(int((high - low) / STEP_M), 2))
+    return np.column_stack([x, *(np.interp(x, points[order, 0], points[order, k]) for k in (1, 2))])
+
+
+def _offset(points: Array, shape: RoadShape) -> float:
+    return float(np.median(points[:, 1] - shape.course(points[:, 0])))
+
+
+def _follows(points: Array, shape: RoadShape) -> bool:
+    beside = points[:, 1] - shape.course(points[:, 0])
+    span = float(np.ptp(points[:, 0]))
+    spread = float(np.abs(beside - np.median(beside)).max())
+    turn = abs(float(np.polyfit(points[:, 0], beside, 1)[0])) if span > 0 else np.inf
+    reach = float(points[:, 0].max())
+    return spread <= TOLERANCE_M + TOLERANCE_PER_M * reach and turn <= 0.02 + 2 * TOLERANCE_M / max(span, 1.0)
+
+
+def _groups(offsets: list[float]) -> list[list[int]]:
+    """Group indices of offsets that are near their neighbors."""
+    order = np.argsort(offsets, kind="stable")
+    groups: list[list[int]] = []
+    for k in order.tolist():
+        if groups and offsets[k] - offsets[groups[-1][-1]] <= SAME_LINE_M:
+            groups[-1].append(k)
+        else:
+            groups.append([k])
+    return groups
+
+
+def _fit(lines: list[Array], weights: Array) -> RoadShape:
+    """Fit one course to lines, each with its own offset; bends need length to be seen, or are slight."""
+    rows, right = [], []
+    for k, (points, weight) in enumerate(zip(lines, weights)):
+        x, y = points[:, 0], points[:, 1]
+        # Pixels shrink with distance, and errors grow.
+        w = np.sqrt(weight / len(x)) / (TOLERANCE_M + TOLERANCE_PER_M * x)
+        block = np.zeros((len(x), 2 + len(lines)))
+        block[:, 0], block[:, 1], block[:, 2 + k] = w * x, w * x**2, w
+        rows.append(block)
+        right.append(w * y)
+    prior = np.zeros((1, 2 + len(lines)))
+    prior[0, 1] = 1 / BEND_SIGMA_PER_M
+    rows.append(prior)
+    right.append(np.zeros(1))
+    solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    return RoadShape(float(solution[0]), float(solution[1]))
+
+
+CELL_M = 0.05
+HALF_WIDTH_M, REACH_M = 18.0, 90.0
+COARSEST_M = 3.0  # a dash is 3 m long; what is coarser along the road shows no line's begin, but where it runs
+# Behind the windshield of cars cameras are 1.2 m to 1.6 m above the road; widths scale with it.
+CAMERA_HEIGHT_M = 1.5
+HORIZONTAL_FIELD_RAD = np.deg2rad(60)  # dashboard cameras: 50 to 70 deg; lengths along the road scale with its tangent
+ROUNDS = 2
+MIN_LINE_M, MIN_APART_M = 8.0, 2.0
+# Rows that a line spans, as a share of the picture's height: less is too little to tell its course; more counts no more.
+SHORT_LINE, LONG_LINE = 0.015, 0.1
+NEAR_M, FAR_M = 2.0, 150.0  # to where lane lines are continued
+# Of lines that do not count alone, but where others run beside them; dashes are 1 m and more.
+MIN_CONFIDENCE, MIN_DASH_M = 0.15, 1.0
+UPRIGHT_SLOPE, UPRIGHT_OFFSET_M = 0.06, 0.7
+MAX_PITCH_STEP_RAD = np.deg2rad(3)
+
+
+@dataclass(frozen=True, eq=False)
+class PictureMarkings:
+    """What one picture shows of the road.
+
+    Attributes
+    ----------
+    markings : tuple of Marking
+        In the frame of the ground below the camera: x forward, y left, z up.
+    lane_lines : tuple of LaneLine
+        The lines of which lane markings are parts, from left to right.
+    camera : Camera
+        Its `mount_T_cam` is its pose in that frame.
+    ground : GroundMap
+        The ground as the picture shows it.
+    notes : tuple of str
+        What was not seen or is assumed.
+    """
+
+    markings: tuple[Marking, ...]
+    borders: tuple[RoadBorder, ...]
+    lane_lines: tuple[LaneLine, ...]
+    camera: Camera
+    ground: GroundMap
+    notes: tuple[str, ...]
+
+    def project(self, points_m: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3) of the ground, NaN where they are not in front of the camera."""
+        return project(self.camera, apply(inverse(self.camera.mount_T_cam), points_m))[0]
+
+
+def find_markings_in_picture(
+    image_bgr: Image, camera: Camera | None = None, *, height_m: float = CAMERA_HEIGHT_M
+) -> PictureMarkings:
+    """Find markings in one picture that looks along a road.
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) uint8
+        Without lens distortion, unless a camera states it.
+    camera : Camera, optional
+        `mount_T_cam` is its pose above the ground z = 0 of its mount, x forward. Without it, the direction is that in which
+        lines of the road meet, the field of view is assumed, and lengths along the road are no better than that.
+    height_m : float, m
+        Of the camera above the road, where there is no camera.
+
+    Returns
+    -------
+    PictureMarkings
+        Without markings where no lines meet.
+
+    Notes
+    -----
+    Where the direction is estimated, markings are found again after the horizon is corrected so that lane lines stay at one
+    distance from each other.
+    """
+    if camera is not None:
+        return _find(image_bgr, camera)
+    point = find_vanishing_point(image_bgr, rng=np.random.default_rng(0))
+    if point is None:
+        nowhere = _camera_towards(image_bgr, (image_bgr.shape[1] / 2, image_bgr.shape[0] / 2), height_m)
+        note = "no markings seen: no lines meet, so the horizon of the road is unknown"
+        return PictureMarkings((), (), (), nowhere, _lay_out(image_bgr, nowhere), (note,))
+    found = _find(image_bgr, _camera_towards(image_bgr, point, height_m))
+    for _ in range(ROUNDS):
+        corrected = _make_parallel(found, image_bgr, height_m)
+        if corrected is None:
+            break
+        again = _find(image_bgr, corrected)
+        if _seen_rows(again) < _seen_rows(found):
+            break
+        found = again
+    field = f"{np.rad2deg(HORIZONTAL_FIELD_RAD):.0f} deg"
+    assumed = f"camera: {height_m:g} m above the road and a field of view of {field} are assumed"
+    return replace(found, notes=(*found.notes, assumed))
+
+
+def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
+    """Find markings by a camera's pose, and leave out lines that do not follow the course of the road."""
+    ground = _lay_out(image_bgr, camera)
+    markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M, symbols=False)
+    notes = ("markings by a camera only: light streaks are harder to tell from paint",)
+    found = PictureMarkings(markings, (), (), camera, ground, notes)
+    lines = [m for m in markings if m.is_lane_line and not _is_upright(m, camera)]
+    weights = np.array([_visible(found, m) * m.confidence for m in lines]) / (LONG_LINE * camera.height_px)
+    large = [k for k in range(len(lines)) if weights[k] >= SHORT_LINE / LONG_LINE]
+    lines, weights = [lines[k] for k in large], weights[large]
+    shape = find_shape(lines, weights)
+    if shape is None:
+        others = tuple(m for m in markings if not m.is_lane_line)
+        return replace(found, markings=others, notes=(*notes, "no lane lines seen: none run beside each other"))
+    kept = [lines[k] for k in shape[1]]
+    x = camera.mount_T_cam[0, 3]
+    joined = join_lines(kept, shape[0], x + NEAR_M, x + FAR_M)
+    others = tuple(m for m in markings if not m.is_lane_line)
+    return replace(found, markings=(*kept, *others), lane_lines=tuple(joined))
+
+
+def _is_upright(marking: Marking, camera: Camera) -> bool:
+    """Whether a line points to below the camera but not along the road, as upright things do that are laid out flat."""
+    x, y = marking.points_m[:, 0] - camera.mount_T_cam[0, 3], marking.points_m[:, 1] - camera.mount_T_cam[1, 3]
+    slope, offset = np.polyfit(x, y, 1)
+    return bool(abs(slope) > UPRIGHT_SLOPE and abs(offset) < UPRIGHT_OFFSET_M)
+
+
+def _seen_rows(found: PictureMarkings) -> float:
+    """Sum the rows of the picture that lane lines span, by confidence."""
+    return sum(_visible(found, m) * m.confidence for line in found.lane_lines for m in line.markings)
+
+
+def _visible(found: PictureMarkings, marking: Marking) -> float:
+    """Count the rows of the picture that a marking spans."""
+    uv = found.project(marking.points_m)
+    rows = uv[np.isfinite(uv[:, 1]), 1]
+    return float(np.ptp(rows)) if len(rows) > 1 else 0.0
+
+
+def _lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
+    """Lay the ground in front of a camera out flat."""
+    view = GroundView.from_pose(image_bgr, camera, camera.mount_T_cam)
+    x, y = camera.mount_T_cam[:2, 3]
+    extent = (x, x + REACH_M, y - HALF_WIDTH_M, y + HALF_WIDTH_M)
+    laid = render_birdseye([view], extent_m=extent, resolution_m=CELL_M, coarsest_m=COARSEST_M, frame="ego")
+    unknown = np.full(laid.alpha.shape, np.nan, np.float32)
+    ground = GroundMap(laid.image_bgr, laid.alpha, unknown, unknown, laid.resolution_m, laid.extent_m)
+    return keep_road(ground, float(x), float(y))
+
+
+def _camera_towards(image_bgr: Image, point: tuple[float, float], height_m: float) -> Camera:
+    """Make the camera whose pixel `point` looks along the road, without roll."""
+    height, width = image_bgr.shape[:2]
+    focal = width / 2 / np.tan(HORIZONTAL_FIELD_RAD / 2)
+    K = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1.0]])
+    forward = np.linalg.solve(K, np.array([*point, 1.0]))
+    forward /= np.linalg.norm(forward)
+    up = np.array([0.0, -1.0, (point[1] - K[1, 2]) / focal])  # the horizon is a row
+    up /= np.linalg.norm(up)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([forward, np.cross(up, forward), up])
+    pose[2, 3] = height_m
+    return Camera("picture", width, height, K, "ego", pose)
+
+
+def _make_parallel(found: PictureMarkings, image_bgr: Image, height_m: float) -> Camera | None:
+    """Correct the horizon so that lane lines keep their distances; None where there are no two, or nothing changes.
+
+    Notes
+    -----
+    A row that is wrong by d pixels adds d / (f h) to 1 / x, with focal length f and height h, and leaves y / x as it is:
+    the line y = a + b x becomes y = a + (b + a d / (f h)) x. So b grows by a line with a.
+    """
+    camera = found.camera
+    rows = [row for m in found.markings if m.is_lane_line and (row := _offset_and_slope(m.points_m)) is not None]
+    if len(rows) < 2:
+        return None
+    a, b, w = np.array(rows).T
+    if np.ptp(a) < MIN_APART_M:
+        return None
+    rate, level = _robust_line(a, b, w)
+    focal = camera.K[0, 0]
+    forward = camera.K @ np.linalg.inv(camera.mount_T_cam[:3, :3]) @ np.array([1.0, level, 0.0])
+    limit = MAX_PITCH_STEP_RAD * focal
+    point = (
+        float(forward[0] / forward[2]),
+        float(forward[1] / forward[2] - np.clip(rate * focal * height_m, -limit, limit)),
+    )
+    return _camera_towards(image_bgr, point, height_m)
+
+
+def _robust_line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
+    """Slope and intercept of the line through most of some points: weighted medians of pairs (Theil and Sen)."""
+    i, j = np.triu_indices(len(x), 1)
+    apart = np.abs(x[i] - x[j]) >= MIN_APART_M
+    i, j = i[apart], j[apart]
+    slope = _weighted_median((y[i] - y[j]) / (x[i] - x[j]), weight[i] * weight[j] * np.abs(x[i] - x[j]))
+    return slope, _weighted_median(y - slope * x, weight)
+
+
+def _weighted_median(values: Array, weight: Array) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def _offset_and_slope(points: Array) -> tuple[float, float, float] | None:
+    """Offset and slope of a line where it passes the camera, and its weight; None for one that is short or across."""
+    x, y = points[:, 0], points[:, 1]
+    span = float(np.ptp(x))
+    if span < MIN_LINE_M or span < 3 * np.ptp(y):
+        return None
+    # A bend at least as long as the line reaches beyond it would be uncertain.
+    degree = 2 if span > 25 and x.min() < 15 else 1
+    fit = np.polyfit(x, y, degree)
+    return float(fit[-1]), float(fit[-2]), span

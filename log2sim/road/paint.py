@@ -1,0 +1,454 @@
+"""Straight pieces of ridges, profiles across them, and how likely they are paint."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, fields
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from log2sim.geometry import Array
+from log2sim.road.ground_map import GroundMap
+from log2sim.road.ridges import Layer, RidgePoints, Samples, sample
+
+AROUND_M = 0.25
+
+
+def at_height(ground: GroundMap, xy: Array) -> Array:
+    """Put points (N, 2) on the ground: (N, 3), m. Where the height is unknown it is that of the nearest point, or 0."""
+    reach = max(1, round(AROUND_M / ground.resolution_m))
+    rows = ((ground.extent_m[3] - xy[:, 1]) / ground.resolution_m).astype(int)
+    columns = ((xy[:, 0] - ground.extent_m[0]) / ground.resolution_m).astype(int)
+    z = np.full(len(xy), np.nan)
+    for k, (r, c) in enumerate(zip(rows, columns)):
+        part = ground.height_m[max(r - reach, 0) : max(r + reach + 1, 0), max(c - reach, 0) : max(c + reach + 1, 0)]
+        known = part[np.isfinite(part)]
+        if known.size:
+            z[k] = np.median(known)
+    known = np.isfinite(z)
+    if not known.any():
+        everywhere = ground.height_m[::20, ::20]
+        level = float(np.nanmedian(everywhere)) if np.isfinite(everywhere).any() else 0.0
+        return np.column_stack([xy, np.full(len(xy), level)])
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    return np.column_stack([xy, np.interp(s, s[known], z[known])])
+
+
+PROFILE_M, PROFILE_STEP_M, ALONG_SAMPLES = 1.5, 0.05, 11
+MIN_SEEN = 0.6  # share of a profile's middle; of what is hidden beside a line, the other side tells
+MAX_SHIFT_M = 0.12  # from the ridge, which is as fine as a coarse cell, to the middle of the paint
+FLANK_M = (0.08, 0.4)  # from the middle: where the road beside the paint is looked for
+# From the edge: between a line and a curb there are often 0.1 m of road, and paint may be blurred so far.
+SIDES_M = ((0.03, 0.13), (0.1, 0.3))
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Straight pieces of ridges.
+
+    Attributes
+    ----------
+    xy : (N, 2) float64, m
+        Middles.
+    direction : (N,) float64, rad in [0, pi)
+    length_m, width_m : (N,) float64
+        Width at half of the contrast.
+    color, color_sigma : (N,) float64
+        Contrast of the logarithm of color to the brighter side, and its standard error; NaN where no camera saw it.
+    edge_m : (N,) float64
+        Length in which the edges rise from a quarter to three quarters of the contrast.
+    uneven : (N,) float64
+        Difference of both sides.
+    outshines : (N,) float64
+        Logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side.
+    yellow : (N,) float64
+        Contrast of yellowness.
+    reflected, reflected_sigma : (N,) float64
+        Contrast of the logarithm of LiDAR intensity, and its standard error; NaN where LiDAR saw too little.
+    """
+
+    xy: Array
+    direction: Array
+    length_m: Array
+    width_m: Array
+    color: Array
+    color_sigma: Array
+    edge_m: Array
+    uneven: Array
+    outshines: Array
+    yellow: Array
+    reflected: Array
+    reflected_sigma: Array
+
+    def __len__(self) -> int:
+        """Count the pieces."""
+        return len(self.xy)
+
+    def take(self, chosen: NDArray[Any]) -> Pieces:
+        """Choose pieces by a mask or by indices."""
+        return Pieces(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+    def ends(self, chosen: NDArray[np.int64]) -> Array:
+        """Return both ends (K, 2, 2), m, of some pieces (K,)."""
+        angle, xy = self.direction[chosen], self.xy[chosen]
+        half = np.stack([np.cos(angle), np.sin(angle)], 1) * self.length_m[chosen, None] / 2
+        return np.stack([xy - half, xy + half], 1)
+
+
+def no_pieces(count: int, **known: Array) -> Pieces:
+    """Make pieces of which only some attributes are known; the others are 1, so that all are alike."""
+    plain = {f.name: np.ones((count, 2) if f.name == "xy" else count) for f in fields(Pieces)}
+    return Pieces(**(plain | known))
+
+
+def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
+    """Measure the profiles across lines (N, 4): x, y, direction, length."""
+    steps = round(PROFILE_M / PROFILE_STEP_M)
+    across = np.arange(-steps, steps + 1, dtype=np.float64) * PROFILE_STEP_M
+    along = (np.arange(ALONG_SAMPLES) + 0.5) / ALONG_SAMPLES - 0.5
+    c, s = np.cos(lines[:, 2]), np.sin(lines[:, 2])
+    # (N, along, across)
+    u = np.broadcast_to((along[None] * lines[:, 3:4])[:, :, None], (len(lines), ALONG_SAMPLES, len(across)))
+    x = lines[:, 0, None, None] + u * c[:, None, None] - across * s[:, None, None]
+    y = lines[:, 1, None, None] + u * s[:, None, None] + across * c[:, None, None]
+    flat = (len(lines), ALONG_SAMPLES * len(across))
+    seen = sample(ground, x.reshape(flat), y.reshape(flat))
+    samples = Samples(*(a.reshape(x.shape) for a in (seen.bright, seen.yellow, seen.intensity)))
+    color, reflected = (_quiet(np.nanmean, a) for a in (samples.paint, samples.intensity))
+    by_camera = np.isfinite(color[:, np.abs(across) <= 0.5]).mean(1) > MIN_SEEN
+    # Of values, not of their logarithms, in which edges that are blurred lie farther out.
+    left, right, edge = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
+    shift, width = (left + right) / 2, right - left
+    inside = np.abs(across - shift[:, None]) <= np.maximum(width / 2 - 0.02, 0.03)[:, None]
+    sides = [_side(across, shift, width, side) for side in (-1, 1)]
+    contrast, sigma, uneven = _contrast(samples.paint, inside, sides, one_side=True)
+    yellow = _contrast(samples.yellow, inside, sides, one_side=True)[0]
+    intensity, intensity_sigma, _ = _contrast(samples.intensity, inside, sides, one_side=False)
+    xy = lines[:, :2] + shift[:, None] * np.stack([-s, c], 1)
+    bright = np.where(inside, color, np.nan)
+    around = [
+        _quiet(
+            np.nanquantile, np.where(side * (across - shift[:, None]) > width[:, None] / 2 + 0.1, color, np.nan), q=0.75
+        )
+        for side in (-1, 1)
+    ]
+    # Beside a road there are brighter grounds; the road itself is on one side at least.
+    outshines = _quiet(np.nanmean, bright) - np.fmin(*around)
+    return Pieces(
+        xy,
+        lines[:, 2],
+        lines[:, 3],
+        width,
+        contrast,
+        sigma,
+        edge,
+        uneven,
+        outshines,
+        yellow,
+        intensity,
+        intensity_sigma,
+    )
+
+
+def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
+    """Reduce rows, of which some may be NaN altogether."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(function(values, axis=1, **options), np.float64)
+
+
+def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
+    """Positions (N,) left and right of the middle where profiles (N, P) fall to half of their contrast on that side.
+
+    The third result is the length in which they fall from three quarters to one.
+    """
+    filled, soft = _without_gaps(profile)
+    near = np.abs(across) <= MAX_SHIFT_M
+    peak = np.argmax(np.where(near, soft, -np.inf), axis=1)
+    index = np.arange(len(profile))
+    top = soft[index, peak]
+    # Lines wider than the blur have a flat top: its mean is nearer to the paint than its largest value.
+    edges, falls = [], []
+    distance = across - across[peak][:, None]
+    roads = [_darkest(soft, (side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1])) for side in (-1, 1)]
+    for side, road, other in zip((-1, 1), roads, roads[::-1]):
+        road = np.where(np.isfinite(road), road, other)
+        high, half, low = (_crossing(filled, peak, road + q * (top - road), side, across) for q in (0.75, 0.5, 0.25))
+        edges.append(half)
+        falls.append(side * (low - high))
+    return edges[0], edges[1], np.fmax(falls[0], falls[1])
+
+
+def _darkest(soft: Array, where: NDArray[np.bool_]) -> Array:
+    """Least value (N,) of profiles (N, P) somewhere; NaN where nothing is known there."""
+    least = np.where(where & np.isfinite(soft), soft, np.inf).min(axis=1)
+    return np.where(np.isfinite(least), least, np.nan)
+
+
+def _without_gaps(profile: Array) -> tuple[Array, Array]:
+    """Fill gaps of profiles (N, P), where LiDAR hit no cell, from their neighbors; also blur them, without gaps."""
+    known = np.isfinite(profile).astype(np.float64)
+    total, count = cv2.blur(np.nan_to_num(profile), (3, 1)), cv2.blur(known, (3, 1))
+    soft = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+    soft[count == 0] = np.nan
+    return np.where(known > 0, profile, soft), np.asarray(soft)
+
+
+def _crossing(profile: Array, peak: NDArray[Any], half: Array, side: int, across: Array) -> Array:
+    """Position (N,) of the first crossing of a level, going to one side from the peak; NaN where there is none."""
+    steps = len(across)
+    index = np.arange(len(profile))
+    at = np.full(len(profile), np.nan)
+    for k in range(1, steps):
+        column, before = peak + side * k, peak + side * (k - 1)
+        inside = (column >= 0) & (column < steps)
+        value = profile[index, np.clip(column, 0, steps - 1)]
+        crossed = np.isnan(at) & inside & (value < half)
+        if crossed.any():
+            previous = profile[index, np.clip(before, 0, steps - 1)]
+            fall = previous - value
+            part = np.divide(previous - half, fall, out=np.full(len(fall), 0.5), where=np.isfinite(fall) & (fall > 0))
+            at[crossed] = (across[np.clip(before, 0, steps - 1)] + side * np.clip(part, 0, 1) * PROFILE_STEP_M)[crossed]
+    return at
+
+
+def _side(across: Array, shift: Array, width: Array, side: int) -> list[NDArray[np.bool_]]:
+    """Masks (N, P) of the road beside the paint, near and farther, on one side."""
+    distance = side * (across - shift[:, None]) - width[:, None] / 2
+    return [np.asarray((distance > low) & (distance < high)) for low, high in SIDES_M]
+
+
+def _contrast(
+    values: Layer, inside: NDArray[np.bool_], sides: list[list[NDArray[np.bool_]]], *, one_side: bool
+) -> tuple[Array, Array, Array]:
+    """Contrast (N,) of samples (N, along, across) to the brighter side, its standard error, and the sides' difference."""
+    middle = _masked_mean(values, inside)
+    beside = [_darker([_masked_mean(values, part) for part in side]) for side in sides]
+    left, right = (_quiet(np.nanmean, b) for b in beside)
+    ridge = middle - np.maximum(*beside)
+    count = np.isfinite(ridge).sum(1)
+    mean = _quiet(np.nanmean, middle) - (np.fmax if one_side else np.maximum)(left, right)
+    sigma = _quiet(np.nanstd, ridge) / np.sqrt(np.maximum(count - 1, 1))
+    enough = count >= 3
+    return (
+        np.where(enough, mean, np.nan),
+        np.where(enough, sigma, np.nan),
+        np.where(enough, np.abs(left - right), np.nan),
+    )
+
+
+def _darker(parts: list[Array]) -> Array:
+    """Choose, for each profile, that of two parts (N, along) whose mean is darker."""
+    means = [_quiet(np.nanmean, part) for part in parts]
+    return np.where((means[0] < means[1])[:, None] | ~np.isfinite(means[1])[:, None], parts[0], parts[1])
+
+
+def _masked_mean(values: Layer, mask: NDArray[Any]) -> Array:
+    """Mean (N, along) over the samples across that a mask (N, P) has."""
+    known = np.isfinite(values) & mask[:, None, :]
+    count = known.sum(2)
+    total = np.where(known, values, 0).sum(2, dtype=np.float64)
+    return np.asarray(np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0), np.float64)
+
+
+# Log-odds before anything but one ridge of a meter is known: on gravel, one in 20 is followed by paint.
+PRIOR = -3.0
+PER_METER = 0.8  # of paint in line, which texture seldom continues
+MAX_BY_LENGTH = 5.5
+PER_METER_MORE, MAX_BY_MORE = 0.03, 1.5  # of longer lines
+DASHES = 1.5  # three or more dashes of one length at one distance
+# Sun between two shadows and wet glare are ridges to a camera, too: more than that it alone does not say.
+MAX_BY_CAMERA = 3.0
+UNEVEN = -1.5  # a step beside which a little stands out
+NOT_BRIGHTEST, MIN_OUTSHINING = -2.5, 0.4  # no brighter than much of the ground around; share of its contrast
+# Glare fades to its sides; paint ends. Lines of 0.3 m or less look alike to a camera.
+FADING, FADING_FROM_M, FADING_WIDTH_M = -5.0, 0.1, 0.3
+FADING_SHARE = 0.25  # of the width; 0.39 of a Gaussian's
+WIDTH_VARIES = -2.0
+WIDTH_UNUSUAL = -4.0
+# Contrast of logarithms of LiDAR intensity of paint and of other ridges: mean, sigma.
+PAINT_REFLECTS, OTHER_REFLECTS = (0.8, 0.35), (0.0, 0.12)
+# Dashes along lanes are up to 0.3 m wide (VwV-StVO: broad lines of 0.25 m and 0.3 m).
+MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
+MAX_BY_LIDAR, MAX_BY_LIDAR_ALONE = 6.0, 3.0
+ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
+MIN_REFLECTING = 2  # pieces
+MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
+
+
+def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True) -> float:
+    """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
+    odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
+    odds += DASHES * min(max(dashes - 2, 0), 2) / 2
+    by_camera = _median_known(pieces.color)
+    if np.isfinite(by_camera):
+        odds += _by_shape(pieces, alone=alone)
+    odds += _by_width(pieces)
+    if alone and dashes > 1 and np.median(pieces.width_m) > MAX_DASH_WIDTH_M:
+        odds += WIDE_DASHES
+    odds = min(odds, MAX_BY_CAMERA)
+    lidar = by_lidar(pieces)
+    if np.isfinite(by_camera):
+        return odds + lidar
+    # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen.
+    return min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
+
+
+def _by_shape(pieces: Pieces, *, alone: bool) -> float:
+    contrast = np.maximum(pieces.color, 1e-3)
+    odds = 0.0
+    uneven = _median_known(pieces.uneven / contrast)
+    odds += UNEVEN * float(np.clip((uneven - 0.5) / 0.5, 0, 1))
+    bright = pieces.outshines[np.isfinite(pieces.outshines)]
+    if len(bright) and alone:
+        share = float(np.mean(bright > MIN_OUTSHINING * contrast[np.isfinite(pieces.outshines)]))
+        odds += NOT_BRIGHTEST * float(np.clip((0.5 - share) / 0.4, 0, 1))
+    width, edge = float(np.median(pieces.width_m)), _median_known(pieces.edge_m)
+    if width > FADING_WIDTH_M and edge > max(FADING_FROM_M, FADING_SHARE * width):
+        odds += FADING
+    typical = _median_known(pieces.color)
+    return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
+
+
+def _by_width(pieces: Pieces) -> float:
+    middle = float(np.median(pieces.width_m))
+    odds = 0.0 if MIN_WIDTH_M <= middle <= MAX_WIDTH_M else WIDTH_UNUSUAL
+    if len(pieces) >= 3:
+        varies = float(np.median(np.abs(pieces.width_m - middle))) / middle
+        odds += WIDTH_VARIES * float(np.clip((varies - 0.2) / 0.3, 0, 1))
+    return odds
+
+
+def by_lidar(pieces: Pieces) -> float:
+    """Log-odds by LiDAR intensity: 0 where it saw too little."""
+    known = np.isfinite(pieces.reflected) & np.isfinite(pieces.reflected_sigma)
+    if np.count_nonzero(known) < MIN_REFLECTING:
+        return 0.0
+    values = pieces.reflected[known]
+    mean = float(np.median(values))
+    error = float(np.median(pieces.reflected_sigma[known]) / np.sqrt(len(values)))
+
+    def log_density(of: tuple[float, float]) -> float:
+        sigma = float(np.hypot(of[1], error))
+        return -0.5 * ((mean - of[0]) / sigma) ** 2 - float(np.log(sigma))
+
+    return float(np.clip(log_density(PAINT_REFLECTS) - log_density(OTHER_REFLECTS), -MAX_BY_LIDAR, MAX_BY_LIDAR))
+
+
+def probability(log_odds: float) -> float:
+    """Probability of log-odds."""
+    return float(1 / (1 + np.exp(-log_odds)))
+
+
+def _median_known(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+HALF_PIECE_M = 1.0
+ACROSS_M = 0.15  # half a coarse cell of error, and the bend of a curve of 6 m radius within a piece
+MAX_TURN_RAD = np.deg2rad(20)  # the directions of ridge points are 15 deg apart
+SHORT_M, MAX_SLANT_RAD = 1.0, np.deg2rad(8)
+MIN_POINTS = 5
+MIN_PIECE_M = 0.4
+MIN_COVERED = 0.6  # share of a piece's length that has ridge points
+CELL_M = 0.1  # distance of ridge points along a line
+PROFILES_AT_ONCE = 4000  # bound of memory
+
+
+def find_pieces(ground: GroundMap, points: RidgePoints) -> Pieces:
+    """Fit straight pieces to ridge points and measure the profile across each."""
+    lines = fit_lines(points)
+    if not len(lines):
+        return no_pieces(0)
+    parts = [measure_pieces(ground, lines[k : k + PROFILES_AT_ONCE]) for k in range(0, len(lines), PROFILES_AT_ONCE)]
+    pieces = Pieces(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pieces)))
+    pieces = pieces.take(np.isfinite(pieces.width_m) & (pieces.width_m > 0))
+    return pieces.take(~_aslant(pieces))
+
+
+def _aslant(pieces: Pieces) -> NDArray[np.bool_]:
+    """Mask (N,) of short pieces that touch longer ones aslant: at the ends of paint, slanting filters respond too."""
+    short = np.flatnonzero(pieces.length_m < SHORT_M)
+    out = np.zeros(len(pieces), bool)
+    if not len(short):
+        return out
+    near = cKDTree(pieces.xy).query_ball_point(pieces.xy[short], 2 * HALF_PIECE_M)
+    for k, others in zip(short.tolist(), near):
+        other = np.array([j for j in others if pieces.length_m[j] > 1.3 * pieces.length_m[k]], int)
+        if not len(other):
+            continue
+        angle = pieces.direction[other]
+        offset = pieces.xy[k] - pieces.xy[other]
+        along = offset[:, 0] * np.cos(angle) + offset[:, 1] * np.sin(angle)
+        across = offset[:, 1] * np.cos(angle) - offset[:, 0] * np.sin(angle)
+        beyond = np.abs(along) - pieces.length_m[other] / 2 - pieces.length_m[k] / 2
+        turn = np.abs((pieces.direction[k] - angle + np.pi / 2) % np.pi - np.pi / 2)
+        reach = (pieces.width_m[other] + pieces.length_m[k]) / 2
+        out[k] = np.any((np.abs(across) < reach) & (beyond < ACROSS_M) & (turn > MAX_SLANT_RAD))
+    return out
+
+
+def fit_lines(points: RidgePoints, cell_m: float = CELL_M) -> Array:
+    """Fit lines to ridge points, the strongest first, each point to one: x, y, direction, length (N, 4).
+
+    Points are `cell_m` apart along a line; all lengths are in proportion to that.
+    """
+    scale = cell_m / CELL_M
+    if not len(points.xy_map):
+        return np.zeros((0, 4))
+    tree = cKDTree(points.xy_map)
+    free = np.ones(len(points.xy_map), bool)
+    lines = []
+    for seed in np.argsort(-points.strength, kind="stable"):
+        if not free[seed]:
+            continue
+        near = np.array(tree.query_ball_point(points.xy_map[seed], HALF_PIECE_M * scale))
+        near = near[free[near]]
+        free[seed] = False
+        if len(near) < MIN_POINTS:
+            continue
+        line = _fit_line(points, int(seed), near, scale)
+        if line is not None:
+            lines.append(line[0])
+            free[line[1]] = False
+    return np.array(lines).reshape(-1, 4)
+
+
+def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any], scale: float) -> tuple[Array, NDArray[Any]] | None:
+    """Fit a line through a seed to points near it; also the indices of those that it explains."""
+    xy = points.xy_map[near] - points.xy_map[seed]
+    turn = np.abs((points.direction[near] - points.direction[seed] + np.pi / 2) % np.pi - np.pi / 2)
+    angle, center = float(points.direction[seed]), np.zeros(2)
+    chosen = turn < MAX_TURN_RAD
+    across_m, cell_m = ACROSS_M * scale, CELL_M * scale
+    for width in (2 * across_m, across_m):
+        along, across = _turned(xy - center, angle)
+        member = chosen & (np.abs(across) < width)
+        if np.count_nonzero(member) < MIN_POINTS:
+            return None
+        center = xy[member].mean(axis=0)
+        off = xy[member] - center
+        moments = off.T @ off  # of which only the directions are asked for
+        angle = float(0.5 * np.arctan2(2 * moments[0, 1], moments[0, 0] - moments[1, 1]))
+    along, across = _turned(xy - center, angle)
+    member = chosen & (np.abs(across) < across_m)
+    if np.count_nonzero(member) < MIN_POINTS:
+        return None
+    begin, end = along[member].min(), along[member].max()
+    length = end - begin + cell_m
+    covered = len(set(np.floor((along[member] - begin) / cell_m + 0.5).tolist())) * cell_m
+    if length < MIN_PIECE_M * scale or covered < MIN_COVERED * length:
+        return None
+    middle = points.xy_map[seed] + center + (begin + end) / 2 * np.array([np.cos(angle), np.sin(angle)])
+    explained = near[(np.abs(across) < 2 * across_m) & (along > begin - cell_m) & (along < end + cell_m)]
+    return np.array([*middle, angle % np.pi, length]), explained
+
+
+def _turned(xy: Array, angle: float) -> tuple[Array, Array]:
+    c, s = np.cos(angle), np.sin(angle)
+    return xy[:, 0] * c + xy[:, 1] * s, xy[:, 1] * c - xy[:, 0] * s

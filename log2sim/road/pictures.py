@@ -1,0 +1,489 @@
+"""Pictures warped onto the ground, their colors on a raster, and what hides it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Log
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    Camera,
+    distort,
+    fold_radius,
+    ground_homography,
+    inverse,
+    project,
+    project_moving,
+)
+from log2sim.road.ground_map import Raster
+from log2sim.road.surface import Surface, upsample
+
+# Levels of the image pyramid above the image itself, to average pixels where many fall into one cell.
+PYRAMID_LEVELS = 4
+# Opacity rises from the image border inwards over this share of the width, which feathers seams.
+FEATHER_SHARE = 0.04
+SAMPLES_A_ROW = 1024
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class GroundView:
+    """Camera frame with the homography from its pixels to the ground.
+
+    Attributes
+    ----------
+    image_bgr : (H, W, 3) uint8
+    ground_H_image : (3, 3) float64
+        Undistorted pixels to ground positions, m, in the frame of the bird's-eye view.
+    camera : Camera or None
+        Needed only to distort: without it the image counts as undistorted.
+    weight : float
+        Trust relative to other views, > 0.
+    signed : bool
+        Whether the third row of `ground_H_image` is known to be positive below the horizon, as `ground_homography` has
+        it. Otherwise the middle of the lowest image row is assumed to see the ground.
+    """
+
+    image_bgr: Image
+    ground_H_image: Array
+    camera: Camera | None = None
+    weight: float = 1.0
+    signed: bool = False
+
+    @classmethod
+    def from_pose(
+        cls, image_bgr: Image, camera: Camera, map_T_cam: Array, ground_z_m: float = 0.0, **options: Any
+    ) -> GroundView:
+        """Make the view of a camera with pose (4, 4) onto the plane z = `ground_z_m` of the frame of the pose."""
+        return cls(image_bgr, ground_homography(camera, map_T_cam, ground_z_m), camera, signed=True, **options)
+
+
+def signed_inverse(view: GroundView) -> Array:
+    """Invert the homography to `image_H_ground` (3, 3), with a third row that is positive in front of the camera."""
+    height, width = view.image_bgr.shape[:2]
+    image_H_ground: Array = np.linalg.inv(view.ground_H_image).astype(np.float64)
+    below = view.ground_H_image[2] @ np.array([width / 2, height - 1, 1.0])
+    return -image_H_ground if not view.signed and below < 0 else image_H_ground
+
+
+def project_cells(
+    view: GroundView, image_H_cell: Array, rows: NDArray[Any], columns: NDArray[Any], coarsest_cells: float
+) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32], NDArray[np.float32]]:
+    """Project the cells of `rows` and `columns` of a raster into the image.
+
+    Parameters
+    ----------
+    image_H_cell : (3, 3) float64
+        Column and row of a cell to undistorted pixels.
+    rows, columns : (R,), (C,) int
+    coarsest_cells : float
+        Cells longer than this under one pixel are left out.
+
+    Returns
+    -------
+    uv : pair of (R, C) float32
+        Pixels of the cell centers.
+    scale : (R, C) float32
+        Pixels along a cell's edge, geometric mean of the two directions.
+    opacity : (R, C) float32
+        In [0, 1], 0 outside the image.
+    """
+    h = image_H_cell
+    x, y = columns[None, :].astype(np.float64), rows[:, None].astype(np.float64)
+    un, vn, w = ((h[k, 0] * x + (h[k, 1] * y + h[k, 2])).astype(np.float32) for k in range(3))
+    front = w > np.float32(1e-9 * np.abs(h[2]).max())
+    inverse_w = np.divide(1, w, out=np.zeros_like(w), where=front)
+    u, v = un * inverse_w, vn * inverse_w
+    # Squares would overflow far outside the image, where nothing is needed.
+    height, width = view.image_bgr.shape[:2]
+    front &= (np.abs(u) < 4 * width) & (np.abs(v) < 4 * height)
+    u, v, inverse_w = (np.where(front, a, 0) for a in (u, v, inverse_w))
+    ju, jv = (h[0, 0] - u * h[2, 0], h[0, 1] - u * h[2, 1]), (h[1, 0] - v * h[2, 0], h[1, 1] - v * h[2, 1])
+    norm = sum(np.square(j, dtype=np.float32) for j in (*ju, *jv)) * inverse_w**2
+    area = np.abs(np.float32(np.linalg.det(h))) * inverse_w**3
+    # Singular values a >= b of the Jacobian: a b = area, a^2 + b^2 = norm; b is the coarse direction.
+    largest = np.sqrt((norm + np.sqrt(np.maximum(norm**2 - 4 * area**2, 0))) / 2)
+    finest_px = np.divide(area, largest, out=np.zeros_like(area), where=largest > 0)
+    if view.camera is not None and view.camera.distortion_model != "none" and any(view.camera.distortion):
+        u, v = _distort_pixels(view.camera, u, v, front)
+    edge = np.minimum(np.minimum(u, width - 1 - u), np.minimum(v, height - 1 - v)) / (FEATHER_SHARE * width)
+    fine = (finest_px * np.float32(coarsest_cells) - 1) / 0.5
+    opacity = np.where(front, np.clip(np.minimum(edge, fine), 0, 1), 0).astype(np.float32)
+    return (u.astype(np.float32), v.astype(np.float32)), np.sqrt(area).astype(np.float32), opacity
+
+
+def _distort_pixels(camera: Camera, u: Array, v: Array, front: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Apply the lens distortion to pixels; those beyond the radius where the model folds back lie outside the image."""
+    uv = np.stack([u[front], v[front]], axis=1).astype(np.float64)
+    xy = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
+    seen = np.hypot(xy[:, 0], xy[:, 1]) < fold_radius(camera)
+    distorted = distort(camera, np.where(seen[:, None], xy, 0.0)) @ camera.K[:2, :2].T + camera.K[:2, 2]
+    out = np.full((2, *u.shape), -1e6)
+    out[:, front] = np.where(seen[:, None], distorted, -1e6).T
+    return out[0], out[1]
+
+
+def visible_window(
+    view: GroundView, image_H_cell: Array, shape: tuple[int, ...], coarsest_cells: float, step: int = 8
+) -> tuple[slice, slice] | None:
+    """Find the rows and columns around all cells inside the view, on every `step`-th cell; None if there are none."""
+    rows, columns = np.arange(0, shape[0] + step, step), np.arange(0, shape[1] + step, step)
+    seen = project_cells(view, image_H_cell, rows, columns, coarsest_cells)[2] > 0
+    if not seen.any():
+        return None
+    r, c = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    return (
+        slice(max(int(rows[r[0]]) - step, 0), min(int(rows[r[-1]]) + step, shape[0])),
+        slice(max(int(columns[c[0]]) - step, 0), min(int(columns[c[-1]]) + step, shape[1])),
+    )
+
+
+def sample_colors(
+    image: Image,
+    uv: tuple[NDArray[np.float32], NDArray[np.float32]],
+    scale: NDArray[np.float32],
+    wanted: NDArray[np.bool_] | None = None,
+) -> Image:
+    """Sample colors at pixels, from higher levels of an image pyramid where a cell holds several pixels.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8
+    uv : pair of (R, C) float32
+    scale : (R, C) float32
+        Pixels along a cell's edge.
+    wanted : (R, C) bool, optional
+        The others stay black.
+    """
+    chosen = np.ones(scale.shape, bool) if wanted is None else wanted
+    out = np.zeros((*scale.shape, 3), dtype=np.uint8)
+    out[chosen] = sample_at(image, uv[0][chosen], uv[1][chosen], scale[chosen])
+    return out
+
+
+def sample_at(
+    image: Image, u: NDArray[np.float32], v: NDArray[np.float32], scale: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """Sample colors (N, 3) at pixels (N,) as `sample_colors` does."""
+    level = np.clip(np.rint(np.log2(np.maximum(scale, 1e-6))), 0, PYRAMID_LEVELS).astype(np.int8)
+    out = np.zeros((len(level), 3), dtype=np.uint8)
+    highest = int(level.max(initial=0))
+    for k in range(highest + 1):
+        chosen = np.flatnonzero(level == k)
+        if len(chosen):
+            out[chosen] = _sample(image, u[chosen] * np.float32(0.5**k), v[chosen] * np.float32(0.5**k))
+        if k < highest:
+            image = np.asarray(cv2.pyrDown(image), dtype=np.uint8)
+    return out
+
+
+def _sample(image: Image, u: NDArray[np.float32], v: NDArray[np.float32]) -> Image:
+    """Interpolate colors (N, 3) at pixels (N,); they are put into rows, since OpenCV takes no longer ones."""
+    rows = -(-len(u) // SAMPLES_A_ROW)
+    at = [np.resize(a, (rows, SAMPLES_A_ROW)) for a in (u, v)]
+    seen = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.uint8).reshape(-1, 3)[: len(u)]
+
+
+# Cells longer than this under one pixel are left out: four times the width of a lane marking.
+COARSEST_M = 0.6
+MIN_OPACITY = 0.01
+MAX_REACH_M = 100.0
+# Cells of the surface between those that are projected first, to find the part of the map that is in view.
+PROBE_STEP = 8
+# Pixels of the picture for one of the depths of what hides the ground: about as far apart as neighboring rings of a LiDAR.
+DEPTH_SHRINK = 24
+# Ground hides nothing of itself, though its depth at the edge of such a pixel is another than in its middle.
+MIN_HIDDEN_BY, MIN_HIDDEN_BY_M = 0.08, 0.5
+NOTHING_M = 1e6
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Where the cells of a map that are in view appear in a picture, N cells.
+
+    Attributes
+    ----------
+    rows, columns : (N,) int64
+        Of the cells in the map.
+    u, v : (N,) float32, px
+    scale : (N,) float32
+        Pixels along a cell's edge, geometric mean of both directions.
+    opacity : (N,) float32
+        In (0, 1].
+    depth_m : (N,) float32, m
+        Along the optical axis.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+
+    def take(self, kept: NDArray[np.bool_]) -> Warp:
+        """Choose cells by a mask (N,)."""
+        return Warp(*(getattr(self, f.name)[kept] for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture's camera at the time of the picture.
+
+    Attributes
+    ----------
+    map_T_cam : (4, 4) float64
+    """
+
+    log: Log
+    camera: Camera
+    t_ns: int
+    map_T_cam: Array
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Project points (N, 3), m, map frame: pixels (N, 2), NaN behind the camera, and depths (N,), m.
+
+        Lines that are read one after the other see the ground from where the camera is then.
+        """
+        if self.camera.rolling_shutter is None or self.camera.mount == "map":
+            cam_T_map = inverse(self.map_T_cam)
+            local = points @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
+            return project(self.camera, local)[0], local[:, 2]
+        uv, depth, _ = project_moving(self.camera, points, self._cam_T_map)
+        return uv, depth
+
+    def _cam_T_map(self, t_s: Array) -> Array:
+        poses, known = self.log.map_T_sensor(self.camera.name, self.t_ns + np.round(t_s * NS_PER_S).astype(np.int64))
+        return inverse(np.where(known[:, None, None], poses, self.map_T_cam))
+
+
+def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster) -> Warp | None:
+    """Find the cells of a raster in a picture; None where it shows none.
+
+    Parameters
+    ----------
+    surface : Surface
+        With the north-west corner of the raster and cells a whole number of times as long.
+    z0_m : float
+        Height of reference of the surface, m.
+    """
+    window = _window(view, surface, z0_m)
+    if window is None:
+        return None
+    rows, columns = window
+    every = [np.arange(k.start, k.stop) for k in window]
+    uv, depth, usable = _project_nodes(view, surface, z0_m, every[0], every[1])
+    factor = round(surface.raster.resolution_m / raster.resolution_m)
+    scale, opacity = _quality(view.camera, uv, usable, factor, raster.resolution_m)
+    if not opacity.any():
+        return None
+    shape = (
+        min(rows.stop * factor, raster.shape[0]) - rows.start * factor,
+        min(columns.stop * factor, raster.shape[1]) - columns.start * factor,
+    )
+    fine_opacity = upsample(opacity, factor, shape)
+    row, column = np.nonzero(fine_opacity > MIN_OPACITY)
+    nodes = np.where(np.isfinite(uv), uv, -1e4).astype(np.float32)
+    u, v, fine_scale, fine_depth = (
+        upsample(np.ascontiguousarray(layer, np.float32), factor, shape)[row, column]
+        for layer in (nodes[..., 0], nodes[..., 1], scale, depth)
+    )
+    place = (row + rows.start * factor, column + columns.start * factor)
+    return Warp(*place, u, v, fine_scale, fine_opacity[row, column], fine_depth)
+
+
+def reach_of(camera: Camera, height_m: float) -> float:
+    """Return how far from the camera a pixel is as long on the ground as `COARSEST_M`, m."""
+    return min(float(np.sqrt(COARSEST_M * camera.K[1, 1] * max(height_m, 0.5))), MAX_REACH_M)
+
+
+def _window(view: View, surface: Surface, z0_m: float) -> tuple[slice, slice] | None:
+    """Rows and columns of the surface around all cells in view."""
+    raster, place = surface.raster, view.map_T_cam[:3, 3]
+    (row,), (column,) = raster.cells_of(place[None, :2])
+    r, c = (int(np.clip(round(at), 0, n - 1)) for at, n in zip((row, column), raster.shape))
+    height_m = float(place[2] - z0_m - surface.z_m[r, c])
+    reach = int(reach_of(view.camera, height_m) / raster.resolution_m)
+    low = [max(round(at) - reach, 0) for at in (row, column)]
+    high = [min(round(at) + reach + 1, n) for at, n in zip((row, column), raster.shape)]
+    if low[0] >= high[0] or low[1] >= high[1]:
+        return None
+    nodes = [np.unique(np.append(np.arange(a, b, PROBE_STEP), b - 1)) for a, b in zip(low, high)]
+    _, _, usable = _project_nodes(view, surface, z0_m, nodes[0], nodes[1])
+    if not usable.any():
+        return None
+    found = [nodes[axis][usable.any(axis=1 - axis)] for axis in (0, 1)]
+    spans = [
+        slice(max(int(k[0]) - PROBE_STEP, a), min(int(k[-1]) + PROBE_STEP, b)) for k, a, b in zip(found, low, high)
+    ]
+    return spans[0], spans[1]
+
+
+def _project_nodes(
+    view: View, surface: Surface, z0_m: float, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Project cells of the surface: pixels (r, c, 2), depths (r, c), m, and whether they are in the picture (r, c)."""
+    xy = surface.raster.xy_of(rows[:, None], columns[None, :])
+    z = surface.z_m[np.ix_(rows, columns)] + z0_m
+    uv, depth = view.project(np.concatenate([xy, z[..., None]], axis=2).reshape(-1, 3))
+    camera = view.camera
+    with np.errstate(invalid="ignore"):
+        inside = np.all((uv >= 0) & (uv <= [camera.width_px - 1, camera.height_px - 1]), axis=1)
+    return uv.reshape(*z.shape, 2), depth.reshape(z.shape), inside.reshape(z.shape)
+
+
+def _quality(
+    camera: Camera, uv: Array, usable: NDArray[np.bool_], factor: int, cell_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels along the edge of a fine cell, and opacity, of nodes (r, c)."""
+    if min(usable.shape) < 2:
+        return np.zeros(usable.shape, np.float32), np.zeros(usable.shape, np.float32)
+    with np.errstate(invalid="ignore"):
+        # Over a few cells, so that what is left of noise in the heights makes no holes.
+        along, across = (cv2.blur(np.gradient(uv, axis=axis) / factor, (5, 5)) for axis in (0, 1))
+        area = np.abs(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])
+        norm = (along**2 + across**2).sum(axis=2)
+        largest = np.sqrt((norm + np.sqrt(np.maximum(norm**2 - 4 * area**2, 0))) / 2)
+        finest = np.divide(area, largest, out=np.zeros_like(area), where=largest > 0)
+        edge = np.minimum(uv, np.array([camera.width_px - 1, camera.height_px - 1]) - uv).min(axis=2)
+        opacity = np.minimum(edge / (FEATHER_SHARE * camera.width_px), (finest * COARSEST_M / cell_m - 1) / 0.5)
+    known = cv2.erode((usable & np.isfinite(area)).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    opacity = np.where(known, np.clip(opacity, 0, 1), 0)
+    return np.where(known, np.sqrt(area), 0).astype(np.float32), opacity.astype(np.float32)
+
+
+def find_hidden(view: View, warp: Warp, hiding: Array) -> NDArray[np.bool_]:
+    """Mark the cells (N,) of a warp that are behind points (H, 3), m, map frame, of what stands on the ground."""
+    uv, depth = view.project(hiding)
+    width, height = (-(-n // DEPTH_SHRINK) for n in (view.camera.width_px, view.camera.height_px))
+    with np.errstate(invalid="ignore"):
+        column, row = np.floor(uv / DEPTH_SHRINK).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    nearest = np.full(height * width, NOTHING_M, np.float32)
+    cell = (row[inside] * width + column[inside]).astype(np.int64)
+    np.minimum.at(nearest, cell, depth[inside].astype(np.float32))
+    # Between two rings of points there is the same object.
+    image = np.asarray(cv2.erode(nearest.reshape(height, width), np.ones((3, 1), np.uint8)), np.float32)
+    shown = sample_nearest(image, warp, DEPTH_SHRINK, np.float32(NOTHING_M))
+    return np.asarray(warp.depth_m > shown * (1 + MIN_HIDDEN_BY) + MIN_HIDDEN_BY_M)
+
+
+def sample_nearest(image: NDArray[Pixel], warp: Warp, shrink: int, outside: Pixel) -> NDArray[Pixel]:
+    """Look up in an image, `shrink` times smaller than the picture, what cells (N,) of a warp show."""
+    column, row = (np.rint(a / shrink - np.float32(0.5)).astype(np.int32) for a in (warp.u, warp.v))
+    height, width = image.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen = image.ravel().take(np.where(inside, row * width + column, 0))
+    return np.where(inside, seen, outside).astype(image.dtype)
+
+
+# Cells between those that are compared for the exposure.
+STEP = 4
+MIN_COMMON_CELLS = 100
+# An exposure may differ from what is mapped so far by at most one stop.
+MAX_LOG_GAIN = 0.7
+# Finer pixels do not show more of a cell, but they are those of the nearest view.
+MAX_SCALE = 4.0
+# Darker values, of 255, say little about the exposure, and brighter ones are clipped.
+DARKEST, BRIGHTEST = 10.0, 245.0
+MIN_COMMON_OPACITY = 0.5
+
+
+class ColorRaster:
+    """Accumulate pictures that were warped onto a raster.
+
+    Notes
+    -----
+    Weights are the fourth power of the pixels along a cell's edge, so that the nearest view decides and far ones only fill the
+    rest. The gain of a picture is the median ratio of its colors to those mapped so far, after Brown and Lowe (2007), section
+    6, but one picture after the other; without an overlap it is that of the last picture of its camera.
+    """
+
+    def __init__(self, raster: Raster) -> None:
+        self.raster = raster
+        self._sum = np.zeros((*raster.shape, 3), dtype=np.float32)
+        self._weight = np.zeros(raster.shape, dtype=np.float32)
+        self._opacity = np.zeros(raster.shape, dtype=np.uint8)
+        self.gains: dict[str, list[Array]] = {}
+
+    def add(self, camera: str, image: Image, warp: Warp) -> None:
+        """Add a picture of a camera, as far as a warp shows it."""
+        color = sample_at(image, warp.u, warp.v, warp.scale).astype(np.float32)
+        weight = warp.opacity * np.minimum(warp.scale, MAX_SCALE) ** 4
+        cell = warp.rows * self.raster.shape[1] + warp.columns
+        gain = self._gain(camera, color, weight, warp, cell)
+        color *= weight[:, None] * gain.astype(np.float32)
+        # Each cell is there once.
+        self._sum.reshape(-1, 3)[cell] += color
+        self._weight.reshape(-1)[cell] += weight
+        opacity = self._opacity.reshape(-1)
+        opacity[cell] = np.maximum(opacity[cell], np.rint(255 * warp.opacity).astype(np.uint8))
+
+    def image(self) -> tuple[Image, Image]:
+        """Return colors (R, C, 3) and opacity (R, C)."""
+        seen = self._weight > 0
+        color = np.empty((*self.raster.shape, 3), dtype=np.uint8)
+        for k in range(3):  # by channel, so that no second array of floats is made of all
+            mean = np.divide(self._sum[..., k], self._weight, out=np.zeros_like(self._weight), where=seen)
+            color[..., k] = np.clip(np.rint(mean), 0, 255)
+        return color, np.where(seen, np.maximum(self._opacity, 1), 0).astype(np.uint8)
+
+    def _gain(
+        self,
+        camera: str,
+        color: NDArray[np.float32],
+        weight: NDArray[np.float32],
+        warp: Warp,
+        cell: NDArray[np.int64],
+    ) -> Array:
+        """Gains (3,) of a picture's channels that fit it to what is mapped so far."""
+        some = np.flatnonzero(
+            (warp.rows % STEP == 0) & (warp.columns % STEP == 0) & (warp.opacity > MIN_COMMON_OPACITY) & (weight > 0)
+        )
+        some = some[self._opacity.reshape(-1)[cell[some]] > 255 * MIN_COMMON_OPACITY]
+        some = some[np.all((color[some] > DARKEST) & (color[some] < BRIGHTEST), axis=1)]
+        last = self.gains.setdefault(camera, [])
+        if len(some) < MIN_COMMON_CELLS:
+            gain = last[-1] if last else np.ones(3)
+        else:
+            mapped = self._sum.reshape(-1, 3)[cell[some]] / self._weight.reshape(-1)[cell[some], None]
+            ratio = mapped / color[some]
+            gain = np.exp(np.clip(np.log(np.maximum(np.median(ratio, axis=0), 1e-3)), -MAX_LOG_GAIN, MAX_LOG_GAIN))
+        last.append(np.asarray(gain, dtype=np.float64))
+        return last[-1]
+
+
+# Rows of pictures whose median is taken at a time, which bounds the memory.
+ROWS_AT_A_TIME = 64
+
+
+class StandingPictures:
+    """Keep the few pictures that a map takes of a standing camera."""
+
+    def __init__(self) -> None:
+        self._images: list[Image] = []
+        self._users: list[NDArray[np.uint8]] = []
+
+    def add(self, image: Image, users: NDArray[np.uint8]) -> None:
+        """Keep a picture (H, W, 3) and the mask (h, w), smaller, of what it shows of road users."""
+        self._images.append(image)
+        self._users.append(users)
+
+    def median(self) -> tuple[Image, NDArray[np.uint8]]:
+        """Return the median picture, and the mask that is 1 where road users were in more than half of the pictures."""
+        out = np.empty_like(self._images[0])
+        for k in range(0, len(out), ROWS_AT_A_TIME):
+            rows = slice(k, k + ROWS_AT_A_TIME)
+            out[rows] = np.median([image[rows] for image in self._images], axis=0).astype(np.uint8)
+        often = 2 * np.sum(self._users, axis=0, dtype=np.int64) > len(self._users)
+        return out, np.asarray(often, dtype=np.uint8)

@@ -1,0 +1,535 @@
+"""Routes: the paths of many vehicles merged, one center line for each lane."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, wrap_angle
+from log2sim.road.polyline import (
+    ENTER_M,
+    MAX_TURN_RAD,
+    SHORT_M,
+    SPACING_M,
+    STAY_M,
+    DrivenPath,
+    Match,
+    Polyline,
+    Run,
+    match,
+)
+
+STEP_M = 2.0
+"""Stations at which distances are taken."""
+
+MIN_APART_M, MAX_APART_M = 2.2, 5.0
+"""Between the middles of neighboring lanes: from the narrowest of roadworks to the widest."""
+
+PARALLEL_RAD = float(np.deg2rad(8.0))
+"""Lanes of one road differ less in heading; ramps leave at 3 to 5 degrees and are apart soon."""
+
+MIN_LENGTH_M = 8.0
+"""Lines that pass each other at a small angle are that near for less than this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A stretch of a route with another beside it.
+
+    Attributes
+    ----------
+    s_m, other_s_m : (K,) float64
+        Stations on both; those of `other` fall where it leads the other way.
+    aside_m : (K,) float64
+        Of the other, to the left.
+    same_way : bool
+        Whether both lead the same way.
+    """
+
+    route: int
+    other: int
+    s_m: Array
+    other_s_m: Array
+    aside_m: Array
+    same_way: bool
+
+
+def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
+    """Return for each polyline those next to it on both sides, stretch by stretch."""
+    found = []
+    for i, line in enumerate(lines):
+        s = _stations(line, lines)
+        points, heading = line.at(s)[:, :2], line.heading_at(s)
+        candidates = []
+        for j, other in enumerate(lines):
+            apart = np.any(other.bounds_m[0] - MAX_APART_M > line.bounds_m[1]) or np.any(
+                other.bounds_m[1] + MAX_APART_M < line.bounds_m[0]
+            )
+            if i != j and not apart:
+                candidates += [(j, same, *_next_to(points, heading, other, same)) for same in (True, False)]
+        for sign in (1, -1):
+            found += _nearest(i, s, [c for c in candidates if np.any(sign * c[3] > 0)], sign)
+    return found
+
+
+def _stations(line: Polyline, lines: Sequence[Polyline]) -> Array:
+    """Return stations about `STEP_M` apart on a polyline, and those next to the ends of others."""
+    s = np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / STEP_M)), 1) + 1)
+    low, high = (bound + sign * MAX_APART_M for bound, sign in zip(line.bounds_m, (-1, 1)))
+    ends = [(other.points_m[k, :2], other.heading_rad[k]) for other in lines if other is not line for k in (0, -1)]
+    ends = [end for end in ends if np.all(end[0] >= low) and np.all(end[0] <= high)]
+    if not ends:
+        return s
+    xy, heading = np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
+    extra = [line.project(xy, heading + turned).s_m for turned in (0.0, np.pi)]
+    at = np.concatenate(extra)
+    at = at[(at > 0) & (at < line.length_m)]
+    return np.unique(np.round(np.concatenate([s, at, at - 1e-3, at + 1e-3]).clip(0.0, line.length_m), 6))
+
+
+def _next_to(points: Array, heading: Array, other: Polyline, same: bool) -> tuple[Array, Array]:
+    """Stations on another polyline (K,) and its offset (K,) to the left of the points; NaN where it is not beside them."""
+    at = other.project(points, heading if same else heading + np.pi)
+    turn = np.abs(wrap_angle(at.turn_rad))
+    good = (
+        at.inside & (turn <= PARALLEL_RAD) & (np.abs(at.aside_m) >= MIN_APART_M) & (np.abs(at.aside_m) <= MAX_APART_M)
+    )
+    aside = -at.aside_m if same else at.aside_m
+    return np.where(good, at.s_m, np.nan), np.where(good, aside, np.nan)
+
+
+def _nearest(route: int, s: Array, candidates: list[tuple[int, bool, Array, Array]], sign: int) -> list[Beside]:
+    """Return the stretches of the nearest of candidates on one side."""
+    if not candidates:
+        return []
+    aside = np.array([np.where(sign * c[3] > 0, np.abs(c[3]), np.inf) for c in candidates])
+    best = aside.argmin(axis=0)
+    best[~np.isfinite(aside.min(axis=0))] = -1
+    found = []
+    for k, (other, same, other_s, offset) in enumerate(candidates):
+        rows = np.flatnonzero(best == k)
+        long = [run for run in _stretches(rows, other_s) if s[run[-1]] - s[run[0]] >= MIN_LENGTH_M]
+        found += [Beside(route, other, s[run], other_s[run], offset[run], same) for run in long]
+    return found
+
+
+def _stretches(rows: NDArray[np.intp], other_s: Array) -> list[NDArray[np.intp]]:
+    """Cut rows where one is missing or the other's station jumps."""
+    if not len(rows):
+        return []
+    cut = (np.diff(rows) > 1) | (np.abs(np.diff(other_s[rows])) > 3 * STEP_M)
+    return np.split(rows, np.flatnonzero(cut) + 1)
+
+
+SAME_M = 1.3
+"""Two vehicles in one lane are less apart than this: each keeps within some half meter of its middle."""
+
+SETTLED_M = 0.4
+"""An offset that stays within this is that of a vehicle which keeps its lane."""
+
+PLATEAU_M = 8.0
+"""Two cars' lengths: so long two vehicles are in the same lane, or beside each other, before and after a change."""
+
+MAX_CHANGES = 20
+"""Changes of lane of one vehicle in one log; a bound for odd paths."""
+
+
+@dataclass(frozen=True)
+class _Change:
+    """Samples `first` to `last` of a path over which it changes from `before_m` to `after_m` left of another's path."""
+
+    other: int
+    first: int
+    last: int
+    before_m: float
+    after_m: float
+    known_m: float
+
+
+def without_lane_changes(paths: Sequence[DrivenPath]) -> list[DrivenPath]:
+    """Cut paths where their vehicles change lanes beside others that keep theirs.
+
+    Both parts are continued to the end and from the beginning of the change, along the path of the other vehicle. Of two paths
+    that come apart or together, the one that bends more changes lanes.
+    """
+    open_paths = [(path, MAX_CHANGES) for path in paths]
+    out = []
+    while open_paths:
+        path, left = open_paths.pop(0)
+        change = _find_change(path, paths) if left else None
+        if change is None:
+            out.append(path)
+            continue
+        one, two = _parts(path, paths[change.other], change)
+        out.append(one)
+        open_paths.insert(0, (two, left - 1))
+    return sorted(out, key=lambda p: (p.rank, -round(p.line.length_m, 2), p.agent))
+
+
+def _find_change(path: DrivenPath, others: Sequence[DrivenPath]) -> _Change | None:
+    """Return the first change of lane of a path, beside the vehicle that is beside it longest."""
+    found = []
+    for k, other in enumerate(others):
+        if other.agent == path.agent or other.rank == 2 or path.rank == 2:
+            continue
+        low, high = path.line.bounds_m
+        if np.any(other.line.bounds_m[0] - MAX_APART_M > high) or np.any(other.line.bounds_m[1] + MAX_APART_M < low):
+            continue
+        change = _change_beside(path, other, k)
+        found += [change] if change is not None else []
+    return min(found, key=lambda c: (c.first, -c.known_m)) if found else None
+
+
+def _change_beside(path: DrivenPath, other: DrivenPath, k: int) -> _Change | None:
+    at = other.line.project(path.line.points_m[:, :2], path.line.heading_rad)
+    along = at.inside & (np.abs(at.turn_rad) <= MAX_TURN_RAD) & (np.abs(at.aside_m) <= MAX_APART_M)
+    s = path.line.s_m
+    for rows in np.split(np.arange(len(s)), np.flatnonzero(np.diff(along.astype(int))) + 1):
+        if not along[rows[0]] or s[rows[-1]] - s[rows[0]] < 2 * PLATEAU_M:
+            continue
+        levels = _levels(s[rows], at.aside_m[rows], at.turn_rad[rows])
+        for (a, b, one), (c, d, two) in itertools.pairwise(levels):
+            kinds = {_kind(one), _kind(two)}
+            if kinds != {"same", "beside"}:
+                continue
+            first, last = rows[b], rows[c]
+            if _bend(path, s[first], s[last]) <= _bend(other, at.s_m[first], at.s_m[last]):
+                continue
+            known = float(s[rows[d]] - s[rows[a]])
+            return _Change(k, int(first), int(last), one, two, known)
+    return None
+
+
+def _kind(level_m: float) -> str:
+    apart = abs(level_m)
+    return "same" if apart <= SAME_M else "beside" if apart >= MIN_APART_M else "between"
+
+
+def _levels(s: Array, aside: Array, turn: Array) -> list[tuple[int, int, float]]:
+    """Return stretches on which an offset stays within `SETTLED_M`: first and last row and its mean."""
+    found, a = [], 0
+    while a < len(s) - 1:
+        low = high = aside[a]
+        b = a
+        while b + 1 < len(s):
+            low, high = min(low, aside[b + 1]), max(high, aside[b + 1])
+            if high - low > 2 * SETTLED_M or abs(turn[b + 1]) > PARALLEL_RAD:
+                break
+            b += 1
+        if s[b] - s[a] >= PLATEAU_M:
+            found.append((a, b, float(np.median(aside[a : b + 1]))))
+            a = b
+        a += 1
+    return _longest([level for level in found if _kind(level[2]) != "between"])
+
+
+def _longest(levels: list[tuple[int, int, float]]) -> list[tuple[int, int, float]]:
+    """Keep the longest of consecutive levels in the same lane, where a vehicle surely keeps it."""
+    out: list[tuple[int, int, float]] = []
+    for level in levels:
+        if out and _kind(out[-1][2]) == _kind(level[2]) and (_kind(level[2]) == "same" or out[-1][2] * level[2] > 0):
+            out[-1] = max(out[-1], level, key=lambda kept: kept[1] - kept[0])
+        else:
+            out.append(level)
+    return out
+
+
+def _bend(path: DrivenPath, first_m: float, last_m: float) -> float:
+    """Return the sum of squared turns from one station to another."""
+    steps = np.linspace(first_m, last_m, max(int((last_m - first_m) / 5.0), 4) + 1)
+    return float((np.diff(path.line.heading_at(steps)) ** 2).sum())
+
+
+def _parts(path: DrivenPath, other: DrivenPath, change: _Change) -> tuple[DrivenPath, DrivenPath]:
+    at = other.line.project(path.line.points_m[:, :2], path.line.heading_rad)
+    span = at.s_m[change.first], at.s_m[change.last]
+    s = np.linspace(*span, max(int(np.ceil(span[1] - span[0])), 2) + 1)
+    share = (s - s[0]) / (s[-1] - s[0])
+    eased = share * share * (3 - 2 * share)
+    now = at.aside_m[[change.first, change.last]]
+    before = other.line.offset(s, now[0] + eased * (change.before_m - now[0]))
+    after = other.line.offset(s, change.after_m + eased * (now[1] - change.after_m))
+    one = np.concatenate([path.line.points_m[: change.first], before])
+    two = np.concatenate([after, path.line.points_m[change.last + 1 :]])
+    return path.with_points(one), path.with_points(two)
+
+
+LANE_M = 3.5
+"""Width of a lane where none is measured: 3.5 m on rural roads (RAL 2012), 3.25 to 3.75 m elsewhere."""
+
+CLEARANCE_M = 0.8
+"""Free space beside the vehicle that a lane is made for, both sides together."""
+
+MAX_LANE_M = 5.0
+"""Wider strips are two lanes or a parking lane more."""
+
+JOIN_M = 5.0
+"""A path that leaves a route within this distance of its end goes on where the other vehicle was last seen."""
+
+BLEND_M = 20.0
+"""Over this length a path that lengthens a route comes to its own offset from it: 2.5 degrees at most, as a driver steers."""
+
+GAP_M = 8.0
+"""Between two routes that a vehicle drove one after the other, for the way from the middle of one to that of the next."""
+
+KEEP_M = 1.6
+"""Center lines stay this close to every path on them, so that all lie within half of a lane of `LANE_M`."""
+
+GRID_M = 2.0
+"""Stations at which offsets of paths are compared."""
+
+SMOOTH_M = 8.0
+"""Standard deviation of the smoothing along the lane of the mean offset, which jumps by up to a meter where a vehicle appears."""
+
+RETURN_M = 15.0
+"""A path that comes back to a place after this distance, which is less than the smallest roundabout, is there a second time."""
+
+BESIDE_M = 3.5
+"""Two-wheelers ride beside the middle of a lane by up to its width: nearer ones make no lane of their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A center line that vehicles follow.
+
+    Attributes
+    ----------
+    width_m : (K,) float64
+        At the stations `width_s_m` (K,), constant beyond.
+    width_s_m : (K,) float64
+    free : (2,) tuple of bool
+        Whether start and end are where a vehicle was first or last seen, so that others may lengthen it.
+    marked_m : (2,) tuple of float or None
+        Stations between which markings make it; elsewhere its middle is that of the paths.
+    left, right : str or None
+        Ids of the markings or borders beside it, there.
+    confidence : float
+        That it is a lane in this direction, by its markings.
+    """
+
+    line: Polyline
+    width_m: Array
+    width_s_m: Array
+    free: tuple[bool, bool] = (True, True)
+    marked_m: tuple[float, float] | None = None
+    left: str | None = None
+    right: str | None = None
+    confidence: float = 0.0
+
+    def width_at(self, s_m: Array) -> Array:
+        """Return the width (N,) at stations (N,)."""
+        return np.asarray(np.interp(s_m, self.width_s_m, self.width_m))
+
+
+def merge_paths(paths: Sequence[DrivenPath], marked: Sequence[Route] = ()) -> list[Route]:
+    """Return routes that hold all paths: those that markings make, and one wherever a path leaves the routes before.
+
+    Notes
+    -----
+    Incremental merging of traces (as Cao and Krumm 2009, From GPS traces to a routable road map), then the median of the
+    offsets at each station. Cost: paths times routes times samples.
+    """
+    routes = list(marked)
+    for path in paths:
+        _add(routes, path)
+    matches = [match_path(routes, path) for path in paths]
+    return [
+        route if route.marked_m is not None else _center(route, k, paths, matches) for k, route in enumerate(routes)
+    ]
+
+
+def match_path(routes: Sequence[Route], path: DrivenPath) -> Match:
+    """Match a path to routes; two-wheelers from farther away."""
+    reach = (BESIDE_M, BESIDE_M) if path.rank == 2 else (ENTER_M, STAY_M)
+    return match([route.line for route in routes], path.line, *reach)
+
+
+def _add(routes: list[Route], path: DrivenPath) -> None:
+    """Add or lengthen routes until a path is on them."""
+    s = path.line.s_m
+    tried: set[int] = set()
+    for _ in range(len(s)):
+        found = match_path(routes, path)
+        runs = found.runs
+        off = [k for k in range(len(runs)) if runs[k].first not in tried and _is_new(routes, found, k, s)]
+        if not off:
+            return
+        k = off[0]
+        first, last = runs[k].first, runs[k].last
+        tried.add(first)
+        back = _first_return(path.line, first, last)
+        if back is None and _is_bridge(routes, found, k):
+            last = int(np.searchsorted(s, s[last] - GAP_M))
+        last = back if back is not None else last
+        before = runs[k - 1].route if k > 0 else -1
+        after = runs[k + 1].route if k + 1 < len(runs) and back is None else -1
+        free = (first == 0, last == len(s) - 1)
+        if before >= 0 and _is_at_end(routes[before], found.s_m[first - 1]):
+            routes[before] = _lengthened(routes[before], path, (first, last), found.aside_m[first - 1], free[1])
+        elif after >= 0 and _is_at_start(routes[after], found.s_m[last + 1]):
+            routes[after] = _preceded(routes[after], path, (first, last), found.aside_m[last + 1], free[0])
+        elif last > first:
+            width = min(max(LANE_M, path.width_m + CLEARANCE_M), MAX_LANE_M)
+            line = Polyline.through(path.line.points_m[first : last + 1])
+            routes.append(Route(line, np.array([width]), np.zeros(1), free))
+
+
+def _is_new(routes: Sequence[Route], found: Match, k: int, s: Array) -> bool:
+    """Whether run k of a path is off all routes for long, or beyond the end of one."""
+    run = found.runs[k]
+    if run.route >= 0:
+        return False
+    before = found.runs[k - 1].route if k > 0 else -1
+    after = found.runs[k + 1].route if k + 1 < len(found.runs) else -1
+    if _is_bridge(routes, found, k) and s[run.last] - s[run.first] <= GAP_M + SHORT_M:
+        return False
+    if before >= 0 and run.last == len(s) - 1 and _is_at_end(routes[before], found.s_m[run.first - 1]):
+        return True
+    if after >= 0 and run.first == 0 and _is_at_start(routes[after], found.s_m[run.last + 1]):
+        return True
+    return bool(s[run.last] - s[run.first] >= SHORT_M)
+
+
+def _is_bridge(routes: Sequence[Route], found: Match, k: int) -> bool:
+    """Whether run k of a path leads from the end of a route to the start of another."""
+    if not 0 < k < len(found.runs) - 1:
+        return False
+    one, run, two = found.runs[k - 1 : k + 2]
+    if one.route < 0 or two.route < 0:
+        return False
+    left = routes[one.route].line.length_m - found.s_m[run.first - 1]
+    return bool(left < JOIN_M and found.s_m[run.last + 1] < JOIN_M)
+
+
+def _is_at_end(route: Route, s_m: float) -> bool:
+    return route.free[1] and route.line.length_m - s_m < JOIN_M
+
+
+def _is_at_start(route: Route, s_m: float) -> bool:
+    return route.free[0] and s_m < JOIN_M
+
+
+def _first_return(line: Polyline, first: int, last: int) -> int | None:
+    """Return the sample of `first` to `last` before a path comes back to where it was, None if it does not."""
+    xy, heading, s = line.points_m[first : last + 1, :2], line.heading_rad[first : last + 1], line.s_m[first : last + 1]
+    if s[-1] - s[0] < RETURN_M or np.ptp(heading) < np.pi:
+        return None
+    for k in range(len(xy)):
+        earlier = s[:k] < s[k] - RETURN_M
+        if not earlier.any():
+            continue
+        near = np.hypot(*(xy[:k][earlier] - xy[k]).T) <= ENTER_M
+        turn = np.abs((heading[:k][earlier] - heading[k] + np.pi) % (2 * np.pi) - np.pi)
+        if np.any(near & (turn <= MAX_TURN_RAD)):
+            return first + k - 1
+    return None
+
+
+def _lengthened(route: Route, path: DrivenPath, rows: tuple[int, int], aside_m: float, free: bool) -> Route:
+    """Lengthen a route by samples of a path that was `aside_m` left of its end."""
+    first, last = rows
+    s = path.line.s_m[first : last + 1]
+    moved = path.line.offset(s, -aside_m * (1 - _ease((s - s[0]) / BLEND_M)))
+    head = route.line.points_m[:-1] if route.line.length_m > path.line.s_m[1] else route.line.points_m
+    return replace(route, line=Polyline.through(_forward(np.concatenate([head, moved]))), free=(route.free[0], free))
+
+
+def _preceded(route: Route, path: DrivenPath, rows: tuple[int, int], aside_m: float, free: bool) -> Route:
+    """Put samples of a path that comes to `aside_m` left of a route before its start."""
+    first, last = rows
+    s = path.line.s_m[first : last + 1]
+    moved = path.line.offset(s, -aside_m * (1 - _ease((s[-1] - s) / BLEND_M)))
+    points = np.concatenate([moved, route.line.points_m[1:]])
+    grown = Polyline.through(_forward(points[::-1])[::-1])
+    later = grown.length_m - route.line.length_m
+    marked = None if route.marked_m is None else (route.marked_m[0] + later, route.marked_m[1] + later)
+    return replace(route, line=grown, width_s_m=route.width_s_m + later, marked_m=marked, free=(free, route.free[1]))
+
+
+def _forward(points: Array) -> Array:
+    """Drop points (N, 3) that lie behind those before them, where two parts overlap."""
+    kept = [0]
+    for k in range(1, len(points)):
+        ahead = points[k, :2] - points[kept[-1], :2]
+        onward = points[min(k + 1, len(points) - 1), :2] - points[k, :2] if k + 1 < len(points) else ahead
+        if ahead @ onward > 0:
+            kept.append(k)
+    return points[kept]
+
+
+def _ease(u: Array) -> Array:
+    """Cubic from 0 at 0 to 1 at 1, level at both ends."""
+    v = np.clip(u, 0.0, 1.0)
+    return np.asarray(v * v * (3 - 2 * v))
+
+
+def _center(route: Route, k: int, paths: Sequence[DrivenPath], matches: Sequence[Match]) -> Route:
+    """Move a route to the median of the paths on it."""
+    grid = np.linspace(0.0, route.line.length_m, max(int(np.ceil(route.line.length_m / GRID_M)), 1) + 1)
+    asides = []
+    width = float(route.width_m.max())
+    for path, found in zip(paths, matches):
+        for run in found.runs:
+            if run.route == k and path.rank < 2 and run.last > run.first:
+                rows = slice(run.first, run.last + 1)
+                asides.append(np.interp(grid, found.s_m[rows], found.aside_m[rows], left=np.nan, right=np.nan))
+                width = max(width, min(path.width_m + CLEARANCE_M, MAX_LANE_M))
+    route = replace(route, width_m=np.array([width]), width_s_m=np.zeros(1))
+    if len(asides) < 2:
+        return route
+    shift = _smoothed(_middle(np.array(asides)), GRID_M)
+    moved = route.line.offset(route.line.s_m, np.interp(route.line.s_m, grid, shift))
+    return replace(route, line=Polyline.through(moved)) if np.any(shift) else route
+
+
+def _middle(asides: Array) -> Array:
+    """Return the medians (K,) of offsets (P, K), as near to every path as `KEEP_M` demands; zero where there is none."""
+    known = np.isfinite(asides).any(axis=0)
+    held = np.where(known, asides, 0.0)
+    middle, low, high = np.nanmedian(held, axis=0), np.nanmin(held, axis=0), np.nanmax(held, axis=0)
+    near = np.clip(middle, high - KEEP_M, np.maximum(low + KEEP_M, high - KEEP_M))
+    return np.asarray(np.where(high - low > 2 * KEEP_M, (high + low) / 2, near))
+
+
+def _smoothed(values: Array, step_m: float) -> Array:
+    from scipy.ndimage import gaussian_filter1d
+
+    return np.asarray(gaussian_filter1d(values, SMOOTH_M / step_m, mode="nearest"))
+
+
+REACH_M = 30.0
+"""How far: through a junction of four lanes each way."""
+
+MAX_KINK_RAD = float(np.deg2rad(12.0))
+"""A vehicle that is turned more against the route is about to leave it, or has come from elsewhere."""
+
+
+def continued(routes: Sequence[Route], path: DrivenPath, match: Match) -> DrivenPath:
+    """Return a path with up to `REACH_M` of the routes on which it begins and ends."""
+    first, last = match.runs[0], match.runs[-1]
+    before = _along(routes, match, first, first.first, -1)
+    after = _along(routes, match, last, last.last, 1)
+    if not len(before) and not len(after):
+        return path
+    return path.with_points(np.concatenate([before, path.line.points_m, after]))
+
+
+def _along(routes: Sequence[Route], match: Match, run: Run, k: int, sign: int) -> Array:
+    """Points (N, 3) of the run's route before (-1) or after (1) sample k, eased from the path's offset to the middle."""
+    if run.route < 0 or abs(match.turn_rad[k]) > MAX_KINK_RAD:
+        return np.zeros((0, 3))
+    line = routes[run.route].line
+    s = match.s_m[k]
+    room = min(REACH_M, s if sign < 0 else line.length_m - s)
+    if room < SPACING_M:
+        return np.zeros((0, 3))
+    ahead = np.linspace(0.0, room, int(np.ceil(room / SPACING_M)) + 1)[1:]
+    u = ahead / room
+    slope = sign * np.tan(match.turn_rad[k])
+    aside = match.aside_m[k] * (1 - u) ** 2 * (1 + 2 * u) + slope * room * u * (1 - u) ** 2
+    points = line.offset(s + sign * ahead, aside)
+    return points[::sign]

@@ -1,0 +1,644 @@
+"""Sections and junctions: where routes branch, merge and cross, and how vehicles go from one to the next."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.road.polyline import JUMP_M, STAY_M, DrivenPath, Match, Polyline, Projection, Run, crossings
+from log2sim.road.routes import JOIN_M, LANE_M, MAX_LANE_M, Beside, Route
+
+ALIGNED_RAD = float(np.deg2rad(2.0))
+"""A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two."""
+
+MAX_TURNOFF_M = 20.0
+"""How far before it leaves a route a path may begin to turn."""
+
+CHANGE_RAD = float(np.deg2rad(10.0))
+"""Routes that differ less in heading run side by side; a path from one to the other changes lanes."""
+
+MARGIN_M = 2.0
+"""Between where two lanes touch and where a junction begins: vehicles there overlap no lane but their own."""
+
+MAX_HALF_M = 15.0
+"""Half of the length of the place where two lanes cross at a small angle."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A stretch of a route in a conflict or junction."""
+
+    route: int
+    first_m: float
+    last_m: float
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Stretches of routes that share ground.
+
+    Attributes
+    ----------
+    crossing : bool
+        Whether lanes cross there; else they branch, merge or follow each other.
+    """
+
+    intervals: tuple[Interval, ...]
+    crossing: bool
+
+
+def find_transitions(match: Match) -> Iterator[tuple[Run, Run]]:
+    """Yield consecutive runs of a path on two routes, or on one that it comes back to."""
+    on = [run for run in match.runs if run.route >= 0]
+    for one, two in pairwise(on):
+        if one.route != two.route or abs(match.s_m[two.first] - match.s_m[one.last]) > JUMP_M:
+            yield one, two
+
+
+def find_conflicts(routes: Sequence[Route], paths: Sequence[DrivenPath], matches: Sequence[Match]) -> list[Conflict]:
+    """Return where routes cross, and where paths go from one to another without being beside each other."""
+    found = []
+    for path, match in zip(paths, matches):
+        if path.rank < 2 or len({run.route for run in match.runs}) > 1:
+            for one, two in find_transitions(match):
+                conflict = _transition(routes, path, match, one, two)
+                found += [conflict] if conflict is not None else []
+    for i, a in enumerate(routes):
+        for j, b in enumerate(routes[i:], start=i):
+            found += [_crossing(routes, i, j, float(s), float(t)) for s, t in crossings(a.line, b.line)]
+    return found
+
+
+def _crossing(routes: Sequence[Route], i: int, j: int, s: float, t: float) -> Conflict:
+    one, two = routes[i], routes[j]
+    turn = float(one.line.heading_at(np.array(s)) - two.line.heading_at(np.array(t)))
+    sine, cosine = max(abs(np.sin(turn)), 1e-3), abs(np.cos(turn))
+    wide = [float(r.width_at(np.array(x))) for r, x in ((one, s), (two, t))]
+    intervals = []
+    for k, x, own, other in ((i, s, wide[0], wide[1]), (j, t, wide[1], wide[0])):
+        half = min((other / 2 + own / 2 * cosine) / sine, MAX_HALF_M) + MARGIN_M
+        intervals.append(hold(routes[k], k, x - half, x + half))
+    return Conflict(tuple(intervals), crossing=True)
+
+
+def hold(route: Route, k: int, first: float, last: float) -> Interval:
+    """Return a stretch of route k as far as the route goes."""
+    return Interval(k, max(first, 0.0), min(last, route.line.length_m))
+
+
+def is_lane_change(routes: Sequence[Route], path: DrivenPath, one: Run, two: Run) -> bool:
+    """Whether a path goes from a route to one that runs beside it, before and after."""
+    if one.route == two.route:
+        return False
+    for other, k in ((two.route, one.last), (one.route, two.first)):
+        line = routes[other].line
+        at = line.project(path.line.points_m[k : k + 1, :2], path.line.heading_rad[k : k + 1])
+        there = JOIN_M < at.s_m[0] < line.length_m - JOIN_M
+        if not there or not STAY_M / 2 <= abs(at.aside_m[0]) <= MAX_LANE_M or abs(at.turn_rad[0]) > 2 * CHANGE_RAD:
+            return False
+    return True
+
+
+def _transition(routes: Sequence[Route], path: DrivenPath, match: Match, one: Run, two: Run) -> Conflict | None:
+    """Return the stretches between leaving a route and following another, None for a change of lanes."""
+    if is_lane_change(routes, path, one, two):
+        return None
+    rows = np.arange(one.first, two.last + 1)
+    xy, heading, s = path.line.points_m[rows, :2], path.line.heading_rad[rows], path.line.s_m[rows]
+    a, b = (routes[run.route].line.project(xy, heading) for run in (one, two))
+    leave, arrive = one.last - one.first, two.first - one.first
+    straight = np.flatnonzero(
+        (np.abs(a.turn_rad[: leave + 1]) <= ALIGNED_RAD) & (s[: leave + 1] >= s[leave] - MAX_TURNOFF_M)
+    )
+    begin = int(straight[-1]) if len(straight) else int(np.searchsorted(s, s[leave] - MAX_TURNOFF_M))
+    aligned = np.flatnonzero((np.abs(b.turn_rad[arrive:]) <= ALIGNED_RAD) & (s[arrive:] <= s[arrive] + MAX_TURNOFF_M))
+    end = (
+        arrive + int(aligned[0])
+        if len(aligned)
+        else int(np.searchsorted(s, s[arrive] + MAX_TURNOFF_M, side="right")) - 1
+    )
+    apart = _first(_is_apart(a)[leave:]) + leave
+    together = arrive - _first(_is_apart(b)[arrive::-1])
+    own = match.s_m[rows]
+    first = own[max(min(begin, together), 0)] if together <= leave else own[begin]
+    last = max(own[leave], min(a.s_m[apart], routes[one.route].line.length_m))
+    enter = min(own[arrive], max(b.s_m[together], 0.0)) if b.inside[together] else own[arrive]
+    out = max(own[end], own[apart] if apart >= arrive else -np.inf)
+    length = routes[one.route].line.length_m
+    room = JUMP_M if s[arrive] - s[leave] < JUMP_M else 0.0
+    if length - own[leave] < JOIN_M and own[arrive] < JOIN_M:  # one goes on as the other
+        return Conflict((Interval(one.route, length - room, length), Interval(two.route, 0.0, room)), crossing=False)
+    return Conflict(
+        (
+            hold(
+                routes[one.route],
+                one.route,
+                min(first, own[leave] - JUMP_M),
+                length if length - own[leave] < JOIN_M else last,
+            ),
+            hold(routes[two.route], two.route, 0.0 if own[arrive] < JOIN_M else enter, max(out, own[arrive] + JUMP_M)),
+        ),
+        crossing=False,
+    )
+
+
+def _is_apart(at: Projection) -> NDArray[np.bool_]:
+    return np.asarray((np.abs(at.aside_m) >= LANE_M) | ~at.inside)
+
+
+def _first(mask: NDArray[np.bool_]) -> int:
+    """Return the first index at which a mask holds, the last index if it never does."""
+    return int(mask.argmax()) if mask.any() else len(mask) - 1
+
+
+MIN_SECTION_M = 4.0
+"""Between two conflicts nearer than this no vehicle can wait: they are one junction."""
+
+Stretch = tuple[float, float, int]
+"""First and last station on a route, and the conflict or area that it belongs to."""
+
+
+@dataclass(frozen=True)
+class Areas:
+    """Conflicts that belong together.
+
+    Attributes
+    ----------
+    stretches : mapping of int to list of Stretch
+        By route, in order and apart.
+    crossing : frozenset of int
+        Areas in which lanes cross.
+    """
+
+    stretches: Mapping[int, Sequence[Stretch]]
+    crossing: frozenset[int]
+
+
+class Union:
+    """Sets of the numbers below `count` that are united step by step (Tarjan 1975)."""
+
+    def __init__(self, count: int) -> None:
+        self._parent = list(range(count))
+
+    def root(self, k: int) -> int:
+        """Return the number that stands for the set of k."""
+        while self._parent[k] != k:
+            self._parent[k] = self._parent[self._parent[k]]
+            k = self._parent[k]
+        return k
+
+    def unite(self, one: int, two: int) -> None:
+        """Make one set of two."""
+        one, two = self.root(one), self.root(two)
+        self._parent[max(one, two)] = min(one, two)
+
+
+def join_conflicts(routes: Sequence[Route], conflicts: Sequence[Conflict], beside: Sequence[Beside]) -> Areas:
+    """Join conflicts whose stretches overlap, on any route, and let lanes side by side enter a junction together."""
+    union = Union(len(conflicts))
+    stretches: dict[int, list[Stretch]] = {}
+    for k, conflict in enumerate(conflicts):
+        for interval in conflict.intervals:
+            stretches.setdefault(interval.route, []).append((interval.first_m, interval.last_m, k))
+    for _ in range(len(routes) + 1):
+        stretches = {route: _merge(items, union) for route, items in stretches.items()}
+        if not _spread(routes, stretches, beside):
+            break
+    crossing = frozenset(union.root(k) for k, conflict in enumerate(conflicts) if conflict.crossing)
+    merged = {route: _merge(items, union) for route, items in stretches.items()}
+    return Areas({route: [(a, b, union.root(k)) for a, b, k in items] for route, items in merged.items()}, crossing)
+
+
+def _merge(items: Iterable[Stretch], union: Union) -> list[Stretch]:
+    """Unite stretches that overlap or leave no section between them."""
+    out: list[Stretch] = []
+    for first, last, k in sorted(items):
+        if out and first - out[-1][1] < MIN_SECTION_M:
+            union.unite(k, out[-1][2])
+            out[-1] = (out[-1][0], max(out[-1][1], last), union.root(k))
+        else:
+            out.append((first, last, union.root(k)))
+    return out
+
+
+def _spread(routes: Sequence[Route], stretches: dict[int, list[Stretch]], beside: Sequence[Beside]) -> bool:
+    """Add the stretches of each route to those beside it; return whether any was new."""
+    grown = False
+    for pair in beside:
+        if not pair.same_way:
+            continue
+        for first, last, k in list(stretches.get(pair.route, ())):
+            if last < pair.s_m[0] or first > pair.s_m[-1]:
+                continue
+            ends = [
+                np.interp(v, pair.s_m, pair.other_s_m) if pair.s_m[0] <= v <= pair.s_m[-1] else None
+                for v in (first, last)
+            ]
+            a = (
+                ends[0]
+                if ends[0] is not None
+                else ends[1] - (last - first)
+                if ends[1] is not None
+                else pair.other_s_m[0]
+            )
+            b = ends[1] if ends[1] is not None else a + (last - first)
+            held = hold(routes[pair.other], pair.other, float(a), float(b))
+            own = stretches.setdefault(pair.other, [])
+            if held.last_m > held.first_m and not any(
+                low <= held.first_m + 0.1 and high >= held.last_m - 0.1 and j == k for low, high, j in own
+            ):
+                own.append((held.first_m, held.last_m, k))
+                grown = True
+    return grown
+
+
+FREE, CUT = -1, -2
+"""What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes."""
+
+FIRST_M = 3.0
+"""Of a path that begins or ends within a junction, this much is a section, from which its way through the junction leads on."""
+
+MIN_LENGTH_M = 0.5
+"""Shorter sections are what rounding leaves: a sample of a path."""
+
+TAPER_M = 10.0
+"""Over this length a lane comes to the width that it has beside others: 6 cm a meter at most."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A stretch of a route.
+
+    Attributes
+    ----------
+    first_m, last_m : float
+        Stations on the route.
+    start, end : int
+        The area there, `FREE` or `CUT`.
+    """
+
+    route: int
+    first_m: float
+    last_m: float
+    start: int
+    end: int
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """A section's ground.
+
+    Attributes
+    ----------
+    line : Polyline
+        Its center line.
+    width_m : (N,) float64
+        At the vertices.
+    left, right : int or None
+        Sections beside it, as indices, which have the same ends.
+    """
+
+    section: Section
+    line: Polyline
+    width_m: Array
+    left: int | None = None
+    right: int | None = None
+
+
+def cut_sections(
+    routes: Sequence[Route], areas: Areas, beside: Sequence[Beside], ends: set[tuple[int, bool]]
+) -> list[Section]:
+    """Return the sections between junctions, cut where a lane beside them begins or ends.
+
+    `ends` names the routes, and whether it is the start, whose first or last station a path enters or leaves by another route.
+    """
+    cuts = _find_cuts(routes, areas, beside)
+    found = []
+    for k, route in enumerate(routes):
+        length = route.line.length_m
+        first, start = 0.0, FREE
+        for low, high, area in areas.stretches.get(k, []):
+            low, high = _with_ends(low, high, length, ((k, True) in ends, (k, False) in ends))
+            if low - first > 1e-6:
+                found += _pieces(k, (first, low), (start, area), cuts.get(k, []))
+            first, start = high, area
+        if length - first > 1e-6:
+            found += _pieces(k, (first, length), (start, FREE), cuts.get(k, []))
+    return found
+
+
+def _with_ends(low: float, high: float, length: float, entered: tuple[bool, bool]) -> tuple[float, float]:
+    """Leave a section before and after a stretch of a junction where the route itself begins or ends in it."""
+    room = min(FIRST_M, (high - low) / 3)
+    if low < room and not entered[0]:
+        low = room
+    if high > length - room and not entered[1]:
+        high = length - room
+    return low, high
+
+
+def _pieces(k: int, span: tuple[float, float], ends: tuple[int, int], cuts: Iterable[float]) -> list[Section]:
+    if span[1] - span[0] < MIN_LENGTH_M:
+        return []
+    inner = [c for c in sorted(cuts) if span[0] + MIN_SECTION_M < c < span[1] - MIN_SECTION_M]
+    at = [span[0], *inner, span[1]]
+    kinds = [ends[0], *([CUT] * len(inner)), ends[1]]
+    return [Section(k, a, b, x, y) for a, b, x, y in zip(at, at[1:], kinds, kinds[1:])]
+
+
+def _find_cuts(routes: Sequence[Route], areas: Areas, beside: Sequence[Beside]) -> dict[int, list[float]]:
+    """Return stations of routes at which a lane beside them begins or ends, and those across from them."""
+    cuts: dict[int, list[float]] = {k: [] for k in range(len(routes))}
+
+    def add(route: int, s: float) -> bool:
+        if any(abs(s - c) < MIN_SECTION_M for c in (*cuts[route], 0.0, routes[route].line.length_m)):
+            return False
+        if any(low - MIN_SECTION_M < s < high + MIN_SECTION_M for low, high, _ in areas.stretches.get(route, [])):
+            return False
+        cuts[route].append(s)
+        return True
+
+    for k, route in enumerate(routes):
+        for s in route.marked_m or ():
+            add(k, s)
+    same = [pair for pair in beside if pair.same_way]
+    for pair in same:
+        for k in (0, -1):
+            add(pair.route, float(pair.s_m[k]))
+            add(pair.other, float(pair.other_s_m[k]))
+    grown = True
+    while grown:
+        grown = False
+        for pair in same:
+            for s in list(cuts[pair.route]):
+                if pair.s_m[0] <= s <= pair.s_m[-1]:
+                    grown |= add(pair.other, float(np.interp(s, pair.s_m, pair.other_s_m)))
+    return cuts
+
+
+def lay_out(routes: Sequence[Route], sections: Sequence[Section], beside: Sequence[Beside]) -> list[Strip]:
+    """Give sections their ground: those side by side share their edges, and begin and end at the same line across."""
+    strips: list[Strip | None] = [None] * len(sections)
+    halves = _end_halves(routes, sections, groups := _groups(sections, beside))
+    for group in groups:
+        for k, strip in zip(group, _lay_out_group(routes, sections, group, halves)):
+            strips[k] = strip
+    return [strip for strip in strips if strip is not None]
+
+
+def _groups(sections: Sequence[Section], beside: Sequence[Beside]) -> list[list[int]]:
+    """Return sections that lie side by side from end to end, each group from the left to the right."""
+    by_route: dict[int, list[int]] = {}
+    for k, section in enumerate(sections):
+        by_route.setdefault(section.route, []).append(k)
+    right_of: dict[int, int] = {}
+    for pair in beside:
+        if not pair.same_way or pair.aside_m[0] > 0:
+            continue
+        for k in by_route.get(pair.route, []):
+            if _overlap(sections[k], pair) < 0.5 * (sections[k].last_m - sections[k].first_m):
+                continue
+            ends = np.interp([sections[k].first_m, sections[k].last_m], pair.s_m, pair.other_s_m)
+            ends += np.array([min(sections[k].first_m - pair.s_m[0], 0.0), max(sections[k].last_m - pair.s_m[-1], 0.0)])
+            for j in by_route.get(pair.other, []):
+                off = np.abs(ends - [sections[j].first_m, sections[j].last_m])
+                if off.max() <= 1.5 * MIN_SECTION_M and k not in right_of and j not in right_of.values():
+                    right_of[k] = j
+    starts = [k for k in range(len(sections)) if k not in right_of.values()]
+    return [_chain(k, right_of) for k in starts]
+
+
+def _chain(k: int, right_of: Mapping[int, int]) -> list[int]:
+    chain = [k]
+    while chain[-1] in right_of:
+        chain.append(right_of[chain[-1]])
+    return chain
+
+
+def _overlap(section: Section, pair: Beside) -> float:
+    return float(min(section.last_m, pair.s_m[-1]) - max(section.first_m, pair.s_m[0]))
+
+
+def _offsets(
+    routes: Sequence[Route], sections: Sequence[Section], group: Sequence[int]
+) -> tuple[Polyline, Array, Array, Array]:
+    """Return the base line of a group, and of its lanes (G, N): offsets from it, default half widths and heights."""
+    base = min(group, key=lambda k: sections[k].route)
+    section = sections[base]
+    line = Polyline.through(routes[section.route].line.part(section.first_m, section.last_m))
+    heading = line.heading_rad
+    along, left = (
+        np.column_stack([np.cos(heading), np.sin(heading)]),
+        np.column_stack([-np.sin(heading), np.cos(heading)]),
+    )
+    offsets, halves, heights = [], [], []
+    for k in group:
+        other = routes[sections[k].route]
+        if k == base:
+            s, points = section.first_m + line.s_m, line.points_m
+        else:
+            s = other.line.project(line.points_m[:, :2], heading).s_m
+            for _ in range(4):
+                points = other.line.at(s)
+                s = s - ((points - line.points_m)[:, :2] * along).sum(axis=1)
+            points = other.line.at(s)
+        offsets.append(((points - line.points_m)[:, :2] * left).sum(axis=1) if k != base else np.zeros(len(s)))
+        halves.append(other.width_at(s) / 2)
+        heights.append(points[:, 2])
+    return line, np.array(offsets), np.array(halves), np.array(heights)
+
+
+def _edges(offsets: Array, halves: Array) -> Array:
+    """Return the edges (G + 1, N) of G lanes from the left to the right: neighbors meet in the middle."""
+    outer_left, outer_right = offsets[:1] + halves[:1], offsets[-1:] - halves[-1:]
+    inner = (offsets[:-1] - halves[:-1] + offsets[1:] + halves[1:]) / 2
+    return np.concatenate([outer_left, inner, outer_right])
+
+
+def _end_halves(
+    routes: Sequence[Route], sections: Sequence[Section], groups: Sequence[Sequence[int]]
+) -> dict[tuple[int, float, int], float]:
+    """Return half widths at cuts, by route, station and side (1 left, -1 right), of the sections that have a neighbor there."""
+    found: dict[tuple[int, float, int], float] = {}
+    for group in groups:
+        if len(group) == 1:
+            continue
+        _, offsets, halves, _ = _offsets(routes, sections, group)
+        edges = _edges(offsets, halves)
+        for row, k in enumerate(group):
+            section = sections[k]
+            for kind, s, at in ((section.start, section.first_m, 0), (section.end, section.last_m, -1)):
+                if kind != CUT:
+                    continue
+                if row > 0:
+                    found[section.route, s, 1] = float(edges[row, at] - offsets[row, at])
+                if row < len(group) - 1:
+                    found[section.route, s, -1] = float(offsets[row, at] - edges[row + 1, at])
+    return found
+
+
+def _lay_out_group(
+    routes: Sequence[Route],
+    sections: Sequence[Section],
+    group: Sequence[int],
+    halves_at: Mapping[tuple[int, float, int], float],
+) -> list[Strip]:
+    line, offsets, halves, heights = _offsets(routes, sections, group)
+    edges = _edges(offsets, halves)
+    for row, lane, side in ((0, 0, 1), (-1, len(group) - 1, -1)):
+        section = sections[group[lane]]
+        for kind, s, since in (
+            (section.start, section.first_m, line.s_m),
+            (section.end, section.last_m, line.length_m - line.s_m),
+        ):
+            wanted = halves_at.get((section.route, s, side))
+            if kind == CUT and wanted is not None:
+                taper = np.clip(1 - since / min(TAPER_M, line.length_m), 0.0, 1.0)
+                eased = taper * taper * (3 - 2 * taper)
+                edges[row] += side * eased * (wanted - halves[lane])
+    out = []
+    for row, k in enumerate(group):
+        middle, width = (edges[row] + edges[row + 1]) / 2, edges[row] - edges[row + 1]
+        points = line.offset(line.s_m, middle)
+        points[:, 2] = heights[row]
+        left = group[row - 1] if row > 0 else None
+        right = group[row + 1] if row + 1 < len(group) else None
+        out.append(Strip(sections[k], Polyline(points), width, left, right))
+    return out
+
+
+BLEND_M = 15.0
+"""Over this length from its ends a connection comes from the lanes' middles to the path that was driven."""
+
+MISSED_M = 3.0
+"""A path that is first seen, or last, this far from the end of a section did not pass it."""
+
+MIN_CONNECTION_M = 1.0
+"""Sections that are nearer meet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Connection:
+    """A way from the end of a section to the start of another.
+
+    Attributes
+    ----------
+    origin, target : int
+        Sections.
+    width_m : (N,) float64
+    area : int
+        Where it is.
+    agents : tuple of str
+        Who drove it.
+    """
+
+    origin: int
+    target: int
+    line: Polyline
+    width_m: Array
+    area: int
+    agents: tuple[str, ...]
+
+
+def connect(
+    routes: Sequence[Route], strips: Sequence[Strip], paths: Sequence[DrivenPath], matches: Sequence[Match]
+) -> list[Connection]:
+    """Return a connection for each pair of sections that some path leads from one to the other, through an area."""
+    driven: dict[tuple[int, int], list[tuple[DrivenPath, Array]]] = {}
+    for path, match in zip(paths, matches):
+        for origin, target, span in _passages(routes, strips, path, match):
+            points = _fitted(path.line.part(*span), strips[origin], strips[target])
+            driven.setdefault((origin, target), []).append((path, points))
+    out = []
+    for (origin, target), ways in sorted(driven.items()):
+        lead = min(path.rank == 2 for path, _ in ways)
+        kept = [(path, points) for path, points in ways if (path.rank == 2) == lead]
+        line = Polyline(_mean([points for _, points in kept]))
+        ends = strips[origin].width_m[-1], strips[target].width_m[0]
+        width = np.interp(line.s_m, [0.0, line.length_m], ends)
+        names = tuple(dict.fromkeys(path.agent for path, _ in kept))
+        out.append(Connection(origin, target, line, width, strips[origin].section.end, names))
+    return out
+
+
+def _passages(
+    routes: Sequence[Route], strips: Sequence[Strip], path: DrivenPath, match: Match
+) -> Iterator[tuple[int, int, tuple[float, float]]]:
+    """Yield pairs of sections that a path passes in turn, and its stations at the end of one and the start of the other."""
+    visits = _visits(strips, match)
+    for (one, _, k), (two, j, _) in itertools.pairwise(visits):
+        a, b = strips[one].section, strips[two].section
+        if a.end < 0 or a.end != b.start:
+            continue
+        out, into = a.last_m - match.s_m[k], match.s_m[j] - b.first_m
+        runs = [next(run for run in match.runs if run.first <= i <= run.last) for i in (k, j)]
+        beside = runs[0] != runs[1] and is_lane_change(routes, path, *runs)
+        if out > MISSED_M or into > MISSED_M or (beside and a.route != b.route and k + 1 == j):
+            continue
+        span = float(path.line.s_m[k] + out), float(path.line.s_m[j] - into)
+        if span[1] - span[0] >= MIN_CONNECTION_M:
+            yield one, two, span
+
+
+def _visits(strips: Sequence[Strip], match: Match) -> list[tuple[int, int, int]]:
+    """Return the sections that a path visits, each with its first and last sample there."""
+    visits: list[tuple[int, int, int]] = []
+    for run in match.runs:
+        if run.route < 0:
+            continue
+        own = [k for k, strip in enumerate(strips) if strip.section.route == run.route]
+        rows = np.arange(run.first, run.last + 1)
+        for k in sorted(own, key=lambda k: strips[k].section.first_m):
+            section = strips[k].section
+            inside = rows[(match.s_m[rows] >= section.first_m - 1e-6) & (match.s_m[rows] <= section.last_m + 1e-6)]
+            if len(inside):
+                visits.append((k, int(inside[0]), int(inside[-1])))
+    return visits
+
+
+def _fitted(points: Array, origin: Strip, target: Strip) -> Array:
+    """Bend a path (N, 3) so that it begins and ends on the middles of the lanes, in their directions."""
+    line = Polyline.through(points)
+    s, length = line.s_m, line.length_m
+    reach = length if length <= 2 * BLEND_M else BLEND_M
+    moved = line.points_m.copy()
+    for end, strip, since, sign in ((0, origin, s, 1.0), (-1, target, length - s, -1.0)):
+        other = -1 if end == 0 else 0
+        u = np.clip(since / reach, 0.0, 1.0)
+        gap = strip.line.points_m[other] - line.points_m[end]
+        wanted, own = strip.line.heading_rad[other], line.heading_rad[end]
+        slope = sign * np.array([np.cos(wanted) - np.cos(own), np.sin(wanted) - np.sin(own), 0.0])
+        fade, swing = (1 - u) ** 2 * (1 + 2 * u), u * (1 - u) ** 2 * reach
+        moved += fade[:, None] * gap + swing[:, None] * slope
+    return moved
+
+
+def _mean(ways: Sequence[Array]) -> Array:
+    """Return the median of polylines (N, 3) that begin and end together, at equal shares of their lengths."""
+    if len(ways) == 1:
+        return ways[0]
+    count = max(len(points) for points in ways)
+    share = np.linspace(0.0, 1.0, count)
+    columns = []
+    for points in ways:
+        line = Polyline(points)
+        columns.append(line.at(share * line.length_m))
+    middle: Array = np.median(columns, axis=0)
+    return middle
+
+
+def continuations(strips: Sequence[Strip]) -> list[tuple[int, int]]:
+    """Return pairs of sections of which one goes on as the other."""
+    order = sorted(range(len(strips)), key=lambda k: (strips[k].section.route, strips[k].section.first_m))
+    return [(a, b) for a, b in itertools.pairwise(order) if _meets(strips[a], strips[b])]
+
+
+def _meets(one: Strip, two: Strip) -> bool:
+    a, b = one.section, two.section
+    return a.route == b.route and a.end == CUT == b.start and a.end != FREE

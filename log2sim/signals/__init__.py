@@ -1,1 +1,0 @@
-"""Traffic lights and their states."""

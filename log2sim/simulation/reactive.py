@@ -1,0 +1,632 @@
+"""Reactive agents: they keep to their paths and brake for what the scenario does not have.
+
+Each reactive agent has its own time in the scenario: it passes its trajectory at `rate` (1 as there, 0 standing), and
+so falls behind by `delay_s`. It never leaves its path, keeps the scenario's stops, returns to the scenario's speed of
+the place, and never catches up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import STANDSTILL_MPS, Agent, Trajectory
+from log2sim.geometry import Array, wrap_angle
+from log2sim.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
+from log2sim.simulation.corridors import (
+    EXTENSION_M,
+    HORIZON_S,
+    TIME_STEP_S,
+    PathTable,
+    Pose,
+    PredictedBoxes,
+    Prediction,
+    SafetyMargins,
+    SweptCorridor,
+    leaders,
+    predict_along_path,
+    predict_by_log,
+    predict_policy_vehicle,
+)
+from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, Snapshot, StepClock, VehicleGroup
+from log2sim.simulation.metrics.collisions import BoxTracks, contacts
+from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
+from log2sim.simulation.vehicles.parameters import WHEELED
+from log2sim.simulation.vehicles.vehicle import Columns
+
+EXPONENT = 4.0
+MIN_GAP_M = 0.1  # shorter gaps, and overlaps, count as this one
+MIN_PACE_MPS = 0.5  # where it is slower, the rate responds as at this speed; it would have no bound at standstill
+HOLD_MPS = 0.2  # a slower agent with a leader is held at standstill,
+HOLD_DEMAND = (
+    0.5  # until the leader's demand falls below this share of the free acceleration: 1.4 times the minimum gap
+)
+
+# Time gap in s, minimum gap in m, acceleration, comfortable and hardest braking in m/s2. On wheels: town traffic in
+# Treiber and Kesting, "Traffic Flow Dynamics", 2013, chapter 11. On foot: an arm's length, and a stop within one step.
+ON_WHEELS = (1.0, 2.0, 1.0, 1.5, 8.0)
+ON_FOOT = (0.5, 0.7, 1.0, 1.5, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class IdmParameters(Columns):
+    """Parameters of the intelligent driver model, all (A,).
+
+    Attributes
+    ----------
+    time_gap_s : (A,) float64
+    gap_m : (A,) float64
+        Minimum gap, kept at standstill.
+    accel_mps2 : (A,) float64
+        Free acceleration.
+    comfort_mps2 : (A,) float64
+        Comfortable braking.
+    brake_mps2 : (A,) float64
+        Hardest braking.
+    """
+
+    time_gap_s: Array
+    gap_m: Array
+    accel_mps2: Array
+    comfort_mps2: Array
+    brake_mps2: Array
+
+
+def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
+    """Return the parameters of agents by category."""
+    rows = [ON_WHEELS if a.category in WHEELED else ON_FOOT for a in agents]
+    return IdmParameters(*np.array(rows, dtype=np.float64).reshape(-1, 5).T)
+
+
+def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_mps: Array) -> Array:
+    """Return the share of the free acceleration that a leader takes: (s* / s)^2 of the model; 1 at the minimum gap at low speed.
+
+    Notes
+    -----
+    Treiber, Hennecke and Helbing, "Congested traffic states in empirical observations and microscopic simulations", 2000.
+    """
+    closing = pace_mps * (pace_mps - leader_mps) / (2 * np.sqrt(driver.accel_mps2 * driver.comfort_mps2))
+    desired = driver.gap_m + np.maximum(pace_mps * driver.time_gap_s + closing, 0.0)
+    result: Array = (desired / np.maximum(gap_m, MIN_GAP_M)) ** 2
+    return result
+
+
+def rate_response(
+    driver: IdmParameters, rate: Array, taken: Array, pace_mps: Array, log_accel_mps2: Array
+) -> tuple[Array, Array]:
+    """Return the rate and its slope in 1/s, (A,) each, of trajectories at `pace_mps` here, with demand `taken`.
+
+    Notes
+    -----
+    The scenario's speed at a place is the model's desired speed, so the rate is its v / v0, and the model's
+    acceleration is added to the scenario's. Braking that the scenario does anyway counts as a response to the leader.
+    Without demand a rate of 1 stays 1: the agent follows the scenario.
+    """
+    logged = rate**2 * log_accel_mps2
+    excess = np.maximum(driver.accel_mps2 * taken - np.maximum(-logged, 0.0), 0.0)
+    accel = driver.accel_mps2 * (1 - rate**EXPONENT) - excess
+    accel = np.maximum(accel, -driver.brake_mps2 - np.minimum(logged, 0.0))
+    slope = accel / np.maximum(pace_mps, MIN_PACE_MPS)
+    held = (rate * pace_mps < HOLD_MPS) & (taken > HOLD_DEMAND)
+    return np.where(held, 0.0, rate), np.where(held, 0.0, slope)
+
+
+FORESIGHTS = ("path", "motion")
+"""`path`: others go where the scenario has them go. `motion`: they go on as they have moved so far, as who sees them for the
+first time expects."""
+
+DRIVEN_TURN_S = 0.3
+"""Time constant of the turn rate of a vehicle that a policy drives: short, since simulated headings have no noise."""
+
+Index = NDArray[np.intp]
+
+
+class Foresight(Protocol):
+    """Predictions (P, H) at the times of `HORIZON_S`."""
+
+    def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
+        """Predict agents (P,) that pass their trajectories at rates (P,), from where these are at times (P,)."""
+
+    def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
+        """Predict an agent that a policy drives, from where it is among all poses; (1, H)."""
+
+    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
+        """Predict that agent by the same rules from where the scenario has it at times (P,)."""
+
+
+class PathForesight:
+    """Others go where the scenario has them go."""
+
+    def __init__(self, paths: PathTable) -> None:
+        self._paths = paths
+
+    def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
+        """See `Foresight`."""
+        return predict_by_log(self._paths, agent, t_s, rate)
+
+    def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
+        """See `Foresight`."""
+        x, y, yaw, speed = (float(c[agent]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
+        return predict_policy_vehicle(self._paths, agent, x, y, yaw, speed)
+
+    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
+        """See `Foresight`."""
+        pose = self._paths.at(np.full(len(t_s), agent), t_s)
+        return predict_along_path(self._paths, agent, pose.distance_m, np.abs(pose.speed_mps))
+
+
+class MotionForesight:
+    """Others go on at the speed and turn rate that they had so far, smoothed as `log2sim.prediction` does."""
+
+    def __init__(self, paths: PathTable, agents: Sequence[Agent]) -> None:
+        self._paths = paths
+        begin_s, end_s = float(paths.begin_s.min()), float(paths.end_s.max())
+        self._begin_s = begin_s
+        ticks = np.arange(int((end_s - begin_s) / TICK_S) + 1, dtype=np.float64)
+        table = tabulate(agents, begin_s + TICK_S * ticks, TICK_S)
+        smooth = smooth_motion(table)
+        self._velocity = np.where(table.present, smooth.velocity_mps, 0.0)
+        self._turn_radps = np.where(table.present, smooth.turn_radps, 0.0)
+        self._seen: tuple[float, float] | None = None
+        self._driven_radps = 0.0
+
+    def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
+        """See `Foresight`."""
+        pose = self._paths.at(agent, t_s)
+        since = (t_s - self._begin_s) / TICK_S + 1e-6
+        tick = np.clip(since.astype(np.intp), 0, self._turn_radps.shape[1] - 1)
+        turn = self._turn_radps[agent, tick]
+        turned = np.exp(1j * turn * np.clip(since - tick, 0.0, 1.0) * TICK_S)
+        return _go_on(pose, np.asarray(self._velocity[agent, tick] * turned * rate), turn * rate)
+
+    def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
+        """See `Foresight`."""
+        one = Pose(*(np.asarray(c)[agent : agent + 1] for c in pose))
+        yaw = float(one.yaw_rad[0])
+        if self._seen is None or not t_s > self._seen[0]:  # it begins, or begins again
+            self._driven_radps = 0.0
+        else:
+            step_s = t_s - self._seen[0]
+            rate = float(wrap_angle(yaw - self._seen[1])) / step_s
+            self._driven_radps += (rate - self._driven_radps) * -np.expm1(-step_s / DRIVEN_TURN_S)
+        self._seen = t_s, yaw
+        return _go_on(one, one.speed_mps * np.exp(1j * one.yaw_rad), np.array([self._driven_radps]))
+
+    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
+        """See `Foresight`."""
+        return self.expect(np.full(len(t_s), agent), t_s, np.ones(len(t_s)))
+
+
+def _go_on(pose: Pose, velocity: NDArray[np.complex128], turn_radps: Array) -> Prediction:
+    """Go on from poses (P,) with velocities (P,) that turn at rates (P,)."""
+    way = displacement(velocity[:, None], turn_radps[:, None], HORIZON_S)
+    yaw = pose.yaw_rad[:, None] + turn_radps[:, None] * HORIZON_S
+    speed = np.copysign(np.abs(velocity), pose.speed_mps)[:, None]
+    return pose.x_m[:, None] + way.real, pose.y_m[:, None] + way.imag, yaw, np.broadcast_to(speed, yaw.shape)
+
+
+MIN_LOOKAHEAD_M = 10.0  # also at standstill
+
+MARGINS_NOW = SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
+MARGINS_IN_SCENARIO = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
+GAP_M, SPEED_MPS = 0.5, 0.5
+"""Tolerances, besides the difference of the margins, within which an interaction counts as that of the scenario."""
+
+MIN_DEMAND = 1e-3  # share of the free acceleration below which a demand is ignored
+PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their points
+
+
+@dataclass(frozen=True, eq=False)
+class TrafficState:
+    """All agents (A,) at one time.
+
+    Attributes
+    ----------
+    size_m : (A, 3) float64
+    reacts : (A,) bool
+        Whether an agent is reactive.
+    driven : int
+        The agent that a policy drives, -1 without.
+    t_s : (A,) float64
+        Time on the scenario of each agent.
+    rate : (A,) float64
+        Rate at which each agent passes its trajectory.
+    pose : Pose
+        Where the agents are, (A,).
+    prediction : Prediction
+        Where they are expected to go, (A, H).
+    foresight : Foresight
+        What expects it.
+    """
+
+    paths: PathTable
+    idm: IdmParameters
+    size_m: Array
+    reacts: NDArray[np.bool_]
+    driven: int
+    t_s: Array
+    rate: Array
+    pose: Pose
+    prediction: Prediction
+    foresight: Foresight
+
+    def reach_m(self, i: Index) -> Array:
+        """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
+        pace, d = np.abs(self.pose.speed_mps[i]), self.idm.take(i)
+        stop_m = pace * (d.time_gap_s + HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
+        result: Array = np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], EXTENSION_M)
+        return result
+
+    def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
+        """Select those of the pairs (P,), (P,) that may come near each other within the horizon."""
+        p, radius = self.pose, np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
+        reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * HORIZON_S[-1] + radius[i] + radius[j]
+        near = (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
+        i, j = i[near], j[near]
+        level = self._level(i, j)
+        i, j = i[level], j[level]
+        # Four boxes about the path ahead exclude most agents within the circle, above all those in other lanes.
+        x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.prediction[:2])
+        swept = self._hull(i, x[:, j], y[:, j])
+        room = radius[j] + self.size_m[i, 1] / 2 + MARGINS_IN_SCENARIO.side_m + PATH_HULL_MARGIN_M
+        own = np.flatnonzero(self.reacts)
+        ahead = np.linspace(0.0, 1.0, 13)[:, None] * self.reach_m(own)
+        x, y, *_ = self.paths.along(own[None], self.pose.distance_m[own] + ahead)
+        meets, slot = np.zeros(len(i), dtype=bool), np.searchsorted(own, i)
+        for part in (slice(0, 4), slice(3, 7), slice(6, 10), slice(9, 13)):
+            section = self._hull(own, x[part], y[part])
+            apart = [
+                (low > end[slot] + room) | (high < begin[slot] - room)
+                for (low, high), (begin, end) in zip(swept, section)
+            ]
+            meets |= ~(apart[0] | apart[1])
+        return i[meets], j[meets]
+
+    def _level(self, i: Index, j: Index) -> NDArray[np.bool_]:
+        """Whether agents j (P,) are at the height of agents i (P,), or of the paths of these that far ahead."""
+        p = self.pose
+        gap_m = np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j])
+        ahead_m = self.paths.at(i, self.paths.times(i, p.distance_m[i] + gap_m)).z_m
+        apart_m = np.minimum(np.abs(p.z_m[i] - p.z_m[j]), np.abs(ahead_m - p.z_m[j]))
+        result: NDArray[np.bool_] = apart_m < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
+        return result
+
+    def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Return minimum and maximum of points (N, P), ahead and to the left of agents i (P,)."""
+        cos, sin = np.cos(self.pose.yaw_rad[i]), np.sin(self.pose.yaw_rad[i])
+        dx, dy = x_m - self.pose.x_m[i], y_m - self.pose.y_m[i]
+        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+        return (ahead.min(axis=0), ahead.max(axis=0)), (left.min(axis=0), left.max(axis=0))
+
+
+def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
+    """Return the share of the free acceleration of agents i (P,) that agents j (P,) take beyond the scenario.
+
+    Where the scenario is not `trusted` (P,), the whole demand counts.
+    """
+    driver, logged_pace = m.idm.take(i), np.abs(m.pose.speed_mps[i])
+    pace = m.rate[i] * logged_pace
+    logged = m.paths.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
+    starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
+    means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
+    x, y, yaw, speed = (c[j] for c in m.prediction)
+    found = leaders(m.paths, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), MARGINS_NOW)
+    # Where two reactive agents meet, the one that was first in the scenario goes first; an obstacle already in the path is
+    # waited for.
+    first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
+    first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s
+    gap = np.where(first & trusted, np.inf, found.gap_m)
+    taken = leader_demand(driver, gap, pace, found.speed_mps)
+    t_s = m.t_s[i]
+    k = np.flatnonzero((taken > MIN_DEMAND) & trusted & (m.paths.begin_s[j] <= t_s) & (t_s <= m.paths.end_s[j]))
+    if len(k):
+        taken[k] -= _demand_in_scenario(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
+    return np.maximum(taken, 0.0)
+
+
+def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: SweptCorridor) -> Array:
+    """Return the demand of agents j (P,) in the scenario when agents i (P,) were here, as far as it applies now.
+
+    The nearer the other agent is than it was in the scenario, the less of the scenario's demand counts; at half the gap
+    none.
+    """
+    found = leaders(m.paths, corridor, _boxes(m, j, _predict_in_scenario(m, j, m.t_s[i])), MARGINS_IN_SCENARIO)
+    gap = found.gap_m - GAP_M
+    taken = leader_demand(m.idm.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
+    known = np.isfinite(gap)
+    scale = np.maximum(np.where(known, gap, 0.0) / 2, 1.0)
+    lost = np.where(known, np.maximum(np.where(known, gap, 0.0) - gap_m, 0.0) / scale, 1.0)
+    result: Array = np.maximum(1 - lost, 0.0) * taken
+    return result
+
+
+def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> SweptCorridor:
+    reach = float(m.reach_m(i).max())
+    return SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
+
+
+def _boxes(m: TrafficState, j: Index, prediction: Prediction) -> PredictedBoxes:
+    return PredictedBoxes(*prediction, m.size_m[j, 0], m.size_m[j, 1])
+
+
+def predict_all(foresight: Foresight, t_s: float, pose: Pose, own_s: Array, rate: Array, driven: int) -> Prediction:
+    """Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,)."""
+    everyone = np.arange(len(own_s))
+    prediction = foresight.expect(everyone, own_s, rate)
+    return (
+        prediction
+        if driven < 0
+        else _select(everyone == driven, foresight.expect_driven(driven, t_s, pose), prediction)
+    )
+
+
+def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
+    """Predict agents (P,) from the scenario at times (P,), by the same rules."""
+    prediction = m.foresight.expect(j, t_s, np.ones(len(j)))
+    if not np.any(j == m.driven):
+        return prediction
+    return _select(j == m.driven, m.foresight.expect_driven_in_scenario(m.driven, t_s), prediction)
+
+
+def _select(mask: NDArray[np.bool_], one: Prediction, other: Prediction) -> Prediction:
+    x, y, yaw, speed = (np.where(mask[:, None], a, b) for a, b in zip(one, other))
+    return x, y, yaw, speed
+
+
+DEEP_OVERLAP_M = 0.5  # larger than the errors of boxes
+OVERLAP_CHUNK = 200
+
+
+def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pairs (A, A) whose boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
+
+    Pairs that overlap from the start are one object detected twice, or a load and its carrier: no reason to brake.
+    """
+    count = len(size_m)
+    deep, together = np.zeros((2, count, count), dtype=bool)
+    stays = static & (paths.begin_s == paths.end_s)
+    moving = ~static
+    if not moving.any():
+        return deep
+    begin_s = np.where(stays, -np.inf, paths.begin_s)
+    end_s = np.where(stays, np.inf, paths.end_s)
+    t_s = np.arange(paths.begin_s[moving].min(), paths.end_s[moving].max() + TIME_STEP_S, TIME_STEP_S)
+    size = np.maximum(size_m - [DEEP_OVERLAP_M, DEEP_OVERLAP_M, 0.0], 0.1)
+    everybody = np.arange(count)
+    for part in np.split(t_s, range(OVERLAP_CHUNK, len(t_s), OVERLAP_CHUNK)):
+        pose = paths.at(everybody, part[:, None])
+        there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
+        x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
+        found = contacts(BoxTracks(x, y, z, yaw, speed, size), moving)
+        a, b = found.a, found.b
+        deep[a, b] = True
+        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + TIME_STEP_S
+        together[a[at_once], b[at_once]] = True
+    into = deep & ~together
+    return into | into.T
+
+
+DECISION_STEP_S = 0.1
+CHUNK = 4096  # pairs evaluated together
+RELEASE_S, MAX_KEPT_DEMAND = 0.5, 4.0
+"""A demand fades over this time after it ends, so that the rate does not oscillate at the edge of a conflict."""
+
+SAME_DELAY_S = 1e-9  # delays that differ by rounding are the same
+
+
+class Traffic:
+    """Decisions of the reactive agents among the A agents of a scenario; all columns are (A,) over all of them.
+
+    Parameters
+    ----------
+    agents, trajectories : sequences
+        All agents, and the trajectories of their box centers; for static agents one pose.
+    reactive : collection of str
+        Ids of the reactive agents.
+    driven : str, optional
+        Id of the agent whose states are given with each decision, since a policy drives it.
+    foresight : str
+        One of `FORESIGHTS`: what the reactive agents expect of others.
+
+    Notes
+    -----
+    A pair of agents is evaluated only while it differs from the scenario: one is driven by a policy, or their delays
+    differ, or they overlap in the scenario itself. The demand of a leader is compared with its demand in the scenario
+    when the agent was at this place, and only the excess counts; so a scenario that drives closer than the model would
+    is reproduced. Where the paths of two reactive agents cross, the one that was there first in the scenario goes
+    first. Cost: R A comparisons a decision, then some 500 distances for each pair in reach.
+    """
+
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        trajectories: Sequence[Trajectory],
+        reactive: Collection[str],
+        driven: str | None,
+        foresight: str = "path",
+    ) -> None:
+        self.index = {a.id: k for k, a in enumerate(agents)}
+        self.paths = PathTable(trajectories)
+        self._foresight: Foresight
+        self._foresight = MotionForesight(self.paths, agents) if foresight == "motion" else PathForesight(self.paths)
+        self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
+        self.idm = idm_parameters(agents)
+        self._static = np.array([a.static for a in agents], dtype=bool)
+        self._stays = np.array([a.is_permanent for a in agents], dtype=bool)
+        self._driven = self.index[driven] if driven is not None else -1
+        self._size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
+        self._distrusted = deep_overlaps(self.paths, self._size, self._static)
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset all agents to the time of the scenario."""
+        count, self._decided_s = len(self.reacts), -np.inf
+        self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
+        self._taken, self._driven_m = np.zeros(count), 0.0
+
+    def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
+        """Choose the rates of the reactive agents, and advance their times in the scenario by `dt_s`.
+
+        `ego` is the state of the driven agent, None if there is none.
+        """
+        tau = t_s - self.delay_s
+        going = self.reacts & (self.paths.begin_s <= tau) & (tau < self.paths.end_s)
+        if t_s > self._decided_s + DECISION_STEP_S - SAME_DELAY_S:
+            self._decided_s = t_s
+            self._decide(t_s, tau, np.flatnonzero(going), ego)
+        rate = np.where(going, np.clip(self.rate + self.rate_slope * dt_s, 0.0, 1.0), 1.0)
+        self.delay_s = self.delay_s + np.where(going, (1 - (self.rate + rate) / 2) * dt_s, 0.0)
+        self.rate = rate
+
+    def _decide(self, t_s: float, tau: Array, own: NDArray[np.intp], ego: Snapshot | None) -> None:
+        """Set the rates of agents `own` (R,) and their slopes."""
+        pose = self.paths.at(np.arange(len(tau)), tau)
+        pace = np.abs(pose.speed_mps[own])
+        log_accel = (np.abs(self.paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
+        pose = self._with_ego(pose, ego)
+        prediction = predict_all(self._foresight, t_s, pose, tau, self.rate, self._driven)
+        moment = TrafficState(
+            self.paths,
+            self.idm,
+            self._size,
+            self.reacts,
+            self._driven,
+            tau,
+            self.rate,
+            pose,
+            prediction,
+            self._foresight,
+        )
+        taken = np.zeros(len(tau))
+        pairs = moment.meeting(*self._pairs(t_s, tau, own))
+        for begin in range(0, len(pairs[0]), CHUNK):
+            i, j = (p[begin : begin + CHUNK] for p in pairs)
+            np.maximum.at(taken, i, excess_demand(moment, i, j, ~self._distrusted[i, j]))
+        kept = np.minimum(self._taken, MAX_KEPT_DEMAND) * np.exp(-DECISION_STEP_S / RELEASE_S)
+        taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
+        self._taken = taken
+        rate, slope = rate_response(self.idm.take(own), self.rate[own], taken[own], pace, log_accel)
+        stands = pace < STANDSTILL_MPS  # the scenario's time goes on: waiting then counts as the scenario's own stop
+        self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
+
+    def _with_ego(self, pose: Pose, ego: Snapshot | None) -> Pose:
+        """Replace the pose of the driven agent by the one to which the policy has driven it."""
+        k = self._driven
+        if ego is None or k < 0 or not len(ego.x_m):
+            return pose
+        x, y, yaw, speed = pose.x_m.copy(), pose.y_m.copy(), pose.yaw_rad.copy(), pose.speed_mps.copy()
+        x[k], y[k] = ego.x_m[0] - self.paths.origin_m[0], ego.y_m[0] - self.paths.origin_m[1]
+        yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
+        # Its height is that of the scenario at this place; by time, nobody would brake for it on a slope if it fell behind.
+        self._driven_m = self.paths.progress_near(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
+        z = pose.z_m.copy()
+        driven = np.array([k])
+        z[k] = self.paths.at(driven, self.paths.times(driven, np.array([self._driven_m]))).z_m[0]
+        return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
+
+    def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return pairs of a reactive agent (P,) and a present agent (P,) whose relation differs from the scenario."""
+        differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_DELAY_S) & ~self._static
+        if self._driven >= 0:
+            differs[:, self._driven] = True
+        differs |= self._distrusted[own]
+        differs &= (self.paths.begin_s <= t_s) & (tau <= self.paths.end_s) | self._stays
+        differs[np.arange(len(own)), own] = False
+        row, j = np.nonzero(differs)
+        return own[row], j
+
+
+RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
+"""Columns that scale with the rate, and the columns of their derivatives."""
+
+
+class ReactiveGroup(AgentGroup):
+    """A group whose agents follow the scenario at the time and rate that `traffic` decides."""
+
+    driver = "reactive"
+    follows_scenario_time = False
+    columns: tuple[str, ...] = ("x", "y", "yaw", "speed")
+
+    def join(self, traffic: Traffic, clock: StepClock) -> None:
+        """Connect the group with the traffic; call it once, before anything else."""
+        self.traffic, self.clock, self._logged_last = traffic, clock, self.last
+        self.index = np.array([traffic.index[a.id] for a in self.agents], dtype=np.intp)
+        self._end_s = np.array([r.trajectory.t_s[-1] for r in self.references])
+        self._first_row = np.array([r.first_row for r in self.references], dtype=np.intp)
+        self._rows = np.array([len(r.columns) for r in self.references], dtype=np.intp)
+        self._begin = np.cumsum(self._rows) - self._rows
+        self._flat = np.concatenate([r.columns for r in self.references])
+        jumps = [(k, t) for k, r in enumerate(self.references) for t in r.trajectory.discontinuity_times()]
+        # As in the scenario, an agent is placed again after the row that blends both sides of a discontinuity.
+        self._discontinuities = np.array([(k, t + wait) for k, t in jumps for wait in (0.0, GRID_S)]).reshape(-1, 2)
+        self._tau = np.full(len(self.agents), -np.inf)
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        """Prepare the tables; at the first step also reset the lifetimes, which delays extend."""
+        if begin == 0:
+            self.last, self._tau = self._logged_last, np.full(len(self.agents), -np.inf)
+        super().open_window(begin, end, begin_s, end_s)
+
+    def log_times(self, t_s: float) -> Array:
+        """Return the scenario times of the living agents: the present time less their delay."""
+        return t_s - self.traffic.delay_s[self.index[self.live]]
+
+    def look_up(self, t_s: float) -> None:
+        """Set `row` (C, A) to the references at the agents' times in the scenario."""
+        self.now_s = t_s
+        live, delay = self.live, self.traffic.delay_s[self.index]
+        # A delayed agent lives on until it has reached the end of its trajectory.
+        self.last = np.minimum(self.clock.last_step(self._end_s + delay), self.clock.steps - 1)
+        tau = t_s - delay
+        last = self._rows[live] - 1
+        place = np.clip(tau[live] / GRID_S - self._first_row[live], 0.0, last)
+        k = np.minimum(place.astype(np.intp), np.maximum(last - 1, 0))
+        low = self._flat[self._begin[live] + k]
+        high = self._flat[self._begin[live] + np.minimum(k + 1, last)]
+        self.row = self._slowed((low + (place - k)[:, None] * (high - low)).T, live)
+        agent, at_s = self._discontinuities[:, 0].astype(np.intp), self._discontinuities[:, 1]
+        jumped = (self._tau[agent] < at_s) & (at_s <= tau[agent]) & np.isfinite(self._tau[agent])
+        self._tau = tau
+        if jumped.any():
+            self.place(np.intersect1d(agent[jumped], live), t_s)
+
+    def _exact(self, index: NDArray[np.intp], t_s: float) -> Array:
+        at_s = t_s - self.traffic.delay_s[self.index[index]]
+        rows = [self.references[i].exact(np.array([t]))[0] for i, t in zip(index, at_s)]
+        return self._slowed(np.stack(rows, axis=1), index)
+
+    def _slowed(self, row: Array, index: NDArray[np.intp]) -> Array:
+        """Scale the rows (C, N) of agents that pass their references at their rate."""
+        rate, slope = self.traffic.rate[self.index[index]], self.traffic.rate_slope[self.index[index]]
+        if np.all(rate == 1):
+            return row
+        row = row.copy()
+        names = {name: k for k, name in enumerate(self.columns)}
+        speeds = [names[speed] for speed in RATE_OF_SPEED if speed in names]
+        for speed, change in RATE_OF_SPEED.items():
+            if change in names:
+                row[names[change]] = row[names[change]] * rate**2 + row[names[speed]] * slope
+        row[speeds] *= rate
+        if "stands" in names:
+            row[names["stands"]] = np.maximum(row[names["stands"]], np.hypot.reduce(row[speeds]) < REFERENCE_HOLD_MPS)
+        return row
+
+
+class ReactiveVehicleGroup(ReactiveGroup, VehicleGroup):
+    """Vehicles that react."""
+
+    columns = VEHICLE_COLUMNS
+
+
+class ReactivePedestrianGroup(ReactiveGroup, PedestrianGroup):
+    """Points that react."""
+
+    columns = POINT_COLUMNS
+
+
+class ReactiveLogReplayGroup(ReactiveGroup, LogReplayGroup):
+    """Agents that react and are placed exactly on their path."""

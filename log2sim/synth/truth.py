@@ -1,0 +1,502 @@
+"""The exact truth of a scene: labels, map features, and which ground was shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Point
+from shapely.geometry.base import BaseGeometry
+
+from log2sim.datatypes import ImageLabels, Labels, MapFeatures, MapLane, Marking, RoadBorder
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, project, rotation_from_rpy, transform
+from log2sim.synth import raycast
+from log2sim.synth.actors import Actor, MovingScene
+from log2sim.synth.ground import (
+    GroundPlan,
+    RoadLine,
+    Stroke,
+    arrow_outline,
+    crosswalk_stripes,
+    parallel,
+    road_lines,
+    stretch,
+)
+from log2sim.synth.raycast import sweep_stamps
+from log2sim.synth.render import frame_stamps
+from log2sim.synth.scene import Road, Scene, Zebra
+
+CELL_M = 1.0
+MAX_RANGE_M = 40.0
+STEP_S = 0.5  # between instants that are looked at
+MIN_DEPTH_M = 0.5
+
+Cells = NDArray[np.int64]
+Caster = Callable[[str, int], raycast.LabeledSweep]
+
+
+def seen_ground(moving: MovingScene, cameras: Mapping[str, Camera], cast: Caster) -> dict[str, Any]:
+    """Return the cells as runs along x: `cell_m`, and rows [column of the first cell, row, number of cells].
+
+    Cell (i, j) reaches from (i, j) to (i + 1, j + 1) times `cell_m` in the map.
+    """
+    parts = [*_shown(moving, cameras), *_met(moving, cast)]
+    cells = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *parts]), axis=0)
+    cells = cells[np.lexsort((cells[:, 0], cells[:, 1]))]
+    new = np.ones(len(cells), dtype=bool)
+    new[1:] = (np.diff(cells[:, 1]) != 0) | (np.diff(cells[:, 0]) != 1)
+    first = np.flatnonzero(new)
+    count = np.diff(np.append(first, len(cells)))
+    return {"cell_m": CELL_M, "runs": np.column_stack([cells[first], count]).tolist()}
+
+
+def _every(t_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Choose records at least `STEP_S` apart."""
+    _, first = np.unique((t_ns - t_ns[:1]) // int(STEP_S * NS_PER_S), return_index=True)
+    return np.asarray(first)
+
+
+def _met(moving: MovingScene, cast: Caster) -> Iterator[Cells]:
+    """Yield cells (N, 2) that beams met."""
+    for spec in moving.scene.lidar:
+        for i in _every(raycast.sweep_stamps(spec, moving.scene)):
+            labeled = cast(spec.name, int(i))
+            on = (labeled.hit == raycast.GROUND) & (np.linalg.norm(labeled.sweep.xyz_m, axis=1) < MAX_RANGE_M)
+            stamps = np.full(1, labeled.sweep.stamp_ns) if labeled.sweep.t_ns is None else labeled.sweep.t_ns[on]
+            moments, column = np.unique(stamps, return_inverse=True)
+            map_T_lidar = moving.map_T_mount(spec.mount, moments) @ raycast.mount_T_lidar(spec)
+            xyz = labeled.sweep.xyz_m[on].astype(np.float64)
+            at = np.einsum("nij,nj->ni", map_T_lidar[column, :3, :3], xyz) + map_T_lidar[column, :3, 3]
+            yield np.unique(np.floor(at[:, :2] / CELL_M).astype(np.int64), axis=0)
+
+
+def _shown(moving: MovingScene, cameras: Mapping[str, Camera]) -> Iterator[Cells]:
+    """Yield cells (N, 2) whose middles cameras show."""
+    for spec in moving.scene.camera:
+        camera, stamps = cameras[spec.name], frame_stamps(spec, moving.scene)
+        poses = moving.map_T_mount(camera.mount, stamps) @ camera.mount_T_cam
+        for i in _every(stamps):
+            yield _in_view(moving, camera, poses[i], int(stamps[i]))
+
+
+def _in_view(moving: MovingScene, camera: Camera, map_T_cam: Array, t_ns: int) -> Cells:
+    eye = map_T_cam[:3, 3]
+    reach = np.arange(-int(MAX_RANGE_M / CELL_M), int(MAX_RANGE_M / CELL_M) + 1)
+    i, j = np.meshgrid(reach, reach)
+    cells = np.column_stack([i.ravel(), j.ravel()]) + np.floor(eye[:2] / CELL_M).astype(np.int64)
+    middle = np.column_stack([(cells + 0.5) * CELL_M, np.zeros(len(cells))])
+    p = apply(inverse(map_T_cam), middle)
+    ahead = p[:, 2] > MIN_DEPTH_M
+    uv = np.full((len(p), 2), -1.0)
+    uv[ahead] = p[ahead, :2] / p[ahead, 2:] @ camera.K[:2, :2].T + camera.K[:2, 2]
+    inside = ahead & (uv >= 0).all(1) & (uv < [camera.width_px, camera.height_px]).all(1)
+    inside &= np.linalg.norm(middle - eye, axis=1) < MAX_RANGE_M
+    cells, middle = cells[inside], middle[inside]
+    free = np.ones(len(cells), dtype=bool)
+    ray = middle - eye
+    for map_T_box, size in _boxes(moving, camera.mount, t_ns):
+        box_T_map = inverse(map_T_box)
+        start = np.tile(apply(box_T_map, eye[None]), (len(ray), 1))
+        hit = raycast.slab_distance(size, start, ray @ box_T_map[:3, :3].T)
+        free &= ~(hit < 1.0)
+    return cells[free]
+
+
+def _boxes(moving: MovingScene, mount: Any, t_ns: int) -> Iterator[tuple[Array, Array]]:
+    """Yield poses and sizes (3,) of all that hides the ground."""
+    for building in moving.scene.building:
+        size = np.array(building.size_m)
+        turn = rotation_from_rpy(0.0, 0.0, np.deg2rad(building.yaw_deg))
+        yield transform(turn, np.array([*building.center, size[2] / 2])), size
+    for actor in moving.seen_from(mount):
+        yield actor.at(moving.seconds(t_ns)).map_T_agent()[0], np.array(actor.spec.box_m)
+
+
+MIN_PIECE_M = 0.05  # of a line; less is what rounding leaves
+CIRCLE_SEGMENTS = 64  # a quarter of a circle; 1 mm off on one of 4 m
+DIGITS = 9  # whole nanometers: exact enough, and the file stays small
+TURNS = "lanes that turn in junctions are not listed"
+
+Interval = tuple[float, float]
+
+
+def map_features_of(scene: Scene) -> MapFeatures:
+    """Say what is painted on the ground of a scene, where its roads end, and which lanes they have.
+
+    Notes
+    -----
+    A line is cut where another road, a crosswalk or a stretch without markings interrupts it; a piece goes from where its
+    paint begins to where it ends. Worn lines are whole, removed ones are left out. A lane lies between the lines that are
+    painted, else between the ends of its road; it is cut where another road crosses it.
+    """
+    plan = GroundPlan.of(scene)
+    markings: list[Marking] = []
+    borders: list[RoadBorder] = []
+    lanes: list[MapLane] = []
+    for k, road in enumerate(plan.roads):
+        lines = road_lines(road, keeps_right=plan.keeps_right)
+        own = [_pieces_of(line, area_of(plan.interruptions(k)), f"line_{k}_{n}") for n, line in enumerate(lines)]
+        markings += [piece for pieces in own for piece in pieces]
+        crossed = area_of([Stroke(np.array(r.line), r.width_m) for n, r in enumerate(plan.roads) if n != k])
+        sides = _borders(road, crossed, k)
+        borders += [piece for pieces in sides for piece in pieces]
+        lanes += _Lanes.of(road, k, plan.keeps_right, tuple(zip(lines, own)), sides).cut(crossed)
+    markings += [_crosswalk(zebra, k) for k, zebra in enumerate(plan.zebras)]
+    for k, stop in enumerate(plan.stop_lines):
+        markings.append(
+            Marking(f"stop_line_{k}", "stop_line", _on_ground(np.array(stop.line)), stop.width_m, stop.color)
+        )
+    for k, arrow in enumerate(plan.arrows):
+        outline = arrow_outline(arrow)
+        turn = np.deg2rad(arrow.yaw_deg)
+        across = outline @ np.array([-np.sin(turn), np.cos(turn)])
+        markings.append(Marking(f"arrow_{k}", "other", _on_ground(outline), float(np.ptp(across)), "white"))
+    return MapFeatures(tuple(markings), tuple(borders), tuple(lanes), (TURNS,) if len(plan.roads) > 1 else ())
+
+
+def area_of(strokes: Sequence[Stroke]) -> BaseGeometry:
+    """Area of strokes as they are painted: square ends, round joints."""
+    parts = []
+    for stroke in strokes:
+        for a, b in zip(stroke.line, stroke.line[1:]):
+            if not np.array_equal(a, b):
+                parts.append(LineString([a, b]).buffer(stroke.width_m / 2, cap_style="flat"))
+        parts += [Point(p).buffer(stroke.width_m / 2, quad_segs=CIRCLE_SEGMENTS) for p in stroke.line[1:-1]]
+    return shapely.union_all(parts)
+
+
+def _left_over(line: Array, area: BaseGeometry) -> list[Interval]:
+    """Parts of a line (P, 2) outside an area, as distances along it in ascending order."""
+    whole = LineString(line)
+    return _along(whole, whole.difference(area))
+
+
+def _along(whole: LineString, part: BaseGeometry) -> list[Interval]:
+    pieces = [p for p in shapely.get_parts(part) if p.geom_type == "LineString" and p.length >= MIN_PIECE_M]
+    ends = [[float(whole.project(Point(p.coords[n]))) for n in (0, -1)] for p in pieces]
+    # Pieces that meet at a point of the line are one.
+    out: list[Interval] = []
+    for begin, end in sorted((min(e), max(e)) for e in ends):
+        if out and begin - out[-1][1] < 10**-DIGITS:
+            out[-1] = (out[-1][0], end)
+        else:
+            out.append((begin, end))
+    return out
+
+
+def _pieces_of(line: RoadLine, gaps: BaseGeometry, name: str) -> list[Marking]:
+    """Cut a line where it is interrupted."""
+    whole = LineString(line.line)
+    painted = [_along(whole, LineString(dash).difference(gaps)) for dash in line.dashes if len(dash) > 1]
+    dashes = [interval for intervals in painted for interval in intervals]
+    out: list[Marking] = []
+    for begin, end in _left_over(line.line, gaps):
+        inside = [(a, b) for a, b in dashes if a >= begin - MIN_PIECE_M and b <= end + MIN_PIECE_M]
+        if inside:
+            points = stretch(line.line, min(a for a, _ in inside), max(b for _, b in inside))
+            out.append(Marking(f"{name}_{len(out)}", line.kind, _on_ground(points), line.width_m, line.color))
+    return out
+
+
+def _borders(road: Road, crossed: BaseGeometry, k: int) -> tuple[list[RoadBorder], list[RoadBorder]]:
+    """List the ends of the road at its right and its left, as its line runs."""
+    kind = "curb" if road.sidewalk_m > 0 else "edge"
+    sides = []
+    for name, side in (("right", -1), ("left", 1)):
+        line = parallel(np.array(road.line), side * road.width_m / 2)
+        pieces = [stretch(line, *interval) for interval in _left_over(line, crossed)]
+        sides.append([RoadBorder(f"border_{k}_{name}_{n}", kind, _on_ground(p)) for n, p in enumerate(pieces)])
+    return sides[0], sides[1]
+
+
+def _crosswalk(zebra: Zebra, k: int) -> Marking:
+    stripes = crosswalk_stripes(zebra)
+    whole = LineString(np.array(zebra.line))
+    begin = whole.project(Point(stripes[0].line[0]))
+    end = whole.project(Point(stripes[-1].line[-1]))
+    middle = stretch(np.array(zebra.line), begin, end)
+    outline = np.concatenate([parallel(middle, -zebra.width_m / 2), parallel(middle, zebra.width_m / 2)[::-1]])
+    return Marking(f"crosswalk_{k}", "crosswalk", _on_ground(outline), zebra.width_m, "white")
+
+
+@dataclass(frozen=True, eq=False)
+class _Lanes:
+    """The lanes of a road from its right to its left, as its line runs.
+
+    Attributes
+    ----------
+    first_forward, last_forward : int
+        Which lanes lead along the line.
+    at_m : (L + 1,) float64
+        How far to the left of the road's line their boundaries lie.
+    sides : tuple of lists
+        Markings, or borders, of each boundary for the lane at its right and the one at its left.
+    """
+
+    road: Road
+    number: int
+    first_forward: int
+    last_forward: int
+    at_m: Array
+    sides: tuple[tuple[list[Marking] | list[RoadBorder], list[Marking] | list[RoadBorder]], ...]
+
+    @classmethod
+    def of(
+        cls,
+        road: Road,
+        number: int,
+        keeps_right: bool,
+        lines: Sequence[tuple[RoadLine, list[Marking]]],
+        borders: tuple[list[RoadBorder], list[RoadBorder]],
+    ) -> _Lanes:
+        """Find what lies at the boundaries."""
+        back = road.backward_lanes
+        first = 0 if keeps_right else back
+        at = (np.arange(road.lanes + 1) / road.lanes - 0.5) * road.width_m
+        sides: list[tuple[list[Marking] | list[RoadBorder], list[Marking] | list[RoadBorder]]] = []
+        for boundary in range(road.lanes + 1):
+            own = [(line, pieces) for line, pieces in lines if line.boundary == boundary]
+            if own:
+                offsets = [_offset(road, line) for line, _ in own]
+                at[boundary] = np.mean(offsets)
+                # Of a double line each lane has the one that is nearer.
+                sides.append((own[int(np.argmin(offsets))][1], own[int(np.argmax(offsets))][1]))
+            else:
+                border = borders[0] if boundary == 0 else borders[1] if boundary == road.lanes else []
+                sides.append((border, border))
+        return cls(road, number, first, first + road.lanes - back - 1, at, tuple(sides))
+
+    def cut(self, crossed: BaseGeometry) -> list[MapLane]:
+        """List the lanes in the directions in which they are driven, cut where other roads cross."""
+        parts = [self._parts(lane, crossed) for lane in range(self.road.lanes)]
+        out = []
+        for lane, pieces in enumerate(parts):
+            for n, piece in enumerate(pieces):
+                right, left = (parts[k][n] if self._alike(parts, lane, k) else None for k in (lane - 1, lane + 1))
+                forward = self._forward(lane)
+                beside = {"right": right, "left": left} if forward else {"right": left, "left": right}
+                numbers = {"right": lane - 1 if forward else lane + 1, "left": lane + 1 if forward else lane - 1}
+                same = {
+                    side: other.id
+                    for side, other in beside.items()
+                    if other is not None and self._forward(numbers[side]) == forward
+                }
+                opposite = [o.id for side, o in beside.items() if o is not None and side not in same]
+                out.append(
+                    replace(
+                        piece,
+                        left_lane=same.get("left"),
+                        right_lane=same.get("right"),
+                        opposite=opposite[0] if opposite else None,
+                    )
+                )
+        return out
+
+    def _alike(self, parts: list[list[MapLane]], lane: int, other: int) -> bool:
+        return 0 <= other < len(parts) and len(parts[other]) == len(parts[lane])
+
+    def _forward(self, lane: int) -> bool:
+        return self.first_forward <= lane <= self.last_forward
+
+    def _parts(self, lane: int, crossed: BaseGeometry) -> list[MapLane]:
+        """Cut a lane at other roads; the parts on them belong to junctions. In the order of the road's line."""
+        middle = parallel(np.array(self.road.line), float(self.at_m[lane : lane + 2].mean()))
+        whole = LineString(middle)
+        free = [(interval, False) for interval in _along(whole, whole.difference(crossed))]
+        parts = sorted([*free, *((interval, True) for interval in _along(whole, whole.intersection(crossed)))])
+        names = [f"lane_{self.number}_{lane}_{n}" for n in range(len(parts))]
+        forward = self._forward(lane)
+        out = []
+        for n, ((begin, end), inside) in enumerate(parts):
+            points = stretch(middle, begin, end)
+            before, after = names[max(n - 1, 0) : n], names[n + 1 : n + 2]
+            right = None if inside else _beside(points, self.sides[lane][1])
+            left = None if inside else _beside(points, self.sides[lane + 1][0])
+            out.append(
+                MapLane(
+                    id=names[n],
+                    points_m=_on_ground(points if forward else points[::-1]),
+                    width_m=np.full(len(points), float(np.diff(self.at_m)[lane])),
+                    left=left if forward else right,
+                    right=right if forward else left,
+                    predecessors=tuple(before if forward else after),
+                    successors=tuple(after if forward else before),
+                    junction=f"junction_{self.number}_{n}" if inside else None,
+                )
+            )
+        return out
+
+
+def _offset(road: Road, line: RoadLine) -> float:
+    """How far a line lies to the left of its road's line, m."""
+    a, b = np.array(road.line[:2])
+    ahead = (b - a) / np.linalg.norm(b - a)
+    return float((line.line[0] - a) @ [-ahead[1], ahead[0]])
+
+
+def _beside(points: Array, pieces: Sequence[Marking | RoadBorder]) -> str | None:
+    """Find which piece runs along most of a lane, None without one."""
+    lane = LineString(points)
+
+    def shared_m(piece: Marking | RoadBorder) -> float:
+        ends = [lane.project(Point(p)) for p in piece.points_m[[0, -1], :2]]
+        return float(abs(ends[1] - ends[0]))
+
+    best = max(pieces, key=shared_m, default=None)
+    return best.id if best is not None and shared_m(best) > 0 else None
+
+
+def _on_ground(points: Array) -> Array:
+    return np.column_stack([np.round(points, DIGITS), np.zeros(len(points))])
+
+
+MIN_UNOCCLUDED = 1 / 3
+MIN_BOX_INSIDE = 0.5
+MIN_LIDAR_POINTS = 20
+MIN_LABEL_PX = 8.0  # a smaller box is no label
+
+
+@dataclass(frozen=True, eq=False)
+class FrameVisibility:
+    """Visibility of the actors in one camera frame.
+
+    Attributes
+    ----------
+    unoccluded : (A,) float64
+        Share of the silhouette that is visible.
+    inside : (A,) float64
+        Share of the projected box inside the image.
+    box_px : (A, 4) float64, px
+        Box of the visible part; NaN without one.
+    """
+
+    t_ns: int
+    unoccluded: Array
+    inside: Array
+    box_px: Array
+
+
+def visibility_by_camera(
+    moving: MovingScene, cameras: Mapping[str, Camera], backdrop: Any
+) -> dict[str, list[FrameVisibility]]:
+    """Segment every frame of every camera."""
+    from log2sim.synth.render import Body, SceneInstant, segment
+
+    out: dict[str, list[FrameVisibility]] = {}
+    for spec in moving.scene.camera:
+        camera = cameras[spec.name]
+        out[spec.name] = []
+        for t_ns in frame_stamps(spec, moving.scene):
+            t_s = moving.seconds(t_ns)
+            map_T_cam = moving.map_T_mount(camera.mount, np.array([t_ns]))[0] @ camera.mount_T_cam
+            bodies = [Body.of(actor, t_s) for actor in moving.seen_from(spec.mount)]
+            parts = segment(camera, map_T_cam, SceneInstant(backdrop, bodies))[: len(moving.actors)]
+            unoccluded = np.array([0.0 if p is None else p.visible_px / p.silhouette_px for p in parts])
+            boxes = np.array([np.full(4, np.nan) if p is None else p.box_px for p in parts]).reshape(-1, 4)
+            inside = np.array([_box_inside(camera, inverse(map_T_cam), a, t_s) for a in moving.actors])
+            out[spec.name].append(FrameVisibility(int(t_ns), unoccluded, inside, boxes))
+    return out
+
+
+def _box_inside(camera: Camera, cam_T_map: Array, actor: Actor, t_s: float) -> float:
+    """Share of the rectangle around the projected 3D box that lies inside the image; 0 unless all corners are ahead."""
+    state = actor.at(t_s)
+    uv, _ = project(camera, apply(cam_T_map, box_corners(state.center_m, actor.spec.box_m, state.yaw_rad)[0]))
+    if not np.all(np.isfinite(uv)):
+        return 0.0
+    low, high = uv.min(0), uv.max(0)
+    size = np.array([camera.width_px, camera.height_px])
+    inside = np.clip(np.minimum(high, size) - np.maximum(low, 0), 0, None)
+    return float(inside.prod() / (high - low).prod())
+
+
+@dataclass(frozen=True, eq=False)
+class LidarVisibility:
+    """Points of one LiDAR on the actors.
+
+    Attributes
+    ----------
+    t_ns : (F,) int64
+        Middles of the sweeps.
+    points : (F, A) int
+        Points on each actor.
+    """
+
+    t_ns: NDArray[np.int64]
+    points: NDArray[np.intp]
+
+
+def visible_at(
+    t_ns: NDArray[np.int64],
+    frames: Mapping[str, Sequence[FrameVisibility]],
+    sweeps: Mapping[str, LidarVisibility],
+    count: int,
+) -> NDArray[np.bool_]:
+    """Decide which of `count` actors are visible: mask (T, A) at stamps (T,).
+
+    An actor is visible when the frame of one camera and the sweep of one LiDAR nearest in time both show it well. Without
+    cameras, or without LiDARs, the others decide.
+    """
+    by_camera = np.full((len(t_ns), count), not frames)
+    for parts in frames.values():
+        if parts:
+            shown = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in parts])
+            by_camera |= shown[_nearest(np.array([f.t_ns for f in parts]), t_ns)]
+    by_lidar = np.full_like(by_camera, not sweeps)
+    for sweep in sweeps.values():
+        if len(sweep.t_ns):
+            by_lidar |= (sweep.points >= MIN_LIDAR_POINTS)[_nearest(sweep.t_ns, t_ns)]
+    return np.asarray(by_camera & by_lidar)
+
+
+def _nearest(stamps: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.asarray(np.abs(stamps[None, :] - t_ns[:, None]).argmin(1))
+
+
+def labels_2d(
+    frames_by_camera: Mapping[str, list[FrameVisibility]], actors: tuple[Actor, ...]
+) -> dict[str, ImageLabels]:
+    """Boxes around the visible parts of agents that are at least a third unoccluded, by camera."""
+    category = np.array([a.spec.category for a in actors])
+    out = {}
+    for name, frames in frames_by_camera.items():
+        t_ns, boxes, categories = [], [], []
+        for frame in frames:
+            big = np.nan_to_num(frame.box_px[:, 2:] - frame.box_px[:, :2]).min(1) >= MIN_LABEL_PX
+            rows = np.flatnonzero((frame.unoccluded >= MIN_UNOCCLUDED) & big)
+            t_ns += [frame.t_ns] * len(rows)
+            boxes.append(frame.box_px[rows])
+            categories.append(category[rows])
+        out[name] = ImageLabels(
+            np.array(t_ns, dtype=np.int64),
+            np.concatenate(boxes).reshape(-1, 4),
+            np.concatenate(categories).astype("<U16"),
+        )
+    return out
+
+
+def labels_3d(
+    scene: Scene, frames_by_camera: Mapping[str, list[FrameVisibility]], actors: tuple[Actor, ...]
+) -> Labels | None:
+    """Boxes of all agents at the frames of the first camera, without one at the sweeps of the first LiDAR."""
+    if not actors or not (scene.camera or scene.lidar):
+        return None
+    if scene.camera:
+        t_ns = np.array([f.t_ns for f in frames_by_camera[scene.camera[0].name]], dtype=np.int64)
+    else:
+        t_ns = sweep_stamps(scene.lidar[0], scene)
+    t_s = (t_ns - scene.start_ns) / NS_PER_S
+    states = [a.at(t_s) for a in actors]
+    return Labels(
+        t_ns=np.tile(t_ns, len(actors)),
+        track_id=np.repeat([a.spec.id for a in actors], len(t_ns)),
+        category=np.repeat([a.spec.category for a in actors], len(t_ns)),
+        center_m=np.concatenate([s.center_m for s in states]),
+        size_m=np.repeat([a.spec.box_m for a in actors], len(t_ns), axis=0),
+        yaw_rad=np.concatenate([s.yaw_rad for s in states]),
+        visible=None,
+    )

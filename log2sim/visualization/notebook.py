@@ -1,0 +1,311 @@
+"""What a notebook shows of logs, scenarios and replays."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from log2sim.datatypes import EGO, Agent, Labels, Log, Scenario, Tick, Waypoints
+from log2sim.errors import RecordError
+from log2sim.files.documents import refuse_existing, replaced
+from log2sim.geometry import NS_PER_S
+from log2sim.simulation.metrics.collisions import REPLAY
+from log2sim.simulation.result import AgentReplay, Replay
+from log2sim.visualization.overlay import draw_moment, read_moment
+from log2sim.visualization.plot.drawing import draw_collisions
+from log2sim.visualization.plot.layers import new_collisions
+from log2sim.visualization.plot.scene import plot
+from log2sim.visualization.plot.style import PAPER
+
+WIDTH_IN, HEIGHT_IN, DPI = 5.2, 3.6, 100
+MAX_CAMERAS = 6
+FRAME_WIDTH_PX, JPEG_QUALITY = 236, 80
+ABOVE_PX, ABOVE_REACH_M = 236, 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A small picture.
+
+    Attributes
+    ----------
+    media_type : str
+        "image/png" or "image/jpeg".
+    """
+
+    media_type: str
+    data: bytes
+    caption: str = ""
+
+
+def thumbnails_of_log(log: Log) -> list[Thumbnail]:
+    """Take the frame in the middle of each camera, without cameras a sweep from above; frames that cannot be read are left out."""
+    found = []
+    for name in list(log.cameras)[:MAX_CAMERAS]:
+        image = _middle_record(log, name)
+        if image is not None:
+            height = max(1, round(FRAME_WIDTH_PX * image.shape[0] / image.shape[1]))
+            small = cv2.resize(image, (FRAME_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+            found.append(_jpeg(small, name))
+    if not log.cameras and log.lidars:
+        name = next(iter(log.lidars))
+        sweep = _middle_record(log, name)
+        if sweep is not None:
+            found.append(_jpeg(_from_above(sweep.xyz_m), f"{name}, from above"))
+    return found
+
+
+def thumbnail_of_scenario(scenario: Scenario) -> list[Thumbnail]:
+    """Draw the tracks from above."""
+    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    ax = figure.add_axes((0.005, 0.005, 0.99, 0.99))
+    plot(scenario, ax)
+    ax.set(xlabel="", ylabel="")
+    ax.tick_params(length=0, labelbottom=False, labelleft=False)
+    return [_png(figure)]
+
+
+def thumbnail_of_replay(replay: Replay) -> list[Thumbnail]:
+    """Draw the paths that were driven from above, with the collisions of the replay."""
+    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    ax = figure.add_axes((0.005, 0.005, 0.99, 0.99))
+    agents = tuple(_as_agent(a) for a in replay.agents if len(a))
+    end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
+    plot(Scenario(replay.scenario, 0, end_s, agents), ax)
+    draw_collisions(ax, new_collisions(replay)[1])
+    ax.set(xlabel="", ylabel="")
+    ax.tick_params(length=0, labelbottom=False, labelleft=False)
+    return [_png(figure)]
+
+
+def _as_agent(driven: AgentReplay) -> Agent:
+    waypoints = Waypoints(
+        driven.t_s, driven.x_m, driven.y_m, driven.z_m, driven.yaw_rad, driven.speed_mps,
+        observed=np.ones(len(driven), dtype=bool), sigma_xy_m=np.zeros(len(driven)),
+    )  # fmt: skip
+    return Agent(driven.id, driven.category, driven.size_m, waypoints, static=driven.driver == "static")
+
+
+def _middle_record(log: Log, name: str) -> Any:
+    stream = log.streams[name]
+    try:
+        return stream.read(len(stream.t_ns) // 2) if len(stream.t_ns) else None
+    except RecordError:
+        return None
+
+
+def _from_above(xyz_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Draw points around the sensor as a gray picture, x up as a LiDAR looks ahead."""
+    limits = [(-ABOVE_REACH_M, ABOVE_REACH_M)] * 2
+    count, _, _ = np.histogram2d(xyz_m[:, 0], xyz_m[:, 1], bins=ABOVE_PX, range=limits)
+    shade = 255 * (1 - np.minimum(np.sqrt(count[::-1, ::-1]) / 4, 1))
+    return np.ascontiguousarray(shade.astype(np.uint8))
+
+
+def _jpeg(image: NDArray[np.uint8], caption: str) -> Thumbnail:
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return Thumbnail("image/jpeg", data.tobytes(), caption)
+
+
+def _png(figure: Figure) -> Thumbnail:
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
+    return Thumbnail("image/png", data.getvalue())
+
+
+MAX_TEXT = 200
+"""Letters of a name or a note that are shown."""
+
+MAX_SENSORS = 12
+Row = tuple[str, str]
+
+
+def html_of(value: Log | Scenario | Replay) -> str:
+    """Return the HTML of a value; its text is escaped, and without a picture where that cannot be drawn."""
+    rows: list[Row]
+    draw: Callable[[], list[Thumbnail]]
+    if isinstance(value, Log):
+        rows, draw = _rows_of_log(value), partial(thumbnails_of_log, value)
+    elif isinstance(value, Scenario):
+        rows, draw = _rows_of_scenario(value), partial(thumbnail_of_scenario, value)
+    else:
+        rows, draw = _rows_of_replay(value), partial(thumbnail_of_replay, value)
+    try:
+        drawn = draw()
+    except Exception:  # a picture that cannot be drawn must not hide the rest
+        drawn = []
+    return _page(repr(value), rows, drawn)
+
+
+def _rows_of_log(log: Log) -> list[Row]:
+    kinds = [*((n, "camera") for n in log.cameras), *((n, "LiDAR") for n in log.lidars)]
+    rows = []
+    for name, kind in kinds[:MAX_SENSORS]:
+        t_ns = log.streams[name].t_ns
+        span_s = float(t_ns[-1] - t_ns[0]) / NS_PER_S if len(t_ns) else 0.0
+        rate = f" at {(len(t_ns) - 1) / span_s:.1f} Hz" if span_s > 0 else ""
+        size = f", {log.cameras[name].width_px} x {log.cameras[name].height_px} px" if kind == "camera" else ""
+        rows.append((name, f"{kind}{size}, {_count(len(t_ns), 'record')}{rate}"))
+    if len(kinds) > MAX_SENSORS:
+        rows.append(("", f"and {_count(len(kinds) - MAX_SENSORS, 'more sensor')}"))
+    poses = "no poses" if log.ego is None else _count(len(log.ego.t_ns), "pose")
+    return [*rows, ("ego", poses)]
+
+
+def _rows_of_scenario(scenario: Scenario) -> list[Row]:
+    rows = [("agents", _by_category(a.category for a in scenario.others))]
+    if scenario.doubtful:
+        rows.append(("doubtful", ", ".join(a.id for a in scenario.doubtful)))
+    features = scenario.map_features
+    found = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
+    found.append((len(scenario.signals), "traffic light"))
+    if any(count for count, _ in found):
+        rows.append(("road", ", ".join(_count(count, noun) for count, noun in found if count)))
+    if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
+        rows.append(("origin", f"{scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°"))
+    return rows
+
+
+def _rows_of_replay(replay: Replay) -> list[Row]:
+    events = [e for e in replay.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
+    models = Counter(a.model for a in replay.agents if a.model != "none")
+    rows = [
+        ("agents", _by_category(a.category for a in replay.agents if a.id != EGO)),
+        ("models", ", ".join(f"{name} {count}" for name, count in models.most_common()) or "none"),
+        ("collisions", "; ".join(f"{' and '.join(e['agents'])} at {e['t_s']:.2f} s" for e in events) or "none"),
+    ]
+    if replay.metrics.get("cross_track_rms_m") is not None:
+        rows.append(("beside the path", f"{replay.metrics['cross_track_rms_m']:.3f} m rms"))
+    return rows
+
+
+def _page(title: str, rows: Iterable[Row], pictures: Iterable[Thumbnail]) -> str:
+    cell = 'style="text-align:left;padding:1px 12px 1px 0;vertical-align:top'
+    table = "".join(
+        f'<tr><td {cell};opacity:0.65">{_text(name)}</td><td {cell}">{_text(value)}</td></tr>' for name, value in rows
+    )
+    shown = "".join(_figure(picture) for picture in pictures)
+    return (
+        f'<div style="max-width:760px"><div><code>{_text(title)}</code></div>'
+        f'<table style="border-collapse:collapse;margin:4px 0">{table}</table>'
+        f'<div style="display:flex;flex-wrap:wrap;gap:8px">{shown}</div></div>'
+    )
+
+
+def _figure(picture: Thumbnail) -> str:
+    data = base64.b64encode(picture.data).decode("ascii")
+    caption = f'<figcaption style="font-size:85%;opacity:0.65">{_text(picture.caption)}</figcaption>'
+    name = escape(picture.caption or "picture", quote=True)
+    image = f'<img alt="{name}" src="data:{picture.media_type};base64,{data}" style="max-width:100%;height:auto">'
+    return f'<figure style="margin:0">{image}{caption * bool(picture.caption)}</figure>'
+
+
+def _text(text: str) -> str:
+    return escape(text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 1]}…", quote=True)
+
+
+def _by_category(categories: Iterable[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in Counter(categories).most_common()) or "none"
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+SHOWN_DPI, SAVED_DPI = 100, 150
+AROUND_S = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])
+"""Times around a tick at which agents are looked up: pictures of a tick are not of one time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture that a notebook shows.
+
+    Attributes
+    ----------
+    figure : matplotlib.figure.Figure
+    """
+
+    figure: Figure
+    title: str
+
+    def __repr__(self) -> str:
+        """Return what it shows, and how to keep it."""
+        return f"<Picture of {self.title}; save it by .save('FILE.png')>"
+
+    def _repr_png_(self) -> bytes:
+        """Return the picture as a notebook shows it."""
+        data = io.BytesIO()
+        self.figure.savefig(data, format="png", dpi=SHOWN_DPI)
+        return data.getvalue()
+
+    def save(self, path: Path | str, *, overwrite: bool = False) -> None:
+        """Write the picture, in the format of the file's name.
+
+        Raises
+        ------
+        ConfigError
+            When the file exists and `overwrite` is False, or it cannot be written.
+        """
+        refuse_existing(path, overwrite=overwrite)
+        with replaced(path) as temporary:
+            self.figure.savefig(temporary, dpi=SAVED_DPI)
+
+
+def show_log(
+    log: Log,
+    when: float | Tick | None = None,
+    *,
+    camera: str | Sequence[str] = (),
+    scenario: Scenario | None = None,
+) -> Picture:
+    """Draw one moment of a log, as `Log.show` does; see there."""
+    cameras = (camera,) if isinstance(camera, str) else tuple(camera)
+    at_s, t_ns = (None, when.t_ns) if isinstance(when, Tick) else (when, None)
+    boxes = None if scenario is None else (lambda stamp_ns: labels_of(scenario, log, stamp_ns))
+    moment = read_moment(log, cameras, at_s, t_ns=t_ns, labels=boxes)
+    figure = draw_moment(moment, box_name="3D label" if scenario is None else "agent")
+    return Picture(figure, f"{log.name!r:.80} at {moment.at_s:.3f} s")
+
+
+def labels_of(scenario: Scenario, log: Log, t_ns: int) -> Labels:
+    """Return the agents but for the ego around a stamp as labels in the map frame of a log."""
+    shift = np.array(scenario.map.offset_m) - np.array(log.map.offset_m)
+    t_s = (t_ns - scenario.t0_ns) / NS_PER_S + AROUND_S
+    stamps = t_ns + np.round(AROUND_S * NS_PER_S).astype(np.int64)
+    rows: list[tuple[np.ndarray, str, str, np.ndarray, np.ndarray, np.ndarray]] = []
+    for agent in scenario.agents:
+        if agent.id == EGO:
+            continue
+        if agent.is_permanent:
+            states = agent.at(np.full(len(t_s), agent.waypoints.t_s[0]))
+        else:
+            states = agent.at(t_s)
+        there = states.valid
+        center = np.column_stack([states.x_m, states.y_m, states.z_m])[there] + shift
+        size = np.tile(np.array(agent.size_m, dtype=np.float64), (len(center), 1))
+        rows.append((stamps[there], agent.id, agent.category, center, size, states.yaw_rad[there]))
+    count = [len(row[0]) for row in rows]
+    return Labels(
+        t_ns=np.concatenate([np.zeros(0, np.int64), *(row[0] for row in rows)]),
+        track_id=np.repeat(np.array([row[1] for row in rows], dtype=np.str_), count),
+        category=np.repeat(np.array([row[2] for row in rows], dtype=np.str_), count),
+        center_m=np.concatenate([np.zeros((0, 3)), *(row[3] for row in rows)]),
+        size_m=np.concatenate([np.zeros((0, 3)), *(row[4] for row in rows)]),
+        yaw_rad=np.concatenate([np.zeros(0), *(row[5] for row in rows)]),
+    )

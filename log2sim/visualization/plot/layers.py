@@ -1,0 +1,553 @@
+"""What a picture shows besides agents: lanes, doubts, predictions, warnings, collisions, observers."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Wedge
+
+from log2sim.datatypes import (
+    ENDS,
+    MIN_TRUSTED_CONFIDENCE,
+    STANDSTILL_MPS,
+    Agent,
+    MapLane,
+    Marking,
+    Scenario,
+    Signal,
+    Span,
+    why_doubtful,
+)
+from log2sim.geometry import Array
+from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
+from log2sim.simulation.expected_motion import ends_of
+from log2sim.simulation.metrics.collisions import REPLAY
+from log2sim.visualization.plot import viewport
+from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, Background
+from log2sim.visualization.plot.selection import NO_OPTIONS, PlotOptions, TimeRange
+from log2sim.visualization.plot.style import (
+    BORDER_COLOR,
+    END_COLOR,
+    FONT,
+    LANE_ARROW,
+    LANE_FACE,
+    MARKING_COLOR,
+    MUTED,
+    PAPER,
+    PARKED_FACE,
+    SENSOR_COLOR,
+    SIGNAL_COLOR,
+    WARNING,
+    halo,
+    printable,
+)
+from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy
+
+STEP_S = 0.1
+"""Between the points of a line: ends observe at the rate of their LiDARs."""
+
+WIDTH_PT, BESIDE_PT = 1.3, 3.4
+"""Width of a line, and how far to the right of the track it is."""
+
+
+def tells_ends(scenario: Scenario) -> bool:
+    """Whether both ends of a cooperative log observed somebody, so that there is something to distinguish."""
+    return len(ends_of(scenario)) > 1
+
+
+def draw_observers(ax: Axes, roles: AgentRoles, view: Viewport) -> None:
+    """Draw a line beside the tracks of movers where one end alone observed them."""
+    aside_m = BESIDE_PT * view.m_per_pt
+    for end in ENDS:
+        lines = [line for role in roles.movers for line in lines_of(role.agent, end, aside_m)]
+        artist = LineCollection(lines, colors=END_COLOR[end], linewidths=WIDTH_PT, capstyle="butt", zorder=TRACK - 0.2)
+        ax.add_collection(artist, autolim=False)
+
+
+def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
+    """Return lines (K, 2), m, map frame, along which an end alone observed an agent; `aside_m` to its right."""
+    w, others = agent.waypoints, [e for e in ENDS if e != end]
+    if not agent.observed_by.get(end) or len(w) < 2:
+        return []
+    t_s = np.arange(w.t_s[0], w.t_s[-1] + STEP_S / 2, STEP_S)
+    alone = _within(t_s, agent.observed_by[end])
+    for other in others:
+        alone &= ~_within(t_s, agent.observed_by.get(other, ()))
+    states = agent.trajectory.at(t_s)
+    right = states.yaw_rad - np.pi / 2
+    points = np.column_stack([states.x_m + aside_m * np.cos(right), states.y_m + aside_m * np.sin(right)])
+    runs = np.split(np.arange(len(t_s)), np.flatnonzero(np.diff(alone)) + 1)
+    return [points[run] for run in runs if alone[run[0]] and len(run) > 1]
+
+
+def observer_rows() -> list[tuple[Line2D, str]]:
+    """Return the lines of the legend."""
+    return [(Line2D([0, 1], [0, 1], color=END_COLOR[e], lw=WIDTH_PT), f"observed by the {e} alone") for e in ENDS]
+
+
+def _within(t_s: Array, spans: tuple[Span, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    return np.asarray(np.any([(t_s >= a - 1e-6) & (t_s <= b + 1e-6) for a, b in spans] or [t_s < -np.inf], axis=0))
+
+
+LINE: dict[str, Any] = {"color": WARNING, "lw": 1.2, "ls": (0, (4.0, 2.5)), "marker": "o", "ms": 3.5, "mfc": "none"}
+
+TEXT_PT = -9.0
+"""How far above the middle of the line its text is."""
+
+
+class WarnedPlace(NamedTuple):
+    """A warning to draw.
+
+    Attributes
+    ----------
+    ends_m : (2, 2) float64, m
+        Centers of the warned vehicle and of the agent.
+    """
+
+    ends_m: Array
+    text: str
+
+
+def warned_places(replay: Any) -> list[WarnedPlace]:
+    """Find where the warned vehicle and the others are in a replay when they are first warned of."""
+    if replay is None or replay.warnings is None:
+        return []
+    places = []
+    for w in replay.warnings.events:
+        if w.warned is not None:
+            pair = [replay.agent(id) for id in (w.driver, w.agent)]
+            ends = [[float(np.interp(w.warned.t_s, a.t_s, c)) for c in (a.x_m, a.y_m)] for a in pair]
+            places.append(WarnedPlace(np.array(ends), f"{w.warned.t_s:.1f} s: {w.warned.distance_m:.1f} m"))
+    return places
+
+
+def draw_warnings(ax: Axes, places: list[WarnedPlace]) -> None:
+    """Draw a line from the warned vehicle to the agent for each warning, with the time and the distance."""
+    for place in places:
+        ax.plot(*place.ends_m.T, zorder=LABEL - 0.2, **LINE)
+        ax.annotate(
+            place.text, place.ends_m.mean(axis=0), (0.0, TEXT_PT), textcoords="offset points", color=WARNING, fontsize=6.5,
+            fontweight="bold", family=FONT, ha="center", va="center", path_effects=halo(), zorder=LABEL, parse_math=False,
+            annotation_clip=True,
+        )  # fmt: skip
+
+
+def warning_row() -> tuple[Line2D, str]:
+    """Return the line of the legend."""
+    return Line2D([0, 1], [0, 1], **LINE), "warning: when, and how far apart"
+
+
+def new_collisions(replay: Any) -> tuple[Array, Array]:
+    """Find the collisions of a replay that its scenario does not have.
+
+    Returns
+    -------
+    t_s : (K,) float64
+        When each begins.
+    xy_m : (K, 2) float64
+        Midpoints between the centers of both boxes, map frame.
+    """
+    if replay is None:
+        return np.zeros(0), np.zeros((0, 2))
+    events = [e for e in replay.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
+    agents = {a.id: a for a in replay.agents}
+    places = [
+        np.mean(
+            [[np.interp(e["t_s"], agents[k].t_s, c) for c in (agents[k].x_m, agents[k].y_m)] for k in e["agents"]],
+            axis=0,
+        )
+        for e in events
+    ]
+    return np.array([e["t_s"] for e in events], dtype=np.float64), np.array(places, dtype=np.float64).reshape(-1, 2)
+
+
+DOTS: dict[str, Any] = {"linestyles": [(0, (1.0, 1.3))], "linewidths": 1.3}
+ELLIPSE_ALPHA, ELLIPSE_EDGE_ALPHA = 0.14, 0.6
+_CIRCLE = np.exp(2j * np.pi * np.arange(36) / 36)
+
+
+class Expected(NamedTuple):
+    """A prediction to draw.
+
+    Attributes
+    ----------
+    path_m : (H + 1, 2) float64, m
+        From where the agent is to where it is expected to be.
+    ellipse_m : (V, 2) float64, m
+        One standard deviation about the end.
+    """
+
+    path_m: Array
+    ellipse_m: Array
+
+
+class PredictedPaths:
+    """Predictions of the agents of a scenario, to be drawn at times."""
+
+    def __init__(self, scenario: Scenario, horizon_s: float) -> None:
+        self.horizon_s = horizon_s
+        self._found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
+        self._rows = {a.id: self._found.rows_of(a.id) for a in scenario.agents}
+
+    def at(self, agent: str, t_s: float) -> Expected | None:
+        """Return what was expected of an agent at the last tick up to a time; None when it is absent or stands."""
+        found, rows = self._found, self._rows[agent]
+        table, ticks = found.table, found.tick[rows]
+        k = int(np.searchsorted(table.t_s[ticks], t_s + 1e-6, side="right")) - 1
+        if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s or self._stands(rows[k]):
+            return None
+        forecast, row = found.forecasts[DEFAULT_METHOD], rows[k]
+        path = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
+        along, across = forecast.sigma_m[row, -1]
+        rim = path[-1] + forecast.course[row, -1] * (along * _CIRCLE.real + 1j * across * _CIRCLE.imag)
+        return Expected(*(np.column_stack([z.real, z.imag]) for z in (path, rim)))
+
+    def times_of(self, agent: str) -> Array:
+        """Choose the times (K,), s, at which a still picture shows what was expected of an agent.
+
+        Every `horizon_s`, so that they follow each other, and at its last tick, after which nothing else is drawn.
+        """
+        found, rows = self._found, self._rows[agent]
+        t = found.table.t_s[found.tick[rows]]
+        if len(t) < 2:
+            return t[:0]
+        regular = (
+            np.arange(np.ceil(t[0] / self.horizon_s + 1e-6), np.floor(t[-1] / self.horizon_s) + 1) * self.horizon_s
+        )
+        return np.append(regular[regular < t[-1] - self.horizon_s / 3], t[-1])
+
+    def _stands(self, row: int) -> bool:
+        found = self._found
+        return bool(abs(found.table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS)
+
+
+def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None:
+    """Draw what was expected of the leading movers at several times, as dotted lines with an ellipse at the end."""
+    shown = [
+        (role, expected)
+        for role in roles.movers
+        if role.leading
+        for t in paths.times_of(role.agent.id)
+        if role.agent.waypoints.t_s[0] <= t <= role.agent.waypoints.t_s[-1]
+        if (expected := paths.at(role.agent.id, float(t))) is not None
+    ]
+    for artist in (
+        LineCollection([], zorder=MARK + 0.2, **DOTS),
+        PolyCollection([], linewidths=0.7, zorder=TRACK - 0.4),
+    ):
+        show_expected(artist, shown)
+        ax.add_collection(artist, autolim=False)
+
+
+def show_expected(artist: LineCollection | PolyCollection, shown: list[tuple[AgentRole, Expected]]) -> None:
+    """Set the paths of a line collection or the ellipses of a polygon collection, in the colors of the agents."""
+    colors = [role.color for role, _ in shown]
+    if isinstance(artist, LineCollection):
+        artist.set_segments([expected.path_m for _, expected in shown])
+        artist.set_color([to_rgba(color) for color in colors])
+        return
+    artist.set_verts([expected.ellipse_m for _, expected in shown])
+    artist.set_facecolor([to_rgba(color, ELLIPSE_ALPHA) for color in colors])
+    artist.set_edgecolor([to_rgba(color, ELLIPSE_EDGE_ALPHA) for color in colors])
+
+
+def prediction_row(horizon_s: float) -> tuple[Line2D, str]:
+    """Return the line of the legend."""
+    handle = Line2D([0, 1], [0, 1], color=MUTED, lw=1.3, ls=(0, (1.0, 1.3)))
+    return handle, f"predicted for {horizon_s:g} s, 1 sigma"
+
+
+@dataclass(frozen=True, eq=False)
+class Overlays:
+    """What a picture shows besides the scenario, and the options that concern how.
+
+    Attributes
+    ----------
+    replay : log2sim.simulation.result.Replay or None
+        Drawn over the scenario, with charts below the map.
+    truth : Scenario or None
+        In the time and map of the scenario.
+    background : BirdsEyeView or None
+        A picture of the ground, drawn below everything.
+    title : str or None
+        None for the name of the scenario.
+    span : Span or None
+        Range of time that is shown; None for the whole scenario.
+    """
+
+    replay: Any = None
+    truth: Scenario | None = None
+    background: Background | None = None
+    predicted: PredictedPaths | None = None
+    title: str | None = None
+    span: TimeRange | None = None
+    options: PlotOptions = NO_OPTIONS
+
+    def span_of(self, scenario: Scenario) -> TimeRange:
+        """Return the range of time that is shown."""
+        return self.span or TimeRange(0.0, scenario.duration_s)
+
+
+NO_OVERLAYS = Overlays()
+
+
+MAX_NAMED = 5
+"""Doubtful agents whose reasons are in the legend."""
+
+LINE_LETTERS, MAX_LINES = 34, 3
+"""Letters that fit into a line of the legend, and lines of one reason."""
+
+MIN_SHOWN_S = 0.5
+"""A doubt about less time is shown for as much, so that it can be seen."""
+
+"""Spacing at which the doubtful part of a track is followed."""
+
+STRIPES_PT, STRIPE_PT = 3.0, 0.9
+"""Spacing and width of the stripes in boxes."""
+
+
+def shown_spans(agent: Agent) -> list[tuple[float, float]]:
+    """List the spans of time in which an agent is shown as doubtful, s; infinite for its whole life."""
+    if agent.confidence < MIN_TRUSTED_CONFIDENCE:
+        return [(-np.inf, np.inf)]
+    spans = []
+    for doubt in agent.doubts:
+        start = -np.inf if doubt.start_s is None else doubt.start_s
+        end = np.inf if doubt.end_s is None else doubt.end_s
+        more = max(MIN_SHOWN_S - (end - start), 0.0) / 2
+        spans.append((start - more, end + more))
+    return spans
+
+
+def is_doubted_at(agent: Agent, t_s: float) -> bool:
+    """Tell whether an agent is shown as doubtful at a time."""
+    return any(start <= t_s <= end for start, end in shown_spans(agent))
+
+
+def hatch_stationary(ax: Axes, roles: AgentRoles, view: Viewport, z: float) -> None:
+    """Hatch the boxes of doubtful stationary agents, whenever the doubt holds."""
+    for agent in roles.stationary:
+        if agent.is_doubtful:
+            _hatch(ax, agent, len(agent.waypoints) // 2, view, stripe=MUTED, edge=MUTED, z=z)
+
+
+def hatch_movers(ax: Axes, roles: AgentRoles, view: Viewport, z_track: float, z_box: float) -> None:
+    """Stripe the tracks of movers where they are doubtful, and hatch their last boxes if they are so at the end."""
+    tracks: list[Array] = []
+    for role in roles.movers:
+        tracks += doubtful_parts(role.agent)
+        if is_doubted_at(role.agent, float(role.agent.waypoints.t_s[-1])):
+            _hatch(ax, role.agent, -1, view, stripe=PAPER, edge=role.color, z=z_box)
+    dashes: dict[str, Any] = {"linestyles": [(0, (1.1, 1.4))], "linewidths": 1.3, "colors": PAPER, "zorder": z_track}
+    ax.add_collection(LineCollection(tracks, **dashes), autolim=False)
+
+
+def box_stripes(agent: Agent, xy_m: Array, yaw_rad: float, view: Viewport) -> list[Array]:
+    """Compute the stripes, each (2, 2), that hatch the box of an agent at a pose."""
+    return list(viewport.stripes(viewport.footprints(agent, xy_m, yaw_rad)[0], STRIPES_PT * view.m_per_pt))
+
+
+def doubtful_parts(agent: Agent) -> Iterator[Array]:
+    """Yield the parts of a track (K, 2) that are shown as doubtful."""
+    w = agent.waypoints
+    for start, end in shown_spans(agent):
+        first, last = max(start, float(w.t_s[0])), min(end, float(w.t_s[-1]))
+        if last > first:
+            at = agent.at(np.linspace(first, last, max(int((last - first) / STEP_S), 1) + 1))
+            yield np.column_stack([at.x_m, at.y_m])
+
+
+def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[Any, str]]:
+    """List handles and texts of the legend: a line for each of the first doubtful agents but the `told` ones, with the reason."""
+    doubtful = [(r.agent, r.color) for r in roles.movers if r.agent.is_doubtful]
+    doubtful += [(a, PARKED_FACE) for a in roles.stationary if a.is_doubtful and a.id not in told]
+    doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
+    rows: list[tuple[Any, str]] = []
+    for agent, color in doubtful[:MAX_NAMED]:
+        rows.append((_hatched_patch(color), _wrapped(f"{agent.id} is doubtful: {why_doubtful(agent)}")))
+    if len(doubtful) > MAX_NAMED:
+        rows.append((Patch(fc="none", ec="none"), f"and {len(doubtful) - MAX_NAMED} more doubtful"))
+    if not doubtful and any(a.is_doubtful for a in roles.stationary):
+        rows.append((_hatched_patch(PARKED_FACE), "doubtful"))
+    return rows
+
+
+def _hatched_patch(color: str) -> Patch:
+    return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
+
+
+def _wrapped(text: str) -> str:
+    whole = printable(text, LINE_LETTERS * MAX_LINES)
+    return "\n".join(textwrap.wrap(whole, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …"))
+
+
+def _hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
+    """Draw stripes and outline of the box at waypoint `k`."""
+    xy_m, yaw_rad = centers_xy(agent)[k], float(agent.waypoints.yaw_rad[k])
+    lines = LineCollection(box_stripes(agent, xy_m, yaw_rad, view), colors=stripe, linewidths=STRIPE_PT, zorder=z)
+    outline = list(viewport.footprints(agent, xy_m, yaw_rad))
+    ax.add_collection(lines, autolim=False)
+    ax.add_collection(
+        PolyCollection(outline, facecolors="none", edgecolors=edge, linewidths=0.9, zorder=z), autolim=False
+    )
+
+
+LANES, LINES = BACKGROUND + 0.2, BACKGROUND + 0.4
+"""z-order: above a picture of the ground, below what stands."""
+
+MIN_LINE_PT, BORDER_PT = 0.9, 0.8
+DASHES = (0, (4.0, 3.0))
+ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)
+"""Arrows along lanes: distance from one to the next, length and half width."""
+
+
+def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: bool) -> None:
+    """Draw the map features of a scenario; the faces of lanes not over a picture of the ground, which they would hide."""
+    draw_sensors(ax, scenario.sensors)
+    features = scenario.map_features
+    if features is None:
+        return
+    if not over_picture:
+        faces = [lane_outline(lane) for lane in features.lanes]
+        ax.add_collection(PolyCollection(faces, facecolors=LANE_FACE, edgecolors="none", zorder=LANES), autolim=False)
+    arrows = [arrow for lane in features.lanes for arrow in lane_arrows(lane)]
+    ax.add_collection(PolyCollection(arrows, facecolors=LANE_ARROW, zorder=LANES + 0.1), autolim=False)
+    borders = [border.points_m[:, :2] for border in features.borders]
+    ax.add_collection(
+        LineCollection(borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1), autolim=False
+    )
+    _draw_markings(ax, features.markings, view)
+
+
+def draw_sensors(ax: Axes, sensors: Sequence[Mapping[str, Any]]) -> None:
+    """Draw sensors that are fixed in the map with their fields of view."""
+    for sensor in sensors:
+        half = min(np.rad2deg(sensor["fov_rad"]) / 2, 180.0)
+        yaw, place = np.rad2deg(sensor["yaw_rad"]), (sensor["x_m"], sensor["y_m"])
+        wedge = Wedge(
+            place, sensor["range_m"], yaw - half, yaw + half, fc=SENSOR_COLOR, ec=SENSOR_COLOR, alpha=0.05, lw=0.8
+        )
+        wedge.set_zorder(LANES - 0.2)
+        ax.add_artist(wedge)
+        ax.plot(
+            *place,
+            marker="^",
+            ms=7,
+            mfc=SENSOR_COLOR,
+            mec=PAPER,
+            mew=0.8,
+            ls="none",
+            zorder=LINES + 3,
+            scalex=False,
+            scaley=False,
+        )
+
+
+def _draw_markings(ax: Axes, markings: Sequence[Marking], view: Viewport) -> None:
+    """Draw lines along their middle, dashed ones with dashes, and outlines of crosswalks and symbols; doubtful ones are pale."""
+    areas = [m for m in markings if m.kind in ("crosswalk", "other")]
+    ax.add_collection(
+        PolyCollection(
+            [m.points_m[:, :2] for m in areas],
+            facecolors=[_shade(m, 0.25) for m in areas],
+            edgecolors=[_shade(m, 0.9) for m in areas],
+            linewidths=0.6,
+            hatch="////",
+            zorder=LINES,
+        ),
+        autolim=False,
+    )
+    for dashed in (False, True):
+        lines = [m for m in markings if m not in areas and (m.kind == "dashed") is dashed]
+        widths = [max(m.width_m / view.m_per_pt, MIN_LINE_PT) for m in lines]
+        style: dict[str, Any] = {"linestyles": [DASHES]} if dashed else {"capstyle": "butt"}
+        points, colors = [m.points_m[:, :2] for m in lines], [_shade(m, 1.0) for m in lines]
+        ax.add_collection(
+            LineCollection(points, colors=colors, linewidths=widths, zorder=LINES, **style), autolim=False
+        )
+
+
+def draw_signals(ax: Axes, signals: Sequence[Signal], t_s: float) -> None:
+    """Draw traffic lights in the color of their state at a time, s."""
+    for signal in signals:
+        color = SIGNAL_COLOR[str(signal.at(t_s)[0])]
+        ax.plot(*signal.position_m[:2], "o", ms=5.0, mfc=color, mec=PAPER, mew=0.9, zorder=LABEL - 0.3)
+
+
+class SignalLights:
+    """Traffic lights of an animation, each in the color of its state at the time that is shown."""
+
+    def __init__(self, ax: Axes, signals: Sequence[Signal]) -> None:
+        self._ax, self._signals = ax, signals
+        style: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 5.0, "mec": PAPER, "mew": 0.9, "animated": True}
+        self._marks = [ax.plot(*signal.position_m[:2], zorder=LABEL - 0.3, **style)[0] for signal in signals]
+
+    def show(self, t_s: float) -> None:
+        """Draw the states at a time, s."""
+        for signal, mark in zip(self._signals, self._marks):
+            mark.set_markerfacecolor(SIGNAL_COLOR[str(signal.at(t_s)[0])])
+            self._ax.draw_artist(mark)
+
+
+def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
+    """Return the lines of the legend for what there is."""
+    features = scenario.map_features
+    rows: list[tuple[Any, str]] = []
+    if features is not None:
+        if features.lanes:
+            inferred = sum(lane.inferred_from == "paths" for lane in features.lanes)
+            text = f"{len(features.lanes)} lanes" + (f", {inferred} from paths alone" if inferred else "")
+            rows.append((Patch(fc=LANE_FACE, ec="none"), text))
+        if features.markings:
+            rows.append((Line2D([0, 1], [0, 1], color=MARKING_COLOR["white"], lw=1.3), "marking on the ground"))
+        if any(m.color == "yellow" for m in features.markings):
+            rows.append((Line2D([0, 1], [0, 1], color=MARKING_COLOR["yellow"], lw=1.3), "yellow marking"))
+        if features.borders:
+            rows.append((Line2D([0, 1], [0, 1], color=BORDER_COLOR, lw=BORDER_PT), "border of a road"))
+    if scenario.sensors:
+        marker: dict[str, Any] = {"marker": "^", "ms": 6.0, "mfc": SENSOR_COLOR, "mec": PAPER, "ls": "none"}
+        rows.append((Line2D([], [], **marker), "sensor at the road, its field of view"))
+    if scenario.signals:
+        style: dict[str, Any] = {"marker": "o", "ms": 5.0, "mfc": SIGNAL_COLOR["red"], "mec": PAPER, "ls": "none"}
+        rows.append((Line2D([], [], **style), "traffic light"))
+    return rows
+
+
+def lane_outline(lane: MapLane) -> Array:
+    """Return the outline (2 N, 2) of a lane, m, map frame."""
+    xy = lane.points_m[:, :2]
+    along = np.gradient(xy, axis=0)
+    along /= np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    aside = np.stack([-along[:, 1], along[:, 0]], axis=1) * lane.width_m[:, None] / 2
+    return np.concatenate([xy + aside, (xy - aside)[::-1]])
+
+
+def lane_arrows(lane: MapLane) -> list[Array]:
+    """Return triangles (3, 2), m, along the middle of a lane that show its direction."""
+    xy = lane.points_m[:, :2]
+    traveled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    count = max(int(traveled[-1] // ARROW_EVERY_M), 1)
+    if traveled[-1] < 2 * ARROW_M[0]:
+        return []
+    arrows = []
+    for s in (np.arange(count) + 0.5) * traveled[-1] / count:
+        tip, tail = (
+            np.array([np.interp(s + d, traveled, column) for column in xy.T]) for d in (ARROW_M[0] / 2, -ARROW_M[0] / 2)
+        )
+        ahead = tip - tail
+        left = np.array([-ahead[1], ahead[0]]) / max(float(np.hypot(*ahead)), 1e-9) * ARROW_M[1]
+        arrows.append(np.array([tip, tail + left, tail - left]))
+    return arrows
+
+
+def _shade(marking: Marking, alpha: float) -> tuple[float, float, float, float]:
+    doubtful = marking.confidence < MIN_TRUSTED_CONFIDENCE
+    return to_rgba(MARKING_COLOR[marking.color or "white"], alpha * (0.4 if doubtful else 1.0))

@@ -1,0 +1,687 @@
+"""What cameras and LiDARs recorded, made small enough for one file."""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.errors import ConfigError, LogError
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    Camera,
+    apply,
+    box_corners,
+    box_lines,
+    inverse,
+    line_time_s,
+    nearest_index,
+    period_of,
+    project,
+)
+from log2sim.geometry.boxes import EDGES, NEAR_M
+from log2sim.perception.frames import RecordReader, look_again
+from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
+from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
+from log2sim.perception.sync import sweep_middle_ns
+
+MARGIN_S = 0.05
+"""Records this far outside the scenario are taken too: half a tick of most logs."""
+
+BACK_RAD = np.radians(150.0)
+"""Cameras that are turned farther from the front than this look back."""
+
+
+def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the cameras to show, from left to right: those asked for, else those that the scenario was made with, else all.
+
+    Raises
+    ------
+    ConfigError
+        For a camera that the log does not have.
+    """
+    unknown = [name for name in asked if name not in log.cameras]
+    if unknown:
+        there = ", ".join(log.cameras) or "none"
+        raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
+    used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
+    return tuple(sorted(asked or used or log.cameras, key=lambda name: _place(log.cameras[name])))
+
+
+def _place(camera: Camera) -> tuple[int, float]:
+    """Sort cameras of a vehicle from left to right, then those that look back, then those at the road."""
+    x, y = camera.mount_T_cam[:2, 2]
+    azimuth = float(np.arctan2(y, x))
+    if camera.mount != "ego":
+        return 2, 0.0
+    return (1 if abs(azimuth) > BACK_RAD else 0), -azimuth
+
+
+def require_overlap(log: Log, scenario: Scenario) -> None:
+    """Require that a log has records during a scenario.
+
+    Raises
+    ------
+    LogError
+        When it has none.
+    """
+    spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
+    if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
+        first, last = min(span[0] for span in spans), max(span[1] for span in spans)
+        end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        raise LogError(
+            f"{log.name}: its records are from stamp {first} to {last} ns, the scenario '{scenario.name}' from {scenario.t0_ns} "
+            f"to {end_ns} ns; choose the log that the scenario was made of"
+        )
+
+
+def records_within(t_ns: NDArray[np.int64], scenario: Scenario) -> NDArray[np.int64]:
+    """Return the indices of the records with stamps (F,) during a scenario."""
+    margin_ns = round(MARGIN_S * NS_PER_S)
+    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    return np.flatnonzero((t_ns >= scenario.t0_ns - margin_ns) & (t_ns <= end_ns + margin_ns)).astype(np.int64)
+
+
+def take_at_rate(t_ns: NDArray[np.int64], index: NDArray[np.int64], rate_hz: float, start_ns: int) -> NDArray[np.int64]:
+    """Return those of the records `index` (n,) of stamps (F,) that are nearest to the beats of a rate; all of slower sensors.
+
+    Beats count from `start_ns`, so that the cameras of a rig show the same moments.
+    """
+    if len(index) < 2 or period_of(t_ns[index]) * rate_hz > 0.75:
+        return index
+    stamps, step_ns = t_ns[index], round(NS_PER_S / rate_hz)
+    beats = np.arange(start_ns, stamps[-1] + step_ns // 2, step_ns, dtype=np.int64)
+    return index[np.unique(nearest_index(stamps, beats))]
+
+
+def take_evenly(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` of the numbers 0 to `count` - 1, evenly spaced, with the first and the last."""
+    if count <= most:
+        return np.arange(count, dtype=np.int64)
+    return np.unique(np.rint(np.linspace(0, count - 1, max(most, 1))).astype(np.int64))
+
+
+MIN_SHARE = 1 / 200
+"""Of the height of a picture: smaller boxes would be dots in it."""
+
+STRAIGHT_SHARE = 1 / 640
+"""Of the width of a picture, one pixel of the usual size: edges that a lens bends by less are drawn straight."""
+
+CORNERS, SEGMENTS = 1, 0
+"""Kinds of outlines: eight corners u, v in the order of `box_corners`, or segments u0, v0, u1, v1."""
+
+
+class OutlineProjector:
+    """Projects the agents of a scenario, but for the ego, into the frames of a log.
+
+    Parameters
+    ----------
+    log : Log
+        With the poses that the scenario was made with.
+    scenario : Scenario
+
+    Attributes
+    ----------
+    agents : tuple of Agent
+        Outlines name them by their place among these.
+    """
+
+    def __init__(self, log: Log, scenario: Scenario) -> None:
+        self.agents = scenario.others
+        self._log, self._t0_ns = log, scenario.t0_ns
+        self._size_m = np.array([a.size_m for a in self.agents], dtype=np.float64).reshape(-1, 3)
+
+    def outlines(self, camera: str, t_ns: int) -> list[list[int]]:
+        """Project the agents into the frame of a camera at a stamp, the farthest first.
+
+        Returns
+        -------
+        list of [agent, kind, coordinates...]
+            Whole pixels of the camera; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not known.
+        """
+        view = view_of(self._log, camera, t_ns)
+        if view is None or not self.agents:
+            return []
+        center, yaw, present = _states(self.agents, (t_ns - self._t0_ns) / NS_PER_S)
+        rows = np.flatnonzero(present)
+        found = project_boxes_in_view(view, center[rows], self._size_m[rows], yaw[rows])
+        height_px = found.box_px[:, 3] - found.box_px[:, 1]
+        with np.errstate(invalid="ignore"):
+            shown = np.flatnonzero(found.valid & (height_px >= MIN_SHARE * view.camera.height_px))
+        out = []
+        for i in shown[np.argsort(-found.range_m[shown], kind="stable")]:
+            row = int(rows[i])
+            corners = box_corners(center[row], self._size_m[row], yaw[row])[0]
+            middle_px = found.box_px[i].reshape(2, 2).mean(axis=0)[None]
+            kind, coordinates = outline_of(view.camera, apply(_cam_T_map(view, middle_px), corners))
+            if len(coordinates):
+                out.append([row, kind, *np.rint(coordinates).astype(np.int64).ravel().tolist()])
+        return out
+
+
+def outline_of(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
+    """Return the kind and the coordinates, px, of the outline of a box with corners (8, 3), m, cam frame.
+
+    Corners where straight lines between them are right: all in front of the camera, and the lens bends no edge visibly.
+    """
+    if (corners_cam[:, 2] > NEAR_M).all():
+        ends = corners_cam[np.array(EDGES)]
+        uv = project(camera, np.concatenate([corners_cam, ends.mean(axis=1)]))[0]
+        straight = uv[np.array(EDGES)].mean(axis=1)
+        # Perspective moves the middle of an edge along it; what counts is its distance from the line.
+        along = uv[np.array(EDGES)[:, 1]] - uv[np.array(EDGES)[:, 0]]
+        off = uv[8:] - straight
+        length = np.maximum(np.hypot(*along.T), 1e-9)
+        bent = np.abs(along[:, 0] * off[:, 1] - along[:, 1] * off[:, 0]) / length
+        if np.isfinite(uv).all() and bent.max() <= STRAIGHT_SHARE * camera.width_px:
+            return CORNERS, uv[:8]
+    return SEGMENTS, box_lines(camera, corners_cam)
+
+
+def _cam_T_map(view: View, middle_px: Array) -> Array:
+    """Return the transform (4, 4) at the time of the line that shows the middle of a box."""
+    if view.cam_T_map_at is None:
+        return inverse(view.map_T_cam)
+    return np.asarray(view.cam_T_map_at(line_time_s(view.camera, middle_px))[0])
+
+
+def _states(agents: Sequence[Agent], t_s: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return centers (A, 3), m, yaws (A,) and whether each agent is present at a time."""
+    center, yaw, present = np.full((len(agents), 3), np.nan), np.zeros(len(agents)), np.zeros(len(agents), dtype=bool)
+    for k, agent in enumerate(agents):
+        at = agent.at(float(agent.waypoints.t_s[0]) if agent.is_permanent else t_s)
+        if at.valid[0]:
+            center[k], yaw[k], present[k] = (at.x_m[0], at.y_m[0], at.z_m[0]), at.yaw_rad[0], True
+    return center, yaw, present
+
+
+QUALITY = 72
+"""Of JPEGs, of 100: at the sizes of a page, blocks are hardly seen."""
+
+
+class PictureSize(NamedTuple):
+    """Width of pictures, px, and how many a second are taken of each camera."""
+
+    width_px: int
+    rate_hz: float
+
+
+SIZES = tuple(
+    PictureSize(*size)
+    for size in (
+        (960, 10), (800, 10), (640, 10), (640, 5), (480, 5), (400, 5), (400, 2), (320, 2), (320, 1), (240, 1), (240, 0.5), (160, 0.5),
+        (160, 0.2),
+    )
+)  # fmt: skip
+"""From the best down; the first that fits is taken. Motion is followed at 5 a second, and people are seen at 400 px."""
+
+PROBES = 3
+"""Pictures of each camera that are encoded in all sizes, to estimate how many bytes the others will have."""
+
+SAFETY = 1.1
+"""By how much a scene may have more bytes than its probes tell; what is still too much is thinned out."""
+
+OUTLINE_BYTES = 100
+"""Of an outline in the page: sixteen numbers of up to four digits, mostly."""
+
+
+@dataclass(eq=False)
+class ShrunkPictures:
+    """Takes pictures of a log as JPEGs; a `PictureConsumer`.
+
+    Attributes
+    ----------
+    chosen : mapping of str to (n,) int64
+        Indices of the frames by camera.
+    width_px : int
+        Pictures that are wider are made as wide as this.
+    jpeg : dict of str to dict of int to bytes
+        Pictures taken so far, by camera and index.
+    """
+
+    chosen: Mapping[str, NDArray[np.int64]]
+    width_px: int
+    jpeg: dict[str, dict[int, bytes]] = field(default_factory=dict)
+
+    def frames(self) -> Mapping[str, NDArray[np.int64]]:
+        """Return the indices of the frames that are wanted, by camera."""
+        return self.chosen
+
+    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
+        """Take a picture (H, W, 3)."""
+        self.jpeg.setdefault(camera, {})[index] = encode_small(image_bgr, self.width_px)
+
+
+def encode_small(image_bgr: NDArray[np.uint8], width_px: int) -> bytes:
+    """Encode a picture as a JPEG that is at most `width_px` wide."""
+    shrink = min(width_px / image_bgr.shape[1], 1.0)
+    if shrink < 1:
+        height_px = max(round(image_bgr.shape[0] * shrink), 1)
+        image_bgr = np.asarray(cv2.resize(image_bgr, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
+    done, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+    return bytes(data.tobytes()) if done else b""
+
+
+def text_bytes(count: int) -> int:
+    """Return how many bytes of base64 text `count` bytes become."""
+    return 4 * -(-count // 3)
+
+
+def picture_document(
+    log: Log,
+    scenario: Scenario,
+    cameras: tuple[str, ...],
+    budget_bytes: int,
+    reader: RecordReader,
+    progress: Callable[[int, int], None],
+) -> dict[str, Any]:
+    """Return the pictures of cameras within a budget, with the outlines of the agents in them.
+
+    Parameters
+    ----------
+    budget_bytes : int
+        Of the pictures and outlines as text in a page.
+
+    Returns
+    -------
+    dict
+        "cameras": for each name, size in px, times in s, JPEGs as base64 and outlines; "ahead": which of them looks ahead;
+        "agents": ids that outlines refer to;
+        "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out.
+
+    Raises
+    ------
+    ConfigError
+        When not even one small picture of each camera fits.
+    """
+    projector = OutlineProjector(log, scenario)
+    within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
+    within = {name: index for name, index in within.items() if len(index)}
+    probes = _probe(log, within, projector, reader)
+    size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
+    pictures = ShrunkPictures(chosen, size.width_px)
+    look_again(log, reader, [pictures], progress)
+    entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
+    entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
+    _thin_out(entries, budget_bytes)
+    return {
+        "cameras": list(entries.values()),
+        "ahead": _ahead([log.cameras[name] for name in entries]),
+        "agents": [agent.id for agent in projector.agents],
+        "width_px": min(size.width_px, max((log.cameras[name].width_px for name in entries), default=0)),
+        "rate_hz": size.rate_hz,
+        "bytes": sum(map(_bytes_of, entries.values())),
+    }
+
+
+def _probe(
+    log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordReader
+) -> dict[str, dict[int, float]]:
+    """Return the mean bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
+    widths = sorted({size.width_px for size in SIZES})
+    out: dict[str, dict[int, float]] = {}
+    for name, index in within.items():
+        sizes: dict[int, list[int]] = {width: [] for width in widths}
+        for i in index[take_evenly(len(index), PROBES)].tolist():
+            image = reader.get(name, i)
+            if image is None:
+                continue
+            outlines = OUTLINE_BYTES * len(projector.outlines(name, int(log.streams[name].t_ns[i])))
+            for width in widths:
+                sizes[width].append(text_bytes(len(encode_small(image, width))) + outlines)
+        if sizes[widths[0]]:
+            out[name] = {width: float(np.mean(found)) for width, found in sizes.items()}
+    return out
+
+
+def _fit(
+    log: Log,
+    start_ns: int,
+    within: Mapping[str, NDArray[np.int64]],
+    probes: Mapping[str, Mapping[int, float]],
+    budget_bytes: int,
+) -> tuple[PictureSize, dict[str, NDArray[np.int64]]]:
+    """Choose the best size that fits, and the frames of each camera."""
+    chosen: dict[str, NDArray[np.int64]] = {}
+    size = SIZES[-1]
+    for size in SIZES:
+        chosen = {n: take_at_rate(log.streams[n].t_ns, index, size.rate_hz, start_ns) for n, index in within.items()}
+        if SAFETY * sum(len(index) * probes[n][size.width_px] for n, index in chosen.items()) <= budget_bytes:
+            return size, chosen
+    one_of_each = SAFETY * sum(probe[size.width_px] for probe in probes.values())
+    most = int(budget_bytes / one_of_each) if one_of_each else 0
+    if most < 1:
+        raise ConfigError(
+            f"--max-mb: {budget_bytes / 1e6:.2f} MB are left for pictures, and one of each camera has {one_of_each / 1e6:.2f} MB; "
+            f"give more, or choose fewer cameras with --cameras"
+        )
+    return size, {name: index[take_evenly(len(index), most)] for name, index in chosen.items()}
+
+
+def _entry(
+    log: Log, scenario: Scenario, projector: OutlineProjector, name: str, jpeg: Mapping[int, bytes]
+) -> dict[str, Any]:
+    camera, t_ns = log.cameras[name], log.streams[name].t_ns
+    order = sorted(index for index, data in jpeg.items() if data)
+    return {
+        "name": name,
+        "size_px": [camera.width_px, camera.height_px],
+        "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / NS_PER_S, 4) for i in order],
+        "jpeg": [base64.b64encode(jpeg[i]).decode() for i in order],
+        "outlines": [projector.outlines(name, int(t_ns[i])) for i in order],
+    }
+
+
+def _ahead(cameras: Sequence[Camera]) -> int:
+    """Return the place of the camera that looks straight ahead most; 0 where none is on the vehicle."""
+    forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in cameras]
+    return int(np.argmax(forward)) if forward else 0
+
+
+def _thin_out(entries: Mapping[str, dict[str, Any]], budget_bytes: int) -> None:
+    """Leave out pictures, evenly over the time, until all fit."""
+    while (total := sum(map(_bytes_of, entries.values()))) > budget_bytes:
+        for entry in entries.values():
+            kept = take_evenly(len(entry["t_s"]), int(0.97 * len(entry["t_s"]) * budget_bytes / total))
+            for key in ("t_s", "jpeg", "outlines"):
+                entry[key] = [entry[key][k] for k in kept.tolist()]
+        if all(len(entry["t_s"]) <= 1 for entry in entries.values()):
+            return
+
+
+def _bytes_of(entry: Mapping[str, Any]) -> int:
+    """Return the bytes of the pictures of a camera and their outlines in a page."""
+    numbers = sum(len(str(outlines).replace(" ", "")) for outlines in entry["outlines"])
+    return sum(map(len, entry["jpeg"])) + numbers + 12 * len(entry["t_s"])
+
+
+UNIT_M = 0.05
+"""Of stored positions: a pixel of a screen that shows 50 m."""
+
+REACH_M = 120.0
+"""Points farther from the ego, or from the middle of the sensors, are left out."""
+
+MIN_HEIGHT_M, MAX_HEIGHT_M = -1.0, 5.0
+"""Above the ground: what is higher, such as trees and bridges, would cover the road from above."""
+
+HEIGHT_UNIT_M = (MAX_HEIGHT_M - MIN_HEIGHT_M) / 255
+MAX_APART_S = 0.1
+"""Between the sweeps of several LiDARs that are shown as one."""
+
+
+class PointSpacing(NamedTuple):
+    """Edge of the cells that keep one point each, m, and how many sweeps a second are taken."""
+
+    cell_m: float
+    rate_hz: float
+
+
+SPACINGS = tuple(
+    PointSpacing(*spacing)
+    for spacing in ((0.15, 10), (0.25, 10), (0.4, 10), (0.4, 5), (0.6, 5), (0.6, 2), (1.0, 2), (1.0, 1), (1.0, 0.5), (1.0, 0.2))
+)  # fmt: skip
+"""From the best down; the first that fits is taken. People are still seen as a point or two at 0.4 m."""
+
+POINT_PROBES, POINT_SAFETY = 3, 1.15
+BYTES_OF_ENTRY = 60
+"""Time and origin of a sweep in the page."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointsAbove:
+    """Points of one moment.
+
+    Attributes
+    ----------
+    origin : (2,) tuple of int, m
+        Map position that the points are relative to.
+    xy_m : (N, 2) float64
+        Relative to `origin`.
+    height_m : (N,) float64
+        Above the ground.
+    intensity : (N,) float64
+        NaN where it is not known.
+    """
+
+    t_ns: int
+    origin: tuple[int, int]
+    xy_m: Array
+    height_m: Array
+    intensity: Array
+
+
+def point_document(
+    log: Log, scenario: Scenario, budget_bytes: int, reader: RecordReader, progress: Callable[[int, int], None]
+) -> dict[str, Any] | None:
+    """Return the points of a log's LiDARs within a budget; None where there are none during the scenario.
+
+    Returns
+    -------
+    dict
+        "t_s", "origin_m" and "points" of each moment, the last as base64 of deflated columns, see `pack`; "unit_m",
+        "height_m", the lowest height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and
+        "bytes" as chosen.
+
+    Raises
+    ------
+    ConfigError
+        When not even one sweep fits.
+    """
+    lidars = [n for n in log.lidars if n in log.streams and len(records_within(log.streams[n].t_ns, scenario))]
+    if not lidars:
+        return None
+    sweeps = _Sweeps(log, lidars, reader)
+    main = max(lidars, key=lambda name: len(records_within(log.streams[name].t_ns, scenario)))
+    within = records_within(log.streams[main].t_ns, scenario)
+    probes = [p for i in take_evenly(len(within), POINT_PROBES) if (p := sweeps.at(main, int(within[i]))) is not None]
+    if not probes:
+        return None
+    bright = _brightest(probes)
+    spacing, chosen = _fit_points(log.streams[main].t_ns, within, scenario.t0_ns, probes, bright, budget_bytes)
+    moments: list[tuple[PointsAbove, str]] = []
+    for done, i in enumerate(chosen.tolist()):
+        if (points := sweeps.at(main, i)) is not None:
+            moments.append((points, pack(points, spacing.cell_m, bright)))
+        progress(done + 1, len(chosen))
+    while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
+        moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
+    return {
+        "t_s": [round((points.t_ns - scenario.t0_ns) / NS_PER_S, 4) for points, _ in moments],
+        "origin_m": [list(points.origin) for points, _ in moments],
+        "points": [text for _, text in moments],
+        "unit_m": UNIT_M,
+        "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M],
+        "intensity": bright > 0,
+        "cell_m": spacing.cell_m,
+        "rate_hz": spacing.rate_hz,
+        "bytes": total,
+    }
+
+
+def pack(points: PointsAbove, cell_m: float, bright: float) -> str:
+    """Keep the highest point of each cell and pack the rest as base64 of a zlib stream.
+
+    Notes
+    -----
+    For N points in rows of cells from south to north, each from west to east: low bytes of the steps in x (N), their high
+    bytes, the same of y, heights and intensities as bytes. Steps are in `UNIT_M`, modulo 2**16, the first from 0. Small steps
+    in planes of bytes deflate to less than half.
+    """
+    cells = np.floor(points.xy_m / cell_m).astype(np.int64)
+    order = np.lexsort((points.height_m, cells[:, 0], cells[:, 1]))
+    cells = cells[order]
+    last = np.append(np.any(np.diff(cells, axis=0) != 0, axis=1), True) if len(order) else np.zeros(0, dtype=bool)
+    kept = order[last]
+    whole = np.rint(points.xy_m[kept] / UNIT_M).astype(np.int64)
+    steps = np.diff(whole, axis=0, prepend=[[0, 0]]).astype(np.uint16)
+    height = np.clip(np.rint((points.height_m[kept] - MIN_HEIGHT_M) / HEIGHT_UNIT_M), 0, 255)
+    intensity = np.clip(np.nan_to_num(points.intensity[kept]) / (bright or 1.0) * 255, 0, 255)
+    planes = [steps[:, 0] & 255, steps[:, 0] >> 8, steps[:, 1] & 255, steps[:, 1] >> 8, height, intensity]
+    return base64.b64encode(zlib.compress(np.concatenate(planes).astype(np.uint8).tobytes(), 9)).decode()
+
+
+def _brightest(points: list[PointsAbove]) -> float:
+    """Return the intensity that is shown as the brightest, which only mirrors exceed; 0 where none is known."""
+    known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in points])
+    return max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
+
+
+def _fit_points(
+    t_ns: NDArray[np.int64],
+    within: NDArray[np.int64],
+    start_ns: int,
+    probes: list[PointsAbove],
+    bright: float,
+    budget_bytes: int,
+) -> tuple[PointSpacing, NDArray[np.int64]]:
+    """Choose the finest spacing that fits, and the sweeps."""
+    sizes: Mapping[float, float] = {}
+    for spacing in SPACINGS:
+        if spacing.cell_m not in sizes:
+            mean = np.mean([len(pack(p, spacing.cell_m, bright)) for p in probes])
+            sizes = {**sizes, spacing.cell_m: POINT_SAFETY * float(mean) + BYTES_OF_ENTRY}
+        chosen = take_at_rate(t_ns, within, spacing.rate_hz, start_ns)
+        if len(chosen) * sizes[spacing.cell_m] <= budget_bytes:
+            return spacing, chosen
+    most = int(budget_bytes / sizes[spacing.cell_m])
+    if most < 1:
+        raise ConfigError(
+            f"--max-mb: {budget_bytes / 1e6:.2f} MB are left for LiDAR points, and one sweep has {sizes[spacing.cell_m] / 1e6:.2f} MB; "
+            f"give more"
+        )
+    return spacing, chosen[take_evenly(len(chosen), most)]
+
+
+class _Sweeps:
+    """Reads the sweeps of all LiDARs around a moment as points from above."""
+
+    def __init__(self, log: Log, lidars: list[str], reader: RecordReader) -> None:
+        self._log, self._reader = log, reader
+        self._middle_ns = {name: sweep_middle_ns(log.streams[name]) for name in lidars}
+
+    def at(self, main: str, index: int) -> PointsAbove | None:
+        """Return the points around a sweep of one LiDAR; None where it cannot be read or has no known pose."""
+        t_ns = int(self._log.streams[main].t_ns[index]) + self._middle_ns[main]
+        xyz, intensity = [], []
+        for name, middle_ns in self._middle_ns.items():
+            stamps = self._log.streams[name].t_ns + middle_ns
+            near = index if name == main else int(nearest_index(stamps, t_ns)[0])
+            if abs(int(stamps[near]) - t_ns) > MAX_APART_S * NS_PER_S:
+                continue
+            sweep = self._reader.get(name, near)
+            mapped = None if sweep is None else sweep_to_map(self._log, name, sweep, compensate=True)
+            if sweep is None or mapped is None:
+                if name == main:
+                    return None
+                continue
+            xyz.append(mapped[0])
+            none = np.full(len(mapped[0]), np.nan)
+            intensity.append(none if sweep.intensity is None else np.asarray(sweep.intensity, dtype=np.float64))
+        return self._from_above(t_ns, np.concatenate(xyz), np.concatenate(intensity))
+
+    def _from_above(self, t_ns: int, xyz: Array, intensity: Array) -> PointsAbove:
+        """Keep what is near and neither under the ground nor high above it."""
+        middle, ground_z = cloud_origin(self._log, t_ns)
+        origin = np.rint(middle[:2])
+        local = xyz - [*origin, 0.0]
+        near = np.flatnonzero(np.abs(local[:, :2]).max(axis=1) <= REACH_M)
+        local = local[near]
+        height = local[:, 2] - estimate_ground(local, middle[:2] - origin, ground_z).at(local[:, :2])
+        kept = np.flatnonzero((height >= MIN_HEIGHT_M) & (height <= MAX_HEIGHT_M))
+        at = (int(origin[0]), int(origin[1]))
+        return PointsAbove(t_ns, at, local[kept, :2], height[kept], intensity[near][kept])
+
+
+POINT_SHARE = 0.3
+"""Of the budget, for points, where there are pictures too; what they leave is for the pictures."""
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Report nothing."""
+
+
+DEFAULT_MAX_BYTES = 40_000_000
+"""Of a page with pictures: mail and chat programs take so much, and a phone still opens it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What to take of a log, and how much of it.
+
+    Attributes
+    ----------
+    log : Log
+        With the poses that the scenario was made with.
+    max_bytes : int
+        Of the whole page.
+    cameras : tuple of str
+        Whose pictures to take; those that the scenario was made with where it is empty.
+    progress : callable
+        Called as `progress(stage, done, total)` while records are read.
+    """
+
+    log: Log
+    max_bytes: int = DEFAULT_MAX_BYTES
+    cameras: tuple[str, ...] = ()
+    progress: Callable[[str, int, int], None] = _silent
+
+
+def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int) -> dict[str, Any]:
+    """Return the pictures and points of a log for a page, within a budget.
+
+    Returns
+    -------
+    dict
+        "pictures" and "points", see `picture_document` and `point_document`, None where there are none, and "notes": what
+        was chosen, in sentences.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown camera, or when the budget is too small for a single moment.
+    LogError
+        When none of the records asked for can be read.
+    """
+    log, report = recorded.log, recorded.progress
+    reader = RecordReader(log)
+    cameras = choose_cameras(log, scenario, recorded.cameras)
+    share = POINT_SHARE if cameras else 1.0
+    points = point_document(
+        log, scenario, int(share * budget_bytes), reader, lambda done, total: report("page: sweeps", done, total)
+    )
+    left = budget_bytes - (0 if points is None else points["bytes"])
+    pictures = None
+    if cameras:
+        pictures = picture_document(
+            log, scenario, cameras, left, reader, lambda done, total: report("page: pictures", done, total)
+        )
+    reader.require_some()
+    if pictures is not None and not pictures["cameras"]:
+        pictures = None
+    return {"pictures": pictures, "points": points, "notes": [_tell_pictures(pictures), _tell_points(points)]}
+
+
+def _tell_pictures(pictures: dict[str, Any] | None) -> str:
+    if pictures is None:
+        return "no pictures: the log has none during the scenario"
+    count, cameras = sum(len(c["t_s"]) for c in pictures["cameras"]), len(pictures["cameras"])
+    noun = f"{count} picture{'s' * (count != 1)} of {cameras} camera{'s' * (cameras != 1)}"
+    rate = f"up to {pictures['rate_hz']:g} a second"
+    return f"{noun}, {pictures['width_px']} px wide, {rate}: {pictures['bytes'] / 1e6:.1f} MB"
+
+
+def _tell_points(points: dict[str, Any] | None) -> str:
+    if points is None:
+        return "no LiDAR points: the log has none during the scenario"
+    count = len(points["t_s"])
+    noun = f"LiDAR points of {count} sweep{'s' * (count != 1)}"
+    rate = f"up to {points['rate_hz']:g} a second"
+    return f"{noun}, one in {points['cell_m']:g} m, {rate}: {points['bytes'] / 1e6:.1f} MB"

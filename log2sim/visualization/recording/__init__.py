@@ -1,1 +1,0 @@
-"""What cameras and LiDARs recorded, made small enough for one file: pictures with the boxes of agents, and points."""
