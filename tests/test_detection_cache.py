@@ -306,13 +306,14 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(
 def test_a_run_that_was_killed_goes_on_where_it_was(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
     code = (
         "import os, signal, sys, test_detection_cache as t\n"
-        "from log2sim import open_log, registry\n"
+        "from log2sim import open_log\n"
+        "from log2sim.files import plugins\n"
         "def kill(seeing):\n"
         "    if len(seeing.seen) == 4: os.kill(os.getpid(), signal.SIGKILL)\n"
         "t.STATED['before'] = kill\n"
         "create = lambda log, **_: t.Seeing(log)\n"
         "sys.modules['seeing_package'] = sys.modules['__main__']\n"
-        "registry.BUILT_IN['detector']['seeing'] = 'seeing_package:create'\n"
+        "plugins.BUILT_IN['detector']['seeing'] = 'seeing_package:create'\n"
         "t.look(open_log(sys.argv[1]))\n"
     )
     ended = subprocess.run(

@@ -121,9 +121,9 @@ def test_a_projection_that_no_file_can_hold_is_refused(projection: str, scenario
 def test_a_missing_package_names_its_extra(
     to: str, module: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for loaded in [name for name in sys.modules if name.startswith("log2sim.export.viewers")]:
+    for loaded in [name for name in sys.modules if name.startswith("log2sim.export.foxglove")]:
         monkeypatch.delitem(sys.modules, loaded)
-    monkeypatch.delattr("log2sim.export.viewers", raising=False)
+    monkeypatch.delattr("log2sim.export.foxglove", raising=False)
     monkeypatch.setitem(sys.modules, module, None)
     ran = run("export", SAMPLE, "--to", to, "--out", tmp_path / "out")
     assert ran.code == 5

@@ -194,7 +194,7 @@ def test_wide_pictures_are_made_smaller_with_their_calibration(scenario: Scenari
     ],
 )
 def test_lenses_have_foxgloves_names(model: str, given: tuple[float, ...], named: str, count: int) -> None:
-    foxglove = pytest.importorskip("log2sim.export.viewers", exc_type=ImportError)
+    foxglove = pytest.importorskip("log2sim.export.foxglove", exc_type=ImportError)
     camera = Camera("c", 64, 48, np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), "ego", np.eye(4), model, given)
     found = {topic: m for _, topic, m in foxglove.record_messages(CameraFrame(0, camera, None, b"", ()), np.zeros(3))}
     calibration = found["/camera/c/calibration"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import secrets
-import signal
 import socket
 import time
 import traceback
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
-from distributed import Worker, WorkerPlugin
 
 from log2sim.batch.discovery import find_logs
 from log2sim.batch.folder import (
@@ -118,20 +116,6 @@ def _stopwatch() -> Callable[[], dict[str, float]]:
     return spent
 
 
-class Preparation(WorkerPlugin):  # type: ignore[misc]
-    """Imports what logs need before the first one comes, and leaves Ctrl-C to the process that started the workers.
-
-    A terminal sends Ctrl-C to all processes of a command.
-    """
-
-    name = "log2sim-batch"
-
-    def setup(self, worker: Worker) -> None:
-        """Prepare a worker; called in its main thread."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        import log2sim.batch.run  # noqa: F401
-
-
 HOST = "127.0.0.1"
 """Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for certificates, too: other users of the
 machine do not get in."""
@@ -215,6 +199,8 @@ def local_workers(count: int) -> Iterator[Workers]:
         ) as cluster,
         distributed.Client(cluster, timeout=START_TIMEOUT_S) as client,
     ):
+        from log2sim.batch.preparation import Preparation
+
         client.register_plugin(Preparation())
         yield Workers(client, are_ours=True)
 

@@ -17,7 +17,7 @@ from log2sim.export.exporters import Options, file_name, near_origin
 from log2sim.export.viewers import agent_steps, viewer_records
 
 if TYPE_CHECKING:
-    from log2sim.export.viewers import Message
+    from log2sim.export.foxglove import Message
 
 
 class Mcap:
@@ -38,7 +38,7 @@ class Mcap:
         try:
             from mcap_protobuf.writer import Writer
 
-            from log2sim.export import viewers
+            from log2sim.export import foxglove
         except ImportError:
             raise MissingExtra("export to MCAP", "mcap") from None
         steps = agent_steps(scenario)
@@ -46,10 +46,10 @@ class Mcap:
             raise ScenarioError(f"scenario '{scenario.name}' starts before 1970, which MCAP has no stamps for")
         placement = near_origin(scenario)
         origin = np.array(placement.origin_m)
-        parts: list[Iterable[Message]] = [viewers.scene_messages(steps, origin)]
+        parts: list[Iterable[Message]] = [foxglove.scene_messages(steps, origin)]
         if options.log is not None:
             parts.append(
-                m for record in viewer_records(scenario, options.log) for m in viewers.record_messages(record, origin)
+                m for record in viewer_records(scenario, options.log) for m in foxglove.record_messages(record, origin)
             )
         with (folder / f"{file_name(scenario.name)}.mcap").open("wb") as file, Writer(file) as writer:
             writer.add_metadata("log2sim", dict(_about(scenario, placement.origin_m)))

@@ -1,38 +1,14 @@
-"""Export to viewers: Foxglove's messages in MCAP files, and Rerun's recordings."""
+"""What viewers show of a scenario and its log: boxes at equal steps, downscaled pictures, thinned sweeps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.Color_pb2 import Color
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
-from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.Log_pb2 import Log as LogMessage
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.Point2_pb2 import Point2
-from foxglove_schemas_protobuf.Point3_pb2 import Point3
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
-from foxglove_schemas_protobuf.Pose_pb2 import Pose
-from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
-from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
-from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from foxglove_schemas_protobuf.TextAnnotation_pb2 import TextAnnotation
-from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
-from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
-from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Log, Scenario, Sweep, why_doubtful
+from log2sim.datatypes import Agent, Log, Scenario, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.export.exporters import SampledMotion, sample_steps, step_times
 from log2sim.geometry import (
@@ -43,9 +19,6 @@ from log2sim.geometry import (
     box_corners,
     box_lines,
     inverse,
-    quaternion_from_rotation,
-    rotation_from_rpy,
-    transform,
 )
 from log2sim.perception.lidar.cloud import sweep_to_map
 
@@ -216,158 +189,3 @@ def _points_map(log: Log, name: str, sweep: Sweep) -> Array:
     t_ns = None if sweep.t_ns is None else sweep.t_ns[kept]
     mapped = sweep_to_map(log, name, replace(sweep, xyz_m=sweep.xyz_m[kept], t_ns=t_ns), compensate=True)
     return np.zeros((0, 3)) if mapped is None else mapped[0]
-
-
-MAP = "map"
-BOX_ALPHA, PATH_ALPHA = 0.6, 0.9
-LABEL_ABOVE_M = 0.5
-PATH_PX, OUTLINE_PX, TEXT_PX = 2.0, 2.0, 12.0
-PLUMB_BOB = 5  # number of coefficients of this model; with more it is called rational
-
-Message = tuple[int, str, Any]
-"""Time in ns, topic and message."""
-
-
-def scene_messages(steps: AgentSteps, origin: Array) -> Iterator[Message]:
-    """Yield the paths, then at every step the present boxes and the ego's frame; positions less `origin` (3,)."""
-    yield int(steps.t_ns[0]), "/paths", SceneUpdate(entities=[_path(steps, k, origin) for k in range(len(steps.moves))])
-    for k, t_ns in enumerate(steps.t_ns.tolist()):
-        here = [(a, m.position_m[k] - origin, float(m.yaw_rad[k])) for a, m in steps.moves if m.valid[k]]
-        gone = SceneEntityDeletion(timestamp=_stamp(t_ns), type=SceneEntityDeletion.ALL)
-        yield t_ns, "/agents", SceneUpdate(deletions=[gone], entities=[_box(t_ns, *at) for at in here])
-        for agent, position, yaw in here:
-            if agent.id == "ego":
-                yield t_ns, "/tf", _frame(t_ns, "ego", _rear_axle(agent, position, yaw))
-
-
-def record_messages(record: ViewerRecord, origin: Array) -> Iterable[Message]:
-    """Return the messages of one record of the log."""
-    if isinstance(record, UnreadableRecord):
-        text = LogMessage(
-            timestamp=_stamp(record.t_ns), level=LogMessage.WARNING, name=record.stream, message=record.reason
-        )
-        return [(record.t_ns, "/log", text)]
-    if isinstance(record, ThinnedSweep):
-        return [(record.t_ns, f"/lidar/{record.lidar}", _cloud(record, origin))]
-    return _picture(record, origin)
-
-
-def _stamp(t_ns: int) -> Timestamp:
-    return Timestamp(seconds=t_ns // NS_PER_S, nanos=t_ns % NS_PER_S)
-
-
-def _color(agent: Agent, alpha: float) -> Color:
-    r, g, b = (v / 255 for v in rgb_of(agent))
-    return Color(r=r, g=g, b=b, a=alpha)
-
-
-def _pose(position: Array, yaw_rad: float) -> Pose:
-    x, y, z = position.tolist()
-    turn = Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw_rad / 2)), w=float(np.cos(yaw_rad / 2)))
-    return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn)
-
-
-def _path(steps: AgentSteps, k: int, origin: Array) -> SceneEntity:
-    agent, _ = steps.moves[k]
-    w = agent.waypoints
-    ground = np.column_stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2]) - origin
-    line = LinePrimitive(
-        type=LinePrimitive.LINE_STRIP,
-        pose=_pose(np.zeros(3), 0.0),
-        thickness=PATH_PX,
-        scale_invariant=True,
-        points=[Point3(x=x, y=y, z=z) for x, y, z in ground.tolist()],
-        color=_color(agent, PATH_ALPHA),
-    )
-    return SceneEntity(timestamp=_stamp(int(steps.t_ns[0])), frame_id=MAP, id=agent.id, lines=[line])
-
-
-def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntity:
-    length, width, height = map(float, agent.size_m)
-    above = position + np.array([0.0, 0.0, height / 2 + LABEL_ABOVE_M])
-    about = {"category": agent.category, "static": str(agent.static).lower(), "confidence": f"{agent.confidence:g}"}
-    if agent.is_doubtful:
-        about["doubtful"] = why_doubtful(agent)
-    name = TextPrimitive(
-        pose=_pose(above, 0.0),
-        billboard=True,
-        font_size=TEXT_PX,
-        scale_invariant=True,
-        text=agent.id,
-        color=_color(agent, 1.0),
-    )
-    cube = CubePrimitive(
-        pose=_pose(position, yaw_rad), size=Vector3(x=length, y=width, z=height), color=_color(agent, BOX_ALPHA)
-    )
-    metadata = [KeyValuePair(key=key, value=value) for key, value in about.items()]
-    return SceneEntity(timestamp=_stamp(t_ns), frame_id=MAP, id=agent.id, cubes=[cube], texts=[name], metadata=metadata)
-
-
-def _rear_axle(agent: Agent, position: Array, yaw_rad: float) -> Array:
-    """Return the ego frame: at the rear axle, on the ground."""
-    map_T_box = transform(rotation_from_rpy(0.0, 0.0, yaw_rad), position)
-    return map_T_box @ transform(np.eye(3), [-agent.rear_axle_offset_m, 0.0, -agent.size_m[2] / 2])
-
-
-def _frame(t_ns: int, child: str, map_T_child: Array) -> FrameTransform:
-    (w, qx, qy, qz), (x, y, z) = quaternion_from_rotation(map_T_child[:3, :3]).tolist(), map_T_child[:3, 3].tolist()
-    rotation = Quaternion(x=qx, y=qy, z=qz, w=w)
-    translation = Vector3(x=x, y=y, z=z)
-    return FrameTransform(
-        timestamp=_stamp(t_ns), parent_frame_id=MAP, child_frame_id=child, translation=translation, rotation=rotation
-    )
-
-
-def _cloud(record: ThinnedSweep, origin: Array) -> PointCloud:
-    data = (record.points_map - origin).astype("<f4").tobytes()
-    columns = [PackedElementField(name=n, offset=4 * i, type=PackedElementField.FLOAT32) for i, n in enumerate("xyz")]
-    place = _pose(np.zeros(3), 0.0)
-    return PointCloud(
-        timestamp=_stamp(record.t_ns), frame_id=MAP, pose=place, point_stride=12, fields=columns, data=data
-    )
-
-
-def _picture(record: CameraFrame, origin: Array) -> Iterator[Message]:
-    name, t_ns = record.camera.name, record.t_ns
-    stamp, topic = _stamp(t_ns), f"/camera/{name}"
-    if record.map_T_cam is not None:
-        yield t_ns, "/tf", _frame(t_ns, name, transform(record.map_T_cam[:3, :3], record.map_T_cam[:3, 3] - origin))
-    yield t_ns, f"{topic}/calibration", _calibration(record)
-    yield t_ns, f"{topic}/image", CompressedImage(timestamp=stamp, frame_id=name, data=record.jpeg, format="jpeg")
-    lines = [
-        PointsAnnotation(
-            timestamp=stamp,
-            type=PointsAnnotation.LINE_LIST,
-            points=[Point2(x=u, y=v) for u, v in outline.reshape(-1, 2).tolist()],
-            outline_color=_color(agent, 1.0),
-            thickness=OUTLINE_PX,
-        )
-        for agent, outline in record.outlines
-    ]
-    texts = []
-    for agent, outline in record.outlines:
-        u, v = outline.reshape(-1, 2).min(axis=0).tolist()
-        place, color = Point2(x=u, y=v), _color(agent, 1.0)
-        texts.append(
-            TextAnnotation(timestamp=stamp, position=place, text=agent.id, font_size=TEXT_PX, text_color=color)
-        )
-    yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
-
-
-def _calibration(record: CameraFrame) -> CameraCalibration:
-    camera = record.camera
-    known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
-    few = len(camera.distortion) <= PLUMB_BOB
-    model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
-    coefficients = [*camera.distortion, *[0.0] * count][:count]
-    return CameraCalibration(
-        timestamp=_stamp(record.t_ns),
-        frame_id=camera.name,
-        width=camera.width_px,
-        height=camera.height_px,
-        distortion_model=model,
-        D=coefficients,
-        K=camera.K.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.column_stack([camera.K, np.zeros(3)]).ravel().tolist(),
-    )
