@@ -14,8 +14,9 @@ from log2sim.datatypes import Agent, Log, Scenario, Stream, Sweep, Waypoints
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform
 from log2sim.road.builder import MAX_SWEEPS, STANDING_RECORDS, choose_records, map_ground, sweep_step_m
-from log2sim.road.ground_map import GroundMap
+from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.road_users import RoadUsers, draw_outlines
+from log2sim.road.surface import PointCollector
 
 SETTINGS = MapConfig(cell_m=0.05)
 
@@ -236,6 +237,31 @@ def test_pictures_and_points_of_moving_agents_are_left_out() -> None:
     error = with_car.height_m - height_at(positions(with_car))
     lane = np.abs(positions(with_car)[..., 1] + 2.5) < 0.8
     assert np.nanpercentile(np.abs(error[lane & near_path(positions(with_car), 10.0)]), 95) < 0.05
+
+
+def test_what_the_lowest_beam_meets_hides_the_ground_from_its_foot_on_and_a_sign_over_the_road_does_not() -> None:
+    """The side of a vehicle next to the ego that a LiDAR on the roof meets at 1 m alone is in no track and yet no ground."""
+    log = world_log(World(lidars=1))
+    raster = Raster.covering((-20.0, 30.0, -20.0, 20.0), 0.1)
+    sweep = log.streams["l0"].read(0)
+    map_T_lidar = log.map_T_sensor("l0", sweep.stamp_ns)[0][0]
+    xyz = apply(map_T_lidar, sweep.xyz_m.astype(float))
+    sensor = map_T_lidar[:3, 3]
+    left = (xyz[:, 1] - sensor[1] > np.abs(xyz[:, 0] - sensor[0])) & (xyz[:, 1] > 2.0)
+    along = np.linspace(-1.5, 1.5, 400) + sensor[0]
+    lowest, highest = (
+        np.column_stack([along, np.full(400, y), height_at(np.column_stack([along, np.full(400, y)])) + above])
+        for y, above in ((sensor[1] + 2.0, 1.0), (sensor[1] - 12.0, 2.2))
+    )
+    points = apply(np.linalg.inv(map_T_lidar), np.concatenate([xyz[~left], lowest, highest])).astype(np.float32)
+    shown = dataclasses.replace(sweep, xyz_m=points, intensity=None)
+    prepared = PointCollector(log, raster, 1, 0.0).prepare("l0", shown, np.zeros(raster.shape, np.uint8))
+    assert prepared is not None
+    above = prepared.hiding[:, 2] - height_at(prepared.hiding[:, :2])
+    beside, over = (np.abs(prepared.hiding[:, 1] - y) < 0.01 for y in (lowest[0, 1], highest[0, 1]))
+    assert above[beside].min() < 0.1
+    assert np.diff(np.unique(above[beside].round(2))).max() < 0.15
+    assert above[over].min() > 2.0
 
 
 def test_dense_sweeps_are_taken_farther_apart_and_sparse_ones_where_the_log_has_them() -> None:

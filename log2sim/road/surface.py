@@ -22,6 +22,10 @@ REACH_M = 45.0
 NEAR_GROUND_M = 0.4
 # What is higher hides the ground behind it.
 MIN_HIDING_HEIGHT_M = 0.3
+# Points that fill what is below the lowest beam are this far apart.
+FILL_STEP_M = 0.1
+# Directions around a LiDAR, of each of which the lowest return is taken: neighboring points are at most half a degree apart.
+DIRECTIONS = 720
 # Points above the ground that are kept of a sweep: about one a degree in both directions.
 MAX_HIDING_POINTS = 20_000
 # Beams of LiDARs are at least 0.1 degrees apart; in between, the ego's pitch moves points of one beam from bin to bin.
@@ -124,11 +128,14 @@ class PointCollector:
         local = (xyz - origin).astype(np.float32)
         ground = estimate_ground(local, np.zeros(2), 0.0)
         within = np.flatnonzero(np.hypot(local[:, 0], local[:, 1]) < REACH_M)
+        lowest = _lowest(xyz[within] - sensor)
         local = local[within]
         height = local[:, 2] - ground.at(local[:, :2])
         above = within[(height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)]
         above = above[:: max(len(above) // MAX_HIDING_POINTS, 1)]
-        hiding = xyz[above]
+        # Nothing was measured below what the lowest beam meets: the side of a vehicle next to the sensor hides the ground as well.
+        standing = lowest & (height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)
+        hiding = np.concatenate([xyz[above], _down_to_ground(xyz[within[standing]], height[standing])])
         near = within[np.abs(height) < NEAR_GROUND_M]
         near = near[:: -(-len(near) // self._most)] if len(near) > self._most else near
         cell, inside = self._raster.index_of(xyz[near, :2])
@@ -157,6 +164,26 @@ class PointCollector:
         )  # fmt: skip
         parts, self._parts = [empty, *self._parts], []
         return GroundPoints(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _lowest(away: Array) -> NDArray[np.bool_]:
+    """Mark the lowest return of each direction around a LiDAR, of points (N, 3), m, from it: none shows what is below it."""
+    level = np.hypot(away[:, 0], away[:, 1])
+    slope = np.divide(away[:, 2], level, out=np.full(len(away), np.inf), where=level > 0)
+    turn = np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5
+    direction = np.minimum((turn * DIRECTIONS).astype(np.int64), DIRECTIONS - 1)
+    least = np.full(DIRECTIONS, np.inf)
+    np.minimum.at(least, direction, slope)
+    return np.asarray((slope <= least[direction]) & np.isfinite(slope))
+
+
+def _down_to_ground(xyz: Array, height_m: NDArray[np.float32]) -> Array:
+    """Return points (F, 3) every `FILL_STEP_M` between points (N, 3), m, and the ground that far below them."""
+    count = np.ceil(height_m / FILL_STEP_M).astype(np.int64)
+    below = np.repeat(xyz, count, axis=0)
+    first = np.repeat(np.cumsum(count) - count, count)
+    below[:, 2] -= FILL_STEP_M * (np.arange(len(below)) - first + 1)
+    return np.asarray(below, dtype=np.float64)
 
 
 ROUNDS = 5
