@@ -285,7 +285,9 @@ def test_a_full_label_is_nearest_to_its_own_track_and_else_the_legend_has_it() -
         for a in scenario.agents
         if any(t.get_text().startswith(f"{a.id} ·") for t in still(scenario, roles).ax.texts)
     }
-    assert {a.id for a in scenario.agents if not any(row.startswith(f"{a.id} ·") for row in rows)} - {"ego"} == told - {"ego"}
+    assert {a.id for a in scenario.agents if not any(row.startswith(f"{a.id} ·") for row in rows)} - {"ego"} == told - {
+        "ego"
+    }
 
 
 @pytest.mark.slow

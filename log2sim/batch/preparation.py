@@ -18,4 +18,4 @@ class Preparation(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Worker) -> None:
         """Prepare a worker; called in its main thread."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        import log2sim.batch.run  # noqa: F401
+        import log2sim.pipeline  # noqa: F401
