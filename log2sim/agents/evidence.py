@@ -280,7 +280,9 @@ def _near_rays(
     """
     if len(to) == 0:
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    azimuth, slope = np.arctan2(to[:, 1], to[:, 0]), to[:, 2] / np.hypot(to[:, 0], to[:, 1])
+    azimuth = np.arctan2(to[:, 1], to[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):  # an upright ray has no slope and meets no box
+        slope = to[:, 2] / np.hypot(to[:, 0], to[:, 1])
     order = np.argsort(azimuth)
     turns = np.concatenate([azimuth[order] - 2 * np.pi, azimuth[order], azimuth[order] + 2 * np.pi])
     distance, reach = np.hypot(to_center[:, 0], to_center[:, 1]), np.hypot(size_m[:, 0], size_m[:, 1]) / 2 + drift_m
