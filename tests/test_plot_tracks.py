@@ -328,3 +328,13 @@ def test_static_agents_have_labels_on_demand() -> None:
     view = choose_viewport(roles).fitted(400, 400)
     assert not any(label.text == "p" for label in place_labels(roles, view, 1.0).labels)
     assert any(label.text == "p" for label in place_labels(roles, view, 1.0, static=True).labels)
+
+
+def test_labels_keep_clear_of_sensors_at_the_road() -> None:
+    roles = assign_roles(crossing())
+    view = choose_viewport(roles).fitted(400, 400)
+    for label in place_labels(roles, view, 1.0).labels:
+        at = {"x_m": label.place_m[0], "y_m": label.place_m[1]}
+        others = place_labels(roles, view, 1.0, sensors=[at]).labels
+        half = np.array([len(label.text) * 0.25, 0.5]) * label.size_pt * view.m_per_pt
+        assert not any((np.abs(o.place_m - label.place_m) < half).all() for o in others)

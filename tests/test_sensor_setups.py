@@ -9,12 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from command_line import names, run
 from worlds import tiny_log, tiny_table
 
+from log2sim.agents.estimate import roadside_sensors
 from log2sim.datatypes import Scenario
 from log2sim.files import plugins
+from log2sim.geometry import rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
 
 TOP, FRONT = tiny_table()["lidar"][0], tiny_table()["camera"][0]
@@ -149,11 +152,27 @@ def test_sensors_at_the_road_stand_in_the_scenario_with_where_they_look(
     assert [(s["name"], s["kind"]) for s in (eye, pole)] == [("eye", "camera"), ("pole", "lidar")]
     for sensor in (eye, pole):
         assert (sensor["x_m"], sensor["y_m"], sensor["z_m"]) == pytest.approx((0.0, -6.0, 5.0), abs=1e-6)
-    assert eye["yaw_rad"] == pytest.approx(math.radians(20.0), abs=1e-6)
-    assert 0.5 < eye["fov_rad"] < 3.0
-    assert pole["fov_rad"] == pytest.approx(2 * math.pi)
+        assert sensor["yaw_rad"] == pytest.approx(math.radians(20.0), abs=0.01)
+    # A camera of 70 degrees that looks down shows a wider part of the ground.
+    tilt = math.cos(math.radians(12.0))
+    assert eye["fov_rad"] == pytest.approx(2 * math.atan(math.tan(math.radians(35.0)) / tilt), abs=0.02)
+    assert pole["fov_rad"] == pytest.approx(math.radians(120.0), abs=0.02)
     moved = scenario.aligned_to(replace(scenario, map=replace(scenario.map, offset_m=(100.0, 0.0, 0.0))))
     assert abs(moved.sensors[0]["x_m"]) == pytest.approx(100.0)
+
+
+def test_fields_of_view_are_those_of_the_lens_and_of_the_points() -> None:
+    log, _ = tiny_log(camera=[EYE], lidar=[{**POLE, "azimuth_deg": [-180.0, 180.0]}], ego=None)
+    focal_px = log.cameras["eye"].width_px / 2.5  # of an equidistant lens: half the width is 1.25 rad
+    K = np.array([[focal_px, 0.0, log.cameras["eye"].width_px / 2], [0.0, focal_px, 150.0], [0.0, 0.0, 1.0]])
+    lens = {"K": K, "distortion_model": "fisheye", "distortion": (1e-9, 0.0, 0.0, 0.0)}
+    level = transform(rotation_from_rpy(-math.pi / 2, 0.0, -math.pi / 2), np.zeros(3))
+    rolled = transform(rotation_from_rpy(0.0, 0.0, math.pi / 2), np.zeros(3))
+    for roll, half in ((np.eye(4), 1.25), (rolled, 150.0 / focal_px)):
+        eye = replace(log.cameras["eye"], **lens, mount_T_cam=level @ roll)
+        camera, pole = roadside_sensors(replace(log, cameras={"eye": eye}), 50.0)
+        assert (camera["yaw_rad"], camera["fov_rad"]) == pytest.approx((0.0, 2 * half), abs=0.01)
+        assert (pole["fov_rad"], pole["range_m"]) == (2 * math.pi, 50.0)
 
 
 @pytest.mark.slow

@@ -28,7 +28,8 @@ from log2sim.datatypes import (
     Track,
     Waypoints,
 )
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, yaw_of
+from log2sim.errors import RecordError
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, undistort, yaw_of
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
 from log2sim.tracking.forward import MAX_MISSES
@@ -248,22 +249,67 @@ def provenance_of(log: Log, config: Config, detector: str, poses: Mapping[str, A
     }
 
 
+# Neighboring directions of LiDARs are less than a degree apart; a mast next to one hides a few degrees more.
+MIN_BLIND_RAD = math.radians(5.0)
+# Sweeps of which directions are taken, over the whole log.
+VIEW_SWEEPS = 3
+
+
 def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
-    """Return the sensors that are fixed in the map, as a scenario states them; LiDARs are taken to look all around."""
-    cameras = [
-        (name, c.mount_T_cam, 2 * math.atan(c.width_px / (2 * c.K[0, 0])))
-        for name, c in log.cameras.items()
-        if c.mount == "map"
-    ]
-    lidars = [(name, lidar.mount_T_lidar, 2 * math.pi) for name, lidar in log.lidars.items() if lidar.mount == "map"]
+    """Return the sensors that are fixed in the map, as a scenario states them.
+
+    A camera looks where the rays of its middle row and column go, a LiDAR where it measured points.
+    """
+    mounts = [(name, "camera", c.mount_T_cam) for name, c in log.cameras.items() if c.mount == "map"]
+    mounts += [(name, "lidar", lidar.mount_T_lidar) for name, lidar in log.lidars.items() if lidar.mount == "map"]
     entries = []
-    for kind, sensors in (("camera", cameras), ("lidar", lidars)):
-        for name, map_T_sensor, fov_rad in sensors:
-            ahead = map_T_sensor[:2, 2 if kind == "camera" else 0]
-            place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
-            look = {"yaw_rad": math.atan2(ahead[1], ahead[0]), "fov_rad": fov_rad, "range_m": range_m}
-            entries.append({"name": name, "kind": kind, **place, **look})
+    for name, kind, map_T_sensor in mounts:
+        rays_map = (_camera_rays(log, name) if kind == "camera" else _lidar_rays(log, name)) @ map_T_sensor[:3, :3].T
+        yaw_rad, fov_rad = _view_of(np.arctan2(rays_map[:, 1], rays_map[:, 0]))
+        place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
+        look = {"yaw_rad": yaw_rad, "fov_rad": fov_rad, "range_m": range_m}
+        entries.append({"name": name, "kind": kind, **place, **look})
     return tuple(entries)
+
+
+def _camera_rays(log: Log, name: str) -> Array:
+    """Return rays (N, 3), cam frame, of pixels in the middle row and column that the lens model explains."""
+    camera = log.cameras[name]
+    u, v = np.linspace([0.0, 0.0], [camera.width_px, camera.height_px], 65).T
+    row = np.column_stack([u, np.full_like(u, camera.height_px / 2)])
+    column = np.column_stack([np.full_like(v, camera.width_px / 2), v])
+    xy = undistort(camera, np.concatenate([row, column]))
+    xy = xy[np.isfinite(xy).all(axis=1)]
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+def _lidar_rays(log: Log, name: str) -> Array:
+    """Return rays (N, 3), lidar frame, to the points of some sweeps of a LiDAR that is fixed in the map."""
+    stream = log.streams[name]
+    lidar_T_map = inverse(log.lidars[name].mount_T_lidar)
+    rays = [np.zeros((0, 3))]
+    count = len(stream.t_ns)
+    for i in np.unique(np.linspace(0, count, VIEW_SWEEPS, endpoint=False).astype(int))[:count]:
+        try:
+            sweep = stream.read(int(i))
+        except RecordError:
+            continue  # the stages before have reported it
+        xyz = np.asarray(sweep.xyz_m, dtype=np.float64)
+        rays.append(apply(lidar_T_map, xyz) if sweep.frame == "map" else xyz)
+    return np.concatenate(rays)
+
+
+def _view_of(azimuth_rad: Array) -> tuple[float, float]:
+    """Return middle and width, rad, of the narrowest field of view that holds azimuths (N,); all around where there are not two."""
+    azimuth = np.unique(azimuth_rad % (2 * math.pi))
+    if len(azimuth) < 2:
+        return 0.0, 2 * math.pi
+    gap = np.diff(azimuth, append=azimuth[0] + 2 * math.pi)
+    widest = int(gap.argmax())
+    if gap[widest] < MIN_BLIND_RAD:
+        return 0.0, 2 * math.pi
+    middle = azimuth[widest] + gap[widest] / 2 + math.pi
+    return math.remainder(float(middle), 2 * math.pi), float(2 * math.pi - gap[widest])
 
 
 def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:

@@ -56,22 +56,25 @@ const stateOf = (signal, t) => {
   return k < 0 ? "unknown" : signal.state[k];
 };
 
-// Sensors that are fixed in the map, with their fields of view.
+// Sensors that are fixed in the map, with their fields of view; of those that look all around only the range.
 const drawSensors = (painter, sensors) => {
   const { ctx, view } = painter;
   ctx.fillStyle = ctx.strokeStyle = theme.road;
   for (const { x_m, y_m, yaw_rad, fov_rad, range_m } of sensors) {
     const x = view.sx(x_m), y = view.sy(y_m);
     ctx.beginPath();
-    if (fov_rad < 6.28) ctx.moveTo(x, y);
+    const around = fov_rad > 6.28;
+    if (!around) ctx.moveTo(x, y);
     ctx.arc(x, y, range_m * view.scale, -yaw_rad - fov_rad / 2, -yaw_rad + fov_rad / 2);
     ctx.closePath();
     ctx.globalAlpha = 0.06;
-    ctx.fill();
+    if (!around) ctx.fill();
     ctx.globalAlpha = 0.5;
     ctx.stroke();
     ctx.globalAlpha = 1;
-    ctx.fillRect(x - 4, y - 4, 8, 8);
+    ctx.beginPath();
+    ctx.moveTo(x, y - 5), ctx.lineTo(x + 5, y + 4), ctx.lineTo(x - 5, y + 4);
+    ctx.fill();
   }
 };
 

@@ -44,6 +44,7 @@ from log2sim.visualization.plot.style import (
     PAPER,
     PARKED_FACE,
     SENSOR_COLOR,
+    SENSOR_PT,
     SIGNAL_COLOR,
     WARNING,
     halo,
@@ -428,19 +429,19 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
 
 
 def draw_sensors(ax: Axes, sensors: Sequence[Mapping[str, Any]]) -> None:
-    """Draw sensors that are fixed in the map with their fields of view."""
+    """Draw sensors that are fixed in the map with their fields of view; of those that look all around only the range."""
     for sensor in sensors:
         half = min(np.rad2deg(sensor["fov_rad"]) / 2, 180.0)
         yaw, place = np.rad2deg(sensor["yaw_rad"]), (sensor["x_m"], sensor["y_m"])
-        wedge = Wedge(
-            place, sensor["range_m"], yaw - half, yaw + half, fc=SENSOR_COLOR, ec=SENSOR_COLOR, alpha=0.05, lw=0.8
-        )
+        face = "none" if half > 179.9 else to_rgba(SENSOR_COLOR, 0.05)
+        edge = to_rgba(SENSOR_COLOR, 0.3)
+        wedge = Wedge(place, sensor["range_m"], yaw - half, yaw + half, fc=face, ec=edge, lw=0.8)
         wedge.set_zorder(LANES - 0.2)
         ax.add_artist(wedge)
         ax.plot(
             *place,
             marker="^",
-            ms=7,
+            ms=SENSOR_PT,
             mfc=SENSOR_COLOR,
             mec=PAPER,
             mew=0.8,
@@ -513,7 +514,7 @@ def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
         if features.borders:
             rows.append((Line2D([0, 1], [0, 1], color=BORDER_COLOR, lw=BORDER_PT), "border of a road"))
     if scenario.sensors:
-        marker: dict[str, Any] = {"marker": "^", "ms": 6.0, "mfc": SENSOR_COLOR, "mec": PAPER, "ls": "none"}
+        marker: dict[str, Any] = {"marker": "^", "ms": SENSOR_PT, "mfc": SENSOR_COLOR, "mec": PAPER, "ls": "none"}
         rows.append((Line2D([], [], **marker), "sensor at the road, its field of view"))
     if scenario.signals:
         style: dict[str, Any] = {"marker": "o", "ms": 5.0, "mfc": SIGNAL_COLOR["red"], "mec": PAPER, "ls": "none"}

@@ -31,6 +31,7 @@ from log2sim.visualization.plot.style import (
     PAPER,
     PARKED_EDGE,
     PARKED_FACE,
+    SENSOR_PT,
     halo,
     printable,
 )
@@ -112,15 +113,26 @@ def full_label(role: AgentRole) -> str:
     return f"{printable(role.agent.id, MAX_ID_LETTERS)}{'?' * role.agent.is_doubtful} · {speed_text(role.agent)}"
 
 
-def place_labels(roles: AgentRoles, view: Viewport, times_step_s: float, *, static: bool = False) -> Placed:
+def place_labels(
+    roles: AgentRoles,
+    view: Viewport,
+    times_step_s: float,
+    *,
+    static: bool = False,
+    sensors: Sequence[Mapping[str, Any]] = (),
+) -> Placed:
     """Find places for the labels of movers and doubtful agents, with `static` of all static ones, and for times along the ego's track.
+
+    Labels keep clear of `sensors`, those of a scenario.
 
     Notes
     -----
     Short labels of all movers get their places before any is replaced by the full one, so that the long texts of some do not
     take the room of the others.
     """
-    room = LabelRoom(view, _occupied(roles, view))
+    mark = SENSOR_PT / 2 * view.m_per_pt
+    marks = [(s["x_m"] - mark, s["y_m"] - mark, s["x_m"] + mark, s["y_m"] + mark) for s in sensors]
+    room = LabelRoom(view, [*_occupied(roles, view), *marks])
     tracks = {role.agent.id: _points_of(role.agent) for role in roles.movers}
     placed = Placed()
     leading = [role for role in roles.movers if role.leading]
@@ -296,7 +308,7 @@ def _bounds(agent: Agent, k: int) -> Bounds:
 
 
 MAX_NAMED = 8
-"""With more leading movers labels are numbers, which the legend explains: names would cover the boxes of others."""
+"""With more leading movers their speeds are in the legend: longer labels would cover the boxes of others."""
 
 MOVING_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
 """Where a label may be beside its box, the best first."""
@@ -305,7 +317,7 @@ GAP_PT = 2.0
 
 
 def names_fit(roles: AgentRoles) -> bool:
-    """Tell whether labels of an animation are names with speeds, so that the legend need not list them."""
+    """Tell whether labels of an animation have speeds, so that the legend need not list them."""
     return sum(role.leading for role in roles.movers) <= MAX_NAMED
 
 

@@ -126,10 +126,14 @@ def _fit_labels(
         return lay_out(rows), rows, ()
     told = leading | {agent.id for agent in roles.stationary}
     layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, told))
-    placed = place_labels(roles, layout.view, mark_step_s, static=overlays.options.label_static)
+    placed = place_labels(
+        roles, layout.view, mark_step_s, static=overlays.options.label_static, sensors=scenario.sensors
+    )
     if not told <= placed.told | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
         layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, placed.told))
-        placed = place_labels(roles, layout.view, mark_step_s, static=overlays.options.label_static)
+        placed = place_labels(
+            roles, layout.view, mark_step_s, static=overlays.options.label_static, sensors=scenario.sensors
+        )
     return layout, _legend(scenario, roles, overlays, mark_step_s, placed.told), tuple(placed.labels)
 
 
@@ -235,7 +239,7 @@ def plot(
     if replay is not None:
         drawing.draw_replay(ax, replay, roles)
         drawing.draw_collisions(ax, new_collisions(replay)[1])
-    placed = place_labels(roles, view, step_s)
+    placed = place_labels(roles, view, step_s, sensors=scenario.sensors)
     draw_labels(ax, placed.labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
     if new if legend is None else legend:

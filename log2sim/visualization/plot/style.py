@@ -35,7 +35,7 @@ LANE_FACE, LANE_ARROW = "#EBEEF2", "#C9D0D9"
 MARKING_COLOR = {"white": "#55606E", "yellow": "#C58A00"}
 """Paint on the ground; white paint is dark, since the pictures are white."""
 
-SENSOR_COLOR = "#8E3B9E"
+SENSOR_COLOR, SENSOR_PT = END_COLOR["road"], 7.0
 BORDER_COLOR = "#9A7B5B"
 SIGNAL_COLOR = {
     "red": "#D11F1F", "red_yellow": "#E2711D", "yellow": "#E0A800", "green": "#1D9A4B", "off": "#3A434F", "unknown": "#9AA3AE",
