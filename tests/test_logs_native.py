@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import struct
+import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -514,6 +517,31 @@ def test_a_header_that_promises_too_much_allocates_nothing(folder: Path) -> None
     (folder / "top" / "x.pcd").write_text(text.replace(str(10**12), "2").replace("binary", "binary_compressed"))
     with pytest.raises(RecordError, match="binary_compressed is not supported"):
         open_log(folder).streams["top"].read(2)
+
+
+@pytest.fixture
+def switching_collector() -> Iterator[None]:
+    """Collect garbage often, each time with a change of threads, as where a library (Dask, hypothesis) follows the collector."""
+    threshold = gc.get_threshold()
+
+    def switch(phase: str, info: dict[str, int]) -> None:
+        time.sleep(0)
+
+    gc.callbacks.append(switch)
+    gc.set_threshold(50)
+    yield
+    gc.set_threshold(*threshold)
+    gc.callbacks.remove(switch)
+
+
+@pytest.mark.usefixtures("switching_collector")
+def test_threads_parse_headers_of_arrays_at_the_same_time(folder: Path) -> None:
+    log = open_log(folder)
+    stream = log.streams[next(iter(log.lidars))]
+    expected = stream.read(0).xyz_m
+    with ThreadPoolExecutor(8) as pool:
+        for sweep in pool.map(stream.read, [0] * 2000):
+            assert np.array_equal(sweep.xyz_m, expected)
 
 
 def test_a_missing_or_unknown_folder_says_what_is_expected(tmp_path: Path) -> None:

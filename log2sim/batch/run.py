@@ -8,7 +8,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import islice
@@ -203,6 +203,9 @@ def local_workers(count: int) -> Iterator[Workers]:
 
         client.register_plugin(Preparation())
         yield Workers(client, are_ours=True)
+        # Dask cannot stop a worker that it is just starting in place of one that died.
+        with suppress(TimeoutError):
+            client.wait_for_workers(count, timeout=START_TIMEOUT_S)
 
 
 @contextmanager

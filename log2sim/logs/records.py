@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import lzma
 import struct
+import threading
 import tokenize
 import zipfile
 import zlib
@@ -528,6 +529,10 @@ def _sweep_points(array: NDArray[Any]) -> NDArray[Any]:
     return array[:, :3]
 
 
+_HEADER_LOCK = threading.Lock()
+"""NumPy parses headers with `ast`, whose depth counter threads share in CPython before 3.13: two at once raise SystemError."""
+
+
 def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
     """Read one .npy array whose header was checked before its data are allocated; never unpickles."""
     version = np.lib.format.read_magic(stream)
@@ -536,7 +541,8 @@ def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
         raise ValueError(f"{what} has a header of more than {MAX_NPY_HEADER_BYTES} bytes")
     header = io.BytesIO(length + stream.read(int.from_bytes(length, "little")))
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read_header(header)
+    with _HEADER_LOCK:
+        shape, fortran, dtype = read_header(header)
     columns = shape[1] if len(shape) == 2 else 1
     if dtype.kind not in "fiu" or len(shape) not in (1, 2) or not 0 <= columns <= MAX_COLUMNS:
         raise ValueError(f"{what} is {str(dtype)[:40]} {shape}, expected numbers, (N, 3) or (N,)")
