@@ -270,9 +270,18 @@ def left_free(
 
 
 def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
-    """Return where rays start and end (K, 3) along the axes of a box, relative to the middle of its bottom at their times."""
-    place = np.append(box.xy_m, box.bottom_m) - origin + rays.t_s[:, None] * np.append(box.velocity_mps, 0.0)
-    start, end = rays.start - place, rays.end - place
+    """Return where rays that pass near a box start and end (K, 3) along its axes, relative to the middle of its bottom then."""
+    position, velocity = rays.position[:, :2].astype(np.float64), rays.velocity_mps[:, :2]
+    # Box and LiDAR move past each other while the rays are sent.
+    drift_m = np.hypot(*(velocity - box.velocity_mps).T).max() * np.abs(rays.t_s).max()
+    reach_m = np.hypot(*box.size_m[:2]) / 2 + 2 * drift_m + MAX_GAP_M + MAX_SHIFT_SHARE * box.size_m.max() + MAX_SHIFT_M
+    to_x, to_y = (box.xy_m - origin[:2] - position).T.astype(np.float32)
+    x, y = rays.end[:, 0] - rays.position[rays.sensor, 0], rays.end[:, 1] - rays.position[rays.sensor, 1]
+    across = np.abs(to_x[rays.sensor] * y - to_y[rays.sensor] * x)
+    near = np.flatnonzero(across <= np.float32(reach_m) * np.hypot(x, y))
+    end, sensor, t_s = rays.end[near], rays.sensor[near], rays.t_s[near, None]
+    place = np.append(box.xy_m, box.bottom_m) - origin + t_s * np.append(box.velocity_mps, 0.0)
+    start, end = rays.position[sensor] + rays.velocity_mps[sensor] * t_s - place, end - place
     start[:, :2], end[:, :2] = rotate(start[:, :2], -box.yaw_rad), rotate(end[:, :2], -box.yaw_rad)
     return start, end
 
