@@ -216,7 +216,7 @@ class GroundMapBuilder:
         map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
         if self._colors is None or not known[0]:
             return
-        view = View(self._log, self._log.cameras[camera], t_ns, map_T_cam[0])
+        view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
         users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
         if view.camera.mount == "map":
             self._standing.setdefault(camera, (view, StandingPictures()))[1].add(image_bgr, users)

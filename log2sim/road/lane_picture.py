@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, Camera, apply, inverse, project
-from log2sim.road.ground_map import GroundMap
+from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.markings import list_markings
-from log2sim.road.mosaic import render_birdseye
-from log2sim.road.pictures import GroundView, Image
+from log2sim.road.pictures import Image, View, sample_at, warp_onto
 from log2sim.road.ridges import log_color
+from log2sim.road.surface import Surface
 
 WIDTH_PX = 960  # pictures are made smaller, so that grain is no line
 MIN_LENGTH = 0.02  # of the width
@@ -454,12 +454,16 @@ def _visible(found: PictureMarkings, marking: Marking) -> float:
 
 def _lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
     """Lay the ground in front of a camera out flat."""
-    view = GroundView.from_pose(image_bgr, camera, camera.mount_T_cam)
     x, y = camera.mount_T_cam[:2, 3]
-    extent = (x, x + REACH_M, y - HALF_WIDTH_M, y + HALF_WIDTH_M)
-    laid = render_birdseye([view], extent_m=extent, resolution_m=CELL_M, coarsest_m=COARSEST_M, frame="ego")
-    unknown = np.full(laid.alpha.shape, np.nan, np.float32)
-    ground = GroundMap(laid.image_bgr, laid.alpha, unknown, unknown, laid.resolution_m, laid.extent_m)
+    raster = Raster.covering((x, x + REACH_M, y - HALF_WIDTH_M, y + HALF_WIDTH_M), CELL_M)
+    color, alpha = np.zeros((*raster.shape, 3), np.uint8), np.zeros(raster.shape, np.uint8)
+    unknown = np.full(raster.shape, np.nan, np.float32)
+    flat = Surface(raster, np.zeros(raster.shape, np.float32), np.ones(raster.shape, bool))
+    warp = warp_onto(View(camera, camera.mount_T_cam), flat, 0.0, raster, COARSEST_M)
+    if warp is not None:
+        color[warp.rows, warp.columns] = sample_at(image_bgr, warp.u, warp.v, warp.scale)
+        alpha[warp.rows, warp.columns] = np.rint(255 * warp.opacity)
+    ground = GroundMap(color, alpha, unknown, unknown, raster.resolution_m, raster.extent_m)
     return keep_road(ground, float(x), float(y))
 
 
