@@ -24,6 +24,7 @@ from log2sim.localization.odometry import (
     read_ego_sweep,
     run_odometry,
 )
+from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
 from log2sim.localization.verdict import (
     bridge_by_lidar,
@@ -64,6 +65,8 @@ class PoseChoice:
         Faults of given poses.
     checked : bool
         Whether given poses were checked, and repaired where that was needed.
+    refined : bool
+        Whether given poses were refined by sweeps.
     """
 
     requested: str
@@ -76,6 +79,7 @@ class PoseChoice:
     during_ns: tuple[int, int] | None = None
     faults: tuple[Fault, ...] = ()
     checked: bool = True
+    refined: bool = False
 
     @property
     def origin(self) -> str:
@@ -97,7 +101,8 @@ class PoseChoice:
     def to_provenance(self) -> dict[str, Any]:
         """Return what `localize_like` needs to find the same poses again."""
         during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
-        return {"source": self.source, **during, **({} if self.checked else {"check": False})}
+        unchecked = {} if self.checked else {"check": False}
+        return {"source": self.source, **during, **unchecked, **({"refined": True} if self.refined else {})}
 
 
 GIVEN = PoseChoice("given", "given", "the log's own poses")
@@ -190,19 +195,20 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
     window = None
     if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
         window = (int(during[0]), int(during[1]))
-    check = entry.get("check") is not False
-    return _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))[0]
+    check, refine = entry.get("check") is not False, entry.get("refined") is True
+    return _localize(_Request(log, source, window, progress or (lambda *_: None), check=check, refine=refine))[0]
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """What to localize, how, from which part, and whether poses of the log are checked first."""
+    """What to localize, how, from which part, and whether poses of the log are checked first and refined."""
 
     log: Log
     requested: str
     during_ns: tuple[int, int] | None
     progress: Progress
     check: bool = True
+    refine: bool = True
 
     def answer(self, source: str, reason: str, **found: Any) -> PoseChoice:
         """Return the choice of a source."""
@@ -227,7 +233,16 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     else:
         mended = request.log.changed(ego=checked.track)
     log, choice = _choose(replace(request, log=mended))
-    return log, replace(choice, faults=faults) if faults else choice
+    choice = replace(choice, faults=faults) if faults else choice
+    if choice.source != "given" or not request.refine:
+        return log, choice
+    refined = refine_poses(log, request.during_ns)
+    if refined is log or refined.ego is None or log.ego is None:
+        return log, choice
+    moved_m = np.linalg.norm(refined.ego.map_T_ego[:, :3, 3] - log.ego.map_T_ego[:, :3, 3], axis=1).max()
+    note = f"poses of the log are moved by up to {moved_m:.2f} m, by which surfaces in sweeps lie on each other"
+    # What is found again is found by the same sweeps.
+    return refined, replace(choice, refined=True, notes=(*choice.notes, note), during_ns=request.during_ns)
 
 
 def _choose(request: _Request) -> tuple[Log, PoseChoice]:

@@ -367,7 +367,7 @@ def map_ground(
     progress : callable, optional
         Called as `progress(stage, done, total)`.
     refine : bool
-        Whether the poses are refined first, see `refine_poses`.
+        Whether the poses are refined first, see `refine_poses`; those of a run, as in `Result.log`, are.
 
     Raises
     ------
@@ -376,7 +376,8 @@ def map_ground(
     """
     reader, settings = reader or RecordReader(log), settings or MapConfig()
     if refine:
-        log = refine_poses(log, scenario, reader)
+        end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        log = refine_poses(log, (scenario.t0_ns, end_ns))
     builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
     look_again(log, reader, [builder], partial(progress, "map: pictures"))
     reader.require_some()

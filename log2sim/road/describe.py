@@ -15,9 +15,8 @@ from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
-from log2sim.localization.pose_refinement import MAX_KEYFRAMES, place_as_given, refine_poses
 from log2sim.perception.detection_cache import LightBox
-from log2sim.perception.frames import KeepingReader, PictureConsumer, RecordReader, look_again
+from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
 from log2sim.plan import Decision, Outcome, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
@@ -65,16 +64,25 @@ def describe(
         Called as `progress(stage, done, total)`.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
-    reader = KeepingReader(log, MAX_KEYFRAMES)
-    with clock.stage("map poses", progress):
-        started = start_map(scenario, log, config, reader) if plan.keeps(Stage.LANES) else None
+    reader = RecordReader(log)
+    builder, features = None, MapFeatures() if plan.keeps(Stage.LANES) else None
+    if features is not None:
+        try:
+            builder = GroundMapBuilder(log, scenario, config.map, reader)
+        except LogError as problem:
+            features = MapFeatures(notes=(f"no map of the ground: {problem}",))
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
-    builder = None if started is None else started.builder
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
     with clock.stage("pictures", progress):
         look_again(log, reader, consumers, lambda done, total: progress("pictures", done, total))
     with clock.stage("lanes", progress):
-        features = None if started is None else with_lanes(read_map(started, log, reader), scenario)
+        if builder is not None:
+            ground = builder.build()
+            markings, borders, notes = find_markings(ground)
+            features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
+        if features is not None:
+            lanes, notes = infer_lanes(features.markings, features.borders, scenario)
+            features = replace(features, lanes=lanes, notes=(*features.notes, *notes))
     with clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
     with clock.stage("signals"):
@@ -83,51 +91,6 @@ def describe(
     figures = {"map_features": count_features(features), "colors": count_colors(agents), "signals": len(signals)}
     uncolored = () if colors is None else colors.notes()
     return Description(described, outcomes_of(plan, described, seen, uncolored), figures, reader.summary())
-
-
-@dataclass(frozen=True, eq=False)
-class StartedMap:
-    """A map of the ground that is being made.
-
-    Attributes
-    ----------
-    log : Log
-        With the poses that the map is made by.
-    builder : GroundMapBuilder or None
-        None where no map can be made.
-    notes : tuple of str
-        Why not.
-    """
-
-    log: Log
-    builder: GroundMapBuilder | None
-    notes: tuple[str, ...] = ()
-
-
-def start_map(scenario: Scenario, log: Log, config: Config, reader: RecordReader) -> StartedMap:
-    """Refine the poses for a map of the ground, and choose what it is made of."""
-    log = refine_poses(log, scenario, reader)
-    try:
-        return StartedMap(log, GroundMapBuilder(log, scenario, config.map, reader))
-    except LogError as problem:
-        return StartedMap(log, None, (f"no map of the ground: {problem}",))
-
-
-def read_map(started: StartedMap, log: Log, reader: KeepingReader) -> MapFeatures:
-    """Find markings and borders in the map, if there is one, and put them where the poses of the log have them."""
-    if started.builder is None:
-        return MapFeatures(notes=started.notes)
-    ground = started.builder.build()
-    reader.forget()
-    markings, borders, notes = find_markings(ground)
-    features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
-    return features.moved(lambda points_m: place_as_given(points_m, started.log, log))
-
-
-def with_lanes(features: MapFeatures, scenario: Scenario) -> MapFeatures:
-    """Add the lanes between markings and where agents drove."""
-    lanes, notes = infer_lanes(features.markings, features.borders, scenario)
-    return replace(features, lanes=lanes, notes=(*features.notes, *notes))
 
 
 def with_colors(agents: tuple[Agent, ...], sampler: ColorSampler) -> tuple[Agent, ...]:
