@@ -46,4 +46,4 @@ def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], Non
     from log2sim.config import MapConfig
     from log2sim.road.builder import map_ground
 
-    return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress, refine=False).as_picture()
+    return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress).as_picture()

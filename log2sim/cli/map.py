@@ -80,7 +80,7 @@ def map_(
         say(f"note: {line}", quiet=quiet)
     reader = RecordReader(opened)
     with progress(quiet=quiet) as report_progress:
-        whole = map_ground(opened, loaded, settings, reader, report_progress, refine=scenario is None)
+        whole = map_ground(opened, loaded, settings, reader, report_progress)
     ground = whole.around(known_cells(whole, chosen))
     with together():
         write_map(ground, out, chosen, opened.map, overwrite=overwrite)

@@ -304,6 +304,6 @@ def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     from log2sim.road.map_files import write_map
 
     reader = RecordReader(result.log)
-    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), reader, refine=False)
+    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), reader)
     write_map(ground.around(ground.coverage), path, overwrite=overwrite)
     result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}

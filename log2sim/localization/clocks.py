@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from log2sim.config import CalibrationConfig, Config
-from log2sim.datatypes import Fault, Log, Stream, Sweep, Treatment
+from log2sim.datatypes import Fault, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.surfaces import (
     MOTION_SPAN_NS,
     SweepPairs,
@@ -34,21 +35,6 @@ from log2sim.localization.surfaces import (
     velocities_at,
 )
 from log2sim.plan import Sensors
-
-
-def shift_stream(stream: Stream, shift_ns: int) -> Stream:
-    """Return the stream of a LiDAR with all stamps moved, those of its points too."""
-
-    def read(i: int) -> Sweep:
-        sweep: Sweep = stream.read(i)
-        return replace(
-            sweep,
-            stamp_ns=int(sweep.stamp_ns) + shift_ns,
-            t_ns=None if sweep.t_ns is None else sweep.t_ns + shift_ns,
-            compensated_ns=None if sweep.compensated_ns is None else int(sweep.compensated_ns) + shift_ns,
-        )
-
-    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read)
 
 
 def turn_mount(mount_T_sensor: Array, turn: Array) -> Array:

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log, Stream, Sweep
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform
+from log2sim.datatypes import Fault, Log
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside_fit import (
     DELAY,
     PRIOR_SIGMA,
@@ -111,28 +112,8 @@ def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log
         cameras[name] = replace(cameras[name], mount_T_cam=moved @ cameras[name].mount_T_cam)
     for name in unit.sensors:
         if name in streams:
-            streams[name] = _corrected_stream(streams[name], moved, -round(delay_s * NS_PER_S))
+            streams[name] = shift_stream(streams[name], -round(delay_s * NS_PER_S), moved)
     return log.changed(lidars=lidars, cameras=cameras, streams=streams)
-
-
-def _corrected_stream(stream: Stream, moved: Array, shift_ns: int) -> Stream:
-    """Move the stamps of all records, and the points of sweeps that are given in the map."""
-
-    def read(i: int) -> Any:
-        record = stream.read(i)
-        return _corrected_sweep(record, moved, shift_ns) if isinstance(record, Sweep) else record
-
-    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded)
-
-
-def _corrected_sweep(sweep: Sweep, moved: Array, shift_ns: int) -> Sweep:
-    return replace(
-        sweep,
-        stamp_ns=int(sweep.stamp_ns) + shift_ns,
-        xyz_m=apply(moved, sweep.xyz_m) if sweep.frame == "map" else sweep.xyz_m,
-        t_ns=None if sweep.t_ns is None else sweep.t_ns + shift_ns,
-        compensated_ns=None if sweep.compensated_ns is None else int(sweep.compensated_ns) + shift_ns,
-    )
 
 
 # An error of 0.5 m and 2 degrees moves what is 40 m away by 1.9 m; then within what noise and edges leave.

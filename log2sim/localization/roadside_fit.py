@@ -14,14 +14,20 @@ from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Boxes3D, Log, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
+from log2sim.localization.surfaces import (
+    CAUCHY,
+    FEW_PIECES,
+    MAD_TO_SIGMA,
+    MAX_REACH_M,
+    MIN_NORMAL_Z,
+    fit_planes,
+    number_voxels,
+    thin,
+)
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Ground, assemble_cloud, estimate_ground, sweep_to_map
 
-# Points farther from a pole than this are too sparse in sweeps of usual LiDARs, and turned farther than any error is meant to be.
-MAX_REACH_M = 60.0
-# Returns nearer to the vehicle's LiDAR are of its own body.
-MIN_RANGE_M = 2.5
 MAX_VEHICLE_SWEEPS, MAX_ROAD_SWEEPS = 16, 10
 MAX_SWEEP_POINTS = 20_000
 # Sweeps of a moving vehicle from places nearer to each other than this show the same.
@@ -32,8 +38,6 @@ VOXEL_M = 0.25
 SCALES_M = ((VOXEL_M, 0.9), (0.7, 3.0), (2.0, 7.0))
 # What an error of 0.5 m and 2 degrees moves at the end of the reach.
 MAX_ERROR_M = 2.5
-# A piece of a plane is thin (RMS over its points, range noise and all) and no line, as the points of one ring are.
-MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
 MIN_UPRIGHT_Z, MAX_POST_WIDTH_M, MIN_POST_LENGTH_M = 0.95, 0.12, 0.25
 # What stands still is in a place in a third of the sweeps or more; what passes is not, unless it waits.
 STATIC_VOXEL_M, MIN_STATIC_SHARE, STEADY_SHARE = 0.4, 0.35, 0.8
@@ -189,7 +193,7 @@ def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, in
         return np.zeros((0, 4))
     xyz = np.concatenate(parts)
     sweep = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    place = _voxels(xyz, STATIC_VOXEL_M)
+    place = number_voxels(xyz, STATIC_VOXEL_M)
     seen = np.unique(place * len(parts) + sweep) // len(parts)
     share = (np.bincount(seen, minlength=int(place.max()) + 1) / len(parts))[place]
     static = share >= MIN_STATIC_SHARE
@@ -208,22 +212,6 @@ def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
     mapped = sweep_to_map(log, lidar, sweep, compensate=True)
     pose, known = log.map_T_sensor(lidar, sweep.stamp_ns)
     return (mapped[0], pose[0, :3, 3]) if mapped is not None and known[0] and len(mapped[0]) else None
-
-
-def _voxels(xyz_m: Array, voxel_m: float) -> NDArray[np.int64]:
-    """Assign numbers (N,), from 0 without gaps, to the voxels of points (N, 3)."""
-    cell = np.floor(xyz_m / voxel_m).astype(np.int64) + (1 << 20)
-    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    return np.asarray(np.unique(key, return_inverse=True)[1], dtype=np.int64)
-
-
-def thin(xyz_m: Array, voxel_m: float) -> Array:
-    """Replace the points (N, D), of which three columns are coordinates, of each voxel by their mean."""
-    if len(xyz_m) == 0:
-        return xyz_m
-    place = _voxels(xyz_m[:, :3], voxel_m)
-    count = np.bincount(place)
-    return np.stack([np.bincount(place, column) / count for column in xyz_m.T], axis=1)
 
 
 def surfaces_of(view: VehicleView, near_m: Array) -> Surfaces | None:
@@ -256,10 +244,7 @@ def _pieces(points: Array, radius_m: float) -> tuple[Array, Array]:
     away, index = cKDTree(points[:, :3]).query(points[:, :3], k=NEIGHBORS)
     near = away[:, -1] < radius_m
     sensor, around = points[near, 3:], points[index[near], :3]
-    middle = around.mean(axis=1)
-    off = around - middle[:, None]
-    spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / NEIGHBORS)
-    plane = (spread[:, 0] < MAX_THICKNESS_M**2) & (spread[:, 1] > MIN_WIDTH_M**2) & (spread[:, 1] > 9 * spread[:, 0])
+    middle, spread, axes, plane = fit_planes(around)
     post = ~plane & (np.abs(axes[:, 2, 2]) > MIN_UPRIGHT_Z) & (spread[:, 1] < MAX_POST_WIDTH_M**2)
     post &= spread[:, 2] > MIN_POST_LENGTH_M**2
     normals = axes.transpose(0, 2, 1)[:, :2].copy()
@@ -343,7 +328,6 @@ def _nearest(off: Array) -> Array:
 SPACING_S = 0.2
 # Farther from a pole, boxes have too few points.
 MAX_AWAY_M = 70.0
-REACH_M = 60.0
 MIN_SCORE = 0.4
 NO_DETECTIONS = "lidar:labels"
 GIVEN = LIDAR_PREFIX + GIVEN_PREFIX
@@ -385,7 +369,9 @@ def detect_boxes(
         before = index
         sweeps = {name: sweep for name, i in index.items() if (sweep := _read_detections(log, name, i)) is not None}
         cloud = (
-            assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=REACH_M) if sweeps else None
+            assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=MAX_REACH_M)
+            if sweeps
+            else None
         )
         if cloud is not None:
             boxes = detector.detect(cloud)
@@ -422,16 +408,11 @@ def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector
 # What an error may be before anything is known; a direction that nothing holds stays where it was.
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, np.radians(2.0), np.radians(2.0), np.radians(2.0), 0.3])
 DELAY = 6
-MAD_TO_SIGMA = 1.4826
 MIN_SCALE_M = 0.02
-# Points so many standard deviations off count half.
-CAUCHY = 2.0
 # Points on surfaces that face one way err together, as those on all posts do: by so much, m.
 PLANE_BIAS_M, POST_BIAS_M = 0.02, 0.1
-# Pieces that are matched by mistake decide where few hold a direction: so many pieces count half. A turn moves points at this
-# distance as much as a translation does.
-FEW_PIECES, LEVER_M = 30.0, 15.0
-MIN_NORMAL_Z = 0.8
+# A turn moves points at this distance as much as a translation does.
+LEVER_M = 15.0
 # Points nearer than this to a surface lie on it.
 ON_SURFACE_M = 0.1
 

@@ -33,7 +33,14 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
-from log2sim.localization.given_poses import MAX_SIGMA_M, USUAL_SIGMA_M, USUAL_SIGMA_RAD, CheckedPoses, Stretch
+from log2sim.localization.given_poses import (
+    MAX_SIGMA_M,
+    USUAL_SIGMA_M,
+    USUAL_SIGMA_RAD,
+    CheckedPoses,
+    Stretch,
+    join_tracks,
+)
 from log2sim.localization.odometry import (
     EgoSweep,
     Odometry,
@@ -365,7 +372,7 @@ def _bridge(
         return None
     rows = (track.t_ns < placed.t_ns[0]) | (track.t_ns > placed.t_ns[-1])
     rows &= (track.t_ns < stretch.first_ns) | (track.t_ns > stretch.last_ns)
-    joined = _joined(track, np.flatnonzero(rows), placed)
+    joined = join_tracks(replace(track, max_gap_s=max(track.max_gap_s, MAX_STEP_S)), np.flatnonzero(rows), placed)
     assert placed.sigma_m is not None
     bridged = replace(stretch, unknown_s=0.0, sigma_m=float(placed.sigma_m.max()), by="LiDAR odometry")
     return joined, bridged
@@ -447,19 +454,3 @@ def _between(first: Array, last: Array, share: Array) -> Array:
     rotation = slerp(quaternion_from_rotation(first[:, :3, :3]), quaternion_from_rotation(last[:, :3, :3]), share)
     place = (1 - share)[:, None] * first[:, :3, 3] + share[:, None] * last[:, :3, 3]
     return transform(rotation_from_quaternion(rotation), place)
-
-
-def _joined(track: PoseTrack, rows: NDArray[np.intp], other: PoseTrack) -> PoseTrack:
-    """Return some poses of a track together with those of another one."""
-    usual = USUAL_SIGMA_M, USUAL_SIGMA_RAD
-    t_ns = np.concatenate([track.t_ns[rows], other.t_ns])
-    order = np.argsort(t_ns, kind="stable")
-    sigmas = np.concatenate([track.sigmas_at(track.t_ns[rows], usual), other.sigmas_at(other.t_ns, usual)])[order]
-    return replace(
-        track,
-        t_ns=t_ns[order],
-        map_T_ego=np.concatenate([track.map_T_ego[rows], other.map_T_ego])[order],
-        max_gap_s=max(track.max_gap_s, MAX_STEP_S),
-        sigma_m=sigmas[:, 0],
-        sigma_yaw_rad=sigmas[:, 1],
-    )

@@ -15,6 +15,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
+from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import RecordReader, look_again, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
@@ -367,7 +368,7 @@ def map_ground(
     progress : callable, optional
         Called as `progress(stage, done, total)`.
     refine : bool
-        Whether the poses are refined first, see `refine_poses`; those of a run, as in `Result.log`, are.
+        Whether the poses are refined first, see `refine_poses`.
 
     Raises
     ------
@@ -377,7 +378,8 @@ def map_ground(
     reader, settings = reader or RecordReader(log), settings or MapConfig()
     if refine:
         end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
-        log = refine_poses(log, (scenario.t0_ns, end_ns))
+        refined = refine_poses(log, (scenario.t0_ns, end_ns))
+        log = log if refined is None else replace_poses(log, refined)
     builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
     look_again(log, reader, [builder], partial(progress, "map: pictures"))
     reader.require_some()

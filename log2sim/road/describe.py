@@ -15,6 +15,8 @@ from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
+from log2sim.localization.choice import PoseChoice
+from log2sim.localization.replaced import replace_poses
 from log2sim.perception.detection_cache import LightBox
 from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
 from log2sim.plan import Decision, Outcome, Plan, Stage
@@ -50,6 +52,7 @@ def describe(
     log: Log,
     config: Config,
     plan: Plan,
+    poses: PoseChoice,
     lights: Sequence[LightBox],
     clock: StageClock,
     progress: Callable[[str, int, int], None],
@@ -58,17 +61,20 @@ def describe(
 
     Parameters
     ----------
+    poses : PoseChoice
+        With those by which the ground is drawn.
     lights : sequence of LightBox
         Traffic lights in frames, from the first pass.
     progress : callable
         Called as `progress(stage, done, total)`.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
-    reader = RecordReader(log)
+    drawn = log if poses.for_map is None else replace_poses(log, poses.for_map)
+    reader = RecordReader(drawn)
     builder, features = None, MapFeatures() if plan.keeps(Stage.LANES) else None
     if features is not None:
         try:
-            builder = GroundMapBuilder(log, scenario, config.map, reader)
+            builder = GroundMapBuilder(drawn, scenario, config.map, reader)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
