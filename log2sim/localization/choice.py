@@ -40,48 +40,26 @@ ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera":
 
 @dataclass(frozen=True, eq=False)
 class PoseChoice:
-    """Where the poses of a run come from, and why.
+    """Where the poses of a run come from, and why."""
 
-    Attributes
-    ----------
-    requested : str
-        As the settings say.
-    source : {"given", "lidar", "camera", "none"}
-        "none": no sensor is on an ego whose pose would have to be known.
-    reason : str
-        For people.
-    excess_m : mapping of str to float
-        How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
-        "apart"; empty where nothing was compared.
-    scatter_m : mapping of str to mapping of str to float
-        RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar".
-    estimate : mapping of str to Any
-        Figures of the odometry, JSON values; empty where none was run.
-    notes : tuple of str
-        What is doubtful about estimated poses.
-    during_ns : (int, int), optional
-        First and last stamp of what poses were estimated from; None for the whole log.
-    faults : tuple of Fault
-        Faults of given poses.
-    checked : bool
-        Whether given poses were checked, and repaired where that was needed.
-    refined : bool
-        Whether given poses, which drift, were replaced by those that sweeps show.
-    for_map : PoseTrack, optional
-        Poses by which the ground is drawn, where given ones drift by less than agents are misplaced anyway.
-    """
-
-    requested: str
+    requested: str  # as the settings say
+    # {"given", "lidar", "camera", "none"}: "none": no sensor is on an ego whose pose would have to be known
     source: str
-    reason: str
+    reason: str  # for people
+    # How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
+    # "apart"; empty where nothing was compared
     excess_m: Mapping[str, float | None] = field(default_factory=dict)
+    # RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar"
     scatter_m: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    # Figures of the odometry, JSON values; empty where none was run
     estimate: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what is doubtful about estimated poses
+    # (int, int): first and last stamp of what poses were estimated from; None for the whole log
     during_ns: tuple[int, int] | None = None
-    faults: tuple[Fault, ...] = ()
-    checked: bool = True
-    refined: bool = False
+    faults: tuple[Fault, ...] = ()  # faults of given poses
+    checked: bool = True  # whether given poses were checked, and repaired where that was needed
+    refined: bool = False  # whether given poses, which drift, were replaced by those that sweeps show
+    # Poses by which the ground is drawn, where given ones drift by less than agents are misplaced anyway
     for_map: PoseTrack | None = None
 
     @property
@@ -160,21 +138,10 @@ Progress = Callable[[str, int, int], None]
 def localize(log: Log, config: Config, *, progress: Progress | None = None) -> tuple[Log, PoseChoice]:
     """Return the log with the poses that the settings ask for, and where they come from.
 
-    Parameters
-    ----------
-    config : Config
-        `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
-    progress : callable, optional
-        Called as `progress(stage, done, total)`.
+    `config`: `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
 
-    Raises
-    ------
-    ConfigError
-        For poses from a sensor that the log does not have.
-    LogError
-        For a log without poses whose sensors do not show how the ego moves.
-    MissingExtra
-        For LiDAR odometry without its library.
+    Raises `ConfigError` for poses from a sensor that the log does not have. Raises `LogError` for a log without poses
+    whose sensors do not show how the ego moves. Raises `MissingExtra` for LiDAR odometry without its library.
     """
     return _localize(
         _Request(
@@ -188,10 +155,7 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
 
     Without such an entry these are the log's own.
 
-    Raises
-    ------
-    LogError, MissingExtra
-        As `localize` does.
+    Raises `LogError, MissingExtra` as `localize` does.
     """
     entry = provenance.get("poses")
     entry = entry if isinstance(entry, Mapping) else {}

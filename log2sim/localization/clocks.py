@@ -57,33 +57,15 @@ MAX_NOISE_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Linearized:
-    """Residuals of motions between sweeps, and their derivatives.
+    """Residuals of motions between sweeps, and their derivatives."""
 
-    Attributes
-    ----------
-    t_ns : (K,) int64
-        Stamps of the sweeps.
-    residual : (6 P,) float64
-        Of P pairs, m and rad.
-    by_values : (6 P, V) float64
-        Derivatives by what is estimated; the first is a time offset.
-    by_poses : (6 P, 6 K) float64
-        By errors of the poses.
-    information : sequence of (6, 6)
-        Of each pair's registration.
-    prior : (V,) float64
-        Information about what is estimated, before.
-    pull : (V,) float64
-        `prior` times how far the values are below what is expected.
-    """
-
-    t_ns: NDArray[np.int64]
-    residual: Array
-    by_values: Array
-    by_poses: Array
-    information: Sequence[Array]
-    prior: Array
-    pull: Array
+    t_ns: NDArray[np.int64]  # (K,): stamps of the sweeps
+    residual: Array  # (6 P,): of P pairs, m and rad
+    by_values: Array  # (6 P, V): derivatives by what is estimated; the first is a time offset
+    by_poses: Array  # (6 P, 6 K): by errors of the poses
+    information: Sequence[Array]  # of each pair's registration
+    prior: Array  # (V,): information about what is estimated, before
+    pull: Array  # (V,): `prior` times how far the values are below what is expected
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,24 +204,14 @@ FIRST_TIME_S, FIRST_STEPS = 2.0, 2
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Time offset and mount of a LiDAR.
+    """Time offset and mount of a LiDAR."""
 
-    Attributes
-    ----------
-    values : (7,) float64
-        What stamps lack, s; rotation vector of the mount in the ego's frame about the sensor, rad, and translation, m, that the
-        mount lacks.
-    covariance : (7, 7) float64
-    shows_offset : bool
-        Whether the ego's motion shows a time offset; without, that is 0 here.
-    pose_error_m : float, m
-        By how much the positions of the poses err, for seconds at a time.
-    """
-
+    # (7,): what stamps lack, s; rotation vector of the mount in the ego's frame about the sensor, rad, and translation,
+    # m, that the mount lacks
     values: Array
-    covariance: Array
-    shows_offset: bool
-    pose_error_m: float
+    covariance: Array  # (7, 7)
+    shows_offset: bool  # whether the ego's motion shows a time offset; without, that is 0 here
+    pose_error_m: float  # by how much the positions of the poses err, for seconds at a time
 
     @property
     def sigma(self) -> Array:
@@ -468,12 +440,8 @@ MAX_POSE_ERROR_M = 0.5
 def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> tuple[Log, tuple[Fault, ...]]:
     """Estimate time offset and mount of each LiDAR on the ego.
 
-    Returns
-    -------
-    log : Log
-        Corrected where the settings ask for it.
-    faults : tuple of Fault
-        What is certain and large enough to matter; and what cannot be corrected although it was asked for.
+    Returns `log`: corrected where the settings ask for it; `faults`: what is certain and large enough to matter; and
+    what cannot be corrected although it was asked for.
 
     Notes
     -----

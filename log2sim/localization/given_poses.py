@@ -27,35 +27,19 @@ from log2sim.localization.path import (
 
 @dataclass(frozen=True)
 class Stretch:
-    """A time in which poses were repaired or are not known.
+    """A time in which poses were repaired or are not known."""
 
-    Attributes
-    ----------
-    kind : {"pose_jump", "frozen_poses", "gap", "skip", "copies"}
-        A skip is a step that stays: the position may have jumped, or stamps may miss some time.
-    first_ns, last_ns : int
-        Stamps of the first and the last pose in question; of a gap those around it.
-    shift_m, turn_rad : float
-        By how much poses were moved at most.
-    sigma_m : float
-        Largest standard deviation of a repaired position that is used.
-    unknown_s : float, s
-        For how long no pose is known well enough.
-    poses : int
-        Number of poses in question.
-    by : str
-        What bridges it.
-    """
-
+    # {"pose_jump", "frozen_poses", "gap", "skip", "copies"}: a skip is a step that stays: the position may have jumped,
+    # or stamps may miss some time
     kind: str
-    first_ns: int
+    first_ns: int  # `first_ns`, `last_ns`: stamps of the first and the last pose in question; of a gap those around it
     last_ns: int
-    shift_m: float = 0.0
+    shift_m: float = 0.0  # `shift_m`, `turn_rad`: by how much poses were moved at most
     turn_rad: float = 0.0
-    sigma_m: float = 0.0
-    unknown_s: float = 0.0
-    poses: int = 0
-    by: str = "the motion around"
+    sigma_m: float = 0.0  # largest standard deviation of a repaired position that is used
+    unknown_s: float = 0.0  # for how long no pose is known well enough
+    poses: int = 0  # number of poses in question
+    by: str = "the motion around"  # what bridges it
 
     @property
     def duration_s(self) -> float:
@@ -266,12 +250,7 @@ MIN_SPARSE_S = float(np.sqrt(8 * 0.25 / 3.0))
 def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, int] | None) -> tuple[Fault, ...]:
     """List the faults of given poses, those of the time that is used and of which something is recorded.
 
-    Parameters
-    ----------
-    stretches : sequence of Stretch
-        In the order of time.
-    during_ns : (int, int), optional
-        First and last stamp that is used; None for all.
+    `stretches`: in the order of time. `during_ns`: (int, int): first and last stamp that is used; None for all.
     """
     if log.ego is None or not stretches:
         return ()

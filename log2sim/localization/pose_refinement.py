@@ -47,15 +47,10 @@ ROUNDS = 5
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A sweep that is registered.
-
-    Attributes
-    ----------
-    map_T_ego : (4, 4) float64
-    """
+    """A sweep that is registered."""
 
     t_ns: int
-    map_T_ego: Array
+    map_T_ego: Array  # (4, 4)
     surfaces: Surfaces
 
 

@@ -53,17 +53,11 @@ MAX_UNIT_M = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """Sensors at one place of the roadside.
-
-    Attributes
-    ----------
-    site_m : (3,) float64, m
-        Mean place of its LiDARs in the map.
-    """
+    """Sensors at one place of the roadside."""
 
     lidars: tuple[str, ...]
     cameras: tuple[str, ...]
-    site_m: Array
+    site_m: Array  # (3,): mean place of its LiDARs in the map
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -96,12 +90,8 @@ def _apart_m(log: Log, first: str, second: str) -> float:
 def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log:
     """Return the log with a unit's sensors moved and its stamps put right.
 
-    Parameters
-    ----------
-    correction : (4, 4) float64
-        Takes places by the unit's poses to right ones, both in the frame of the site: map axes, origin at `site_m`.
-    delay_s : float, s
-        By which its stamps are late.
+    `correction`: (4, 4): takes places by the unit's poses to right ones, both in the frame of the site: map axes,
+    origin at `site_m`. `delay_s`: by which its stamps are late.
     """
     shift = transform(np.eye(3), unit.site_m)
     moved = shift @ correction @ inverse(shift)
@@ -130,18 +120,10 @@ HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What both ends see around a unit, in the frame of its site: map axes, origin at `Unit.site_m`.
+    """What both ends see around a unit, in the frame of its site: map axes, origin at `Unit.site_m`."""
 
-    Attributes
-    ----------
-    view : VehicleView or None
-        Of the vehicle; None where it never comes near.
-    road : RoadView
-        What stands still by the unit's LiDARs.
-    """
-
-    view: VehicleView | None
-    road: RoadView
+    view: VehicleView | None  # of the vehicle; None where it never comes near
+    road: RoadView  # what stands still by the unit's LiDARs
     surfaces: Surfaces | None
     ground: CommonGround | None
     objects: CommonObjects
@@ -149,19 +131,11 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a unit's pose and clock lack.
+    """What a unit's pose and clock lack."""
 
-    Attributes
-    ----------
-    values : (7,) float64
-        Twist (m, rad) of the site that corrects it, and the delay of its stamps, s.
-    covariance : (7, 7) float64
-    structure, objects : pair of MatchedStructure or None, pair of Matched or None
-        Without and with the correction, by the same limit.
-    """
-
-    values: Array
-    covariance: Array
+    values: Array  # (7,): twist (m, rad) of the site that corrects it, and the delay of its stamps, s
+    covariance: Array  # (7, 7)
+    # `structure`, `objects`: without and with the correction, by the same limit
     structure: tuple[MatchedStructure | None, MatchedStructure | None]
     objects: tuple[Matched | None, Matched | None]
 
@@ -312,17 +286,11 @@ HEIGHT_AND_TILT, PLANE = [2, 3, 4], [0, 1, 5]
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a unit is found to lack.
-
-    Attributes
-    ----------
-    visibility : pair of Visibility or None
-        Without and with the correction.
-    """
+    """What a unit is found to lack."""
 
     unit: Unit
     found: Estimate
-    visibility: tuple[Visibility | None, Visibility | None]
+    visibility: tuple[Visibility | None, Visibility | None]  # without and with the correction
 
     @property
     def sigma(self) -> Array:
@@ -512,34 +480,18 @@ MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD = 0.4, np.radians(1.5)
 
 @dataclass(frozen=True, eq=False)
 class RoadRegistration:
-    """What came of the registration of the road's sensors.
+    """What came of the registration of the road's sensors."""
 
-    Attributes
-    ----------
-    log : Log
-        With the corrected mounts and stamps.
-    figures : list of dict
-        For the report, one entry for each roadside unit.
-    """
-
-    log: Log
+    log: Log  # with the corrected mounts and stamps
     faults: tuple[Fault, ...] = ()
-    figures: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)  # for the report, one entry for each roadside unit
 
 
 def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> RoadRegistration:
     """Estimate poses and clocks of the road's sensors against what the vehicle's sensors see.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses that the run uses.
-    config : Config
-        `cooperation.register_road`: whether to do so.
-    sensors : Sensors
-        Those that the run uses.
-    progress : callable
-        Called as `progress(stage, done, total)`.
+    `log`: with the poses that the run uses. `config`: `cooperation.register_road`: whether to do so. `sensors`: those
+    that the run uses.
 
     Notes
     -----

@@ -46,23 +46,14 @@ MAX_ROAD_POINTS = 6000
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Pieces of surfaces that the vehicle saw, in the frame of the site: map axes, origin at a pole's LiDARs.
+    """Pieces of surfaces that the vehicle saw, in the frame of the site: map axes, origin at a pole's LiDARs."""
 
-    Attributes
-    ----------
-    xyz_m : (P, 3) float64, m
-    normals : (P, 2, 3) float64
-        Directions in which each piece holds a point: one of a plane, turned to where it was seen from, and NaN; two of a post.
-    reach_m : (P,) float64, m
-        How far along itself each piece goes.
-    tree : cKDTree
-        Of `xyz_m`.
-    """
-
-    xyz_m: Array
+    xyz_m: Array  # (P, 3)
+    # (P, 2, 3): directions in which each piece holds a point: one of a plane, turned to where it was seen from, and
+    # NaN; two of a post
     normals: Array
-    reach_m: Array
-    tree: cKDTree
+    reach_m: Array  # (P,): how far along itself each piece goes
+    tree: cKDTree  # of `xyz_m`
 
     @property
     def post(self) -> NDArray[np.bool_]:
@@ -72,24 +63,12 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class VehicleView:
-    """What the vehicle saw around a site.
+    """What the vehicle saw around a site."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float64, m
-        Points in the frame of the site, those of several sweeps.
-    sensor_m : (S, 3) float64, m
-        Where the LiDAR was in the middle of each sweep.
-    t_ns : (S,) int64
-        Stamps of the sweeps.
-    sweep : (N,) int64
-        Row of `sensor_m` for each point.
-    """
-
-    xyz_m: Array
-    sensor_m: Array
-    t_ns: NDArray[np.int64]
-    sweep: NDArray[np.int64]
+    xyz_m: Array  # (N, 3): points in the frame of the site, those of several sweeps
+    sensor_m: Array  # (S, 3): where the LiDAR was in the middle of each sweep
+    t_ns: NDArray[np.int64]  # (S,): stamps of the sweeps
+    sweep: NDArray[np.int64]  # (N,): row of `sensor_m` for each point
 
     def parts(self, count: int) -> list[VehicleView]:
         """Split into runs of successive sweeps; fewer than `count` where there are fewer sweeps."""
@@ -145,18 +124,10 @@ def _near_sweeps(
 
 @dataclass(frozen=True, eq=False)
 class RoadView:
-    """What stands still around a site by the LiDARs of a pole.
+    """What stands still around a site by the LiDARs of a pole."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float64, m
-        Points in the frame of the site, one a voxel.
-    share : (N,) float64
-        Of the sweeps that have a point in the same place.
-    """
-
-    xyz_m: Array
-    share: Array
+    xyz_m: Array  # (N, 3): points in the frame of the site, one a voxel
+    share: Array  # (N,): of the sweeps that have a point in the same place
 
     @property
     def steady_m(self) -> Array:
@@ -268,15 +239,9 @@ MIN_FREE_RANGE_M = 3.0
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the vehicle saw where a roadside unit sees upright things.
+    """What the vehicle saw where a roadside unit sees upright things."""
 
-    Attributes
-    ----------
-    seen, seen_through : int
-        Points with a return there, and with returns from behind alone.
-    """
-
-    seen: int
+    seen: int  # `seen`, `seen_through`: points with a return there, and with returns from behind alone
     seen_through: int
 
     @property
@@ -356,10 +321,7 @@ def detect_boxes(
 ) -> list[Boxes3D]:
     """Detect road users in the clouds of some LiDARs nearest to moments (K,).
 
-    Parameters
-    ----------
-    floor_m : (K, 3) float64, m
-        Where clouds begin: a place on the ground, map frame.
+    `floor_m`: (K, 3): where clouds begin: a place on the ground, map frame.
     """
     out, before = [], None
     for moment, floor in zip(moments_ns.tolist(), floor_m):
@@ -419,37 +381,20 @@ ON_SURFACE_M = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What some observations say about a correction: translation, m, and rotation vector, rad, of the site, and delay, s.
+    """What some observations say about a correction: translation, m, and rotation vector, rad, of the site, and delay, s."""
 
-    Attributes
-    ----------
-    information : (7, 7) float64
-    gradient : (7,) float64
-        Of half the sum of weighted squares at the correction so far.
-    """
-
-    information: Array
-    gradient: Array
+    information: Array  # (7, 7)
+    gradient: Array  # (7,): of half the sum of weighted squares at the correction so far
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedStructure:
-    """Points of the road on surfaces of the vehicle.
-
-    Attributes
-    ----------
-    points : int
-        Matched points.
-    on_surface : int
-        Those within `ON_SURFACE_M`.
-    rms_m : float, m
-        Robust, of the distances along the normals.
-    """
+    """Points of the road on surfaces of the vehicle."""
 
     evidence: Evidence
-    points: int
-    on_surface: int
-    rms_m: float
+    points: int  # matched points
+    on_surface: int  # those within `ON_SURFACE_M`
+    rms_m: float  # robust, of the distances along the normals
 
 
 def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within_m: float) -> MatchedStructure | None:
@@ -545,21 +490,11 @@ USUAL_BELOW_M = 4.0
 
 @dataclass(frozen=True, eq=False)
 class CommonGround:
-    """Ground around a unit.
+    """Ground around a unit."""
 
-    Attributes
-    ----------
-    surface : Ground
-        By the vehicle, in the frame of the site.
-    known : cKDTree
-        Of the places (x, y) of the vehicle's ground points.
-    road_m : (N, 3) float64, m
-        Ground points of the unit, thinned out.
-    """
-
-    surface: Ground
-    known: cKDTree
-    road_m: Array
+    surface: Ground  # by the vehicle, in the frame of the site
+    known: cKDTree  # of the places (x, y) of the vehicle's ground points
+    road_m: Array  # (N, 3): ground points of the unit, thinned out
 
 
 def ground_below(road_m: Array) -> float:
@@ -640,24 +575,13 @@ MAX_APART_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """Places of one road user as one end saw it.
+    """Places of one road user as one end saw it."""
 
-    Attributes
-    ----------
-    t_s : (K,) float64, s
-        Since a common time, by the clock of the end, increasing.
-    xyz_m : (K, 3) float64, m
-        In the frame of the site.
-    velocity_mps : (K, 2) float64
-    points : float
-        Median number of points in its boxes.
-    """
-
-    t_s: Array
-    xyz_m: Array
-    velocity_mps: Array
+    t_s: Array  # (K,): since a common time, by the clock of the end, increasing
+    xyz_m: Array  # (K, 3): in the frame of the site
+    velocity_mps: Array  # (K, 2)
     group: int
-    points: float = np.inf
+    points: float = np.inf  # median number of points in its boxes
 
     def at(self, t_s: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Interpolate places (N, 3) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
@@ -719,12 +643,7 @@ def track_of(rows: Array) -> ObjectTrack:
 
 @dataclass(frozen=True, eq=False)
 class CommonObjects:
-    """Tracks of the vehicle, with the vehicle itself, and for each those of the road that may show the same road user.
-
-    Attributes
-    ----------
-    pairs : tuple of (ObjectTrack, tuple of ObjectTrack)
-    """
+    """Tracks of the vehicle, with the vehicle itself, and for each those of the road that may show the same road user."""
 
     pairs: tuple[tuple[ObjectTrack, tuple[ObjectTrack, ...]], ...]
 
@@ -746,25 +665,13 @@ def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Places of common objects at common times.
-
-    Attributes
-    ----------
-    pairs : int
-        Of tracks.
-    moving : int
-        Of those, how many move.
-    gain : float
-        How well all fits together: 1 for each place that fits perfectly, 0 for one that does not.
-    rms_m : float, m
-        Robust, of the distances between places.
-    """
+    """Places of common objects at common times."""
 
     evidence: Evidence
-    pairs: int
-    moving: int
-    gain: float
-    rms_m: float
+    pairs: int  # of tracks
+    moving: int  # of those, how many move
+    gain: float  # how well all fits together: 1 for each place that fits perfectly, 0 for one that does not
+    rms_m: float  # robust, of the distances between places
 
 
 def match_objects(objects: CommonObjects, correction: Array, delay_s: float, within_m: float) -> Matched | None:

@@ -69,12 +69,8 @@ def adjoint_of(dst_T_src: Array) -> Array:
 def velocities_at(track: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
     """Compute how the ego moves at stamps (K,), by poses `MOTION_SPAN_NS` before and after.
 
-    Returns
-    -------
-    velocity : (K, 6) float64, m/s and rad/s
-        Twists in the ego's frame.
-    known : (K,) bool
-        Whether these poses are known.
+    Returns `velocity`: (K, 6), m/s and rad/s: twists in the ego's frame; `known`: (K,): whether these poses are
+    known.
     """
     (before, known), (at, is_known), (after, will_be_known) = (
         track.at(t_ns + shift) for shift in (-MOTION_SPAN_NS, 0, MOTION_SPAN_NS)
@@ -112,38 +108,23 @@ FEW_PIECES, LEVER_M = 30.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Pieces of planes of one sweep.
+    """Pieces of planes of one sweep."""
 
-    Attributes
-    ----------
-    xyz_m, normals : (N, 3) float64, m and unit vectors
-        Middles of pieces of planes and their normals: as many that face up, forward and sideways, if there are.
-    middles : (V, 3) float64, m
-        Of all voxels with points, those of `tree`.
-    """
-
+    # `xyz_m`, `normals`: (N, 3), m and unit vectors: middles of pieces of planes and their normals: as many that face
+    # up, forward and sideways, if there are
     xyz_m: Array
     normals: Array
     tree: cKDTree
-    middles: Array
+    middles: Array  # (V, 3), m: of all voxels with points, those of `tree`
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The motion between two sweeps.
+    """The motion between two sweeps."""
 
-    Attributes
-    ----------
-    first_T_second : (4, 4) float64
-    covariance : (6, 6) float64
-        Of a twist (m, rad) of the second sweep in its own frame.
-    overlap : float
-        Share of the pieces of planes that have a match.
-    """
-
-    first_T_second: Array
-    covariance: Array
-    overlap: float
+    first_T_second: Array  # (4, 4)
+    covariance: Array  # (6, 6): of a twist (m, rad) of the second sweep in its own frame
+    overlap: float  # share of the pieces of planes that have a match
 
 
 def surfaces_of(xyz_m: Array) -> Surfaces | None:
@@ -279,21 +260,11 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class SweepPairs:
-    """What the sweeps of a LiDAR show of the ego's motion.
+    """What the sweeps of a LiDAR show of the ego's motion."""
 
-    Attributes
-    ----------
-    track : PoseTrack
-        The ego's poses.
-    sensor_m : (3,) float64, m
-        Where the LiDAR is in the ego's frame.
-    t_ns : (K,) int64
-        Stamps of the sweeps.
-    """
-
-    track: PoseTrack
-    sensor_m: Array
-    t_ns: NDArray[np.int64]
+    track: PoseTrack  # the ego's poses
+    sensor_m: Array  # (3,): where the LiDAR is in the ego's frame
+    t_ns: NDArray[np.int64]  # (K,): stamps of the sweeps
     pairs: tuple[Pair, ...]
 
 
@@ -302,17 +273,10 @@ def pair_sweeps(
 ) -> SweepPairs | None:
     """Compare sweeps of a LiDAR on the ego with each other.
 
-    Parameters
-    ----------
-    during_ns : (2,) tuple of int or None
-        First and last stamp to look at; None for all.
-    report : callable
-        Called as `report(done, total)`.
+    `during_ns`: (2,) tuple of int or None: first and last stamp to look at; None for all.
 
-    Returns
-    -------
-    SweepPairs or None
-        None where the ego hardly moves, sweeps show too little, or points are given in the map, which hides clock and mount.
+    Returns SweepPairs or None: None where the ego hardly moves, sweeps show too little, or points are given in the map,
+    which hides clock and mount.
     """
     track = log.ego
     if track is None:

@@ -111,10 +111,7 @@ def roadside_places(log: Log, scenario: Scenario) -> Array:
 def extent_of(path: Array, roadside: Array) -> Extent:
     """Return the extent of a map, m, around places (K, 3) of the ego and of roadside sensors.
 
-    Raises
-    ------
-    LogError
-        Where there are neither, as in a log without poses.
+    Raises `LogError` where there are neither, as in a log without poses.
     """
     low, high = [], []
     for places, margin in ((path, MARGIN_M), (roadside, ROADSIDE_MARGIN_M)):
@@ -156,27 +153,12 @@ class _Ground:
 class GroundMapBuilder:
     """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
 
-    Parameters
-    ----------
-    log : Log
-        With refined poses, see `refine_poses`.
-    scenario : Scenario
-        Its agents hide the ground: moving ones where they are at the time of a record, standing ones always.
-    settings : MapConfig
-    reader : RecordReader, optional
-        Reads the sweeps and counts those that cannot be read.
-    progress : callable, optional
-        Called as `progress(done, total)` while sweeps are read.
+    `log`: with refined poses, see `refine_poses`. `scenario`: its agents hide the ground: moving ones where they are at
+    the time of a record, standing ones always. `reader`: reads the sweeps and counts those that cannot be read.
 
-    Attributes
-    ----------
-    notes : list of str
-        What could not be mapped, and why.
+    `notes`: what could not be mapped, and why.
 
-    Raises
-    ------
-    LogError
-        When no pose is known.
+    Raises `LogError` when no pose is known.
     """
 
     def __init__(

@@ -29,22 +29,12 @@ from log2sim.road.signals import find_signals
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A described scenario.
-
-    Attributes
-    ----------
-    outcomes : tuple of Outcome
-        Of the stages of the description.
-    figures : dict
-        For the report: "map_features", "colors", "signals".
-    unreadable : dict
-        Records that could not be read, by stream, for the report.
-    """
+    """A described scenario."""
 
     scenario: Scenario
-    outcomes: tuple[Outcome, ...]
-    figures: dict[str, Any]
-    unreadable: dict[str, Any]
+    outcomes: tuple[Outcome, ...]  # of the stages of the description
+    figures: dict[str, Any]  # for the report: "map_features", "colors", "signals"
+    unreadable: dict[str, Any]  # records that could not be read, by stream, for the report
 
 
 def describe(
@@ -59,14 +49,7 @@ def describe(
 ) -> Description:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario.
 
-    Parameters
-    ----------
-    poses : PoseChoice
-        With those by which the ground is drawn.
-    lights : sequence of LightBox
-        Traffic lights in frames, from the first pass.
-    progress : callable
-        Called as `progress(stage, done, total)`.
+    `poses`: with those by which the ground is drawn. `lights`: traffic lights in frames, from the first pass.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if poses.for_map is None else replace_poses(log, poses.for_map)

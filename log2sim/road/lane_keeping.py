@@ -28,23 +28,12 @@ MIN_MOVED_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class LanePosition:
-    """Positions of an agent in lanes.
+    """Positions of an agent in lanes."""
 
-    Attributes
-    ----------
-    t_s : (T,) float64, s
-    lane : (T,) int
-        Index of the lane, -1 where it is in none.
-    aside_m : (T,) float64, m
-        Of the box center to the left of the lane's middle; NaN in no lane.
-    width_m : (T,) float64, m
-        Of the lane there.
-    """
-
-    t_s: Array
-    lane: NDArray[np.intp]
-    aside_m: Array
-    width_m: Array
+    t_s: Array  # (T,)
+    lane: NDArray[np.intp]  # (T,): index of the lane, -1 where it is in none
+    aside_m: Array  # (T,): of the box center to the left of the lane's middle; NaN in no lane
+    width_m: Array  # (T,): of the lane there
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -63,28 +63,15 @@ Pixel = TypeVar("Pixel", np.uint8, np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Where the cells of a map that are in view appear in a picture, N cells.
+    """Where the cells of a map that are in view appear in a picture, N cells."""
 
-    Attributes
-    ----------
-    rows, columns : (N,) int64
-        Of the cells in the map.
-    u, v : (N,) float32, px
-    scale : (N,) float32
-        Pixels along a cell's edge, geometric mean of both directions.
-    opacity : (N,) float32
-        In (0, 1].
-    depth_m : (N,) float32, m
-        Along the optical axis.
-    """
-
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int64]  # `rows`, `columns`: (N,): of the cells in the map
     columns: NDArray[np.int64]
-    u: NDArray[np.float32]
+    u: NDArray[np.float32]  # `u`, `v`: (N,), px
     v: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    opacity: NDArray[np.float32]
-    depth_m: NDArray[np.float32]
+    scale: NDArray[np.float32]  # (N,): pixels along a cell's edge, geometric mean of both directions
+    opacity: NDArray[np.float32]  # (N,): in (0, 1]
+    depth_m: NDArray[np.float32]  # (N,): along the optical axis
 
     def take(self, kept: NDArray[np.bool_]) -> Warp:
         """Choose cells by a mask (N,)."""
@@ -93,19 +80,12 @@ class Warp:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture's camera at the time of the picture.
-
-    Attributes
-    ----------
-    map_T_cam : (4, 4) float64
-    log : Log, optional
-        Where the camera is while its lines are read, one after the other.
-    """
+    """A picture's camera at the time of the picture."""
 
     camera: Camera
-    map_T_cam: Array
+    map_T_cam: Array  # (4, 4)
     t_ns: int = 0
-    log: Log | None = None
+    log: Log | None = None  # where the camera is while its lines are read, one after the other
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Project points (N, 3), m, map frame: pixels (N, 2), NaN behind the camera, and depths (N,), m."""
@@ -127,14 +107,8 @@ class View:
 def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster, coarsest_m: float = COARSEST_M) -> Warp | None:
     """Find the cells of a raster in a picture; None where it shows none.
 
-    Parameters
-    ----------
-    surface : Surface
-        With the north-west corner of the raster and cells a whole number of times as long.
-    z0_m : float
-        Height of reference of the surface, m.
-    coarsest_m : float
-        Ground longer than this under one pixel is left out, m.
+    `surface`: with the north-west corner of the raster and cells a whole number of times as long. `z0_m`: height of
+    reference of the surface, m. `coarsest_m`: ground longer than this under one pixel is left out, m.
     """
     window = _window(view, surface, z0_m, coarsest_m)
     if window is None:

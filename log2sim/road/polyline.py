@@ -32,37 +32,19 @@ MIN_SINE = 0.02
 
 
 class Projection(NamedTuple):
-    """Where points are relative to a polyline.
+    """Where points are relative to a polyline."""
 
-    Attributes
-    ----------
-    s_m : (N,) float64, m
-        Stations of the feet, beyond the ends where a point is before or after it.
-    aside_m : (N,) float64, m
-        To the left.
-    turn_rad : (N,) float64
-        Headings of the points minus that of the line, in [-pi, pi).
-    inside : (N,) bool
-        Whether the foot is on the polyline.
-    """
-
-    s_m: Array
-    aside_m: Array
-    turn_rad: Array
-    inside: NDArray[np.bool_]
+    s_m: Array  # (N,): stations of the feet, beyond the ends where a point is before or after it
+    aside_m: Array  # (N,): to the left
+    turn_rad: Array  # (N,): headings of the points minus that of the line, in [-pi, pi)
+    inside: NDArray[np.bool_]  # (N,): whether the foot is on the polyline
 
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A directed line.
+    """A directed line."""
 
-    Attributes
-    ----------
-    points_m : (N, 3) float64
-        Vertices in the map frame, N >= 2, about `SPACING_M` apart, none twice in a row.
-    """
-
-    points_m: Array
+    points_m: Array  # (N, 3): vertices in the map frame, N >= 2, about `SPACING_M` apart, none twice in a row
 
     @classmethod
     def through(cls, points_m: Array, spacing_m: float = SPACING_M) -> Polyline:
@@ -235,25 +217,13 @@ VEHICLES_FIRST = ("car", "truck", "bus")
 
 @dataclass(frozen=True, eq=False)
 class DrivenPath:
-    """A stretch of an agent's path without a reversal.
-
-    Attributes
-    ----------
-    line : Polyline
-        Ground under the middle of the box, in the direction of the heading.
-    width_m : float
-        Of the agent.
-    rank : int
-        0 for the ego, 1 for vehicles, 2 for two-wheelers: in this order paths make lanes.
-    confidence : float
-        Of the agent.
-    """
+    """A stretch of an agent's path without a reversal."""
 
     agent: str
-    line: Polyline
-    width_m: float
-    rank: int
-    confidence: float
+    line: Polyline  # ground under the middle of the box, in the direction of the heading
+    width_m: float  # of the agent
+    rank: int  # 0 for the ego, 1 for vehicles, 2 for two-wheelers: in this order paths make lanes
+    confidence: float  # of the agent
 
     def with_points(self, points_m: Array) -> DrivenPath:
         """Return the same path along other points (N, 3)."""
@@ -386,17 +356,11 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Where a path is on routes.
+    """Where a path is on routes."""
 
-    Attributes
-    ----------
-    runs : tuple of Run
-        In order; together they hold every sample once.
-    s_m, aside_m, turn_rad : (N,) float64
-        Station on the route of the run, offset to its left and difference of heading; NaN off all routes.
-    """
-
-    runs: tuple[Run, ...]
+    runs: tuple[Run, ...]  # in order; together they hold every sample once
+    # `s_m`, `aside_m`, `turn_rad`: (N,): station on the route of the run, offset to its left and difference of heading;
+    # NaN off all routes
     s_m: Array
     aside_m: Array
     turn_rad: Array
@@ -453,7 +417,7 @@ def _runs(route_of: NDArray[np.intp], s: Array) -> tuple[Run, ...]:
         own = s[np.maximum(route_of, 0), np.arange(n)]
         changed |= (np.abs(np.diff(own)) > JUMP_M) & (route_of[1:] >= 0)
     cuts = np.concatenate([[0], np.flatnonzero(changed) + 1, [n]])
-    return tuple(Run(int(route_of[a]), int(a), int(b) - 1) for a, b in itertools.pairwise(cuts))
+    return tuple(Run(int(route_of[a])(a), int(b) - 1) for a, b in itertools.pairwise(cuts))
 
 
 def _absorb(runs: tuple[Run, ...], route_of: NDArray[np.intp], stay: NDArray[np.bool_], s: Array) -> tuple[Run, ...]:

@@ -38,24 +38,14 @@ MIN_LENGTH_M = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """A stretch of a route with another beside it.
-
-    Attributes
-    ----------
-    s_m, other_s_m : (K,) float64
-        Stations on both; those of `other` fall where it leads the other way.
-    aside_m : (K,) float64
-        Of the other, to the left.
-    same_way : bool
-        Whether both lead the same way.
-    """
+    """A stretch of a route with another beside it."""
 
     route: int
     other: int
-    s_m: Array
+    s_m: Array  # `s_m`, `other_s_m`: (K,): stations on both; those of `other` fall where it leads the other way
     other_s_m: Array
-    aside_m: Array
-    same_way: bool
+    aside_m: Array  # (K,): of the other, to the left
+    same_way: bool  # whether both lead the same way
 
 
 def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
@@ -294,31 +284,19 @@ BESIDE_M = 3.5
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A center line that vehicles follow.
-
-    Attributes
-    ----------
-    width_m : (K,) float64
-        At the stations `width_s_m` (K,), constant beyond.
-    width_s_m : (K,) float64
-    free : (2,) tuple of bool
-        Whether start and end are where a vehicle was first or last seen, so that others may lengthen it.
-    marked_m : (2,) tuple of float or None
-        Stations between which markings make it; elsewhere its middle is that of the paths.
-    left, right : str or None
-        Ids of the markings or borders beside it, there.
-    confidence : float
-        That it is a lane in this direction, by its markings.
-    """
+    """A center line that vehicles follow."""
 
     line: Polyline
-    width_m: Array
-    width_s_m: Array
+    width_m: Array  # (K,): at the stations `width_s_m` (K,), constant beyond
+    width_s_m: Array  # (K,)
+    # (2,) tuple of bool: whether start and end are where a vehicle was first or last seen, so that others may lengthen
+    # it
     free: tuple[bool, bool] = (True, True)
+    # (2,) tuple of float or None: stations between which markings make it; elsewhere its middle is that of the paths
     marked_m: tuple[float, float] | None = None
-    left: str | None = None
+    left: str | None = None  # `left`, `right`: ids of the markings or borders beside it, there
     right: str | None = None
-    confidence: float = 0.0
+    confidence: float = 0.0  # that it is a lane in this direction, by its markings
 
     def width_at(self, s_m: Array) -> Array:
         """Return the width (N,) at stations (N,)."""

@@ -41,16 +41,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Conflict:
-    """Stretches of routes that share ground.
-
-    Attributes
-    ----------
-    crossing : bool
-        Whether lanes cross there; else they branch, merge or follow each other.
-    """
+    """Stretches of routes that share ground."""
 
     intervals: tuple[Interval, ...]
-    crossing: bool
+    crossing: bool  # whether lanes cross there; else they branch, merge or follow each other
 
 
 def find_transitions(match: Match) -> Iterator[tuple[Run, Run]]:
@@ -166,18 +160,10 @@ Stretch = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class Areas:
-    """Conflicts that belong together.
+    """Conflicts that belong together."""
 
-    Attributes
-    ----------
-    stretches : mapping of int to list of Stretch
-        By route, in order and apart.
-    crossing : frozenset of int
-        Areas in which lanes cross.
-    """
-
-    stretches: Mapping[int, Sequence[Stretch]]
-    crossing: frozenset[int]
+    stretches: Mapping[int, Sequence[Stretch]]  # by route, in order and apart
+    crossing: frozenset[int]  # areas in which lanes cross
 
 
 class Union:
@@ -273,41 +259,23 @@ TAPER_M = 10.0
 
 @dataclass(frozen=True)
 class Section:
-    """A stretch of a route.
-
-    Attributes
-    ----------
-    first_m, last_m : float
-        Stations on the route.
-    start, end : int
-        The area there, `FREE` or `CUT`.
-    """
+    """A stretch of a route."""
 
     route: int
-    first_m: float
+    first_m: float  # `first_m`, `last_m`: stations on the route
     last_m: float
-    start: int
+    start: int  # `start`, `end`: the area there, `FREE` or `CUT`
     end: int
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """A section's ground.
-
-    Attributes
-    ----------
-    line : Polyline
-        Its center line.
-    width_m : (N,) float64
-        At the vertices.
-    left, right : int or None
-        Sections beside it, as indices, which have the same ends.
-    """
+    """A section's ground."""
 
     section: Section
-    line: Polyline
-    width_m: Array
-    left: int | None = None
+    line: Polyline  # its center line
+    width_m: Array  # (N,): at the vertices
+    left: int | None = None  # `left`, `right`: sections beside it, as indices, which have the same ends
     right: int | None = None
 
 
@@ -525,25 +493,14 @@ MIN_CONNECTION_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """A way from the end of a section to the start of another.
+    """A way from the end of a section to the start of another."""
 
-    Attributes
-    ----------
-    origin, target : int
-        Sections.
-    width_m : (N,) float64
-    area : int
-        Where it is.
-    agents : tuple of str
-        Who drove it.
-    """
-
-    origin: int
+    origin: int  # `origin`, `target`: sections
     target: int
     line: Polyline
-    width_m: Array
-    area: int
-    agents: tuple[str, ...]
+    width_m: Array  # (N,)
+    area: int  # where it is
+    agents: tuple[str, ...]  # who drove it
 
 
 def connect(

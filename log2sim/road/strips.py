@@ -40,29 +40,15 @@ RoadLine = Marking | RoadBorder
 
 @dataclass(frozen=True, eq=False)
 class LaneStrip:
-    """A strip between two lines; its direction is that of one of them.
+    """A strip between two lines; its direction is that of one of them."""
 
-    Attributes
-    ----------
-    line : Polyline
-        Its middle.
-    width_m, width_s_m : (K,) float64
-        Widths and their stations.
-    left, right : str
-        Ids of the lines beside it; of the longest if there are several.
-    confidence : float
-        That both lines are there.
-    directed : float
-        Probability that it leads the way of its line.
-    """
-
-    line: Polyline
-    width_m: Array
+    line: Polyline  # its middle
+    width_m: Array  # `width_m`, `width_s_m`: (K,): widths and their stations
     width_s_m: Array
-    left: str
+    left: str  # `left`, `right`: ids of the lines beside it; of the longest if there are several
     right: str
-    confidence: float
-    directed: float = 0.5
+    confidence: float  # that both lines are there
+    directed: float = 0.5  # probability that it leads the way of its line
 
     def reversed(self) -> LaneStrip:
         """Return the strip in the other direction."""
