@@ -196,7 +196,7 @@ class FrameScores:
     # (2, D): sum of the strength of the image at edges on the left and on the right of what is near, for every yaw
     # angle
     scores: Array
-    edges: NDArray[np.int64]  # (2,) int64: numbers of edges in the image at yaw 0
+    edges: NDArray[np.int64]  # (2,): numbers of edges in the image at yaw 0
     # Sum of the squared numbers of edges on one upright line, over the lines: the variance of `scores` by chance
     squares: float
 

@@ -37,7 +37,7 @@ TransformAt = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
 def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T_src_at: TransformAt) -> Array | None:
     """Transform points (N, 3), m, each by the transform at its own stamp (N,).
 
-    Returns (N, 3), m, or None: None where a transform is not known.
+    Returns (N, 3) float64, m, or None: None where a transform is not known.
     """
     if len(xyz_m) == 0:
         return np.zeros((0, 3))

@@ -182,7 +182,7 @@ def smooth_path(
 ) -> tuple[Array, Array]:
     """Smooth the measured samples of a path, in units u; the others stay as they are.
 
-    `t_s`: (P,). `values`: (P, D) u. `measured`: (P,). `noise`: u: standard deviation of the samples, independent
+    `t_s`: (P,). `values`: (P, D) u. `measured`: (P,) bool. `noise`: u: standard deviation of the samples, independent
     of each other.
 
     Returns `values`: (P, D) u; `sigma`: (P,) u: standard deviations of the smoothed samples, 0 of the others.
@@ -421,7 +421,7 @@ def find_skips(samples: Samples, parts: list[Part]) -> list[Skip]:
             samples, _end(samples, one.rows, first=False), _end(samples, other.rows, first=True)
         )
         if np.linalg.norm(off) > most:
-            out.append(Skip(int(one.rows[-1])(other.rows[0]), float(np.linalg.norm(off))))
+            out.append(Skip(int(one.rows[-1]), int(other.rows[0]), float(np.linalg.norm(off))))
     return out
 
 
@@ -484,7 +484,7 @@ class RepairedPath:
 def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.bool_] | None = None) -> RepairedPath:
     """Find and repair the faults of a path.
 
-    `t_s`: (P,). `values`: (P, D) u. `wrong`: (P,): samples that are known to be wrong.
+    `t_s`: (P,). `values`: (P, D) u. `wrong`: (P,) bool: samples that are known to be wrong.
     """
     rows = np.arange(len(t_s)) if wrong is None else np.flatnonzero(~wrong)
     new, sigma = values.copy(), np.zeros(len(t_s))

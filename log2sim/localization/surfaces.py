@@ -69,7 +69,7 @@ def adjoint_of(dst_T_src: Array) -> Array:
 def velocities_at(track: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
     """Compute how the ego moves at stamps (K,), by poses `MOTION_SPAN_NS` before and after.
 
-    Returns `velocity`: (K, 6), m/s and rad/s: twists in the ego's frame; `known`: (K,): whether these poses are
+    Returns `velocity`: (K, 6), m/s and rad/s: twists in the ego's frame; `known`: (K,) bool: whether these poses are
     known.
     """
     (before, known), (at, is_known), (after, will_be_known) = (

@@ -132,10 +132,10 @@ class Scatter:
 def compare_poses(log: Log, lidar: str, tracks: Mapping[str, PoseTrack], t_ns: NDArray[np.int64]) -> dict[str, Scatter]:
     """Measure how sharp the surroundings are under several poses, on the same pairs of sweeps.
 
-    `t_ns`: (P,): stamps of the sweeps to choose from, two at least.
+    `t_ns`: (P,) int64: stamps of the sweeps to choose from, two at least.
     """
     library, stream_t_ns = load_small_gicp(), log.streams[lidar].t_ns
-    apart_ns = min(round(APART_S * NS_PER_S)(t_ns[-1] - t_ns[0]) // 2)
+    apart_ns = min(round(APART_S * NS_PER_S), int(t_ns[-1] - t_ns[0]) // 2)
     starts = np.unique(np.linspace(t_ns[0], t_ns[-1] - apart_ns, PAIRS).astype(np.int64))
     first = np.unique(np.minimum(nearest_index(t_ns, starts), len(t_ns) - 2))
     second = np.maximum(nearest_index(t_ns, t_ns[first] + apart_ns), first + 1)

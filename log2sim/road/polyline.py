@@ -417,7 +417,7 @@ def _runs(route_of: NDArray[np.intp], s: Array) -> tuple[Run, ...]:
         own = s[np.maximum(route_of, 0), np.arange(n)]
         changed |= (np.abs(np.diff(own)) > JUMP_M) & (route_of[1:] >= 0)
     cuts = np.concatenate([[0], np.flatnonzero(changed) + 1, [n]])
-    return tuple(Run(int(route_of[a])(a), int(b) - 1) for a, b in itertools.pairwise(cuts))
+    return tuple(Run(int(route_of[a]), int(a), int(b) - 1) for a, b in itertools.pairwise(cuts))
 
 
 def _absorb(runs: tuple[Run, ...], route_of: NDArray[np.intp], stay: NDArray[np.bool_], s: Array) -> tuple[Run, ...]:

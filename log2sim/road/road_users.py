@@ -38,7 +38,7 @@ class Boxes:
 class RoadUsers:
     """The agents of a scenario at chosen times.
 
-    `log`: whose ego hides the ground too. `t_ns`: (T,): all times that will be asked for.
+    `log`: whose ego hides the ground too. `t_ns`: (T,) int64: all times that will be asked for.
     """
 
     def __init__(self, log: Log, scenario: Scenario, t_ns: NDArray[np.int64]) -> None:
