@@ -34,8 +34,8 @@ from log2sim.localization.verdict import (
     unsure_share,
 )
 
+# What a scenario says about the ego by the source of its poses.
 ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera": "camera motion"}
-"""What a scenario says about the ego by the source of its poses."""
 
 
 @dataclass(frozen=True, eq=False)

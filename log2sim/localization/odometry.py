@@ -30,8 +30,8 @@ from log2sim.geometry import (
 KNOT_NS = 5_000_000
 MAX_KNOTS = 4096
 
+# Gives the transforms (K, 4, 4) at stamps (K,) and whether each is known.
 TransformAt = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
-"""Gives the transforms (K, 4, 4) at stamps (K,) and whether each is known."""
 
 
 def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T_src_at: TransformAt) -> Array | None:

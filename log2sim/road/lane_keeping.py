@@ -16,14 +16,12 @@ from log2sim.geometry import Array
 from log2sim.road.lane_graph import infer_lanes
 from log2sim.road.polyline import MAX_TURN_RAD, Polyline
 
+# Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time.
 STEP_S = 0.1
-"""Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time."""
-
+# An agent is in the next lane when its middle is so far beyond the line between both: it does not go to and fro with noise.
 CROSSED_M = 0.2
-"""An agent is in the next lane when its middle is so far beyond the line between both: it does not go to and fro with noise."""
-
+# Positions of agents that move less say nothing of how they drive.
 MIN_MOVED_M = 1.0
-"""Positions of agents that move less say nothing of how they drive."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,21 +14,17 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO, GROUP_OF, Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
 
+# Of the vertices: on the tightest curve of a car (5 m) the middle of a chord is 6 mm off.
 SPACING_M = 0.5
-"""Of the vertices: on the tightest curve of a car (5 m) the middle of a chord is 6 mm off."""
-
+# Headings that differ by a radian count as much as so many meters when the nearest vertex is looked for.
 TURN_M = 6.0
-"""Headings that differ by a radian count as much as so many meters when the nearest vertex is looked for."""
-
+# Length of the chords whose intersections are computed: on a curve of 10 m they are 5 cm off, which only shifts a junction's
+# edge.
 CROSSING_STEP_M = 2.0
-"""Length of the chords whose intersections are computed: on a curve of 10 m they are 5 cm off, which only shifts a junction's edge."""
-
-
+# Feet this far beyond an end are on the line: resampling moves ends by less.
 INSIDE_M = 0.01
-"""Feet this far beyond an end are on the line: resampling moves ends by less."""
-
+# Lines that meet at less than a degree run into each other, and where they do is not known.
 MIN_SINE = 0.02
-"""Lines that meet at less than a degree run into each other, and where they do is not known."""
 
 
 class Projection(NamedTuple):
@@ -187,32 +183,25 @@ def _features(xy_m: Array, heading_rad: Array) -> Array:
     return np.column_stack([xy_m, TURN_M * np.cos(heading_rad), TURN_M * np.sin(heading_rad)])
 
 
+# A vehicle that moves back by less is settling; more begins a new path.
 REVERSAL_M = 0.1
-"""A vehicle that moves back by less is settling; more begins a new path."""
-
+# Shorter paths say nothing of a lane: half a car's length, as one moves when it parks.
 MIN_PATH_M = 2.0
-"""Shorter paths say nothing of a lane: half a car's length, as one moves when it parks."""
-
+# Points closer than this along a path are merged: below the error of any position.
 MIN_STEP_M = 0.01
-"""Points closer than this along a path are merged: below the error of any position."""
-
+# Greatest distance of points between waypoints.
 STEP_M = 0.5
-"""Greatest distance of points between waypoints."""
-
+# Between waypoints farther apart in time nobody knows where an agent went: the trajectory is a guess that can overshoot.
 MAX_GAP_S = 60.0
-"""Between waypoints farther apart in time nobody knows where an agent went: the trajectory is a guess that can overshoot."""
-
+# Points between two waypoints, which bounds what a jump in a trajectory costs.
 MAX_STEPS = 200
-"""Points between two waypoints, which bounds what a jump in a trajectory costs."""
-
+# Standard deviation of the smoothing of observed paths along them: a curve of 6 m becomes 8 cm tighter, and no car turns in
+# less.
 SMOOTH_M = 1.0
-"""Standard deviation of the smoothing of observed paths along them: a curve of 6 m becomes 8 cm tighter, and no car turns in less."""
-
+# Standard deviation of the smoothing of heights of observed agents: roads curve over tens of meters.
 LEVEL_M = 8.0
-"""Standard deviation of the smoothing of heights of observed agents: roads curve over tens of meters."""
-
+# Categories whose paths make lanes; two-wheelers make some only where those have none.
 VEHICLES_FIRST = ("car", "truck", "bus")
-"""Categories whose paths make lanes; two-wheelers make some only where those have none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,20 +319,16 @@ def _monotone_stretches(progress: Array) -> Iterator[tuple[int, int, int]]:
         yield start, extreme, sign
 
 
+# A vehicle closer than this to a route is on it: half of the narrowest usual lane, 3.0 m (RAA 2008, urban roads).
 ENTER_M = 1.5
-"""A vehicle closer than this to a route is on it: half of the narrowest usual lane, 3.0 m (RAA 2008, urban roads)."""
-
+# It is on it until it is farther away than the narrowest lane of roadworks is wide; a lane beside cannot be nearer.
 STAY_M = 2.2
-"""It is on it until it is farther away than the narrowest lane of roadworks is wide; a lane beside cannot be nearer."""
-
+# Larger differences of heading are crossings of a route.
 MAX_TURN_RAD = float(np.deg2rad(30.0))
-"""Larger differences of heading are crossings of a route."""
-
+# Stations of two neighboring samples that differ by more belong to two passes of the same route.
 JUMP_M = 5.0
-"""Stations of two neighboring samples that differ by more belong to two passes of the same route."""
-
+# Stretches off all routes that are shorter are gaps between two routes.
 SHORT_M = 2.0
-"""Stretches off all routes that are shorter are gaps between two routes."""
 
 
 class Run(NamedTuple):

@@ -14,20 +14,16 @@ from log2sim.geometry import Array
 from log2sim.road.polyline import JUMP_M, STAY_M, DrivenPath, Match, Polyline, Projection, Run, crossings
 from log2sim.road.routes import JOIN_M, LANE_M, MAX_LANE_M, Beside, Route
 
+# A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two.
 ALIGNED_RAD = float(np.deg2rad(2.0))
-"""A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two."""
-
+# How far before it leaves a route a path may begin to turn.
 MAX_TURNOFF_M = 20.0
-"""How far before it leaves a route a path may begin to turn."""
-
+# Routes that differ less in heading run side by side; a path from one to the other changes lanes.
 CHANGE_RAD = float(np.deg2rad(10.0))
-"""Routes that differ less in heading run side by side; a path from one to the other changes lanes."""
-
+# Between where two lanes touch and where a junction begins: vehicles there overlap no lane but their own.
 MARGIN_M = 2.0
-"""Between where two lanes touch and where a junction begins: vehicles there overlap no lane but their own."""
-
+# Half of the length of the place where two lanes cross at a small angle.
 MAX_HALF_M = 15.0
-"""Half of the length of the place where two lanes cross at a small angle."""
 
 
 @dataclass(frozen=True)
@@ -151,11 +147,10 @@ def _first(mask: NDArray[np.bool_]) -> int:
     return int(mask.argmax()) if mask.any() else len(mask) - 1
 
 
+# Between two conflicts nearer than this no vehicle can wait: they are one junction.
 MIN_SECTION_M = 4.0
-"""Between two conflicts nearer than this no vehicle can wait: they are one junction."""
-
+# First and last station on a route, and the conflict or area that it belongs to.
 Stretch = tuple[float, float, int]
-"""First and last station on a route, and the conflict or area that it belongs to."""
 
 
 @dataclass(frozen=True)
@@ -244,17 +239,14 @@ def _spread(routes: Sequence[Route], stretches: dict[int, list[Stretch]], beside
     return grown
 
 
+# What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes.
 FREE, CUT = -1, -2
-"""What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes."""
-
+# Of a path that begins or ends within a junction, this much is a section, from which its way through the junction leads on.
 FIRST_M = 3.0
-"""Of a path that begins or ends within a junction, this much is a section, from which its way through the junction leads on."""
-
+# Shorter sections are what rounding leaves: a sample of a path.
 MIN_LENGTH_M = 0.5
-"""Shorter sections are what rounding leaves: a sample of a path."""
-
+# Over this length a lane comes to the width that it has beside others: 6 cm a meter at most.
 TAPER_M = 10.0
-"""Over this length a lane comes to the width that it has beside others: 6 cm a meter at most."""
 
 
 @dataclass(frozen=True)
@@ -481,14 +473,12 @@ def _lay_out_group(
     return out
 
 
+# Over this length from its ends a connection comes from the lanes' middles to the path that was driven.
 BLEND_M = 15.0
-"""Over this length from its ends a connection comes from the lanes' middles to the path that was driven."""
-
+# A path that is first seen, or last, this far from the end of a section did not pass it.
 MISSED_M = 3.0
-"""A path that is first seen, or last, this far from the end of a section did not pass it."""
-
+# Sections that are nearer meet.
 MIN_CONNECTION_M = 1.0
-"""Sections that are nearer meet."""
 
 
 @dataclass(frozen=True, eq=False)
