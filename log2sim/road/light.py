@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cross_slab
 
 # The camera's own white balance and exposure: white surfaces in the scene's main light look white, up to the errors of
 # automatic white balance (about 5 degrees of angular error, Barnard et al. 2002) and one photographic stop.
@@ -240,18 +240,11 @@ def hit_vehicle(category: str, size_m: Array, origin: Array, rays: Array) -> Hit
 def hit_block(low: Array, high: Array, origin: Array, rays: Array) -> tuple[Array, NDArray[np.intp]]:
     """Return the distances (N,) at which rays enter a block, infinite for none, and the axes (N,) of the faces there.
 
-    Notes
-    -----
-    Slabs (Kay and Kajiya 1986). A block around the origin of the rays is not entered.
+    A block around the origin of the rays is not entered.
     """
     # By axis: reductions over rows of three take many times as long.
-    near, far = [], []
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(3):
-            a, b = (low[k] - origin[k]) / rays[:, k], (high[k] - origin[k]) / rays[:, k]
-            near.append(np.fmin(a, b))
-            far.append(np.fmax(a, b))
-    entry, leave = np.maximum(np.maximum(near[0], near[1]), near[2]), np.minimum(np.minimum(far[0], far[1]), far[2])
+    near, far = zip(*(cross_slab(origin[k], rays[:, k], low[k], high[k]) for k in range(3)))
+    entry, leave = np.fmax(np.fmax(near[0], near[1]), near[2]), np.fmin(np.fmin(far[0], far[1]), far[2])
     axis = np.where(near[0] == entry, 0, np.where(near[1] == entry, 1, 2))
     return np.where((entry <= leave) & (entry > 0), entry, np.inf), axis
 
