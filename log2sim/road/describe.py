@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from log2sim.config import Config
-from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
+from log2sim.datatypes import Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
 from log2sim.localization.choice import PoseChoice
@@ -73,45 +73,33 @@ def describe(
             lanes, notes = infer_lanes(features.markings, features.borders, scenario)
             features = replace(features, lanes=lanes, notes=(*features.notes, *notes))
     with clock.stage("colors"):
-        agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
+        found = {} if colors is None else colors.colors()
+        agents = tuple(replace(agent, color=found.get(agent.id, agent.color)) for agent in scenario.agents)
     with clock.stage("signals"):
-        signals, seen = find_signals(log, scenario, lights) if plan.keeps(Stage.SIGNALS) else ((), "")
+        signals, seen_lights = find_signals(log, scenario, lights) if plan.keeps(Stage.SIGNALS) else ((), "")
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
-    figures = {"map_features": count_features(features), "colors": count_colors(agents), "signals": len(signals)}
     uncolored = () if colors is None else colors.notes()
-    return Description(described, outcomes_of(plan, described, seen, uncolored), figures, reader.summary())
-
-
-def with_colors(agents: tuple[Agent, ...], sampler: ColorSampler) -> tuple[Agent, ...]:
-    """Return the agents with the colors that were found."""
-    found = sampler.colors()
-    return tuple(replace(agent, color=found.get(agent.id, agent.color)) for agent in agents)
-
-
-def outcomes_of(plan: Plan, scenario: Scenario, seen_lights: str, uncolored: Sequence[str]) -> tuple[Outcome, ...]:
-    """Say what came of the stages of the description."""
-    features, colored = scenario.map_features, sum(agent.color is not None for agent in scenario.others)
+    colored = sum(agent.color is not None for agent in described.others)
     said = {
         Stage.LANES: "" if features is None else f"{len(features.markings)} markings, {len(features.lanes)} lanes",
         Stage.COLORS: "; ".join([f"colors of {colored} vehicles", *uncolored]),
         Stage.SIGNALS: seen_lights,
     }
     decisions = [plan.decision(stage) for stage in said]
-    return tuple(Outcome(Decision(d.stage, d.kept, said[d.stage] if d.kept else d.reason)) for d in decisions)
+    outcomes = (Outcome(Decision(d.stage, d.kept, said[d.stage] if d.kept else d.reason)) for d in decisions)
+    figures = {
+        "map_features": None if features is None else count_features(features),
+        "colors": dict(Counter(str(agent.color["name"]) for agent in agents if agent.color is not None)),
+        "signals": len(signals),
+    }
+    return Description(described, tuple(outcomes), figures, reader.summary())
 
 
-def count_features(features: MapFeatures | None) -> dict[str, Any] | None:
-    """Count markings by kind, borders, and lanes by what they are inferred from; None where they were not looked for."""
-    if features is None:
-        return None
+def count_features(features: MapFeatures) -> dict[str, Any]:
+    """Count markings by kind, borders, and lanes by what they are inferred from."""
     return {
         "markings": dict(Counter(marking.kind for marking in features.markings)),
         "borders": len(features.borders),
         "lanes": dict(Counter(lane.inferred_from for lane in features.lanes)),
         "notes": list(features.notes),
     }
-
-
-def count_colors(agents: tuple[Agent, ...]) -> dict[str, int]:
-    """Count agents by the name of their color."""
-    return dict(Counter(str(agent.color["name"]) for agent in agents if agent.color is not None))
