@@ -132,7 +132,7 @@ def check_poses(given: PoseTrack) -> CheckedPoses:
     changed = level.moved | height.moved | yaw.moved | bridged
     new_xyz, turn_rad = np.hstack([level.values, height.values]), yaw.values[:, 0] - yaw_rad
     sigmas = _sigmas(level, yaw)
-    known = (sigmas <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
+    known = np.asarray((sigmas <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1))
     for first, stop in runs_of(changed):
         k = slice(first, stop)
         stretches.append(
