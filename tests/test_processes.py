@@ -135,8 +135,7 @@ def test_errors_come_back_as_what_they_are_and_no_process_is_left() -> None:
 
     results, known = map_in_processes(fail, range(9), 2), set[int]()
     with pytest.raises(PluginError) as raised:
-        for process in results:
-            known.add(process)
+        known.update(results)
     assert str(raised.value) == "detector 'mine': broken"
     assert "in fail" in raised.value.__notes__[0]
     assert known
