@@ -124,16 +124,16 @@ def test_an_image_box_that_the_sweep_should_show_is_doubted_by_its_points() -> N
 
 
 def test_a_box_in_both_takes_its_points_from_the_image_boxes_of_others() -> None:
-    cars = [standing(14, 1, 20), standing(20, 3, 20)]
+    cars = [standing(14, 0, 20), standing(21, 3, 20)]
     world, owner = scan(cars, azimuth_deg=(-40, 40), steps=(400, 60))
-    found = in_image((14, 1), (20, 3))
+    found = in_image((14, 0), (21, 3))
     found.box_px[:] = [outline_px(CAMERA, CAMERA.mount_T_cam, car) for car in cars]
-    rows = joined(in_sweep((14, 1), yaw_deg=20), found, world=world)
+    rows = joined(in_sweep((14, 0), yaw_deg=20), found, world=world)
     assert rows.camera.tolist() == ["front", "front"]
-    assert np.isfinite(rows.box_yaw_rad).tolist() == [False, True]
-    for row, cluster in zip((1, 0), rows.cluster):
-        of = np.argmin(np.linalg.norm(world[:, None] - cluster[None, :, :3], axis=2), axis=0)
-        assert (owner[of] == row).all()
+    assert np.isfinite(rows.box_yaw_rad).tolist() == [True, False]
+    for car, cluster in zip((0, 1), rows.cluster):
+        nearest = np.linalg.norm(world[:, None] - cluster[None, :, :3], axis=2).argmin(axis=0)
+        assert (owner[nearest] == car).mean() > 0.9
 
 
 def test_two_even_chances_that_agree_are_three_to_one() -> None:

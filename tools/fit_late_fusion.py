@@ -10,8 +10,8 @@ evidence as prior, and are printed as `log2sim/perception/lidar/measure.py` hold
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from log2sim.datatypes import GROUP_OF, Boxes3D, Measurements, Scenario
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar import measure
 from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, PairWeights, logit
+from log2sim.perception.lidar.projection import View
 from log2sim.pipeline import observe_log, start
 from log2sim.synth.scene import load_scene
 from log2sim.synth.synthesis import synthesize
@@ -37,8 +38,8 @@ def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, N
     found: list[tuple[Boxes3D, Measurements, Pairs]] = []
     original = measure.match_boxes
 
-    def match(boxes: Boxes3D, images: Measurements, *where: Any) -> Pairs:
-        pairs = original(boxes, images, *where)
+    def match(boxes: Boxes3D, images: Measurements, frame: NDArray[np.intp], views: Sequence[View]) -> Pairs:
+        pairs = original(boxes, images, frame, views)
         found.append((boxes, images, pairs))
         return pairs
 

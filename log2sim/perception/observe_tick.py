@@ -61,22 +61,22 @@ class TickObserver:
             if camera in found and (view := self._view(camera, tick)) is not None:
                 end = end_of(view.camera)
                 frames[end].append((view, found[camera], parts[id(cloud), end]))
+        groups = [(list(chain(*frames.values())), boxes, reference)]
         if self.plan.fusion is FusionLevel.TRACKS and boxes is not None and boxes.seen_by is not None:
-            searched = [(boxes.take(seen), parts[id(reference), end]) for end, seen in zip(ENDS, boxes.seen_by.T)]
-            groups = list(zip(frames.values(), searched))
-        else:
-            groups = [(list(chain(*frames.values())), (boxes, reference))]
+            groups = [
+                (frames[end], boxes.take(seen), parts[id(reference), end]) for end, seen in zip(ENDS, boxes.seen_by.T)
+            ]
         joined = Measurements.join([
             measure(shown, None if of is None else outside_ego(self.log, of), cloud, mode=self.mode)
-            for shown, (of, cloud) in groups
+            for shown, of, cloud in groups
         ])  # fmt: skip
         out = Observed(joined.take(self._in_range(tick, joined)))
         if self.plan.keeps(Stage.HOMOGRAPHY):
             for view, _, cloud in chain(*frames.values()):
-                ego_T_map, camera = inverse(base_pose(self.log, view.t_ns)), view.camera
-                out.feet[camera.name] = foot_points(camera, joined, ego_T_map, tick)
+                ego_T_map, name = inverse(base_pose(self.log, view.t_ns)), view.camera.name
+                out.feet[name] = foot_points(view.camera, joined, ego_T_map, tick)
                 if cloud is not None:
-                    out.ground[camera.name] = _ground_points(view, cloud, ego_T_map, tick)
+                    out.ground[name] = _ground_points(view, cloud, ego_T_map, tick)
         return out
 
     def range_lights(self, tick: int, lights: list[LightBox], clouds: Sequence[Cloud | None]) -> list[LightBox]:

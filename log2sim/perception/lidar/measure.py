@@ -78,47 +78,45 @@ def measure(
     Returns
     -------
     Measurements
-        Rows of the image boxes without a partner, in the order of the frames, which have no position without LiDAR points; then
-        those of the 3D boxes.
+        Rows of the 3D boxes, then those of the image boxes without a partner in the order of the frames; without LiDAR points
+        these have no position.
     """
     searched = boxes is not None and sweep is not None
+    boxes = boxes if boxes is not None and sweep is not None else Boxes3D.empty()
     images, frame = _rows_of_images(frames)
-    if boxes is None or sweep is None:
-        boxes = Boxes3D.empty()
     pairs = match_boxes(boxes, images, frame, [view for view, _, _ in frames])
-    own = _members_of_all(boxes, sweep) if sweep is not None and len(boxes) else []
-    alone = np.ones(len(images), dtype=bool)
-    alone[pairs.image] = False
-    rows, first, frame = images.take(alone), int(alone.sum()), frame[alone]
+    alone = np.setdiff1d(np.arange(len(images)), pairs.image)
+    rows, own = images.take(alone), list[Index]()
+    frame = np.concatenate([np.full(len(boxes), -1), frame[alone]])
     if sweep is not None and len(boxes):
-        rows = Measurements.join([rows, _rows_of_boxes(boxes, sweep, own)])
+        own = _members_of_all(boxes, sweep)
+        rows = Measurements.join([_rows_of_boxes(boxes, sweep, own), rows])
     columns: dict[str, Any] = vars(rows) | {"cluster": list(rows.cluster), "others": [None] * len(rows)}
-    members_of: dict[int, tuple[Cloud, dict[int, Index]]] = {}
+    # The points of rows, by the cloud in which these were sought.
+    found: dict[int, tuple[Cloud, dict[int, Index]]] = {}
     if sweep is not None:
-        large = {first + k: members for k, members in enumerate(own) if len(members) >= MIN_CLUSTER_POINTS}
-        members_of[id(sweep)] = sweep, large
+        found[id(sweep)] = sweep, {k: members for k, members in enumerate(own) if len(members) >= MIN_CLUSTER_POINTS}
+    free = _free_points(frames, sweep, [own[k] for k in np.unique(pairs.box)])
     shown = list[tuple[Shown, Index, Array]]()
-    if mode == "robust":
-        free = _free_points(frames, sweep, [own[k] for k in np.unique(pairs.box)])
-        for k, (view, detections, cloud) in enumerate(frames):
-            of_frame = np.flatnonzero(frame == k)
-            if cloud is not None and len(of_frame):
-                points, columns_m = free[id(cloud)]
-                seen = Shown(view, cloud, points, columns_m, project_points(view, cloud.origin, columns_m))
-                shown.append((seen, of_frame, detections.box_px))
-                members_of.setdefault(id(cloud), (cloud, {}))[1].update(_cluster_boxes(seen, of_frame, columns))
-    for cloud, members in members_of.values():
+    for k, (view, detections, cloud) in enumerate(frames):
+        of_frame = np.flatnonzero(frame == k)
+        if cloud is not None and len(of_frame) and mode == "robust":
+            points, columns_m = free[id(cloud)]
+            seen = Shown(view, cloud, points, columns_m, project_points(view, cloud.origin, columns_m))
+            found.setdefault(id(cloud), (cloud, {}))[1].update(_cluster_boxes(seen, of_frame, columns))
+            shown.append((seen, of_frame, detections.box_px))
+    for cloud, members in found.values():
         write_evidence(columns, list(members), list(members.values()), cloud)
     columns |= vars(place_boxes(Measurements(**columns)))
-    for seen, of_frame, box_px in shown:
-        place_few_points(seen, columns, of_frame, box_px)
+    for seen, of_frame, boxes_px in shown:
+        place_few_points(seen, columns, of_frame, boxes_px)
     if mode == "paper":
         for k, (view, _, cloud) in enumerate(frames):
             if cloud is not None:
                 _measure_as_paper(view, cloud, columns, np.flatnonzero(frame == k))
     if searched:
-        _doubt_images(columns, first)
-        _join_pairs(columns, first, images, pairs, frames)
+        _join_pairs(columns, images, pairs, [view for view, _, _ in frames])
+        _doubt_images(columns, len(boxes))
     others = tuple(columns["others"]) if any(view is not None for view in columns["others"]) else ()
     return Measurements(**columns | {"cluster": tuple(columns["cluster"]), "others": others})
 
@@ -248,39 +246,34 @@ def _may_be_same(boxes: NDArray[np.str_], images: NDArray[np.str_]) -> NDArray[n
     return np.asarray(same)
 
 
-def _join_pairs(
-    columns: dict[str, Any], first: int, images: Measurements, pairs: Pairs, frames: Sequence[Frame]
-) -> None:
-    """Write what image boxes say of the 3D boxes, whose rows begin at `first`, and doubt those that an image should show and does not."""
-    rows = slice(first, None)
-    score = columns["score"][rows].copy()
-    recall = IMAGE_RECALL * np.clip(
-        (pairs.height_px - NO_IMAGE_RECALL_PX) / (IMAGE_RECALL_PX - NO_IMAGE_RECALL_PX), 0, 1
-    )
-    columns["score"][rows] = if_missed(score, recall)
-    views = {view.camera.name: view for view, _, _ in frames}
+def _join_pairs(columns: dict[str, Any], images: Measurements, pairs: Pairs, views: Sequence[View]) -> None:
+    """Write what image boxes say into the first rows, of 3D boxes; doubt those that an image should show and does not."""
+    score = columns["score"][: len(pairs.height_px)].copy()
+    tall = (pairs.height_px - NO_IMAGE_RECALL_PX) / (IMAGE_RECALL_PX - NO_IMAGE_RECALL_PX)
+    columns["score"][: len(score)] = if_missed(score, IMAGE_RECALL * np.clip(tall, 0, 1))
+    view_of = {view.camera.name: view for view in views}
     # Of several images the best one is written last.
     for n in np.argsort(pairs.iou * images.score[pairs.image], kind="stable").tolist():
-        i, j = int(pairs.box[n]), int(pairs.image[n])
-        row, sure = first + i, pairs.iou[n] >= MIN_CATEGORY_IOU
-        for name in ("camera", "box_px", "truncated", *(["category"] if sure else [])):
-            columns[name][row] = getattr(images, name)[j]
-        columns["seen_by"][row] |= images.seen_by[j]
-        columns["score"][row] = PAIR_WEIGHTS.score(images.score[j], score[i], pairs.iou[n])
-        view, points = views[str(images.camera[j])], columns["cluster"][row]
-        places = points[:, :3] if len(points) else columns["center_m"][row][None]
+        row, image, iou = int(pairs.box[n]), int(pairs.image[n]), pairs.iou[n]
+        for name in ("camera", "box_px", "truncated", "category")[: 4 if iou >= MIN_CATEGORY_IOU else 3]:
+            columns[name][row] = getattr(images, name)[image]
+        columns["seen_by"][row] |= images.seen_by[image]
+        columns["score"][row] = PAIR_WEIGHTS.score(images.score[image], score[row], iou)
+        view, cluster = view_of[str(images.camera[image])], columns["cluster"][row]
+        places = cluster[:, :3] if len(cluster) else columns["center_m"][row][None]
         depth_m = (places - view.map_T_cam[:3, 3]) @ view.map_T_cam[:3, 2]
-        columns["height_px_m"][row] = _height_m(images.box_px[j], depth_m, str(columns["category"][row]), view.camera)
+        category = str(columns["category"][row])
+        columns["height_px_m"][row] = _height_m(images.box_px[image], depth_m, category, view.camera)
 
 
-def _doubt_images(columns: dict[str, Any], count: int) -> None:
-    """Lower the scores of the first rows, of image boxes alone, that the detector in sweeps should have found by their points."""
-    found = np.array([SWEEP_RECALL.get(GROUP_OF[str(c)], 0.0) for c in columns["category"][:count]], dtype=np.float64)
-    points = columns["points"][:count]
+def _doubt_images(columns: dict[str, Any], first: int) -> None:
+    """Lower the scores of rows from the `first` on, of images alone, that the detector in sweeps should have found by their points."""
+    found = np.array([SWEEP_RECALL.get(GROUP_OF[str(c)], 0.0) for c in columns["category"][first:]], dtype=np.float64)
+    points = columns["points"][first:]
     with np.errstate(invalid="ignore"):
-        covered = np.hypot(*(columns["center_m"] - columns["sensor_m"])[:count, :2].T) <= SWEEP_RANGE_M
+        covered = np.hypot(*(columns["center_m"] - columns["sensor_m"])[first:, :2].T) <= SWEEP_RANGE_M
     recall = np.where(covered, found * points / (points + SWEEP_RECALL_POINTS), 0.0)
-    columns["score"][:count] = if_missed(columns["score"][:count], recall)
+    columns["score"][first:] = if_missed(columns["score"][first:], recall)
 
 
 def if_missed(score: Array, recall: Array) -> Array:
