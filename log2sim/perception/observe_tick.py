@@ -34,7 +34,7 @@ class Observed:
         Foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs them.
     """
 
-    measurements: Measurements
+    measurements: Measurements = field(default_factory=Measurements.empty)
     feet: dict[str, Correspondences] = field(default_factory=dict)
     ground: dict[str, Correspondences] = field(default_factory=dict)
 
