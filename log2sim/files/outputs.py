@@ -171,9 +171,14 @@ def put(temporary: Path, target: Path) -> bool:
         os.replace(temporary, target)
         return False
     try:
-        _rename_to_new(temporary, target)
+        os.link(temporary, target)  # a renaming would replace what is there
+        temporary.unlink()
     except FileExistsError:
         raise written_meanwhile(target) from None
+    except OSError:  # a file system without hard links
+        if target.exists():
+            raise written_meanwhile(target) from None
+        os.replace(temporary, target)
     expected_new.discard(target.resolve())
     return False
 
@@ -181,20 +186,6 @@ def put(temporary: Path, target: Path) -> bool:
 def written_meanwhile(target: Path) -> ConfigError:
     """Return the error for a target that another run wrote while this one worked."""
     return ConfigError(f"{target}: another run has written it meanwhile; choose another name or pass --overwrite")
-
-
-def _rename_to_new(temporary: Path, target: Path) -> None:
-    """Rename a file; raise `FileExistsError` when there is such a file, which a renaming would replace."""
-    try:
-        os.link(temporary, target)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without hard links
-        if target.exists():
-            raise FileExistsError from None
-        os.replace(temporary, target)
-    else:
-        temporary.unlink()
 
 
 @contextmanager
@@ -310,7 +301,8 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
             elif isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise written_meanwhile(target) from None
             raise
-        for replaced in _earlier_copies(target):  # of runs that died before this line, too
+        # Also those of runs that died before this line.
+        for replaced in list(target.parent.glob(f".{glob.escape(target.name)}.{'[0-9a-f]' * 8}.old")):
             remove(replaced)
 
 
@@ -345,11 +337,6 @@ def unfinished_folder(temporary: Path, target: Path) -> Iterator[Path]:
         raise ConfigError(f"{target / inside}: cannot be written: {error.strerror or error}") from error
     finally:
         remove(temporary)
-
-
-def _earlier_copies(target: Path) -> list[Path]:
-    """Return what was at a target and made room for a new folder."""
-    return list(target.parent.glob(f".{glob.escape(target.name)}.{'[0-9a-f]' * 8}.old"))
 
 
 def _latest_in(folder: Path) -> Path:

@@ -64,14 +64,6 @@ CITIES: Mapping[str, City] = {
 }
 
 
-def find_city(log: Path) -> str | None:
-    """Return the three letters of the city in the names of a log's map files; None without any."""
-    folder = log / "map"
-    names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    found = [match[1] for match in map(CITY_IN_NAME.search, names) if match]
-    return found[0] if found else None
-
-
 def map_frame_of(city: str | None, offset_m: tuple[float, float, float], notes: list[str]) -> MapFrame:
     """Map frame whose origin is `offset_m` from that of a city's frame; only local where the city is not known."""
     place = CITIES.get(city or "")
@@ -103,8 +95,7 @@ def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float
     city_T_ego = transforms_of(columns, path)
     if not len(city_T_ego):
         raise LogError(f"{path}: no poses; expected at least one")
-    keep, problems = strictly_increasing(columns["timestamp_ns"], path.name)
-    notes += problems
+    keep = strictly_increasing(columns["timestamp_ns"], path.name, notes)
     east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / OFFSET_STEP_M) * OFFSET_STEP_M)
     map_T_ego = shift_poses(city_T_ego[keep], np.array([east, north, 0.0]))
     return PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
@@ -411,7 +402,11 @@ class _Folder:
         streams |= sweeps
         if not streams:
             raise LogError(f"{self.path / 'sensors'}: neither sweeps nor images; expected lidar/STAMP.feather")
-        city = find_city(self.path)
+        # Three letters in the names of the map files.
+        folder = self.path / "map"
+        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+        found = [match[1] for match in map(CITY_IN_NAME.search, names) if match]
+        city = found[0] if found else None
         map_frame = map_frame_of(city, offset_m, notes)
         notes.append("stamps count from an unknown moment: only their differences are known")
         upper_lidar_xy = mounts.get("up_lidar", np.eye(4))[:2, 3]

@@ -130,7 +130,12 @@ class Wall:
     @cached_property
     def texture(self) -> tuple[NDArray[np.uint8], ...]:
         """Images (H, W, 3), sRGB as BGR, the first row at the ground, in pixels of `FACADE_M_PER_PX`, then ever twice as large."""
-        return _pyramid(_facade(self.length_m, self.height_m, self.color, self.seed))
+        levels = [_facade(self.length_m, self.height_m, self.color, self.seed)]
+        while len(levels) < FACADE_LEVELS and min(levels[-1].shape[:2]) >= 8:
+            levels.append(
+                np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+            )
+        return tuple(levels)
 
 
 class Backdrop:
@@ -194,14 +199,6 @@ def _facade(length_m: float, height_m: float, color: Sequence[int], seed: tuple[
             image[pane[0] : pane[1], middle - 1 : middle + 1] = np.minimum(np.array(color[::-1]) * 1.05, 255)
     shade = 1 + (grain(seed[0], 0, (0, int(rng.integers(1024))), (h, w)) - 1) * np.float32(GRAIN)
     return np.clip(image * shade[..., None], 0, 255).astype(np.uint8)
-
-
-def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    """Halve an image again and again: copies, each half as large as the one before."""
-    levels = [image]
-    while len(levels) < FACADE_LEVELS and min(levels[-1].shape[:2]) >= 8:
-        levels.append(np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8))
-    return tuple(levels)
 
 
 SUBPIXEL_BITS = 4  # of the coordinates of polygons

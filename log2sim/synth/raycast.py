@@ -15,7 +15,7 @@ from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflect
 from log2sim.synth.raster import first_hit
 from log2sim.synth.render import triangles_of
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
-from log2sim.synth.scene import Building, LidarSpec, Scene
+from log2sim.synth.scene import LidarSpec, Scene
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
@@ -89,7 +89,10 @@ def cast_sweep(
     down = -ray[:, 2] > MIN_GRAZING_SINE
     distance[down] = origin[down, 2] / -ray[down, 2]
     for building in scene.building:
-        nearer = _box_distance(building, origin, ray)
+        c, s = np.cos(np.deg2rad(building.yaw_deg)), np.sin(np.deg2rad(building.yaw_deg))
+        rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+        size = np.array(building.size_m)
+        nearer = slab_distance(size, (origin - [*building.center, size[2] / 2]) @ rotation.T, ray @ rotation.T)
         closer = nearer < distance
         distance[closer], hit[closer] = nearer[closer], BUILDING
     for triangles in triangles_of(scene):
@@ -151,14 +154,6 @@ def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng:
     distance[np.flatnonzero(solid)[~detected(signal, ReturnModel(dropout=0.0), rng)]] = np.inf
     early = np.isfinite(air)
     distance[early], hit[early] = air[early], AIR
-
-
-def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
-    """Distance (N,) at which rays enter a building, inf where they miss it (slab method)."""
-    c, s = np.cos(np.deg2rad(building.yaw_deg)), np.sin(np.deg2rad(building.yaw_deg))
-    rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-    size = np.array(building.size_m)
-    return slab_distance(size, (origin - [*building.center, size[2] / 2]) @ rotation.T, ray @ rotation.T)
 
 
 def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool = False) -> Array:

@@ -490,7 +490,13 @@ def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.rand
     draw_bodies(view, instant.bodies, lit, color, depth)
     glare(view, lit.lamps, light, color, depth)
     draw_rain(view, light, color, rng)
-    return _developed(color, light, rng)
+    # Lens blur, sensor noise and gamma
+    image = cv2.GaussianBlur(color, (3, 3), LENS_BLUR_PX)
+    np.clip(image, 0, 1, out=image)
+    np.power(image, np.float32(1 / GAMMA), out=image)
+    image *= 255
+    image += rng.standard_normal(image.shape[:2], dtype=np.float32)[..., None] * np.float32(GRAIN * light.noise)
+    return np.asarray(cv2.convertScaleAbs(np.maximum(image, 0, out=image)), np.uint8)
 
 
 def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Visibility | None]:
@@ -515,13 +521,3 @@ def _visibility(silhouette: Fragments, visible: Fragments) -> Visibility | None:
         return None
     boxes = (np.array([f.u.min(), f.v.min(), f.u.max() + 1, f.v.max() + 1], float) for f in (visible, silhouette))
     return Visibility(len(visible.u), len(silhouette.u), *boxes)
-
-
-def _developed(color: Image, light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Lens blur, sensor noise and gamma."""
-    image = cv2.GaussianBlur(color, (3, 3), LENS_BLUR_PX)
-    np.clip(image, 0, 1, out=image)
-    np.power(image, np.float32(1 / GAMMA), out=image)
-    image *= 255
-    image += rng.standard_normal(image.shape[:2], dtype=np.float32)[..., None] * np.float32(GRAIN * light.noise)
-    return np.asarray(cv2.convertScaleAbs(np.maximum(image, 0, out=image)), np.uint8)

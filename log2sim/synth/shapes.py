@@ -351,6 +351,7 @@ def bus(size_m: tuple[float, float, float]) -> Mesh:
 STRIDE_M = 1.5  # two steps of a walking adult
 PEDAL_M = 5.2  # distance that a bicycle covers per turn of the pedals
 PHASES = 24
+THIGH_M, SHIN_M = 0.44, 0.43
 # Height as a fraction from hips to neck, half the width and half the depth in m.
 TORSO = (
     (0.0, 0.13, 0.10),
@@ -471,7 +472,14 @@ def _rider(step: int) -> Mesh:
             limb([crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]], [0.014, 0.014], Material.MIRROR, count=6)
         )
         hip, ankle = np.array([-0.22, side * 0.09, hip_z]), pedal + [-0.06, 0, 0.1]
-        knee = _knee(hip, ankle, 0.44, 0.43)
+        # The knee bends forward between hip and ankle.
+        reach = ankle - hip
+        distance = min(float(np.linalg.norm(reach)), 0.999 * (THIGH_M + SHIN_M))
+        along = (THIGH_M**2 - SHIN_M**2 + distance**2) / (2 * distance)
+        off = np.sqrt(max(THIGH_M**2 - along**2, 0.0))
+        axis = reach / np.linalg.norm(reach)
+        forward = np.array([-axis[2], 0.0, axis[0]])
+        knee = np.asarray(hip + axis * along + off * forward / np.linalg.norm(forward))
         parts.append(
             limb(
                 [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
@@ -490,14 +498,3 @@ def _rider(step: int) -> Mesh:
     parts[-1] = Mesh(torso.vertices_m - [0.22, 0, 0], torso.normals, torso.faces, torso.part)
     parts += _head(np.array([0.25, 0.0, 1.68]))
     return merged(parts)
-
-
-def _knee(hip: Array, ankle: Array, thigh_m: float, shin_m: float) -> Array:
-    """Position of a knee that bends forward between hip and ankle."""
-    reach = ankle - hip
-    distance = min(float(np.linalg.norm(reach)), 0.999 * (thigh_m + shin_m))
-    along = (thigh_m**2 - shin_m**2 + distance**2) / (2 * distance)
-    off = np.sqrt(max(thigh_m**2 - along**2, 0.0))
-    axis = reach / np.linalg.norm(reach)
-    forward = np.array([-axis[2], 0.0, axis[0]])
-    return np.asarray(hip + axis * along + off * forward / np.linalg.norm(forward))

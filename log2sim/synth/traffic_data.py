@@ -170,7 +170,10 @@ class TrafficRun:
 
     def at(self, t_s: float) -> TrafficScene:
         """Return the scene at a time since its begin."""
-        distance, speed = self._gone(t_s)
+        position = min(max(t_s / STEP_S, 0.0), len(self.distance_m) - 1.000001)
+        k = int(position)
+        step = self.distance_m[k + 1] - self.distance_m[k]
+        distance, speed = self.distance_m[k] + (position - k) * step, step / STEP_S
         objects = [_moved(o, d, v, self.scene) for o, d, v in zip(self.scene.objects, distance, speed)]
         if self.ego is None:
             return replace(self.scene, objects=tuple(objects))
@@ -186,12 +189,6 @@ class TrafficRun:
         kept = [replace(o, position_m=np.append(xy, -rise), yaw_rad=ego.yaw_rad, speed_mps=speed[-1]) if o.kind == "own car" else o
                 for o in objects]  # fmt: skip
         return replace(self.scene, objects=tuple(kept), sensor=sensor)
-
-    def _gone(self, t_s: float) -> tuple[Array, Array]:
-        position = min(max(t_s / STEP_S, 0.0), len(self.distance_m) - 1.000001)
-        k = int(position)
-        step = self.distance_m[k + 1] - self.distance_m[k]
-        return self.distance_m[k] + (position - k) * step, step / STEP_S
 
 
 def run_of(scene: TrafficScene, duration_s: float) -> TrafficRun:
@@ -281,7 +278,10 @@ def log_of(
     run = run_of(scene, duration_s)
     rig = rig_of(scene)
     mount = "map" if scene.mount == "roadside" else "ego"
-    mount_T_lidar = _ego_T_lidar(scene) if mount == "ego" else rig.map_T_lidar
+    mount_T_lidar = rig.map_T_lidar
+    if mount == "ego":
+        place = np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])])
+        mount_T_lidar = transform(np.eye(3), place)
     lidar_T_cam = mount_T_cam_of(scene.mount, rig)
     camera = replace(rig.camera, name=CAMERA, mount=mount, mount_T_cam=mount_T_lidar @ lidar_T_cam)  # type: ignore[arg-type]
     film = _Film(run, environment, camera, lidar_T_cam, seed)
@@ -310,10 +310,6 @@ def log_of(
 def _stamps(t_s: Array) -> NDArray[np.int64]:
     stamps: NDArray[np.int64] = START_NS + np.rint(t_s * NS_PER_S).astype(np.int64)
     return stamps
-
-
-def _ego_T_lidar(scene: TrafficScene) -> Array:
-    return transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
 
 
 def _map_T_lidar(scene: TrafficScene) -> Array:
@@ -476,7 +472,7 @@ def _write_log(
 ) -> None:
     from log2sim.logs.native.writer import write_log
 
-    name = _scene_name(index)
+    name = f"scene_{index:06d}"
     seed = _scene_seed(settings, index)
     log = log_of(scene, environment, name, settings.duration_s, seed, image_labels=settings.pictures)
     if not settings.pictures:
@@ -487,10 +483,6 @@ def _write_log(
 
 def _scene_seed(settings: TrafficSettings, index: int) -> int:
     return int(np.random.default_rng([settings.seed, index, 2]).integers(2**31))
-
-
-def _scene_name(index: int) -> str:
-    return f"scene_{index:06d}"
 
 
 def _write_splits(root: Path, settings: TrafficSettings) -> None:

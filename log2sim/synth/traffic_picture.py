@@ -116,42 +116,34 @@ def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values)
     z = points[:, 2] + np.float32(look.size_m[2] / 2)
     material = look.material[part]
     if look.category in VEHICLES:
-        _vehicle(look, out, material, points, z, normals)
+        # Paint lamps, plates and the sills of windows
+        length, width, height = look.size_m
+        low = min(1.1, 0.62 * height)
+        x, y = points[:, 0], np.abs(points[:, 1])
+        end = material == Material.PAINT
+        lamp = end & (y > 0.28 * width) & (z > 0.62 * low) & (z < 0.86 * low)
+        for mask, color, glow in (
+            (lamp & (normals[:, 0] > 0.5) & (x > 0.42 * length), LAMP_WHITE, 0.25),
+            (lamp & (normals[:, 0] < -0.5) & (x < -0.42 * length), LAMP_RED, 0.25),
+            (end & (np.abs(normals[:, 0]) > 0.5) & (y < 0.26) & (np.abs(z - 0.5 * low) < 0.06), PLATE, 0.0),
+        ):
+            out.albedo[mask] = color
+            out.glow[mask] = glow * np.asarray(color, np.float32)
     elif look.category in PEOPLE:
-        _person(look, out, material, z, normals)
+        # Paint trousers, hands' height, face and hair by their heights
+        cloth = material == Material.CLOTH
+        share = z / np.float32(look.size_m[2])
+        out.albedo[cloth & (share < 0.5)] = look.trousers
+        head = cloth & (share > 0.855)
+        out.albedo[head] = look.hair
+        out.albedo[head & (normals[:, 0] > 0.2) & (share < 0.965)] = look.skin
+        out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
     elif look.kind == "building":
         _front(out, material, points, z, normals)
     leaves = material == Material.LEAVES
     if leaves.any():
         out.albedo[leaves] *= _mottled(points[leaves])[:, None]
     return out
-
-
-def _vehicle(look: Look, out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
-    """Paint lamps, plates and the sills of windows."""
-    length, width, height = look.size_m
-    low = min(1.1, 0.62 * height)
-    x, y = points[:, 0], np.abs(points[:, 1])
-    end = material == Material.PAINT
-    lamp = end & (y > 0.28 * width) & (z > 0.62 * low) & (z < 0.86 * low)
-    for mask, color, glow in (
-        (lamp & (normals[:, 0] > 0.5) & (x > 0.42 * length), LAMP_WHITE, 0.25),
-        (lamp & (normals[:, 0] < -0.5) & (x < -0.42 * length), LAMP_RED, 0.25),
-        (end & (np.abs(normals[:, 0]) > 0.5) & (y < 0.26) & (np.abs(z - 0.5 * low) < 0.06), PLATE, 0.0),
-    ):
-        out.albedo[mask] = color
-        out.glow[mask] = glow * np.asarray(color, np.float32)
-
-
-def _person(look: Look, out: Paint, material: NDArray[np.int64], z: Values, normals: Values) -> None:
-    """Paint trousers, hands' height, face and hair by their heights."""
-    cloth = material == Material.CLOTH
-    share = z / np.float32(look.size_m[2])
-    out.albedo[cloth & (share < 0.5)] = look.trousers
-    head = cloth & (share > 0.855)
-    out.albedo[head] = look.hair
-    out.albedo[head & (normals[:, 0] > 0.2) & (share < 0.965)] = look.skin
-    out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
 
 
 def _front(out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:

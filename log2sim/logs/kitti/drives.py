@@ -78,7 +78,12 @@ class _Drive:
         streams: dict[str, Stream] = {}
         cameras: dict[str, Camera] = {}
         for number in rig.projections:
-            self._add_camera(rig, number, cameras, streams, notes)
+            file = self.path.parent / CALIBRATION[0]
+            width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+            camera = rig.camera(number, round(width), round(height))
+            t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
+            cameras[camera.name] = camera
+            streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
         if (self.path / "velodyne_points").is_dir():
             streams["velodyne"] = self._sweeps(notes)
         ego_t_ns, poses, map_frame = self._poses(notes)
@@ -117,16 +122,6 @@ class _Drive:
                     drive.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
                 )
         return drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
-
-    def _add_camera(
-        self, rig: drive.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
-    ) -> None:
-        file = self.path.parent / CALIBRATION[0]
-        width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
-        camera = rig.camera(number, round(width), round(height))
-        t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
-        cameras[camera.name] = camera
-        streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
 
     def _sweeps(self, notes: list[str]) -> Stream:
         folder = self.path / "velodyne_points"
@@ -193,8 +188,7 @@ class _Drive:
         if missing:
             first = np.setdiff1d(np.arange(len(stamps)), numbers)[0]
             notes.append(f"{name}: {missing} of {len(stamps)} records are missing, first at stamp {stamps[first]}")
-        keep, problems = strictly_increasing(stamps[numbers], name)
-        notes += problems
+        keep = strictly_increasing(stamps[numbers], name, notes)
         numbers = numbers[keep]
         return stamps[numbers], [files[n] for n in numbers.tolist()], numbers
 

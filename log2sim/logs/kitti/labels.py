@@ -310,7 +310,19 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
         if not words:
             continue
         try:
-            frame, row = _parse_words(words)
+            if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or (
+                words[2] not in CATEGORY_OF and words[2] != NOT_LABELED
+            ):
+                known = ", ".join([*CATEGORY_OF, NOT_LABELED])
+                raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
+            try:
+                frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
+            except ValueError:
+                raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
+            if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
+                raise ValueError(f"a number is not finite, or larger than {MAX_POSITION_M:g}")
+            if not 0 <= frame <= MAX_FRAME:
+                raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
         except ValueError as problem:
             message = f"{path}, line {k}: {problem}"
             if damaged is None:
@@ -325,22 +337,6 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
     return LabelRows(
         np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table
     )
-
-
-def _parse_words(words: list[str]) -> tuple[int, list[float]]:
-    """Return the number of the frame and the numbers after the type of a line; `ValueError` says what is wrong with it."""
-    if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or (words[2] not in CATEGORY_OF and words[2] != NOT_LABELED):
-        known = ", ".join([*CATEGORY_OF, NOT_LABELED])
-        raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
-    try:
-        frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
-    except ValueError:
-        raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
-    if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
-        raise ValueError(f"a number is not finite, or larger than {MAX_POSITION_M:g}")
-    if not 0 <= frame <= MAX_FRAME:
-        raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
-    return frame, row
 
 
 def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:

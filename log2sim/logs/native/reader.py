@@ -437,8 +437,7 @@ class _Folder:
                 table.stack(*GNSS_FIELDS[3:]),
                 where=f"{self.file}, field 'map.projection'",
             )
-        keep, notes = strictly_increasing(table["t_ns"], "ego")
-        self.notes += notes
+        keep = strictly_increasing(table["t_ns"], "ego", self.notes)
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
 
     def _rotations(self, table: CsvTable) -> Array:
@@ -497,8 +496,7 @@ class _Folder:
         compensable = COMPENSATED if entry["kind"] == "lidar" and frame == "lidar" else None
         table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS, compensable)
         self._not_empty(table)
-        keep, notes = strictly_increasing(table["t_ns"], entry["name"])
-        self.notes += notes
+        keep = strictly_increasing(table["t_ns"], entry["name"], self.notes)
         files = [inside(self.root, str(table["file"][row]), table.where(row, "file")) for row in keep]
         t_ns = table["t_ns"][keep]
         for file in files:

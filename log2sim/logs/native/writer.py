@@ -265,7 +265,14 @@ class _Writer:
                     if record.compensated_ns is not None:
                         index.compensated_ns.append(int(record.compensated_ns))
                 else:
-                    file = _write_image(record, folder, i, self.encoding.jpeg_quality)
+                    import simplejpeg
+
+                    name = f"{i:06d}.jpg"
+                    data = simplejpeg.encode_jpeg(
+                        np.ascontiguousarray(record), quality=self.encoding.jpeg_quality, colorspace="BGR"
+                    )
+                    (folder / name).write_bytes(data)
+                    file = f"{folder.name}/{name}"
         except RecordError as error:
             if self.problems is None:
                 raise
@@ -325,15 +332,6 @@ def _sensor(sensor: Camera | Lidar, offset: Array) -> dict[str, Any]:
 def _copy_image(data: bytes, folder: Path, i: int, t_ns: int) -> str:
     image_size(data, f"{folder.name}, stamp {t_ns}")  # an image, or a RecordError
     name = f"{i:06d}.{'jpg' if data[:2] == JPEG_MAGIC else 'png'}"
-    (folder / name).write_bytes(data)
-    return f"{folder.name}/{name}"
-
-
-def _write_image(image: NDArray[np.uint8], folder: Path, i: int, jpeg_quality: int) -> str:
-    import simplejpeg
-
-    name = f"{i:06d}.jpg"
-    data = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=jpeg_quality, colorspace="BGR")
     (folder / name).write_bytes(data)
     return f"{folder.name}/{name}"
 

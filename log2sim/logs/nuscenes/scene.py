@@ -188,8 +188,7 @@ class Scene:
             self.notes.append(f"{name}: {len(rows) - len(same)} records of another calibration left out")
         stamps = np.array([stamp_ns_of(r, self.tables.path(DATA)) for r in same], dtype=np.int64)
         order = np.argsort(stamps, kind="stable")  # tables have no order
-        keep, problems = strictly_increasing(stamps[order], name)
-        self.notes.extend(problems)
+        keep = strictly_increasing(stamps[order], name, self.notes)
         return Channel(
             name,
             str(calibration["modality"]),

@@ -168,7 +168,8 @@ class PoseSources:
         if not valid.any():
             raise NoPoses("none of its orientations is a rotation")
         map_T_child = np.array([p for p in poses if p is not None])
-        keep, problems = strictly_increasing(stamps[valid], name)
+        problems = list[str]()
+        keep = strictly_increasing(stamps[valid], name, problems)
         if not valid.all():
             problems.append(
                 f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or no rotations; dropped"
@@ -185,7 +186,8 @@ class PoseSources:
         rows = np.array([[m.latitude, m.longitude, m.altitude] for m in fixes]).reshape(-1, 3)
         good = np.isfinite(rows).all(axis=1) & np.array([int(m.status.status) >= 0 for m in fixes], dtype=bool)
         good &= (np.abs(rows[:, 0]) < MAX_LATITUDE_DEG) & (np.abs(rows[:, 1]) <= MAX_LONGITUDE_DEG)
-        keep, problems = strictly_increasing(stamps[good], name)
+        problems = list[str]()
+        keep = strictly_increasing(stamps[good], name, problems)
         rows, stamps = rows[good][keep], stamps[good][keep]
         rotation, valid = PoseTrack(t_ns, transform(base_R, np.zeros(3))).at(stamps)
         if not (good.all() and valid.all()):
@@ -219,7 +221,7 @@ class PoseSources:
             valid = np.array([p is not None for p in poses], dtype=bool)
             if valid.sum() >= MIN_POSES:
                 rotations = np.array([p for p in poses if p is not None])[:, :3, :3]
-                keep, _ = strictly_increasing(stamps[valid], name)
+                keep = strictly_increasing(stamps[valid], name, [])
                 return name, stamps[valid][keep], rotations[keep] @ imu_T_base[:3, :3]
             reasons.append(f"{name} gives no orientation")
         raise NoPoses("; ".join(reasons) or "there is no Imu that gives the orientation")

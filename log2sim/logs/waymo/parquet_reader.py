@@ -67,11 +67,6 @@ PROJECTED_BOXES = ("projected_lidar_box", "[ProjectedLiDARBoxComponent]")
 CAMERA_BOXES = ("camera_box", "[CameraBoxComponent]")
 
 
-def component_file(root: Path, component: str, segment: str) -> Path:
-    """Return the path of a component of a segment."""
-    return root / component / f"{segment}.parquet"
-
-
 def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
     """Read stamps in us and poses (4, 4) of the frames, and remarks on those that are none.
 
@@ -341,7 +336,7 @@ class _SegmentFolder:
         return digest_of([self.name, repr(self.stamps_us), np.stack(self.poses).tobytes().hex(), *sizes], [])
 
     def _file(self, component: str) -> Path:
-        return component_file(self.root, component, self.name)
+        return self.root / component / f"{self.name}.parquet"
 
     def _path_of(self, component: str) -> Path | None:
         """Path of a component; None where it was not downloaded."""

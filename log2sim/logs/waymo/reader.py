@@ -85,8 +85,7 @@ class _Assembly:
     def __init__(self, segment: Segment) -> None:
         self.segment, self.notes = segment, list(segment.notes)
         stamps = np.array([frame.stamp_ns for frame in segment.frames], dtype=np.int64)
-        self.order, problems = strictly_increasing(stamps, "frames")
-        self.notes += problems
+        self.order = strictly_increasing(stamps, "frames", self.notes)
         self.frames = [segment.frames[k] for k in self.order]
         self.times = FrameTimes.of(self.frames, self.notes)
         world_T_vehicle = np.stack([frame.world_T_vehicle for frame in self.frames])
@@ -139,8 +138,7 @@ class _Assembly:
                     f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
                 )
             t_ns = np.array([self._image_ns(k, number) for k in rows], dtype=np.int64)
-            keep, problems = strictly_increasing(t_ns, name)
-            self.notes += problems
+            keep = strictly_increasing(t_ns, name, self.notes)
             rows, t_ns = rows[keep], t_ns[keep]
             cameras[name], image_ns[number] = camera, np.full(len(self.frames), -1, dtype=np.int64)
             image_ns[number][rows] = t_ns
@@ -172,8 +170,7 @@ class _Assembly:
                 self.notes.append(f"{name}: {len(rows)} sweeps left out: no calibration of this LiDAR")
             if not len(rows) or calibration is None:
                 continue
-            keep, problems = strictly_increasing(self.times.pose_ns[rows], name)
-            self.notes += problems
+            keep = strictly_increasing(self.times.pose_ns[rows], name, self.notes)
             lidars[name] = Lidar(name, "ego", calibration.vehicle_T_lidar)
             streams[name] = self._sweep_stream(name, number, rows[keep])
         if not lidars:
