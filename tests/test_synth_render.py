@@ -44,7 +44,7 @@ def test_a_road_of_three_kilometers_looks_the_same_wherever_the_ego_is() -> None
         means.append([image[-60:, 200:280].mean(), image[-60:, :20].mean(), image[160:180].mean()])
     assert np.ptp(means, axis=0).max() < 10.0  # by stains; a meadow is 45 brighter
     # The road is darker than the meadow beside it.
-    backdrop = Backdrop(tiny_scene([], road=[{"line": [[-50, 0], [3000, 0]], "width_m": 4.0, "sidewalk_m": 0.0}]), 0)
+    backdrop = Backdrop.of(tiny_scene([], road=[{"line": [[-50, 0], [3000, 0]], "width_m": 4.0, "sidewalk_m": 0.0}]), 0)
     image = picture(backdrop, looking(2500.0, height_m=3.0)).astype(float)
     assert image[250:, 225:255].mean() < image[250:, :40].mean() - 20
 
@@ -76,7 +76,7 @@ def test_markings_lie_where_the_road_says_at_every_level(level: int) -> None:
 
 def test_a_picture_of_the_ground_agrees_with_the_geometry() -> None:
     road = {"line": [[0.0, 0.0], [80.0, 0.0]], "width_m": 6.0, "marking": "none", "sidewalk_m": 0.0}
-    backdrop = Backdrop(tiny_scene([], road=[road]), 0)
+    backdrop = Backdrop.of(tiny_scene([], road=[road]), 0)
     for roll in (0.0, 4.0):
         pose = looking(0.0, height_m=4.0, pitch_deg=-12.0, roll_deg=roll)
         image = picture(backdrop, pose).astype(float).mean(2)
@@ -113,7 +113,7 @@ def test_the_outline_of_a_body_is_soft_and_its_middle_hides_what_is_behind() -> 
     scene = tiny_scene([{"id": "a", "category": "truck", "pose": [15.0, 0.0, 90.0], "color": [250, 250, 250]}])
     from log2sim.synth.actors import actors_of
 
-    backdrop = Backdrop(scene, 0)
+    backdrop = Backdrop.of(scene, 0)
     empty = picture(backdrop, looking(0.0)).astype(float)
     K = np.array([[400.0, 0, 239.5], [0, 400.0, 149.5], [0, 0, 1]])
     bodies = [Body.of(actor, 0.0) for actor in actors_of(scene)]

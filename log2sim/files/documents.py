@@ -233,6 +233,15 @@ def refuse_existing(path: Path | str, *, overwrite: bool) -> None:
         raise ConfigError(f"{path}: exists already; choose another name or pass --overwrite")
 
 
+def refuse_folder(folder: Path, *, overwrite: bool, holding: str, kind: str) -> None:
+    """Raise `ConfigError` for a folder with files that may not be replaced: never one that lacks the file that marks its kind."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    refuse_existing(folder, overwrite=overwrite)
+    if not (folder / holding).is_file():
+        raise ConfigError(f"{folder}: exists and is no {kind}, so it is not replaced; choose another name")
+
+
 def refuse_below_file(path: Path | str) -> None:
     """Raise `ConfigError` when what should be a folder above `path` is a file, or may not be written in."""
     above = next((p for p in Path(path).parents if p.exists()), None)

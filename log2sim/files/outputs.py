@@ -25,13 +25,14 @@ _claims: ContextVar[dict[Path, _Lock] | None] = ContextVar("claims", default=Non
 
 @contextmanager
 def holding_claims() -> Iterator[None]:
-    """Within the block what `claim` takes is kept from other runs; at its end all is released."""
+    """Within the block what `claim` takes is kept from other runs, and files of `expect_new` replace none that others wrote since."""
     held: dict[Path, _Lock] = {}
-    token = _claims.set(held)
+    token, new = _claims.set(held), _expected_new.set(set())
     try:
         yield
     finally:
         _claims.reset(token)
+        _expected_new.reset(new)
         # The first one made the folders for the others.
         for lock in reversed(held.values()):
             lock.release()
@@ -131,8 +132,7 @@ def temporary_beside(target: Path) -> Path:
     The name holds the machine since its last start and the process, so that of another living run nothing is removed.
     """
     for left in target.parent.glob(f".{glob.escape(target.stem)}.*"):
-        found = _TEMPORARY.search(left.name, len(target.stem) + 1)
-        if found and found["machine"] == _machine() and not _is_alive(int(found["process"])):
+        if is_left_over(left):
             remove(left)
     return target.with_name(f".{target.stem}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
 
@@ -228,18 +228,8 @@ def place_all(files: Sequence[tuple[Path, Path]]) -> None:
         raise
 
 
-@contextmanager
-def refusing_to_replace() -> Iterator[None]:
-    """Within the block files of `expect_new` replace none that others wrote since."""
-    token = _expected_new.set(set())
-    try:
-        yield
-    finally:
-        _expected_new.reset(token)
-
-
 def expect_new(targets: Iterable[Path]) -> None:
-    """Remember that there are no such files yet, and that none may be replaced, within `refusing_to_replace`."""
+    """Remember that there are no such files yet, and that none may be replaced, within `holding_claims`."""
     expected = _expected_new.get()
     if expected is not None:
         expected.update(target.resolve() for target in targets)

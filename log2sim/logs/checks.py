@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels, Log
 from log2sim.geometry import NS_PER_S, Camera, Mount, fold_radius, nearest_index, undistort
 from log2sim.geometry.transforms import Array
-from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of
+from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of, take_labels
 from log2sim.logs.records import MAX_POSITION_M
 
 # As a scenario may state; a freight train is not longer.
 MAX_SIZE_M = 1000.0
-_ROWS = ("t_ns", "track_id", "category", "center_m", "size_m", "yaw_rad", "visible", "kind", "occlusion")
 
 
 def find_possible(labels: Labels) -> NDArray[np.bool_]:
@@ -38,9 +36,7 @@ def without_impossible_labels(log: Log) -> Log:
         possible = find_possible(labels)
         if possible.all():
             return labels, 0
-        rows: dict[str, Any] = {name: getattr(labels, name) for name in _ROWS}
-        kept: dict[str, Any] = {name: None if column is None else column[possible] for name, column in rows.items()}
-        return replace(labels, **kept), int((~possible).sum())
+        return take_labels(labels, possible), int((~possible).sum())
 
     def notes() -> tuple[str, ...]:
         count = checked()[1]

@@ -138,16 +138,26 @@ class Wall:
         return tuple(levels)
 
 
+@dataclass(frozen=True, eq=False)
 class Backdrop:
-    """The ground and the facades of a scene, painted when and where they are looked at."""
+    """The static parts of a scene: the ground and facades, painted when and where they are looked at."""
 
-    def __init__(self, scene: Scene, seed: int) -> None:
-        self.terrain: Terrain | None = None  # level
-        self.ground = Ground(GroundPlan.of(scene), seed)
-        self.buildings = tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building))
+    ground: Ground
+    terrain: Terrain | None = None  # heights of the ground, None where it is level
+    buildings: tuple[tuple[Wall, ...], ...] = ()  # sides of each
+    shadows: tuple[Array, ...] = ()  # convex outlines (P, 2), m, of the shadows of what does not move
+
+    @classmethod
+    def of(cls, scene: Scene, seed: int) -> Backdrop:
+        """Take that of a scene file."""
         sun = light_of(scene.environment).sun
         thrown = [_shadow(building, sun) for building in scene.building if building.shadow]
-        self.shadows: tuple[Array, ...] = (*(_hull(np.array(s.outline)) for s in scene.shadow), *thrown)
+        return cls(
+            Ground(GroundPlan.of(scene), seed),
+            None,
+            tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building)),
+            (*(_hull(np.array(s.outline)) for s in scene.shadow), *thrown),
+        )
 
 
 def _shadow(building: Building, sun: tuple[float, float, float]) -> Array:

@@ -85,15 +85,9 @@ DUSK = Light(
     lamps=4.0, noise=2.0, exposure=0.2,
 )  # fmt: skip
 NIGHT = Light(
-    _HIGH,
-    (0.0, 0.0, 0.0),
-    (0.030, 0.023, 0.019),
-    (0.030, 0.024, 0.022),
-    (0.012, 0.008, 0.006),
-    lamps=10.0,
-    noise=5.0,
-    exposure=1.0,
-)
+    _HIGH, (0.0, 0.0, 0.0), (0.030, 0.023, 0.019), (0.030, 0.024, 0.022), (0.012, 0.008, 0.006),
+    lamps=10.0, noise=5.0, exposure=1.0,
+)  # fmt: skip
 LIGHTS = {"noon": NOON, "overcast": OVERCAST, "dusk": DUSK, "night": NIGHT}
 
 
@@ -369,7 +363,6 @@ STREET_SPACING_M, STREET_HEIGHT_M = 30.0, 7.0
 MAX_LAMPS, MAX_LAMP_DISTANCE_M = 14, 90.0
 COARSENESS = 4  # of the grid on which the light of lamps on the static scene is computed
 GLARE = 0.5
-GROUND_BAND_M = 0.2  # what is lower counts as ground, which lamps light at a grazing angle
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,35 +112,21 @@ def cast_sweep(
     xyz = directions[keep] * (distance + noise)[keep, None]
     if spec.resolution_m > 0:
         xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
-    met = _Returns(origin[keep], ray[keep], distance[keep], hit[keep])
-    intensity = None if ground is None else _intensity(met, scene, ground, rng)
+    intensity = None
+    if ground is not None:
+        # What is no ground is taken to face the sensor. The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`,
+        # counted from the end.
+        solid = [body_reflectance(agent.color) for agent in scene.agent]
+        by_hit = [*solid, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
+        reflectance = np.array(by_hit, np.float32)[hit[keep]]
+        incidence = np.ones(len(reflectance), np.float32)
+        met, on = hit[keep] == GROUND, np.flatnonzero(keep)[hit[keep] == GROUND]
+        xy = origin[on, :2] + ray[on, :2] * distance[on, None]
+        reflectance[met], incidence[met] = ground.at(xy, spot_m(distance[on], -ray[on, 2])), -ray[on, 2]
+        intensity = intensity_of(reflectance, incidence, rng)
     # Column after column in memory, which packs a quarter smaller.
     points = np.asfortranarray(xyz, dtype=np.float32)
     return LabeledSweep(Sweep(stamp_ns, points, "lidar", t_ns[keep], intensity=intensity), hit[keep])
-
-
-@dataclass(frozen=True, eq=False)
-class _Returns:
-    """Rays that came back, map frame."""
-
-    origin: Array  # (N, 3)
-    ray: Array  # (N, 3)
-    distance_m: Array  # (N,), m
-    hit: NDArray[np.int64]  # (N,): as in `LabeledSweep`
-
-
-def _intensity(met: _Returns, scene: Scene, ground: GroundReflectance, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Intensities (N,) of returns; what is no ground is taken to face the sensor."""
-    solid = [body_reflectance(agent.color) for agent in scene.agent]
-    # The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`, counted from the end.
-    by_hit = [*solid, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
-    reflectance = np.array(by_hit, np.float32)[met.hit]
-    incidence = np.ones(len(met.hit), np.float32)
-    on = met.hit == GROUND
-    down, range_m = -met.ray[on, 2], met.distance_m[on]
-    xy = met.origin[on, :2] + met.ray[on, :2] * range_m[:, None]
-    reflectance[on], incidence[on] = ground.at(xy, spot_m(range_m, down)), down
-    return intensity_of(reflectance, incidence, rng)
 
 
 def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng: np.random.Generator) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, rotation_from_rpy, transform
-from log2sim.synth.backdrop import Wall
+from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.ground import Ground, GroundPlan
 from log2sim.synth.light import Lamp, Light, headlights
 from log2sim.synth.paint import Paint, linear_bgr
-from log2sim.synth.polytope_caster import MESH_OPENNESS, Terrain
+from log2sim.synth.polytope_caster import MESH_OPENNESS
 from log2sim.synth.polytopes import Material, meshes_of
 from log2sim.synth.render import Body, Painter, SceneInstant, Values
 from log2sim.synth.scene import Road as PaintedRoad
@@ -32,13 +32,8 @@ CLOTHES: tuple[Rgb, ...] = (
     (40, 42, 50), (52, 66, 104), (150, 40, 44), (70, 96, 70), (196, 190, 180), (110, 84, 60), (208, 140, 50), (90, 92, 96),
 )  # fmt: skip
 WALLS: tuple[Rgb, ...] = (
-    (196, 182, 158),
-    (176, 158, 146),
-    (186, 186, 180),
-    (188, 168, 140),
-    (150, 120, 100),
-    (208, 204, 196),
-)
+    (196, 182, 158), (176, 158, 146), (186, 186, 180), (188, 168, 140), (150, 120, 100), (208, 204, 196),
+)  # fmt: skip
 FIXED: dict[Material, Rgb] = {
     Material.GROUND: (120, 112, 96),
     Material.GLASS: (62, 68, 74),
@@ -84,7 +79,8 @@ class Look:
 
 def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
     """Draw the colors of an object."""
-    body = _choice(rng, [c for c, _ in CAR_COLORS], [s for _, s in CAR_COLORS])
+    shares = np.array([share for _, share in CAR_COLORS])
+    body = CAR_COLORS[rng.choice(len(CAR_COLORS), p=shares / np.sum(shares))][0]
     if item.category in ("truck", "bus"):
         body = LOAD_COLORS[rng.integers(len(LOAD_COLORS))]
     cloth, trousers, wall = (pool[rng.integers(len(pool))] for pool in (CLOTHES, CLOTHES[:4], WALLS))
@@ -94,21 +90,8 @@ def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
     color = np.array([green if m == Material.LEAVES else linear_bgr(drawn[Material(m)]) for m in material], np.float32)
     gloss = np.array([GLOSS.get(Material(m), 0.0) for m in material], np.float32)
     skin, hair = SKINS[rng.integers(len(SKINS))], HAIRS[rng.integers(len(HAIRS))]
-    return Look(
-        item.category,
-        item.kind,
-        item.size_m,
-        material,
-        color,
-        gloss,
-        linear_bgr(trousers),
-        linear_bgr(skin),
-        linear_bgr(hair),
-    )
-
-
-def _choice(rng: np.random.Generator, pool: list[Rgb], shares: list[float]) -> Rgb:
-    return pool[rng.choice(len(pool), p=np.array(shares) / np.sum(shares))]
+    person = (linear_bgr(rgb) for rgb in (trousers, skin, hair))
+    return Look(item.category, item.kind, item.size_m, material, color, gloss, *person)
 
 
 def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values) -> Paint:
@@ -173,16 +156,6 @@ OWN_CAR = "own car"
 GRAIN_SEED = 0  # one grain for all scenes, because it takes long to make
 
 
-@dataclass(frozen=True, eq=False)
-class TrafficBackdrop:
-    """The ground of a random scene."""
-
-    ground: Ground
-    terrain: Terrain | None
-    buildings: tuple[tuple[Wall, ...], ...] = ()  # none; houses are bodies
-    shadows: tuple[Array, ...] = ()  # none; houses are bodies
-
-
 class TrafficPainter:
     """Makes the pictures' content of one random scene; shapes and colors are made once.
 
@@ -191,7 +164,7 @@ class TrafficPainter:
 
     def __init__(self, scene: TrafficScene, seed: int) -> None:
         painted = [painted_road(road, scene.surface.kerb_m > 0) for road in scene.roads]
-        self.backdrop = TrafficBackdrop(Ground(GroundPlan(painted), GRAIN_SEED), scene.surface)
+        self.backdrop = Backdrop(Ground(GroundPlan(painted), GRAIN_SEED), scene.surface)
         self._seed = seed
         self._looks: dict[int, Look] = {}
         self._meshes: dict[int, Mesh] = {}

@@ -113,14 +113,9 @@ class _Drive:
     def _rig(self) -> drive.Rig:
         cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
         c = drive.read_calibration(cam)
-        rect = drive.checked_rotation(drive.calibration_entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
-        projections = {}
-        for k in range(4):
-            if (self.path / f"image_{k:02d}").is_dir():
-                key = f"P_rect_{k:02d}"
-                projections[k] = drive.checked_projection(
-                    drive.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
-                )
+        numbers = [k for k in range(4) if (self.path / f"image_{k:02d}").is_dir()]
+        rect = drive.rotation_entry(c, cam, "R_rect_00")
+        projections = {k: drive.projection_entry(c, cam, f"P_rect_{k:02d}") for k in numbers}
         return drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
 
     def _sweeps(self, notes: list[str]) -> Stream:
@@ -195,8 +190,9 @@ class _Drive:
 
 def _rigid(path: Path) -> Array:
     calibration = drive.read_calibration(path)
-    rotation = drive.checked_rotation(drive.calibration_entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
-    return transform(rotation, drive.calibration_entry(calibration, path, (3,), "T"))
+    return transform(
+        drive.rotation_entry(calibration, path, "R"), drive.calibration_entry(calibration, path, (3,), "T")
+    )
 
 
 def _stamps(path: Path) -> NDArray[np.int64]:
@@ -296,20 +292,12 @@ class _Sequence:
     def _rig(self) -> drive.Rig:
         path = self.base / "calib" / f"{self.name}.txt"
         c = drive.read_calibration(path)
-        projections = {}
-        for k in CAMERA_NUMBERS:
-            if (self.base / f"image_{k:02d}" / self.name).is_dir():
-                projections[k] = drive.checked_projection(
-                    drive.calibration_entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
-                )
-        rect = drive.checked_rotation(
-            drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
-        )
-        links = []
-        for keys in (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam")):
-            m = drive.calibration_entry(c, path, (3, 4), *keys)
-            links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
-        return drive.rig_of(links[0], links[1], rect, projections)
+        numbers = [k for k in CAMERA_NUMBERS if (self.base / f"image_{k:02d}" / self.name).is_dir()]
+        projections = {k: drive.projection_entry(c, path, f"P{k}") for k in numbers}
+        rect = drive.rotation_entry(c, path, "R0_rect", "R_rect")
+        keys = (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam"))
+        velo_T_imu, cam_T_velo = (drive.rigid_entry(c, path, *names) for names in keys)
+        return drive.rig_of(velo_T_imu, cam_T_velo, rect, projections)
 
     def _cameras(self, rig: drive.Rig) -> tuple[dict[str, Camera], dict[str, Stream]]:
         cameras, streams = {}, {}

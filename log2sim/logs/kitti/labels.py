@@ -123,10 +123,24 @@ def checked_rotation(rotation: Array, where: str) -> Array:
     return nearest_rotation(rotation)
 
 
-def checked_projection(P: Array, where: str) -> Array:
-    """Return P (3, 4) of a rectified camera; `LogError` when it is none."""
+def rotation_entry(calibration: Mapping[str, Array], path: Path, *keys: str) -> Array:
+    """Entry of a calibration that is a rotation (3, 3)."""
+    return checked_rotation(calibration_entry(calibration, path, (3, 3), *keys), f"{path}, entry '{keys[0]}'")
+
+
+def rigid_entry(calibration: Mapping[str, Array], path: Path, *keys: str) -> Array:
+    """Entry of a calibration that is a rotation and a translation, as (4, 4)."""
+    m = calibration_entry(calibration, path, (3, 4), *keys)
+    return transform(checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3])
+
+
+def projection_entry(calibration: Mapping[str, Array], path: Path, key: str) -> Array:
+    """Entry of a calibration that is the P (3, 4) of a rectified camera."""
+    P = calibration_entry(calibration, path, (3, 4), key)
     if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] == 1 and P[1, 0] == 0 and not P[2, :2].any()):
-        raise LogError(f"{where}: K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1")
+        raise LogError(
+            f"{path}, entry '{key}': K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1"
+        )
     return P
 
 

@@ -80,23 +80,18 @@ class _Calibration:
     def read(cls, path: Path) -> _Calibration:
         """Read a calibration file."""
         c = drive.read_calibration(path)
-
-        def rigid(key: str) -> Array:
-            m = drive.calibration_entry(c, path, (3, 4), key)
-            return transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{key}'"), m[:, 3])
-
         rect = drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect")
         P = drive.calibration_entry(c, path, (3, 4), "P2")
         if not np.linalg.det(P[:, :3]) > 0:
             raise LogError(
                 f"{path}, entry 'P2': {P.tolist()} is singular or mirrors the image; expected intrinsics, or these and a rotation"
             )
-        velo_T_imu = rigid("Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
+        velo_T_imu = drive.rigid_entry(c, path, "Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
         knows_ground = not np.array_equal(velo_T_imu, np.eye(4))
         if not knows_ground:
             velo_T_imu = transform(np.eye(3), [0.0, 0.0, drive.EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
         rect_R_cam = drive.checked_rotation(rect, f"{path}, entry 'R0_rect'")
-        rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ rigid("Tr_velo_to_cam")
+        rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ drive.rigid_entry(c, path, "Tr_velo_to_cam")
         velo_ego = (drive.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
         ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
         return cls(ego_T_rect, rect_T_velo, P, knows_ground, "Tr_imu_to_velo" in c)

@@ -19,7 +19,7 @@ from log2sim.errors import LogError
 from log2sim.files.documents import read_json
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.excerpt import digest_of
-from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, sweep_stream
+from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, read_sweep
 from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, text_of
 from log2sim.logs.records import MAX_IMAGE_PX, first_image_size, image_stream, list_folders
 from log2sim.logs.stamps import defer_notes
@@ -210,7 +210,7 @@ class _SceneReader:
             map_T_ego, known = track.at(stamps)
             return map_T_ego @ channel.ego_T_sensor, known
 
-        return sweep_stream(channel.name, t_ns, files, poses)
+        return Stream(channel.name, t_ns, lambda i: read_sweep(files[i], int(t_ns[i]), poses))
 
     def _map_frame(self, offset_m: Array) -> MapFrame:
         place = MAP_ORIGIN_DEG.get(self.scene.location)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Labels, Stream, Sweep
+from log2sim.datatypes import Labels, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.inputs import inside
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_quaternion, transform, wrap_angle, yaw_of
@@ -39,19 +39,6 @@ BYTES_PER_POINT = 20
 
 # Takes stamps (N,) int64 to the poses (N, 4, 4) of the LiDAR in the map, and whether each is known.
 Poses = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
-
-
-def sweep_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], poses: Poses) -> Stream:
-    """Stream of .pcd.bin files.
-
-    `t_ns` (F,) int64: ends of the turns. `files`: F files. `poses`: returns the poses (N, 4, 4) of the LiDAR in the map
-    at stamps (N,), and whether each is known.
-    """
-
-    def read(i: int) -> Sweep:
-        return read_sweep(files[i], int(t_ns[i]), poses)
-
-    return Stream(name, t_ns, read)
 
 
 def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:

@@ -183,14 +183,6 @@ def matrix(cell: Any) -> Any:
     return None if cell is None else rigid(np.asarray(cell, dtype=np.float64))
 
 
-@dataclass(frozen=True)
-class RecordColumns:
-    """Columns that are large and read row by row."""
-
-    kinds: Mapping[str, Kind]  # what each column holds, as for `log2sim.logs.arrow.read_columns`
-    optional: Collection[str] = ()  # names that may be absent
-
-
 @dataclass(eq=False)
 class SensorRows:
     """A component with one row for each frame and sensor; without any where its file is absent.
@@ -203,7 +195,8 @@ class SensorRows:
     index: Mapping[str, Kind]
     names: Mapping[int, str]
     frame_of: Mapping[int, int]
-    records: RecordColumns
+    kinds: Mapping[str, Kind]  # what columns hold that are large and read row by row
+    optional: Collection[str] = ()  # names out of these that may be absent
     # row of a frame by index and sensor by number
     rows: dict[tuple[int, int], int] = field(default_factory=dict)
     columns: Columns = field(default_factory=dict)  # the columns of `index`
@@ -225,9 +218,9 @@ class SensorRows:
             self.note = f"{self.path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out"
         # Rows can only be read on: a file with one sensor after the other is read from several places at once.
         by_sensor = bool(np.any(np.diff(frame[known]) < 0))
-        shared = ParquetRows(self.path, self.records.kinds, optional=self.records.optional)
+        shared = ParquetRows(self.path, self.kinds, optional=self.optional)
         for number in {number for _, number in self.rows}:
-            own = ParquetRows(self.path, self.records.kinds, optional=self.records.optional) if by_sensor else shared
+            own = ParquetRows(self.path, self.kinds, optional=self.optional) if by_sensor else shared
             self._files[number] = own
 
     def read(self, frame: int, sensor: int) -> Row | None:
@@ -291,11 +284,9 @@ class _SegmentFolder:
         self.frame_of = {t: k for k, t in enumerate(self.stamps_us)}
         of_lidars: dict[str, Kind] = {STAMP: "int", LASER: "text"}
         second = [f"{LIDAR_RETURNS[1]}.{part}" for part in ("values", "shape")]
-        ranges = RecordColumns(_matrices(*LIDAR_RETURNS), second)
-        self.sweeps = self._rows("lidar", of_lidars, LASERS, ranges)
-        self.pixel_poses = self._rows("lidar_pose", of_lidars, LASERS, RecordColumns(_matrices(PIXEL_POSES)))
-        jpeg = RecordColumns({f"{IMAGE}.image": "bytes"})
-        self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, jpeg)
+        self.sweeps = self._rows("lidar", of_lidars, LASERS, _matrices(*LIDAR_RETURNS), second)
+        self.pixel_poses = self._rows("lidar_pose", of_lidars, LASERS, _matrices(PIXEL_POSES))
+        self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, {f"{IMAGE}.image": "bytes"})
 
     def log(self) -> Log:
         boxes = self._path_of(LIDAR_BOXES[0])
@@ -343,8 +334,10 @@ class _SegmentFolder:
         path = self._file(component)
         return path if is_present(path) else None
 
-    def _rows(self, component: str, index: Any, names: dict[int, str], records: RecordColumns) -> SensorRows:
-        rows = SensorRows(self._file(component), index, names, self.frame_of, records)
+    def _rows(
+        self, component: str, index: Any, names: dict[int, str], kinds: Any, optional: Collection[str] = ()
+    ) -> SensorRows:
+        rows = SensorRows(self._file(component), index, names, self.frame_of, kinds, optional)
         self.notes += [rows.note] if rows.note else []
         return rows
 

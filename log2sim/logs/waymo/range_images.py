@@ -57,9 +57,18 @@ def read_matrix(compressed: bytes) -> NDArray[np.float32]:
         if f.kind != BYTES:
             continue
         if f.number == 1:
-            parts.append(_floats(data[f.begin : f.end]))
+            if (f.end - f.begin) % 4:
+                raise WireError(f"a range image has {f.end - f.begin} bytes of values, expected floats of 4")
+            parts.append(np.frombuffer(data[f.begin : f.end], "<f4"))
         elif f.number == 2:
-            dims = _dims(data[f.begin : f.end])
+            # A MatrixShape: its dimensions packed, or one field each.
+            shape = data[f.begin : f.end]
+            found = (
+                varints(shape[g.begin : g.end]) if g.kind == BYTES else [g.value]
+                for g in fields_of(shape)
+                if g.number == 1
+            )
+            dims = [n for numbers in found for n in numbers]
     return shaped(np.concatenate(parts) if parts else np.zeros(0, np.float32), dims)
 
 
@@ -155,21 +164,6 @@ def column_azimuths(laser: LaserCalibration, width: int) -> Array:
 def turn_of(xyz_vehicle: Array, laser: LaserCalibration) -> Array:
     """Share (N,) of the turn, 0 to 1, after which a LiDAR scans points (N, 3), m, of the vehicle's frame."""
     return compute_turn_share(xyz_vehicle - laser.vehicle_T_lidar[:3, 3])
-
-
-def _floats(data: bytes) -> NDArray[np.float32]:
-    if len(data) % 4:
-        raise WireError(f"a range image has {len(data)} bytes of values, expected floats of 4")
-    return np.frombuffer(data, "<f4")
-
-
-def _dims(data: bytes) -> list[int]:
-    """Read the dimensions of a MatrixShape, packed or one field each."""
-    out: list[int] = []
-    for f in fields_of(data):
-        if f.number == 1:
-            out += varints(data[f.begin : f.end]) if f.kind == BYTES else [f.value]
-    return out
 
 
 # Vehicles are cars, trucks, buses and motorcycles.
