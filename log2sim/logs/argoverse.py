@@ -55,13 +55,10 @@ class City:
 # The development kit states the origins as latitude and longitude (av2.geometry.utm); in UTM they are these multiples of 30 m,
 # to 0.07 m in Palo Alto and 0.03 m elsewhere.
 CITIES: Mapping[str, City] = {
-    "ATX": City(14, 621_150.0, 3_349_890.0),
-    "DTW": City(17, 320_670.0, 4_685_370.0),
-    "MIA": City(17, 580_560.0, 2_850_960.0),
-    "PAO": City(10, 576_480.0, 4_141_380.0),
-    "PIT": City(17, 583_710.0, 4_477_260.0),
-    "WDC": City(18, 323_460.0, 4_306_470.0),
-}
+    "ATX": City(14, 621_150.0, 3_349_890.0), "DTW": City(17, 320_670.0, 4_685_370.0),
+    "MIA": City(17, 580_560.0, 2_850_960.0), "PAO": City(10, 576_480.0, 4_141_380.0),
+    "PIT": City(17, 583_710.0, 4_477_260.0), "WDC": City(18, 323_460.0, 4_306_470.0),
+}  # fmt: skip
 
 
 def map_frame_of(city: str | None, offset_m: tuple[float, float, float], notes: list[str]) -> MapFrame:
@@ -131,13 +128,8 @@ def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
 LIDARS = {"up_lidar": 0, "down_lidar": 32}
 LASERS = 32
 COLUMNS: dict[str, Kind] = {
-    "x": "float",
-    "y": "float",
-    "z": "float",
-    "laser_number": "int",
-    "offset_ns": "int",
-    "intensity": "float",
-}
+    "x": "float", "y": "float", "z": "float", "laser_number": "int", "offset_ns": "int", "intensity": "float",
+}  # fmt: skip
 OPTIONAL = ("intensity",)
 SWEEP_LIMITS = TableLimits(rows=MAX_SWEEP_POINTS, file_bytes=MAX_SWEEP_BYTES, unpacked_bytes=MAX_SWEEP_BYTES)
 # A sweep lasts 0.1 s, those of both LiDARs together 0.106 s in the sample log.
@@ -190,27 +182,12 @@ LABEL_COLUMNS: dict[str, Kind] = {
 
 # By the taxonomy of the data set's user guide.
 CATEGORY_OF = {
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "motorcycle",
-    "BICYCLE": "bicycle",
-    "BICYCLIST": "cyclist",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "VEHICULAR_TRAILER": "other",
-    "RAILED_VEHICLE": "other",
-    "WHEELED_DEVICE": "other",
-    "WHEELED_RIDER": "other",
-    "WHEELCHAIR": "other",
-    "STROLLER": "other",
-}
+    "REGULAR_VEHICLE": "car", "LARGE_VEHICLE": "truck", "BOX_TRUCK": "truck", "TRUCK": "truck", "TRUCK_CAB": "truck",
+    "BUS": "bus", "SCHOOL_BUS": "bus", "ARTICULATED_BUS": "bus", "MOTORCYCLE": "motorcycle",
+    "MOTORCYCLIST": "motorcycle", "BICYCLE": "bicycle", "BICYCLIST": "cyclist", "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian", "VEHICULAR_TRAILER": "other", "RAILED_VEHICLE": "other",
+    "WHEELED_DEVICE": "other", "WHEELED_RIDER": "other", "WHEELCHAIR": "other", "STROLLER": "other",
+}  # fmt: skip
 NO_ROAD_USERS = {
     "BOLLARD", "CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STOP_SIGN", "SIGN", "MOBILE_PEDESTRIAN_SIGN",
     "MOBILE_PEDESTRIAN_CROSSING_SIGN", "MESSAGE_BOARD_TRAILER", "TRAFFIC_LIGHT_TRAILER", "DOG", "ANIMAL",

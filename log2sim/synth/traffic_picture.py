@@ -35,13 +35,9 @@ WALLS: tuple[Rgb, ...] = (
     (196, 182, 158), (176, 158, 146), (186, 186, 180), (188, 168, 140), (150, 120, 100), (208, 204, 196),
 )  # fmt: skip
 FIXED: dict[Material, Rgb] = {
-    Material.GROUND: (120, 112, 96),
-    Material.GLASS: (62, 68, 74),
-    Material.DARK: (38, 38, 40),
-    Material.METAL: (150, 154, 158),
-    Material.MESH: (120, 126, 122),
-    Material.WOOD: (104, 82, 62),
-}
+    Material.GROUND: (120, 112, 96), Material.GLASS: (62, 68, 74), Material.DARK: (38, 38, 40),
+    Material.METAL: (150, 154, 158), Material.MESH: (120, 126, 122), Material.WOOD: (104, 82, 62),
+}  # fmt: skip
 GLOSS = {Material.GLASS: 0.34, Material.PAINT: 0.14, Material.METAL: 0.12}
 SKINS: tuple[Rgb, ...] = ((206, 162, 136), (170, 122, 92), (96, 66, 48))
 HAIRS: tuple[Rgb, ...] = ((40, 32, 26), (88, 62, 38), (150, 120, 80), (120, 118, 116))

@@ -513,28 +513,15 @@ def stand(rng: np.random.Generator) -> Parts:
 
 
 SMALL: dict[str, tuple[float, float, Callable[[np.random.Generator], Parts]]] = {
-    "tree": (0.18, 0.4, tree),
-    "bush": (0.2, 0.9, bush),
-    "grass": (0.14, 0.3, grass),
-    "pole": (0.2, 0.2, pole),
-    "stand": (0.08, 0.3, stand),
-    "bin": (0.1, 0.8, bin_),
-    "container": (0.05, 3.5, container),
-    "bench": (0.05, 1.0, bench),
-    "shelter": (0.02, 2.5, shelter),
-    "cone": (0.04, 0.5, cone),
-}
+    "tree": (0.18, 0.4, tree), "bush": (0.2, 0.9, bush), "grass": (0.14, 0.3, grass), "pole": (0.2, 0.2, pole),
+    "stand": (0.08, 0.3, stand), "bin": (0.1, 0.8, bin_), "container": (0.05, 3.5, container),
+    "bench": (0.05, 1.0, bench), "shelter": (0.02, 2.5, shelter), "cone": (0.04, 0.5, cone),
+}  # fmt: skip
 """By kind: share, radius in m that is to be free around it, and how to draw it."""
 
 
 ROAD_USERS: dict[str, Callable[[np.random.Generator], Shape]] = {
-    "car": car,
-    "truck": truck,
-    "bus": bus,
-    "motorcycle": motorcycle,
-    "cyclist": cyclist,
-    "bicycle": bicycle,
-    "pedestrian": pedestrian,
-    "other": stroller,
-}
+    "car": car, "truck": truck, "bus": bus, "motorcycle": motorcycle, "cyclist": cyclist, "bicycle": bicycle,
+    "pedestrian": pedestrian, "other": stroller,
+}  # fmt: skip
 """How to draw a road user of a category."""

@@ -208,16 +208,9 @@ def spin_offset_ns(xyz_m: NDArray[np.floating], begin_ns: int, end_ns: int) -> N
 
 
 CATEGORY_OF = {
-    "Car": "car",
-    "Van": "car",
-    "Truck": "truck",
-    "Pedestrian": "pedestrian",
-    "Person": "pedestrian",
-    "Person_sitting": "pedestrian",
-    "Cyclist": "cyclist",
-    "Tram": "other",
-    "Misc": "other",
-}
+    "Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Person": "pedestrian",
+    "Person_sitting": "pedestrian", "Cyclist": "cyclist", "Tram": "other", "Misc": "other",
+}  # fmt: skip
 NOT_LABELED = "DontCare"
 NEVER_LABELED = ("bicycle",)
 """No class is for bicycles without riders (Geiger et al., "Vision meets robotics", 2013, section III)."""

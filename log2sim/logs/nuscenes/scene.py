@@ -213,24 +213,14 @@ def _pose_of(record: Record, path: Path) -> Array:
 
 ANNOTATIONS = "sample_annotation"
 CATEGORY_OF = {
-    "vehicle.car": "car",
-    "vehicle.truck": "truck",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.construction": "other",
-    "vehicle.emergency.ambulance": "other",
-    "vehicle.emergency.police": "other",
-    "vehicle.trailer": "other",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.wheelchair": "pedestrian",
-    "human.pedestrian.personal_mobility": "other",
+    "vehicle.car": "car", "vehicle.truck": "truck", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus",
+    "vehicle.motorcycle": "motorcycle", "vehicle.bicycle": "bicycle", "vehicle.construction": "other",
+    "vehicle.emergency.ambulance": "other", "vehicle.emergency.police": "other", "vehicle.trailer": "other",
+    "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.police_officer": "pedestrian",
+    "human.pedestrian.wheelchair": "pedestrian", "human.pedestrian.personal_mobility": "other",
     "human.pedestrian.stroller": "other",
-}
+}  # fmt: skip
 NO_ROAD_USERS = {
     "animal", "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
     "movable_object.trafficcone", "static_object.bicycle_rack",

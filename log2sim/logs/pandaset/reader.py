@@ -183,24 +183,13 @@ PERIOD_NS = 100_000_000
 MIN_STEP_NS = 20_000_000
 
 CATEGORY_OF = {
-    "Car": "car",
-    "Pickup Truck": "truck",
-    "Medium-sized Truck": "truck",
-    "Semi-truck": "truck",
-    "Bus": "bus",
-    "Motorcycle": "motorcycle",
-    "Motorized Scooter": "motorcycle",
-    "Pedestrian": "pedestrian",
-    "Pedestrian with Object": "pedestrian",
-    "Emergency Vehicle": "other",
-    "Other Vehicle - Construction Vehicle": "other",
-    "Other Vehicle - Pedicab": "other",
-    "Other Vehicle - Uncommon": "other",
-    "Personal Mobility Device": "other",
-    "Towed Object": "other",
-    "Train": "other",
-    "Tram / Subway": "other",
-}
+    "Car": "car", "Pickup Truck": "truck", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Bus": "bus",
+    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian", "Emergency Vehicle": "other",
+    "Other Vehicle - Construction Vehicle": "other", "Other Vehicle - Pedicab": "other",
+    "Other Vehicle - Uncommon": "other", "Personal Mobility Device": "other", "Towed Object": "other",
+    "Train": "other", "Tram / Subway": "other",
+}  # fmt: skip
 # Things that are no road users.
 NO_ROAD_USERS = {
     "Animals - Bird", "Animals - Other", "Cones", "Construction Signs", "Pylons", "Road Barriers", "Rolling Containers",

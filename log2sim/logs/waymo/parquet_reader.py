@@ -48,14 +48,11 @@ STAMP, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.las
 POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 IMAGE = "[CameraImageComponent]"
 IMAGE_COLUMNS: Mapping[str, Kind] = {
-    STAMP: "int",
-    CAMERA: "text",
-    f"{IMAGE}.pose.transform": "floats",
-    f"{IMAGE}.pose_timestamp": "float",
+    STAMP: "int", CAMERA: "text", f"{IMAGE}.pose.transform": "floats", f"{IMAGE}.pose_timestamp": "float",
     f"{IMAGE}.rolling_shutter_params.shutter": "float",
     f"{IMAGE}.rolling_shutter_params.camera_trigger_time": "float",
     f"{IMAGE}.rolling_shutter_params.camera_readout_done_time": "float",
-}
+}  # fmt: skip
 CAMERA_PREFIX = "[CameraCalibrationComponent]"
 INTRINSICS = tuple(f"{CAMERA_PREFIX}.intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
 LASER_PREFIX = "[LiDARCalibrationComponent]"
