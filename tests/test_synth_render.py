@@ -10,7 +10,7 @@ from log2sim.datatypes import Log
 from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.ground import ASPHALT, GROUND_M_PER_PX, MARKING, MAX_TILES, MEADOW, TILE_PX, Ground, GroundPlan
-from log2sim.synth.raster import NEAR_M, first_hit, rasterize
+from log2sim.synth.raster import NEAR_M, Samples, first_hit, nearest_of
 from log2sim.synth.render import Body, SceneInstant, render
 from log2sim.synth.scene import Road
 from log2sim.synth.shapes import block
@@ -97,7 +97,7 @@ def test_a_wall_beside_the_camera_that_reaches_behind_it_is_drawn_whole() -> Non
     box = block([-1.0, 1.0, -1.0], [12.0, 3.0, 2.0], 0)
     vertices = (box.vertices_m - [4.0, 0.0, 0.0]) @ FORWARD  # from 5 m behind to 8 m ahead, 1 m to the left
     K = np.array([[120.0, 0, 80], [0, 120.0, 60], [0, 0, 1]])
-    seen = rasterize(vertices, box.faces, K, 160, 120)
+    seen = nearest_of(Samples.of(vertices, box.faces, K, 160, 120))
     v, u = np.divmod(np.arange(160 * 120), 160)
     rays = np.column_stack([(u - 80) / 120, (v - 60) / 120, np.ones(len(u))])
     expected = first_hit(np.zeros_like(rays), rays, vertices[box.faces])

@@ -83,8 +83,7 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
     camera = log.cameras.get(name)
     if camera is not None:
         where = f"{place}, camera '{name}'"
-        yield from _focal_lengths(camera, where)
-        yield from _principal_point(camera, where)
+        yield from _pinhole(camera, where)
         yield from _distortion(camera, where)
         yield from _mount(camera.mount, camera.mount_T_cam, where)
     elif name in log.lidars:
@@ -92,7 +91,7 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
         yield from _mount(lidar.mount, lidar.mount_T_lidar, f"{place}, LiDAR '{name}'")
 
 
-def _focal_lengths(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     for field, value_px in (("fx", camera.K[0, 0]), ("fy", camera.K[1, 1])):
         widths = float(value_px) / camera.width_px
         if not MIN_FOCAL_WIDTHS <= widths <= MAX_FOCAL_WIDTHS:
@@ -101,9 +100,6 @@ def _focal_lengths(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
                 f"{MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the size of the images",
                 True,
             )
-
-
-def _principal_point(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     limit = np.tan(np.radians(MAX_RAY_DEGREES))
     for field, axis, size_px in (("cx", 0, camera.width_px), ("cy", 1, camera.height_px)):
         value_px = float(camera.K[axis, 2])

@@ -26,7 +26,7 @@ from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, rotation_from_r
 from log2sim.synth import raycast
 from log2sim.synth.actors import Actor, ActorStates, EgoMotion, MovingScene
 from log2sim.synth.render import camera_of, frame_stamps
-from log2sim.synth.scene import LidarSpec, Scene, load_scene
+from log2sim.synth.scene import Scene, load_scene
 from log2sim.synth.truth import (
     FrameVisibility,
     LidarVisibility,
@@ -86,7 +86,12 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     visible = None
     if observe:
         frames = visibility_by_camera(moving, cameras, _backdrop(scene, seed))
-        sweeps = {spec.name: _lidar_visibility(spec, streams[spec.name], cast, moving) for spec in scene.lidar}
+        sweeps = {}
+        for spec in scene.lidar:
+            stamps, count = streams[spec.name].t_ns, len(moving.actors)
+            hits = (cast(spec.name, i).hit for i in range(len(stamps)))
+            points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(len(stamps), count)
+            sweeps[spec.name] = LidarVisibility(stamps - round(NS_PER_S / spec.rate_hz / 2), points)
         t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
         visible = visible_at(t_ns, frames, sweeps, len(moving.actors))
     truth = _truth(moving, t_s, visible, seed)
@@ -180,13 +185,6 @@ def _caster(moving: MovingScene, seed: int) -> Caster:
         return raycast.cast_sweep(spec, moving, stamp, rng, _ground_reflectance(moving.scene, seed))
 
     return cast
-
-
-def _lidar_visibility(spec: LidarSpec, stream: Stream, cast: Caster, moving: MovingScene) -> LidarVisibility:
-    count = len(moving.actors)
-    hits = (cast(spec.name, i).hit for i in range(len(stream.t_ns)))
-    points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(len(stream.t_ns), count)
-    return LidarVisibility(stream.t_ns - round(NS_PER_S / spec.rate_hz / 2), points)
 
 
 def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> PoseTrack:

@@ -7,7 +7,7 @@ park along, across and at an angle; people, riders and what is no road user stan
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -619,8 +619,3 @@ def draw_environment(rng: np.random.Generator, light: str | None, weather: str |
             "rain_mm_h": round(float(rain), 1),
         }
     )
-
-
-def known(field: str) -> tuple[str, ...]:
-    """Values that a field of the environment may have."""
-    return tuple(str(v) for v in get_args(Environment.model_fields[field].annotation))

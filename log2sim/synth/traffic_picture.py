@@ -171,7 +171,12 @@ class TrafficPainter:
         """Take the scene at one time: what a camera may see, and the index of the object that each body is."""
         seen = [k for k, item in enumerate(scene.objects) if item.kind != OWN_CAR and _in_view(item, camera, map_T_cam)]
         self._make([k for k in seen if k not in self._meshes], scene)
-        bodies = [_body(scene.objects[k], self._meshes[k], self._looks[k]) for k in seen]
+        bodies = []
+        for k in seen:
+            item = scene.objects[k]
+            center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
+            pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
+            bodies.append(Body(self._meshes[k], pose, item.size_m, self._looks[k].painter(), self._looks[k].passes()))
         lamps = lamps_of(scene) if light.lamps > 0 else ()
         return SceneInstant(self.backdrop, bodies, light, lamps), np.array(seen, np.int64)
 
@@ -225,12 +230,6 @@ def _in_view(item: TrafficObject, camera: Camera, map_T_cam: Array) -> bool:
     if distance < radius + 1.0:
         return True
     return bool(np.arccos(np.clip(p[2] / distance, -1, 1)) < half + np.arcsin(min(1.0, radius / distance)))
-
-
-def _body(item: TrafficObject, mesh: Mesh, look: Look) -> Body:
-    center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
-    pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
-    return Body(mesh, pose, item.size_m, look.painter(), passes=look.passes())
 
 
 def _rounded(mesh: Mesh, material: NDArray[np.int64]) -> Mesh:

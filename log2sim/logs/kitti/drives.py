@@ -7,7 +7,6 @@ frame by frame (sequence 0000 is drive 2011_09_26_0005).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -267,7 +266,13 @@ class _Sequence:
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
         poses, map_frame = drive.poses_from_oxts(rows)
         track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
-        notes = [NO_STAMPS, *_missing_records(streams, len(rows))]
+        notes = [NO_STAMPS]
+        for name, stream in streams.items():
+            missing = np.setdiff1d(np.arange(len(rows)), stream.t_ns // PERIOD_NS)
+            if len(missing):
+                notes.append(
+                    f"{name}: {len(missing)} of {len(rows)} records are missing, first number {missing[0]:06d}"
+                )
         labels = self._labels(rig, track, notes)
         records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
         calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
@@ -322,14 +327,6 @@ class _Sequence:
         if not is_present(path):
             return DriveLabels()
         return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS, notes)
-
-
-def _missing_records(streams: Mapping[str, Stream], count: int) -> Iterator[str]:
-    """Say which streams lack records of the frames that the IMU counts."""
-    for name, stream in streams.items():
-        missing = np.setdiff1d(np.arange(count), stream.t_ns // PERIOD_NS)
-        if len(missing):
-            yield f"{name}: {len(missing)} of {count} records are missing, first number {missing[0]:06d}"
 
 
 def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:

@@ -176,11 +176,14 @@ class Scene:
         stamps = np.array([stamp_ns_of(r, self.tables.path(DATA)) for r in same], dtype=np.int64)
         order = np.argsort(stamps, kind="stable")  # tables have no order
         keep = strictly_increasing(stamps[order], name, self.notes)
+        path = self.tables.path("calibrated_sensor")
+        rotation = rotation_from_quaternion(quaternions_of([calibration], path)[0])
+        ego_T_sensor = transform(rotation, numbers_of([calibration], "translation", (3,), path)[0])
         return Channel(
             name,
             str(calibration["modality"]),
             calibration,
-            _pose_of(calibration, self.tables.path("calibrated_sensor")),
+            ego_T_sensor,
             [same[k] for k in order[keep]],
             stamps[order[keep]],
         )
@@ -203,12 +206,6 @@ class Scene:
         """Name of the city and its quarter; "" when log.json does not state it."""
         logs = self.tables.all_of("log")
         return str(logs.get(str(self.record.get("log_token")), {}).get("location", ""))
-
-
-def _pose_of(record: Record, path: Path) -> Array:
-    """Pose (4, 4) of a record with rotation and translation."""
-    rotation = rotation_from_quaternion(quaternions_of([record], path)[0])
-    return transform(rotation, numbers_of([record], "translation", (3,), path)[0])
 
 
 ANNOTATIONS = "sample_annotation"

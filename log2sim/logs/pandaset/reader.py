@@ -418,9 +418,8 @@ class _Sequence:
             if not files:
                 continue
             width, height = first_image_size(list(files.values()))
-            camera = Camera(
-                folder.name, width, height, _intrinsics(folder), "ego", _mount(track, t_ns, map_T_cam, folder, notes)
-            )
+            mount = _mount(track, t_ns, map_T_cam, folder, notes)
+            camera = Camera(folder.name, width, height, _intrinsics(folder / "intrinsics.json"), "ego", mount)
             numbers = np.array(list(files))
             keep = strictly_increasing(t_ns[numbers], folder.name, notes)
             t_ns = t_ns[numbers[keep]]
@@ -511,8 +510,7 @@ def _stamps_ns(stamps: list[Any], path: Path) -> NDArray[np.int64]:
     return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64)
 
 
-def _intrinsics(folder: Path) -> Array:
-    path = folder / "intrinsics.json"
+def _intrinsics(path: Path) -> Array:
     try:
         fx, fy, cx, cy = (float(read_json(path)[k]) for k in ("fx", "fy", "cx", "cy"))
     except (TypeError, KeyError, ValueError):

@@ -75,20 +75,22 @@ class PoseSources:
                 poses = read(topic)
                 if problem := say_uncovered(poses.t_ns, *self.span_ns):
                     raise NoPoses(problem)
-                found = _near_origin(self._with_damage(poses))
+                damaged = self.damaged.get(poses.topic, 0)
+                if damaged:
+                    note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
+                    poses = replace(poses, notes=(*poses.notes, note))
+                offset = whole_kilometers(poses.map_T_base[:, :3, 3])
+                if offset.any():
+                    shifted = shift_poses(poses.map_T_base, offset)
+                    x, y, z = offset.tolist()
+                    poses = replace(poses, map_T_base=shifted, map=replace(poses.map, offset_m=(x, y, z)))
+                found = poses
                 reason = f"{len(poses.t_ns)} poses, the first source of the order that has some"
                 reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, by the settings"
                 considered.append({"source": source, "topic": topic, "used": True, "reason": reason})
             except NoPoses as reason_against:
                 considered.append({"source": source, "topic": topic, "used": False, "reason": str(reason_against)})
         return found, considered
-
-    def _with_damage(self, poses: FoundPoses) -> FoundPoses:
-        damaged = self.damaged.get(poses.topic, 0)
-        if not damaged:
-            return poses
-        note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
-        return replace(poses, notes=(*poses.notes, note))
 
     def _candidates(self) -> list[tuple[str, str, Callable[[str], FoundPoses]]]:
         wanted = self.settings
@@ -238,15 +240,6 @@ class PoseSources:
 
 class _Zero:
     x = y = z = 0.0
-
-
-def _near_origin(poses: FoundPoses) -> FoundPoses:
-    """Take whole kilometers off large coordinates."""
-    offset = whole_kilometers(poses.map_T_base[:, :3, 3])
-    if not offset.any():
-        return poses
-    x, y, z = offset.tolist()
-    return replace(poses, map_T_base=shift_poses(poses.map_T_base, offset), map=replace(poses.map, offset_m=(x, y, z)))
 
 
 def _roll_pitch_yaw(map_T_base: Array) -> Array:

@@ -26,7 +26,7 @@ from log2sim.logs.excerpt import digest_of
 from log2sim.logs.stamps import MAX_TIME_S
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.range_images import checked, shaped
-from log2sim.logs.waymo.reader import log_of
+from log2sim.logs.waymo.reader import SegmentLog
 from log2sim.logs.waymo.segment import (
     CAMERAS,
     LASERS,
@@ -306,7 +306,7 @@ class _SegmentFolder:
             details={**self._statistics(), "frames": len(self.poses)},
             notes=self.notes,
         )
-        return log_of(segment, READER.name, self._digest())
+        return SegmentLog(segment).log(READER.name, self._digest())
 
     def _frames(self) -> list[FrameRow]:
         """Return the frames in the order of the poses."""

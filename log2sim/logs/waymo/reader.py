@@ -74,12 +74,7 @@ MAX_POSE_MISMATCH_M = 0.05
 Stamps = NDArray[np.int64]
 
 
-def log_of(segment: Segment, format: str, digest: str) -> Log:
-    """Make a log of a segment; `LogError` when it has neither images nor points."""
-    return _Assembly(segment).log(format, digest)
-
-
-class _Assembly:
+class SegmentLog:
     """A segment with its frames in order; frames are counted in this order from here on."""
 
     def __init__(self, segment: Segment) -> None:
@@ -93,6 +88,7 @@ class _Assembly:
         self.map_T_vehicle = shift_poses(world_T_vehicle, self.offset_m)
 
     def log(self, format: str, digest: str) -> Log:
+        """Make a log of the segment; `LogError` when it has neither images nor points."""
         cameras, streams, image_ns = self._cameras()
         lidars, sweeps = self._lidars()
         if not cameras and not lidars:
@@ -409,7 +405,7 @@ class _SegmentFile:
             notes=notes,
         )
         records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(frames.record, index)]
-        return log_of(segment, READER.name, digest_of([frames.name, frames.context.hex(), *records], []))
+        return SegmentLog(segment).log(READER.name, digest_of([frames.name, frames.context.hex(), *records], []))
 
     def _read_frames(self) -> _Frames:
         """Read the index of every frame of the segment to which the first one belongs."""
