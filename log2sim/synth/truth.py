@@ -279,7 +279,7 @@ def _lanes(
     out = []
     for lane, own_parts in enumerate(parts):
         for n, piece in enumerate(own_parts):
-            beside: dict[str, str] = {}
+            beside: dict[str, Any] = {}
             # To the left as it is driven, then to the right; of lanes that lead against it the last one counts.
             for field, step in (("left_lane", 1), ("right_lane", -1)):
                 other = lane + (step if forward[lane] else -step)
