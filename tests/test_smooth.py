@@ -385,7 +385,7 @@ def test_observations_a_millisecond_apart_agree_with_one_knot_each_in_the_mean()
 @pytest.fixture(scope="module")
 def maneuvers() -> ModuleType:
     """The module of maneuvers with known truth that the benchmark uses as well."""
-    path = Path(__file__).resolve().parent.parent / "tools" / "smoothing_worlds.py"
+    path = Path(__file__).resolve().parent.parent / "tools" / "benchmarks" / "smoothing_worlds.py"
     spec = importlib.util.spec_from_file_location("smoothing_worlds", path)
     assert spec is not None
     assert spec.loader is not None
