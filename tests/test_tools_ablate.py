@@ -19,6 +19,7 @@ from log2sim.config import Config  # noqa: E402
 pytestmark = pytest.mark.slow
 
 TOY = """
+from __future__ import annotations
 from dataclasses import dataclass
 import numpy as np
 GATE_M = 2.0
@@ -36,6 +37,7 @@ def is_never_asked(row: Row) -> bool:
     return False
 """
 USER = """
+from __future__ import annotations
 from toy.numbers import GATE_M, TABLE, Row, is_long
 HALF_GATE_M = 0.5 * GATE_M
 def wide(value, gate_m=GATE_M):
