@@ -35,7 +35,7 @@ from log2sim.prediction.prediction import (
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 from benchmarks import prediction as bench_prediction  # noqa: E402
-from benchmarks import prediction_worlds  # noqa: E402
+from benchmarks import prediction as prediction_worlds  # noqa: E402
 
 Array = np.ndarray
 

@@ -70,7 +70,7 @@ def test_changes_reach_all_that_is_derived_from_what_is_changed(toy):
     answer = toy[1].answer
     assert answer() == -1.0
     for label, expected in (
-        ("toy.numbers.GATE_M", 0.5), ("toy.user.HALF_GATE_M", 0.0), ("toy.numbers.TABLE.length_m", -3.0), ("toy.numbers.UNUSED_S", -1.0),
+        ("toy.numbers.GATE_M", 0.5), ("toy.user.HALF_GATE_M", -0.5), ("toy.numbers.TABLE.length_m", -3.0), ("toy.numbers.UNUSED_S", -1.0),
     ):  # fmt: skip
         one = found[label]
         graph, usual = ablate.Imports(toy), one.value

@@ -19,7 +19,7 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_equations_given_to_all_are_the_published_ones() -> None:
     pytest.importorskip("vehiclemodels", reason="needs commonroad-vehicle-models, the published model")
-    from benchmarks.vehicle_maneuvers import SWITCH_MPS, Case, single_track_rates
+    from benchmarks.vehicle import SWITCH_MPS, Case, single_track_rates
     from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
     from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
 
@@ -37,8 +37,7 @@ def test_the_equations_given_to_all_are_the_published_ones() -> None:
 @pytest.mark.parametrize("model", ["single-track", "kinematic"])
 @pytest.mark.parametrize("index", range(4))
 def test_steps_of_20_ms_are_within_a_centimeter_one_by_one_and_known_ahead(model: str, index: int) -> None:
-    from benchmarks.vehicle import known_ahead, solved, stepped
-    from benchmarks.vehicle_maneuvers import CASES, kinematic_rates, single_track_rates
+    from benchmarks.vehicle import CASES, kinematic_rates, known_ahead, single_track_rates, solved, stepped
 
     case = CASES[index]
     rates = kinematic_rates(case) if model == "kinematic" else single_track_rates(case, 0.0)

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
 from benchmarks import warnings as bench_warnings  # noqa: E402
-from benchmarks.labeled_drives import CAMERA_AHEAD_M, kitti_tracking  # noqa: E402
+from benchmarks.warnings import CAMERA_AHEAD_M, kitti_tracking  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -16,10 +16,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 import torch
 from lidar_training import fitting, real_logs
-from two_stream import boxes as boxes_of
-from two_stream import inputs
+from two_stream import network as boxes_of
+from two_stream import network as inputs
 from two_stream import network as two_stream
-from two_stream.pairs import Pair, ground_plane, pair_of, pairs_of
+from two_stream.network import Pair, ground_plane, pair_of, pairs_of
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.geometry import Camera, project, project_boxes, rotation_from_rpy, transform

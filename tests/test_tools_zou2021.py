@@ -17,12 +17,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import torch
 from lidar_networks import INFO
 from lidar_training import fitting, real_logs
-from lidar_training.samples import CATEGORIES, Sample, write_shard
+from lidar_training.clouds import CATEGORIES, Sample, write_shard
 from zou2021 import mixing, table_rows
 from zou2021 import network as z
 from zou2021.cluster_boxes import ClusterBoxDetector
-from zou2021.export import export_zou2021
-from zou2021.targets import IGNORED, CellTargets, cell_targets
+from zou2021.network import IGNORED, CellTargets, cell_targets, export_zou2021
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from kitti.boxes import Boxes, read_tracks
-from kitti.scene import Index, Matcher, Scene, make_scene
+from kitti.map import Index, Matcher, Scene, make_scene
 
 from log2sim.errors import Log2SimError
 from log2sim.evaluation.metrics.comparison import Pairs

@@ -17,12 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from kitti.boxes import Boxes, read_detections, write_tracks
-from kitti.choice import choose
-from kitti.confidence import Described, describe
+from kitti.boxes import Boxes, read_detections, rows_offline, rows_online, write_tracks
+from kitti.choice import Described, choose, decide_people, describe, find_pairs
 from kitti.map import View, read_view, to_measurements
-from kitti.people import decide_people, find_pairs
-from kitti.rows import rows_offline, rows_online
 
 from log2sim.datatypes import Measurements
 from log2sim.errors import Log2SimError, LogError

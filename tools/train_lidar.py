@@ -24,15 +24,21 @@ import numpy as np
 import torch
 from entry import parser_of
 from lidar_training import fitting
-from lidar_training.clouds import Example, draw_example
-from lidar_training.export import calibrate, describe, description, export_onnx, quantize
+from lidar_training.clouds import (
+    Example,
+    Sample,
+    Shard,
+    augmented,
+    draw_example,
+    draw_sample,
+    grid_of,
+    window_of,
+    write_shard,
+)
+from lidar_training.export import calibrate, describe, description, export_onnx, quantize, report
 from lidar_training.fitting import FitPlan
-from lidar_training.losses import loss_of
-from lidar_training.network import BevNetwork
+from lidar_training.network import BevNetwork, loss_of, targets_of
 from lidar_training.real_logs import example_of, read_sweeps, sample_of
-from lidar_training.report import report
-from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_of, window_of, write_shard
-from lidar_training.targets import targets_of
 from torch import Tensor, nn
 
 from log2sim.batch.discovery import find_logs

@@ -9,13 +9,20 @@ either below the limits is counted as false.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from entry import parser_of
+from kitti.map import read_view
 
-from benchmarks.labeled_drives import kitti_tracking, labeled_log
-from log2sim.datatypes import EGO, Scenario
+from log2sim.datatypes import EGO, Agent, EgoVehicle, Scenario, Waypoints
+from log2sim.evaluation.metrics.truth import is_static, speed_along, truth_from_log
+from log2sim.geometry import NS_PER_S, apply, wrap_angle, yaw_of
+from log2sim.logs.kitti.labels import CATEGORY_OF
+from log2sim.logs.opening import open_log
 from log2sim.simulation.runner import replay
 from log2sim.simulation.warnings import warn
 
@@ -86,3 +93,69 @@ def near_misses(result: object, agent: str) -> tuple[float, float]:
         if {EGO, agent} == set(entry["agents"]):
             return tuple(float("inf") if entry[k] is None else entry[k] for k in ("min_ttc_s", "pet_s"))
     return float("inf"), float("inf")
+
+
+PERIOD_S = 0.1
+# The camera is 0.27 m before the LiDAR, which is 0.76 m before the rear axle, and 1.65 m above the ground (Geiger et al., "Vision
+# meets robotics", 2013, figure 3).
+CAMERA_AHEAD_M, CAMERA_HEIGHT_M = 1.03, 1.65
+
+
+def kitti_tracking(folder: Path) -> Iterator[tuple[str, Scenario]]:
+    """Yield the scenarios of sequences with labels (`label_02`), `calib` and `ego_motion`."""
+    for labels in sorted((folder / "label_02").glob("*.txt")):
+        motion = folder / "ego_motion" / labels.name
+        if not motion.is_file():
+            continue
+        frames = len(motion.read_text().splitlines())
+        view = read_view(folder / "calib" / labels.name, motion, frames)
+        rows = defaultdict(list)
+        for line in labels.read_text().splitlines():
+            words = line.split()
+            if words[2] in CATEGORY_OF and int(words[0]) < frames:
+                rows[words[1], CATEGORY_OF[words[2]]].append([int(words[0]), *map(float, words[10:17])])
+        agents = [_labeled(name, kind, np.array(r), view.map_T_cam) for (name, kind), r in rows.items()]
+        yield labels.stem, Scenario(labels.stem, 0, frames * PERIOD_S, (_kitti_ego(view.map_T_cam), *agents))
+
+
+def _labeled(name: str, kind: str, rows: np.ndarray, map_T_cam: np.ndarray) -> Agent:
+    """An agent from rows frame, height, width, length, x, y, z (bottom, camera axes), yaw about the camera's y."""
+    pose = map_T_cam[rows[:, 0].astype(int)]
+    height, turn = rows[:, 1], rows[:, 7]
+    center = apply(pose, rows[:, 4:7] - np.column_stack([0 * height, height / 2, 0 * height]))
+    ahead = np.einsum("nij,nj->ni", pose[:, :3, :3], np.column_stack([np.cos(turn), 0 * turn, -np.sin(turn)]))
+    size = tuple(np.median(rows[:, [3, 2, 1]], axis=0).tolist())
+    return _agent(f"{kind}-{name}", kind, size, rows[:, 0] * PERIOD_S, center, np.arctan2(ahead[:, 1], ahead[:, 0]))
+
+
+def _kitti_ego(map_T_cam: np.ndarray) -> Agent:
+    vehicle, forward = EgoVehicle(), map_T_cam[:, :3, 2]
+    back_m = CAMERA_AHEAD_M - vehicle.rear_axle_offset_m
+    center = map_T_cam[:, :3, 3] - back_m * forward + [0, 0, vehicle.size_m[2] / 2 - CAMERA_HEIGHT_M]
+    t_s = np.arange(len(forward)) * PERIOD_S
+    ego = _agent(EGO, "car", vehicle.size_m, t_s, center, np.arctan2(forward[:, 1], forward[:, 0]))
+    return replace(ego, rear_axle_offset_m=vehicle.rear_axle_offset_m)
+
+
+def _agent(id: str, kind: str, size_m: tuple, t_s: np.ndarray, center: np.ndarray, yaw: np.ndarray) -> Agent:
+    static = id != EGO and is_static(t_s, center[:, :2])
+    speed = np.zeros(len(t_s)) if static else speed_along(t_s, center[:, :2], yaw)
+    known = np.ones(len(t_s), dtype=bool)
+    waypoints = Waypoints(t_s, *center.T, wrap_angle(yaw), speed, known, np.zeros(len(t_s)))
+    return Agent(id, kind, size_m, waypoints, static=static)
+
+
+def labeled_log(path: Path) -> Scenario:
+    """Return the labels of a log with the ego at all of its poses, whatever was recorded of sweeps and images."""
+    log = open_log(path)
+    truth = truth_from_log(log, cameras=[])
+    if log.ego is None or truth.ego is None:
+        return truth
+    poses, known = log.ego.at(log.ego.t_ns)
+    t_s = (log.ego.t_ns[known] - truth.t0_ns) / NS_PER_S
+    every = max(1, round(0.5 * PERIOD_S / float(np.median(np.diff(t_s)))))
+    rows = np.flatnonzero((t_s >= 0) & (t_s <= truth.duration_s))[::every]
+    poses, t_s = poses[known][rows], t_s[rows]
+    ego = _agent(EGO, "car", truth.ego.size_m, t_s, log.ego_centers(poses), yaw_of(poses))
+    others = (replace(a, waypoints=replace(a.waypoints, visible=None)) for a in truth.others)
+    return replace(truth, agents=(replace(ego, rear_axle_offset_m=truth.ego.rear_axle_offset_m), *others))

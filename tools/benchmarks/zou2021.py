@@ -29,9 +29,7 @@ from lidar_training.network import BevNetwork
 from lidar_training.real_logs import LogSweep, read_sweeps, sample_of
 from numpy.typing import NDArray
 from zou2021.cluster_boxes import ClusterBoxDetector
-from zou2021.export import export_zou2021
-from zou2021.mixing import Mixture, centers_loss, shards_in, zou2021_loss
-from zou2021.network import Zou2021Network
+from zou2021.network import Mixture, Zou2021Network, centers_loss, export_zou2021, shards_in, zou2021_loss
 from zou2021.table_rows import CENTER, MATCHES, best_score, figures, judged
 
 from benchmarks.table import markdown, replace_section

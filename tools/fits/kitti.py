@@ -18,9 +18,8 @@ from entry import parser_of
 from evaluate_kitti import evaluate, table
 from kitti import choice as kitti_choice
 from kitti.boxes import Boxes, overlap_3d, read_tracks
-from kitti.choice import choose
-from kitti.confidence import Described
-from kitti.scene import in_areas, is_ignorable, is_small, same_frame, with_neighbors
+from kitti.choice import Described, choose
+from kitti.map import in_areas, is_ignorable, is_small, same_frame, with_neighbors
 from track_kitti import describe_sequence, find_sequences, read_sequence
 
 from log2sim.errors import Log2SimError

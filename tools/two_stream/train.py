@@ -21,16 +21,19 @@ from lidar_training.real_logs import read_sweeps
 from log2sim.config import LidarConfig
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.detectors import WEIGHTS, open_network
-from two_stream.boxes import (
+from two_stream.network import (
     CRITERIA,
+    Batch,
+    Pair,
+    TwoStream,
     TwoStreamDetector,
     compare,
     export_two_stream,
+    inputs_of,
+    loss_of_anchors,
+    pairs_of,
     search_by_lidar,
 )
-from two_stream.inputs import inputs_of
-from two_stream.network import Batch, TwoStream, loss_of_anchors
-from two_stream.pairs import Pair, pairs_of
 
 TEST_SHARE = 0.15
 PEAK_RATE = 2e-3

@@ -14,12 +14,22 @@ The paper leaves some things open or prints what cannot be meant. What is done h
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
 import torch
 import torch.nn.functional as F
-from lidar_training.network import OUT_CHANNELS
+from lidar_training.clouds import CATEGORIES, Sample, Shard, augmented, grid_of, window_of
+from lidar_training.export import MAX_EXPORT_ERROR, describe, description
+from lidar_training.network import IN_CHANNELS, MIN_POINTS, OUT_CHANNELS, loss_of, targets_of
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from zou2021.targets import IGNORED, CellTargets
+from log2sim.perception.detect3d.network import load_network
 
 PAPER_CHANNELS, PAPER_OUTPUTS = 8, 11
 OFFSET, CLASSES, HEIGHT, HEADING = slice(0, 2), slice(2, 8), slice(8, 9), slice(9, 11)
@@ -192,3 +202,179 @@ def loss_of_cells(out: Tensor, targets: CellTargets) -> tuple[Tensor, dict[str, 
     square = (1 / PARTS) ** 2
     total = torch.stack([square * part + torch.log(torch.tensor(square + 1.0)) for part in parts.values()]).sum() / 2
     return total, {name: float(value.detach()) for name, value in parts.items()}
+
+
+IGNORED = -1
+CLASS_OF = {"truck": 2, "bus": 2, "car": 3, "motorcycle": 4, "cyclist": 4, "pedestrian": 5}
+# Cells with lower tops are the ground, under road users too.
+GROUND_TOP_M = 0.2
+# Half the diagonal of a cell: the middle of a cell with points of a road user can be that far outside.
+MARGIN_M = 0.14
+
+
+@dataclass(eq=False)
+class CellTargets:
+    """Maps of a batch.
+
+    Attributes
+    ----------
+    label : (B, H, W) int64
+        The class, 0 background, 1 ground; `IGNORED` in empty cells and on road users with too few points.
+    offset : (B, 2, H, W) float32
+        To the center of the cell's road user, m.
+    height : (B, 1, H, W) float32
+        Of the road user, m.
+    heading : (B, 2, H, W) float32
+        Cosine and sine.
+    """
+
+    label: Tensor
+    offset: Tensor
+    height: Tensor
+    heading: Tensor
+
+
+def cell_targets(
+    samples: list[Sample], lows: list[NDArray[np.float64]], grids: NDArray[np.float32], cell_m: float
+) -> CellTargets:
+    """Draw the targets of samples on their grids (B, 12, H, W)."""
+    count, _, h, w = grids.shape
+    label = np.where(grids[:, 3] > 0, np.where(2 * grids[:, 0] < GROUND_TOP_M, 1, 0), IGNORED).astype(np.int64)
+    offset, heading = np.zeros((count, 2, h, w), np.float32), np.zeros((count, 2, h, w), np.float32)
+    height = np.zeros((count, 1, h, w), np.float32)
+    for k, (sample, low) in enumerate(zip(samples, lows, strict=True)):
+        for row, code, points in zip(sample.boxes, sample.category, sample.points, strict=True):
+            name = CATEGORIES[code]
+            if name == "other":
+                continue
+            x, y, _, length, width, tall, yaw = (float(v) for v in row)
+            reach = np.hypot(length, width) / 2 + MARGIN_M
+            i0, i1 = (int(np.clip(v, 0, h)) for v in ((x - low[0] - reach) / cell_m, (x - low[0] + reach) / cell_m + 1))
+            j0, j1 = (int(np.clip(v, 0, w)) for v in ((y - low[1] - reach) / cell_m, (y - low[1] + reach) / cell_m + 1))
+            if i0 >= i1 or j0 >= j1:
+                continue
+            dx = (x - low[0] - (np.arange(i0, i1) + 0.5) * cell_m)[:, None] + np.zeros((1, j1 - j0))
+            dy = (y - low[1] - (np.arange(j0, j1) + 0.5) * cell_m)[None, :] + np.zeros((i1 - i0, 1))
+            c, s = np.cos(yaw), np.sin(yaw)
+            inside = np.abs(dx * c + dy * s) < length / 2 + MARGIN_M
+            inside &= np.abs(dy * c - dx * s) < width / 2 + MARGIN_M
+            area = (slice(i0, i1), slice(j0, j1))
+            inside &= (label[(k, *area)] != IGNORED) & (2 * grids[(k, 0, *area)] >= GROUND_TOP_M)
+            known = points >= MIN_POINTS and name in CLASS_OF
+            label[(k, *area)][inside] = CLASS_OF[name] if known else IGNORED
+            offset[(k, 0, *area)][inside], offset[(k, 1, *area)][inside] = dx[inside], dy[inside]
+            height[(k, 0, *area)][inside] = tall
+            heading[(k, 0, *area)][inside], heading[(k, 1, *area)][inside] = c, s
+    return CellTargets(*(torch.from_numpy(a) for a in (label, offset, height, heading)))
+
+
+RANGE_M = 30.0
+# As far as any of its grids can be: sides of 16 cells but not of 32, unequal ones.
+CHECKED_CELLS = (208, 176)
+
+
+def export_zou2021(network: Zou2021Network, path: Path, card: dict[str, Any]) -> None:
+    """Write the network as ONNX and check that both compute the same.
+
+    Raises
+    ------
+    RuntimeError
+        When they differ by more than `MAX_EXPORT_ERROR`.
+    """
+    laid_out = LaidOut(network).eval()
+    axes = {0: "batch", 2: "x", 3: "y"}
+    with warnings.catch_warnings():
+        # The exporter that needs no further package announces its end.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            laid_out, (torch.zeros(1, IN_CHANNELS, 128, 96),), str(path), input_names=["grid"], output_names=["maps"],
+            opset_version=17, dynamo=False, dynamic_axes={"grid": axes, "maps": axes},
+        )  # fmt: skip
+    describe(path, description("zou2021", CELL_M, RANGE_M) | {"stride": 1, "card": card})
+    grid = np.random.default_rng(0).random((IN_CHANNELS, *CHECKED_CELLS), dtype=np.float32)
+    with torch.no_grad():
+        expected = laid_out(torch.from_numpy(grid[None]))[0].numpy()
+    difference = load_network(path).run(grid) - expected
+    error = float((np.abs(difference) / np.maximum(np.abs(expected), 1)).max())
+    if not error < MAX_EXPORT_ERROR:
+        raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
+
+
+BATCH = 4
+CELLS = 256
+# The paper's network works at full resolution: parts of a window save most of its time.
+ZOU2021_CELLS = (128, 160)
+PART_M = 12.0
+"""Largest distance along an axis between the middles of such a part and of its window."""
+
+
+class Samples(Protocol):
+    """Samples by number: a shard, or a list of samples."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, k: int) -> Sample: ...
+
+
+def shards_in(folders: Sequence[Path]) -> list[Shard]:
+    """Open the shards of folders, in the order of their names."""
+    paths = [path for folder in folders for path in sorted(folder.glob("*.npz"))]
+    if not paths:
+        raise FileNotFoundError(
+            f"{', '.join(map(str, folders))}: no shards; make them by tools/train_lidar.py --only generate"
+        )
+    return [Shard(path) for path in paths]
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Simulated samples, half of whose places in a batch another source may take.
+
+    Attributes
+    ----------
+    simulated : sequence of Samples
+    other : Samples
+        Empty for none.
+    """
+
+    simulated: Sequence[Samples]
+    other: Samples = field(default_factory=list)
+
+    def draw(self, rng: np.random.Generator) -> list[Sample]:
+        """Draw a batch of augmented samples."""
+        out = []
+        for k in range(BATCH):
+            source = self.simulated[int(rng.integers(len(self.simulated)))]
+            if k % 2 and len(self.other):
+                source = self.other
+            out.append(augmented(source[int(rng.integers(len(source)))], rng))
+        return out
+
+
+def windows(
+    samples: list[Sample], cells: int, cell_m: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], list[NDArray[np.float64]]]:
+    """Rasterize samples in random windows: grids (B, 12, H, W) and lower corners."""
+    lows = [window_of(rng, cells, cell_m) for _ in samples]
+    return np.stack([grid_of(s, low, cells, cell_m) for s, low in zip(samples, lows, strict=True)]), lows
+
+
+def zou2021_loss(
+    network: nn.Module, samples: list[Sample], rng: np.random.Generator
+) -> tuple[Tensor, dict[str, float]]:
+    """Return the loss of the paper's network on samples."""
+    grids, lows = windows(samples, int(rng.choice(ZOU2021_CELLS)), CELL_M, rng)
+    middle = torch.from_numpy(rng.uniform(-PART_M, PART_M, (len(samples), 2)).astype(np.float32))
+    out = network(torch.from_numpy(grids).to(memory_format=torch.channels_last), middle)
+    return loss_of_cells(out, cell_targets(samples, lows, grids, CELL_M))
+
+
+def centers_loss(cell_m: float):
+    """Return the loss on samples of a network of `lidar_training.network` with cells of a size."""
+
+    def loss(network: nn.Module, samples: list[Sample], rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        grids, lows = windows(samples, CELLS, cell_m, rng)
+        grid = torch.from_numpy(grids).to(memory_format=torch.channels_last)
+        return loss_of(network(grid), targets_of(samples, lows, CELLS, cell_m), grid)
+
+    return loss

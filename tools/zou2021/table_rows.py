@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from lidar_training.clouds import Example
 from lidar_training.export import group_of
+from lidar_training.network import GROUPS
 from lidar_training.real_logs import LogSweep
-from lidar_training.targets import GROUPS
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision, operating_point

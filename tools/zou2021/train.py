@@ -14,9 +14,7 @@ import torch
 from entry import parser_of
 from lidar_training.fitting import FitPlan, fit
 
-from zou2021.export import export_zou2021
-from zou2021.mixing import Mixture, shards_in, zou2021_loss
-from zou2021.network import Zou2021Network
+from zou2021.network import Mixture, Zou2021Network, export_zou2021, shards_in, zou2021_loss
 
 PEAK_RATE = 2e-3
 
