@@ -18,8 +18,9 @@ import torch
 from lidar_networks import INFO
 from lidar_training import fitting, real_logs
 from lidar_training.clouds import CATEGORIES, Sample, write_shard
-from zou2021 import mixing, table_rows
+from zou2021 import network as mixing
 from zou2021 import network as z
+from zou2021 import table_rows
 from zou2021.cluster_boxes import ClusterBoxDetector
 from zou2021.network import IGNORED, CellTargets, cell_targets, export_zou2021
 

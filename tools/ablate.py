@@ -154,7 +154,7 @@ def measure(options: argparse.Namespace) -> None:
         matter = matters(rows_of(options.out))
         chosen = [v for v in chosen if v.label not in matter]
     done = {(r["case"], r["label"], r["change"]) for r in rows_of(options.out)}
-    cases = [recorded(case_of(name), config) for name in options.logs]
+    cases = [recorded(case_of(name, options.detector), config) for name in options.logs]
     called = set().union(*(case.called for case in cases))
     graph = Imports(method_modules())
     for v in chosen:
@@ -225,16 +225,16 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
 # Logs, and the pipeline with stages that are not computed again.
 
 
-def case_of(name: str) -> Case:
+def case_of(path: str, detector: str) -> Case:
     """A log by its folder, or a scene by its file, made in memory."""
-    path = Path(name)
-    if path.suffix != ".toml":
-        log = open_log(path)
-        return Case(path.name, log, truth_from_log(log))
+    name = Path(path).stem + ("" if detector == "labels" else f" {detector}")
+    if not path.endswith(".toml"):
+        log = open_log(Path(path))
+        return Case(name, log, truth_from_log(log))
     log, truth = synthesize(load_scene(path))
     sweeps = {n: [log.streams[n].read(i) for i in range(len(log.streams[n].t_ns))] for n in log.lidars}
     kept = {n: replace(s, read=sweeps[n].__getitem__) if n in sweeps else s for n, s in log.streams.items()}
-    return Case(path.stem, replace(log, streams=kept), truth)
+    return Case(name, replace(log, streams=kept), truth)
 
 
 def recorded(case: Case, config: Config) -> Case:
