@@ -347,12 +347,7 @@ def measure(sigma: float, outliers: float, seeds: int) -> dict[str, list[float]]
 def sections(*, quick: bool) -> tuple[str, str]:
     """Title and tables."""
     warnings.simplefilter("ignore")
-    cases = {
-        "0.1 m": (0.1, 0.0),
-        "0.3 m": (0.3, 0.0),
-        "0.6 m": (0.6, 0.0),
-        "0.3 m, 3 % outliers": (0.3, 0.03),
-    }
+    cases = {"0.1 m": (0.1, 0.0), "0.3 m": (0.3, 0.0), "0.6 m": (0.6, 0.0), "0.3 m, 3 % outliers": (0.3, 0.03)}
     found = {name: measure(*case, seeds=2 if quick else 8) for name, case in cases.items()}
     rows = []
     for method in found["0.3 m"]:

@@ -244,10 +244,7 @@ def cases_of(seed: int, index: int) -> list[Case]:
     rng = np.random.default_rng([seed, index, 10])
     searched = names[str(rng.choice(list(SEARCHED), p=list(SEARCHED.values())))]
     blind = log.changed(lidars={}, streams={"camera": log.streams["camera"]})
-    return [
-        _case(log, scene, truth, searched, seed + index),
-        _case(blind, scene, truth, "labels", seed + index),
-    ]
+    return [_case(log, scene, truth, searched, seed + index), _case(blind, scene, truth, "labels", seed + index)]
 
 
 def _case(log: Log, scene: TrafficScene, truth: Scenario, detector: str, seed: int) -> Case:

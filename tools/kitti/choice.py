@@ -33,14 +33,7 @@ from log2sim.tracking.stitch import MAX_PEDESTRIAN_SPEED_MPS
 # which the benchmark's validation does not run.
 SEEN = {"constant": -8.89, "score": 0.2, "near_score": 1.0, "near_share": 3.25, "hidden": -3.67, "height": -4.68}
 PREDICTED = {"constant": -5.5, "near_score": 0.67, "near_share": 3.59}
-SEEN_ONLINE = {
-    "constant": -7.45,
-    "score": 0.49,
-    "near_score": 0.7,
-    "near_share": 2.18,
-    "hidden": -1.7,
-    "height": -4.12,
-}
+SEEN_ONLINE = {"constant": -7.45, "score": 0.49, "near_score": 0.7, "near_share": 2.18, "hidden": -1.7, "height": -4.12}
 PREDICTED_ONLINE = {"constant": -5.33, "near_score": 0.98, "near_share": 1.93}
 # A box is told where it is more likely labeled than not; a detected one is left out only where that is unlikely.
 MIN_PREDICTED, MIN_SEEN = 0.5, 0.2
