@@ -74,7 +74,7 @@ def test_changes_reach_all_that_is_derived_from_what_is_changed(toy):
     ):  # fmt: skip
         one = found[label]
         graph, usual = ablate.Imports(toy), one.value
-        graph.put(one.module, one.name, ablate.scaled(usual, 1.5, one.column))
+        graph.put(one.module, one.name, ablate.mapped(usual, lambda v: 1.5 * v, one.column))
         assert answer() == expected, label
         graph.put(one.module, one.name, usual)
         assert answer() == -1.0
@@ -92,9 +92,10 @@ def test_what_nothing_calls_is_told_without_a_run(toy):
 def test_whole_numbers_change_by_one_and_shares_stay_below_one():
     assert [ablate.scaled(2, f) for f in (0.7, 1.3)] == [1, 3]
     assert ablate.scaled(10, 1.3) == 13
-    assert ablate.scaled({"a": (0.9, 0.2)}, 1.3, share=True) == {"a": pytest.approx((0.95, 0.26))}
-    np.testing.assert_allclose(ablate.scaled(np.array([1.0, 2.0]), 0.7), [0.7, 1.4])
-    assert ablate.scaled(True, 0.7) is True
+    assert [ablate.scaled(v, 1.3, share=True) for v in (0.9, 0.2)] == pytest.approx([0.95, 0.26])
+    doubled = ablate.mapped({"a": (0.9, True, "x"), "b": np.array([1.0, 2.0])}, lambda v: 2 * v)
+    assert doubled["a"] == (1.8, True, "x")
+    np.testing.assert_array_equal(doubled["b"], [2.0, 4.0])
     changes = {v.change: v.value for v in ablate.scalings(ablate.Variation("constants", "", "m", "MAX_GAP_M", "", 2.0))}
     assert changes == {"x0.7": pytest.approx(1.4), "x1.3": pytest.approx(2.6), "off": np.inf}
 

@@ -32,13 +32,14 @@ import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
+from entry import parser_of
 
 from log2sim import pipeline
 from log2sim.config import Config, Section
@@ -121,7 +122,7 @@ class Case:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser = parser_of(__doc__)
     parser.add_argument("logs", nargs="*", help="log folders and scene files")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, appended to")
     parser.add_argument("--stages", default=",".join(STAGES))
@@ -145,11 +146,8 @@ def measure(options: argparse.Namespace) -> None:
     config = Config.load(detect={"name": options.detector}, stop_s=options.stop)
     stages, kinds = options.stages.split(","), options.kinds.split(",")
     # Lists of the method's modules are complete before anything runs.
-    chosen = [
-        v
-        for v in variations(config)
-        if v.stage in stages and v.kind in kinds and re.search(options.only, f"{v.label} {v.change}")
-    ]
+    found = [v for v in variations(config) if v.stage in stages and v.kind in kinds]
+    chosen = [v for v in found if re.search(options.only, f"{v.label} {v.change}")]
     if options.idle:
         matter = matters(rows_of(options.out))
         chosen = [v for v in chosen if v.label not in matter]
@@ -192,7 +190,8 @@ def run_one(index: int) -> tuple[int, Figures, str]:
         elif variation.module:
             graph.put(variation.module, variation.name, variation.value)
         else:
-            config = setting_changed(config, variation.name, variation.value)
+            section, _, key = variation.name.partition(".")
+            config = config.changed(**{section: {key: variation.value}})
         figures, digest = figures_of(case, config, variation.stage)
     except (ConfigError, TimeoutError) as problem:
         return index, {}, f"refused: {problem}"
@@ -209,12 +208,9 @@ def _out_of_time(*_: Any) -> None:
 
 def append(path: Path, v: Variation, case: str, figures: Figures, outcome: str) -> None:
     """Append a row to the file."""
-    row = {
-        "case": case, "label": v.label, "change": v.change, "kind": v.kind, "stage": v.stage, "unit": v.unit, "value": short(v.before),
-        "figures": figures, "outcome": outcome,
-    }  # fmt: skip
+    row = {"case": case, "label": v.label, "change": v.change, "kind": v.kind, "stage": v.stage, "unit": v.unit}
     with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
+        file.write(json.dumps({**row, "value": short(v.before), "figures": figures, "outcome": outcome}) + "\n")
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -319,17 +315,10 @@ def method_modules() -> list[ModuleType]:
     return modules
 
 
-def stage_of(name: str, *, setting: bool = False) -> str:
-    """Stage of a module, by its longest beginning among `STAGES`, or of a setting by its section."""
-    if setting:
-        return next((s for s, (*_, sections) in STAGES.items() if name.split(".")[0] in sections.split()), "")
-    places = [
-        (len(p), s)
-        for s, (_, rooms, _) in STAGES.items()
-        for p in rooms.split()
-        if f"{name}.".startswith(f"log2sim.{p}.")
-    ]
-    return max(places)[1]
+def stage_of(module: str) -> str:
+    """Stage of a module, by its longest beginning among `STAGES`."""
+    places = {place: stage for stage, (_, rooms, _) in STAGES.items() for place in rooms.split()}
+    return places[max((p for p in places if f"{module}.".startswith(f"log2sim.{p}.")), key=len)]
 
 
 def variations(config: Config) -> Iterator[Variation]:
@@ -355,9 +344,9 @@ def constants_in(module: ModuleType, stage: str) -> Iterator[Variation]:
             if rows and all(dataclasses.is_dataclass(r) for r in rows):
                 for column in (f.name for f in dataclasses.fields(rows[0]) if f.init):
                     numbers = [getattr(r, column) for r in rows]
-                    if is_number(numbers):
+                    if any(True for _ in numbers_in(numbers)):
                         yield replace(made, column=column, before=numbers)
-            elif is_number(value):
+            elif any(True for _ in numbers_in(value)):
                 yield made
 
 
@@ -367,55 +356,51 @@ def names_of(node: ast.Assign | ast.AnnAssign) -> list[str]:
     return [n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
 
 
-def is_number(value: Any) -> bool:
-    """Whether a value is a number or holds one."""
-    if isinstance(value, Mapping):
-        return any(is_number(v) for v in value.values())
-    if isinstance(value, (tuple, list)):
-        return any(is_number(v) for v in value)
+def numbers_in(value: Any) -> Iterator[float]:
+    """All numbers in a number, an array or a table."""
     if isinstance(value, np.ndarray):
-        return value.dtype.kind in "fi"
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+        yield from map(float, value.ravel() if value.dtype.kind in "fi" else ())
+    elif isinstance(value, (Mapping, tuple, list)):
+        for one in value.values() if isinstance(value, Mapping) else value:
+            yield from numbers_in(one)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield float(value)
 
 
 def scalings(constant: Variation) -> Iterator[Variation]:
     """A constant 0.7 and 1.3 times as large, and off."""
-    for factor in (0.7, 1.3):
-        value = scaled(constant.value, factor, constant.column, share=not constant.unit)
-        yield replace(constant, change=f"x{factor}", value=value)
-    whole = isinstance(constant.value, int)
-    off = (10**6 if whole else math.inf) if UPPER_LIMIT.search((constant.column or constant.name).upper()) else 0
-    yield replace(constant, change="off", value=scaled(constant.value, 1.0, constant.column, fixed=off))
+    upper = UPPER_LIMIT.search((constant.column or constant.name).upper())
+    for change, factor in (("x0.7", 0.7), ("x1.3", 1.3), ("off", None)):
+
+        def number(v: float, factor: float | None = factor) -> float:
+            if factor is not None:
+                return scaled(v, factor, share=not constant.unit)
+            return type(v)((10**6 if isinstance(v, int) else math.inf) if upper else 0)
+
+        yield replace(constant, change=change, value=mapped(constant.value, number, constant.column))
 
 
-def scaled(value: Any, factor: float, column: str = "", *, share: bool = False, fixed: float | None = None) -> Any:
-    """A value, or every number in a table or record, times a factor or at a fixed value.
-
-    Whole numbers change by one at least; a `share` below one stays so, half as far from one at the nearest.
-    """
-    if isinstance(value, Mapping):
-        return type(value)({k: scaled(v, factor, column, share=share, fixed=fixed) for k, v in value.items()})  # type: ignore[call-arg]
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        changed = [f.name for f in dataclasses.fields(value) if f.init and column in ("", f.name)]
-        return replace(value, **{n: scaled(getattr(value, n), factor, share=share, fixed=fixed) for n in changed})
-    if isinstance(value, (tuple, list)):
-        parts = (scaled(v, factor, share=share, fixed=fixed) for v in value)
-        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
-    if isinstance(value, np.ndarray):
-        moved = (
-            value * factor
-            if fixed is None
-            else np.full_like(value, fixed if value.dtype.kind == "f" else min(fixed, 10**6))
-        )
-        return np.rint(moved).astype(value.dtype) if value.dtype.kind == "i" else moved
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return value
-    if fixed is not None:
-        return type(value)(min(fixed, 10**6)) if isinstance(value, int) else float(fixed)
+def scaled(value: float, factor: float, *, share: bool = False) -> float:
+    """A number times a factor; a whole one changes by one at least, and a `share` below one stays so, at most half as far from one."""
     if isinstance(value, int):
         step = 1 if factor > 1 else -1
         return value + step * max(abs(round(value * factor) - value), 1) if value else value
     return min(value * factor, (1 + value) / 2 if share and 0 < value < 1 else math.inf)
+
+
+def mapped(value: Any, number: Callable[[float], float], column: str = "") -> Any:
+    """A value with every number in it, or in one column of its records, replaced."""
+    if isinstance(value, Mapping):
+        return type(value)({k: mapped(v, number, column) for k, v in value.items()})  # type: ignore[call-arg]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [f.name for f in dataclasses.fields(value) if f.init and column in ("", f.name)]
+        return replace(value, **{n: mapped(getattr(value, n), number) for n in names})
+    if isinstance(value, (tuple, list)):
+        parts = [mapped(v, number) for v in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fi":
+        return np.array([number(v) for v in value.ravel().tolist()], dtype=value.dtype).reshape(value.shape)
+    return number(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
 def rules_in(module: ModuleType, stage: str) -> Iterator[Variation]:
@@ -423,22 +408,23 @@ def rules_in(module: ModuleType, stage: str) -> Iterator[Variation]:
     for name, function in vars(module).items():
         if not isinstance(function, FunctionType) or function.__module__ != module.__name__:
             continue
-        annotations = list(inspect.signature(function).parameters.values())
-        first = str(annotations[0].annotation) if annotations else ""
+        annotations = [str(p.annotation) for p in inspect.signature(function).parameters.values()]
         returns = str(function.__annotations__.get("return", ""))
         made = Variation("rules", stage, module.__name__, name, "", None, "function")
+        changes: dict[str, Callable[..., Any]] = {}
         if returns == "bool":
-            yield replace(made, change="off", value=lambda *_, **__: False)
-            yield replace(made, change="always", value=lambda *_, **__: True)
+            changes = {"off": lambda *_, **__: False, "always": lambda *_, **__: True}
         elif returns.endswith("| None"):
-            yield replace(made, change="off", value=lambda *_, **__: None)
-        elif annotations and plain_of(first) == plain_of(returns) and not PLAIN.match(returns):
-            as_list = returns.startswith("list")
-            yield replace(made, change="off", value=lambda x, *_, as_list=as_list, **__: list(x) if as_list else x)
+            changes = {"off": lambda *_, **__: None}
+        elif annotations and plain_of(annotations[0]) == plain_of(returns) and not PLAIN.match(returns):
+            changes = (
+                {"off": lambda x, *_, **__: x}
+                if not returns.startswith("list")
+                else {"off": lambda x, *_, **__: list(x)}
+            )
         elif returns.startswith("list"):
-            yield replace(made, change="off", value=lambda *_, **__: [])
-        elif re.match(r"tuple\[[^,]*, \.\.\.\]$", returns):
-            yield replace(made, change="off", value=lambda *_, **__: ())
+            changes = {"off": lambda *_, **__: []}
+        yield from (replace(made, change=change, value=value) for change, value in changes.items())
 
 
 def plain_of(annotation: str) -> str:
@@ -448,22 +434,17 @@ def plain_of(annotation: str) -> str:
 
 def settings(config: Config) -> Iterator[Variation]:
     """Other choices of options, and numbers scaled and off."""
+    stages = {section: stage for stage, (_, _, sections) in STAGES.items() for section in sections.split()}
     for section, model in config:
         for key, info in type(model).model_fields.items() if isinstance(model, Section) else ():
-            name, value = f"{section}.{key}", getattr(model, key)
-            made = Variation("options", stage_of(name, setting=True), "", name, "", value, value)
+            value = getattr(model, key)
+            made = Variation("options", stages[section], "", f"{section}.{key}", "", value, value)
             if isinstance(value, bool):
                 yield replace(made, change=str(not value), value=not value)
             elif get_origin(info.annotation) is Literal:
                 yield from (replace(made, change=c, value=c) for c in get_args(info.annotation) if c != value)
             elif isinstance(value, (int, float)) and value:
                 yield from scalings(replace(made, kind="constants"))
-
-
-def setting_changed(config: Config, name: str, value: Any) -> Config:
-    """The settings with one changed."""
-    section, _, key = name.partition(".")
-    return config.changed(**{section: {key: value}})
 
 
 class Imports:
@@ -567,7 +548,7 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
         lines, idle, uncalled = [], [], []
         for (_, label), changes in ((k, c) for k, c in by_label.items() if k[0] == stage):
             one = next(iter(next(iter(changes.values())).values()))
-            if all("" in cases for cases in changes.values()):
+            if all(set(cases) == {""} for cases in changes.values()):
                 uncalled.append(label)
                 continue
             told = {change: effect(cases, usual, noise) for change, cases in changes.items()}
@@ -593,7 +574,7 @@ def matters(rows: Sequence[dict[str, Any]]) -> set[str]:
 
 
 def usual_and_noise(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, float]]]:
-    """By log the row of the method as it is, and how much each figure differs by seed, at least its step."""
+    """By log the row of the method as it is, and how much each figure differs by seed, at least half a step."""
     by_case: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         if row["label"] == "seed":
@@ -602,9 +583,8 @@ def usual_and_noise(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, dict[str,
     noise = {}
     for case, seeds in by_case.items():
         values = {k: [r["figures"][k] for r in seeds if r["figures"].get(k) is not None] for k in FIGURES}
-        noise[case] = {
-            k: max(FIGURES[k][0] / 2, float(np.std(v, ddof=1)) if len(v) > 1 else 0.0) for k, v in values.items()
-        }
+        spread = {k: float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for k, v in values.items()}
+        noise[case] = {k: max(step / 2, spread[k]) for k, (step, _) in FIGURES.items()}
     return usual, noise
 
 
@@ -636,19 +616,9 @@ def effect(cases: dict[str, Any], usual: dict[str, Any], noise: dict[str, Any]) 
 
 def short(value: Any) -> str:
     """A number, or the least and the largest of a table."""
-    numbers = list(_numbers(value))
-    if not numbers:
-        return str(value)
-    texts = [f"{v:.3g}" for v in (min(numbers), max(numbers))]
-    return texts[0] if len(numbers) == 1 or texts[0] == texts[1] else " to ".join(texts)
-
-
-def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, (int, float)):
-        yield float(value)
-    elif not isinstance(value, str) and isinstance(value, Iterable):
-        for one in value.values() if isinstance(value, Mapping) else value:
-            yield from _numbers(one)
+    numbers = list(numbers_in(value))
+    texts = [f"{v:.3g}" for v in (min(numbers), max(numbers))] if numbers else [str(value)]
+    return " to ".join(dict.fromkeys(texts))
 
 
 if __name__ == "__main__":
