@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.localization.clocks import shift_stream
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside import RoadRegistration, register_road
 from log2sim.localization.surfaces import exp_of
 from log2sim.plan import choose_detector, select_sensors
