@@ -337,7 +337,7 @@ def test_figures_count_all_groups_together_at_one_score(sample: Sample) -> None:
 
 
 def test_rows_of_the_table_are_made_once_and_written(tmp_path: Path) -> None:
-    from zou2021 import table as t
+    from benchmarks import zou2021 as t
 
     table = t.Table(tmp_path, {}, {}, {}, [], scenes=1, every=1, steps=1)
     assert table.row("a", lambda: {"value": 1}) == table.row("a", lambda: {"value": 2}) == {"value": 1}

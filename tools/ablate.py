@@ -590,7 +590,7 @@ def usual_and_noise(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, dict[str,
 
 def effect(cases: dict[str, Any], usual: dict[str, Any], noise: dict[str, Any]) -> tuple[float, str]:
     """Steps that all logs lose or win beyond noise, and a word: same, equal, worse or better with the largest figure."""
-    score, worst, same = 0.0, (0.0, ""), True
+    gains, same = [(0.0, "")], True
     for case, row in cases.items():
         if case not in usual:
             continue
@@ -605,13 +605,11 @@ def effect(cases: dict[str, Any], usual: dict[str, Any], noise: dict[str, Any]) 
                 now, before = now or 0.0, before or 0.0
             if now is None or abs(now - before) <= NOISE_SIGMAS * noise[case][key]:
                 continue
-            gain = (now - before) * (1 if more else -1) / step
-            score += gain
-            if abs(gain) > abs(worst[0]):
-                worst = (gain, f"{key} {now - before:+.2g}, {case}")
-    if worst[0] == 0:
+            gains.append(((now - before) * (1 if more else -1) / step, f"{key} {now - before:+.2g}, {case}"))
+    if len(gains) == 1:
         return 0.0, "same" if same else "equal"
-    return score, f"{'worse' if score < 0 else 'better'} ({worst[1]})"
+    score = sum(gain for gain, _ in gains)
+    return score, f"worse ({min(gains)[1]})" if score < 0 else f"better ({max(gains)[1]})"
 
 
 def short(value: Any) -> str:

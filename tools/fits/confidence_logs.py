@@ -1,4 +1,4 @@
-"""Make the first passes over synthetic logs on which `fit_confidence.py` fits: random traffic, sensors, rates and detectors.
+"""Make the first passes over synthetic logs on which `fit.py confidence` fits: random traffic, sensors, rates and detectors.
 
     python tools/fit.py confidence_logs --logs 40 --seed 1 --out FOLDER
 

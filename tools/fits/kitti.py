@@ -1,4 +1,4 @@
-"""Fits what tools/kitti_choice.py knows of labeled boxes, and scores every sequence with weights that never saw it.
+"""Fits what tools/kitti/choice.py knows of labeled boxes, and scores every sequence with weights that never saw it.
 
     python tools/fit.py kitti --detections DIR [--detections DIR ...] --calib DIR --ego-motion DIR --labels DIR \\
       [--sequences 0000,0002,...] [--online]
