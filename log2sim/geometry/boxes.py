@@ -69,7 +69,7 @@ def points_in_box(
     return np.asarray((np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(d[:, 2]) <= half[2]))
 
 
-def cross_slab(origin: Array, along: Array, low: ArrayLike, high: ArrayLike) -> tuple[Array, Array]:
+def cross_slab(origin: Array, along: Array, low: Array | float, high: Array | float) -> tuple[Array, Array]:
     """Return where lines enter and leave the slabs between two planes, along one axis, in units of their directions (N,).
 
     Lines are in a box between the latest entry and the earliest exit over its axes (Kay and Kajiya, SIGGRAPH 1986). A line in

@@ -3,7 +3,7 @@
 3D boxes come first. Those that an image box shows, too, take their points; only image boxes without a partner are clustered, in
 the points that are left. A pair is judged by the score in the image, the score in the sweep and the IoU of the image box with
 the projected 3D box, as in Pang, Morris & Radha, "CLOCs: Camera-LiDAR Object Candidates Fusion for 3D Object Detection" (IROS
-2020); in place of their network a logistic function is fitted to these three (`tools/fit_late_fusion.py`).
+2020); in place of their network a logistic function is fitted to these three (`tools/fit.py late_fusion`).
 
 Mode "paper" follows Bhardwaj & Kalra in image boxes: depth of the point nearest to the box center, extents of all points in the
 box. Mode "robust" removes the ground, assigns a cluster to every box, and measures the cluster's oriented extents and which of
