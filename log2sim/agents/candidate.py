@@ -13,7 +13,7 @@ from log2sim.agents.size import TrackGeometry, independent, independent_along
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Doubt, Track, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.fusion import logit
+from log2sim.perception.lidar.measure import logit
 
 
 def spans_of(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
