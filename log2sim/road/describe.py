@@ -16,8 +16,8 @@ from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
 from log2sim.localization.pose_refinement import MAX_KEYFRAMES, place_as_given, refine_poses
-from log2sim.perception.detection_cache import LightBox
 from log2sim.perception.frames import KeepingReader, PictureConsumer, RecordReader, look_again
+from log2sim.perception.traffic_light_boxes import LightBox
 from log2sim.plan import Decision, Outcome, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
