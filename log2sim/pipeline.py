@@ -229,7 +229,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
             **({"faults": faults} if faults else {}),
         },
     )
-    description = describe(scenario, log, config, plan, observations.lights, clock, run.progress)
+    description = describe(scenario, log, config, plan, run.poses, observations.lights, clock, run.progress)
     outcomes = (*stage_outcomes(plan, observations, homographies, agents, clock), *description.outcomes)
     scenario = replace(description.scenario, stages=tuple(outcome.to_dict() for outcome in outcomes))
     cache = run.detectors.cache

@@ -138,9 +138,12 @@ def look_line(log: Path, sequence: str | None, out: Path) -> str:
 
 def pose_notes(poses: dict[str, Any]) -> list[str]:
     """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
-    if poses["source"] == poses["requested"] == "given" or poses["source"] == "none":
+    if poses["source"] == "none":
         return []
-    return [f"poses: {poses['source']} ({poses['reason']})", *(f"note: {note}" for note in poses["notes"])]
+    chosen = (
+        [] if poses["source"] == poses["requested"] == "given" else [f"poses: {poses['source']} ({poses['reason']})"]
+    )
+    return [*chosen, *(f"note: {note}" for note in poses["notes"])]
 
 
 def fault_lines(faults: Sequence[dict[str, Any]]) -> list[str]:
