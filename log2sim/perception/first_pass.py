@@ -442,10 +442,13 @@ class FirstPass:
                     described.append([camera, index, int(self.log.streams[camera].t_ns[index])])
                     value.update(self._picture(camera, index, records))
         for sweep in self.clouds.sweeps_of(ticks, records):
-            for column in [None] if sweep is None else vars(sweep).values():
-                is_array = isinstance(column, np.ndarray)
-                value.update(pack([column.dtype.str, *column.shape] if is_array else column))
-                value.update(np.ascontiguousarray(column) if is_array else b"")
+            columns: dict[str, Any] = {} if sweep is None else vars(sweep)
+            for column in columns.values():
+                if isinstance(column, np.ndarray):
+                    described.append([column.dtype.str, *column.shape])
+                    value.update(np.ascontiguousarray(column).data)
+                else:
+                    described.append(column)
         sweeps = {name: index[:, ticks.start : ticks.stop] for name, index in self.schedule.sweeps.items()}
         before = task.before if self.plan.fusion is FusionLevel.POINTS else []
         states = [sorted(records.watch.known(s).items()) for s in self.log.streams] if task.judged else None
