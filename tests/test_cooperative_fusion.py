@@ -575,7 +575,7 @@ def test_boxes_that_the_road_alone_sees_are_moved_with_the_others() -> None:
 
 def test_the_scale_of_errors_is_found_by_their_likelihood() -> None:
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-    from fit_box_errors import fit_sigma
+    from fits.box_errors import fit_sigma
 
     rng = np.random.default_rng(0)
     terms = np.column_stack([np.ones(4000), rng.uniform(0, 5, 4000)])

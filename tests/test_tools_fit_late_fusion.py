@@ -13,7 +13,7 @@ from worlds import tiny_toml
 from log2sim.perception.fusion import PAIR_WEIGHTS, PairWeights
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import fit_late_fusion
+from fits import late_fusion as fit_late_fusion
 
 pytestmark = pytest.mark.slow
 

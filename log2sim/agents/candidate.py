@@ -71,7 +71,7 @@ class Support:
 
 
 # Limits of `image_confidence`. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes and
-# signs look like: on the logs of `tools/confidence_logs.py --seed 3` those below 0.6 are right at 0.30 of their ticks, above at
+# signs look like: on the logs of `tools/fit.py confidence_logs --seed 3` those below 0.6 are right at 0.30 of their ticks, above at
 # 0.95; vehicles and two-wheelers below at 0.85.
 MIN_TRACK_CONFIDENCE = 0.3
 MIN_SURE_TRACK_CONFIDENCE = 0.6

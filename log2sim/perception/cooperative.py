@@ -32,7 +32,7 @@ from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_
 from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
-# Fitted by `tools/fit_box_errors.py` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
+# Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
 SIDE_WEIGHTS: dict[str, Array] = {
     "vehicle": np.array([-1.9, -0.12, -0.05, -0.33, 1.42, -0.51, 0.47]),
     "two_wheeler": np.array([-1.21, -0.21, -0.13, -0.13, 1.09, -0.1, 0.47]),

@@ -2,7 +2,7 @@
 
 A pair is judged by the score in the image, the score in the sweep, the IoU of the image box with the projected 3D box and
 the distance, as in Pang, Morris & Radha, "CLOCs: Camera-LiDAR Object Candidates Fusion for 3D Object Detection" (IROS 2020);
-in place of their network a logistic function is fitted to these four (`tools/fit_late_fusion.py`).
+in place of their network a logistic function is fitted to these four (`tools/fit.py late_fusion`).
 """
 
 from __future__ import annotations
