@@ -27,11 +27,9 @@ from cooperation_worlds import (
 from cooperation_worlds.draw_blind_area import draw_blind_area
 from cooperation_worlds.draw_overlap import draw_overlap
 from cooperation_worlds.draw_range import draw_range
-from cooperation_worlds.perturb import RoadError, disturb, draw_error
 from cooperation_worlds.plots import plot_world
-from cooperation_worlds.rows import Rows
-from cooperation_worlds.runs import ALONE, WAYS, Found, detect, perceive, prepared
-from cooperation_worlds.world import World, log_of
+from cooperation_worlds.runs import ALONE, WAYS, Found, Rows, detect, perceive, prepared
+from cooperation_worlds.world import RoadError, World, disturb, draw_error, log_of
 
 from log2sim.datatypes import Log
 

@@ -545,7 +545,7 @@ def observe(
     ranges = [range(k, min(k + step, len(schedule))) for k in range(0, len(schedule), step)]
     jobs = 1 if plan.fusion is FusionLevel.POINTS else min(jobs, len(ranges))
     if cache is not None:
-        clouds.most_kept += step
+        clouds.most_kept = step + 1
         # Of the plan what this pass looks at, so that other later stages leave the key as it is.
         looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
         planned = [plan.detector_stride, plan.picture_stride, plan.fusion, [plan.keeps(stage) for stage in looked_at]]
