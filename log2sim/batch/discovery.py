@@ -12,26 +12,16 @@ from log2sim.files import plugins
 from log2sim.files.inputs import follows_links
 from log2sim.logs.opening import Reader, find_reader
 
-MAX_LEVELS = 8
-"""Below the root; data sets have up to four (split, date, drive, sensor)."""
-MAX_FOLDERS = 500_000
-"""That are looked into, so that a wrong root such as "/" ends."""
+MAX_LEVELS = 8  # below the root; data sets have up to four (split, date, drive, sensor)
+MAX_FOLDERS = 500_000  # that are looked into, so that a wrong root such as "/" ends
 
 
 @dataclass(frozen=True)
 class FoundLog:
-    """A log that can be opened.
+    """A log that can be opened."""
 
-    Attributes
-    ----------
-    id : str
-        Path of the log below the root, with the sequence where one folder holds several; unique within a format.
-    path : Path
-        What `open_log` takes.
-    """
-
-    id: str
-    path: Path
+    id: str  # path of the log below the root, with the sequence where one folder holds several; unique within a format
+    path: Path  # what `open_log` takes
     format: str
     sequence: str
 

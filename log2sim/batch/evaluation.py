@@ -41,12 +41,7 @@ DIGITS = 4
 
 @dataclass(frozen=True)
 class Scope:
-    """What is compared, as for one scenario.
-
-    Attributes
-    ----------
-    max_range_m : float, m, optional
-    """
+    """What is compared, as for one scenario."""
 
     max_range_m: float | None = None
     categories: Sequence[str] | None = None

@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
     from log2sim.road.ground_map import GroundMap
 
-CELL_M = 0.06
-"""Edge of a cell, m: pictures on paper and screens show no more of a hundred meters."""
+CELL_M = 0.06  # edge of a cell, m: pictures on paper and screens show no more of a hundred meters
 
 
 def load_background(

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from log2sim.cli.options import (
     Cameras,
     Format,
@@ -19,13 +17,14 @@ from log2sim.cli.options import (
     camera_names,
     counted,
     say,
+    write_to,
 )
 from log2sim.errors import ConfigError
 
 
 def convert(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
+    out: Annotated[Path, write_to("DIR", "Folder to write.")],
     format: Format = "auto",
     sequence: SequenceName = None,
     start: Start = None,

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from log2sim.cli.options import (
     ConfigFile,
     Format,
@@ -20,20 +18,22 @@ from log2sim.cli.options import (
     Stop,
     complete_plugins,
     counted,
+    option,
     say,
+    write_to,
 )
 
 
 def detect(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Boxes file to write.")],
+    out: Annotated[Path, write_to("FILE", "Boxes file to write.")],
     detector: Annotated[
         str,
-        typer.Option(
-            metavar="lidar:NAME|lidar:MODEL.onnx",
-            help="Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
+        option(
+            "Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
             "the log).",
-            autocompletion=complete_plugins("lidar_detector", prefix="lidar:"),
+            "lidar:NAME|lidar:MODEL.onnx",
+            completes=complete_plugins("lidar_detector", prefix="lidar:"),
         ),
     ] = "lidar:vehicle",
     format: Format = "auto",

@@ -7,6 +7,7 @@ from typing import Any
 
 from typer.core import TyperCommand
 
+# Kinds of plug-ins that an option takes, and what stands before their names.
 KINDS = {
     "--format": {"log": ""},
     "--detector": {"detector": "", "lidar_detector": "lidar:"},
@@ -14,13 +15,11 @@ KINDS = {
     "--ego": {"policy": ""},
     "--model": {"vehicle_model": ""},
 }
-"""Kinds of plug-ins that an option takes, and what stands before their names."""
 
+# Commands of which alone an option means that; `export --ego` takes the id of an agent.
 ONLY_OF = {"--ego": "replay", "--model": "replay"}
-"""Commands of which alone an option means that; `export --ego` takes the id of an agent."""
 
-SWEEPS_ALONE = "detect"
-"""Command whose `--detector` takes none in pictures."""
+SWEEPS_ALONE = "detect"  # command whose `--detector` takes none in pictures
 
 
 class CommandWithPlugins(TyperCommand):

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from log2sim.pipeline import Result
 
 
+# Stages without which something is missing in a scenario; the others save time.
 LOOKED_FOR = (
     "image decoding",
     "detection in LiDAR sweeps",
@@ -44,7 +45,6 @@ LOOKED_FOR = (
     "colors of vehicles",
     "traffic lights",
 )
-"""Stages without which something is missing in a scenario; the others save time."""
 
 
 def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:

@@ -21,8 +21,7 @@ from log2sim.cli.plugin_help import CommandWithPlugins
 from log2sim.files.inputs import OPTION
 
 ENDING_SIGNALS = ("SIGTERM", "SIGHUP")
-SIGNAL_CODE = 128
-"""A shell adds the number of the signal to this as the exit code: 143 for SIGTERM."""
+SIGNAL_CODE = 128  # a shell adds the number of the signal to this as the exit code: 143 for SIGTERM
 
 
 class Ended:
@@ -105,19 +104,15 @@ class TolerantStream:
             return
 
 
-def fill_closed_descriptors() -> None:
-    """Let the standard streams that are closed lead nowhere: a file opened next would get the number, and what libraries print."""
+@contextmanager
+def tolerating_lost_output() -> Iterator[None]:
+    """Within the block what cannot be printed changes nothing else."""
+    # Let the standard streams that are closed lead nowhere: a file opened next would get the number, and what libraries print.
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
-
-
-@contextmanager
-def tolerating_lost_output() -> Iterator[None]:
-    """Within the block what cannot be printed changes nothing else."""
-    fill_closed_descriptors()
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = TolerantStream(sys.stdout), TolerantStream(sys.stderr)
     try:
@@ -128,8 +123,7 @@ def tolerating_lost_output() -> Iterator[None]:
         sys.stdout, sys.stderr = before
 
 
-MIN_COLUMNS = 40
-"""Narrower terminals are treated as this wide: a word a line reads no better."""
+MIN_COLUMNS = 40  # narrower terminals are treated as this wide: a word a line reads no better
 
 
 def format_rows(rows: Sequence[Sequence[str]], indent: int = 0) -> list[str]:

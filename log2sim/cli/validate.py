@@ -52,32 +52,28 @@ def validate(
         if problems:
             raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
     else:
-        _validate_file(path)
+        from log2sim.datatypes import Scenario
+        from log2sim.errors import ScenarioError
+        from log2sim.evaluation.detection.boxes import DetectedBoxes, is_boxes_document
+        from log2sim.files.documents import check, read_json
+        from log2sim.simulation.result import Replay
+
+        document = read_json(path, ScenarioError)
+        keys = document if isinstance(document, dict) else {}
+        if "replay_version" in keys:
+            Replay.load(path)
+        elif "metrics_version" in keys:
+            check(document, "metrics-1", ScenarioError)
+        elif "detection_metrics_version" in keys:
+            check(document, "detection-metrics-1", ScenarioError)
+        elif is_boxes_document(document):
+            DetectedBoxes.load(path)
+        elif "report_version" in keys:
+            check(document, "report-1", ScenarioError)
+        elif "prediction_version" in keys:
+            check(document, "prediction-1", ScenarioError)
+        elif "bench_version" in keys:
+            check(document, "bench-1", ScenarioError)
+        else:
+            Scenario.load(path)
     say(f"{path}: valid", quiet=quiet)
-
-
-def _validate_file(path: Path) -> None:
-    from log2sim.datatypes import Scenario
-    from log2sim.errors import ScenarioError
-    from log2sim.evaluation.detection.boxes import DetectedBoxes, is_boxes_document
-    from log2sim.files.documents import check, read_json
-    from log2sim.simulation.result import Replay
-
-    document = read_json(path, ScenarioError)
-    keys = document if isinstance(document, dict) else {}
-    if "replay_version" in keys:
-        Replay.load(path)
-    elif "metrics_version" in keys:
-        check(document, "metrics-1", ScenarioError)
-    elif "detection_metrics_version" in keys:
-        check(document, "detection-metrics-1", ScenarioError)
-    elif is_boxes_document(document):
-        DetectedBoxes.load(path)
-    elif "report_version" in keys:
-        check(document, "report-1", ScenarioError)
-    elif "prediction_version" in keys:
-        check(document, "prediction-1", ScenarioError)
-    elif "bench_version" in keys:
-        check(document, "bench-1", ScenarioError)
-    else:
-        Scenario.load(path)

@@ -5,9 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, SequenceName, camera_names, say, write_to
+from log2sim.cli.options import (
+    Cameras,
+    Overwrite,
+    Quiet,
+    ScenarioPath,
+    SequenceName,
+    camera_names,
+    option,
+    say,
+    write_to,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,36 +28,29 @@ def view(
     scenario: ScenarioPath,
     out: Annotated[Path, write_to("FILE.html", "Page to write.")],
     log: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="LOG", help="Log whose pictures with boxes, LiDAR points and map of the ground the page shows."
-        ),
+        Path | None, option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")
     ] = None,
     max_mb: Annotated[
         float | None,
-        typer.Option(
-            metavar="MB",
-            help="Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
-            show_default="40",
+        option(
+            "Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
+            "MB",
+            default="40",
         ),
     ] = None,
     cameras: Cameras = None,
-    truth: Annotated[
-        Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
-    ] = None,
-    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to show as a layer.")] = None,
+    truth: Annotated[Path | None, option("Ground truth: a scenario file or a log with labels.", "TRUTH")] = None,
+    replay: Annotated[Path | None, option("Replay to show as a layer.", "REPLAY")] = None,
     metrics: Annotated[
-        Path | None, typer.Option(metavar="METRICS", help="Metrics file of log2sim evaluate, to show beside the map.")
+        Path | None, option("Metrics file of log2sim evaluate, to show beside the map.", "METRICS")
     ] = None,
-    predict: Annotated[
-        float | None, typer.Option(metavar="S", help="Show where agents were expected to go for this long, in s.")
-    ] = None,
+    predict: Annotated[float | None, option("Show where agents were expected to go for this long, in s.", "S")] = None,
     background: Annotated[
         Path | None,
-        typer.Option(
-            metavar="LOG|MAP.png",
-            help="Log whose map of the ground is shown below, or a map of log2sim map.",
-            show_default="that of --log",
+        option(
+            "Log whose map of the ground is shown below, or a map of log2sim map.",
+            "LOG|MAP.png",
+            default="that of --log",
         ),
     ] = None,
     sequence: SequenceName = None,

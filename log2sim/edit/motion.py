@@ -13,8 +13,8 @@ from log2sim.datatypes import Agent, Doubt, Waypoints
 from log2sim.geometry import Array, wrap_angle
 
 MIN_PATH_MPS = 0.5  # slower waypoints do not define the curvature of a path
+# Waypoints of a maneuver are so far apart: a lane change of 2 s is then right to a millimeter between them.
 STEP_S = 0.1
-"""Waypoints of a maneuver are so far apart: a lane change of 2 s is then right to a millimeter between them."""
 OLD_TIME = "before it was moved in time"
 _NAMES_A_TIME = re.compile(r"\d s\b")
 

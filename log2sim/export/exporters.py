@@ -21,8 +21,7 @@ from log2sim.geometry import Array, whole_kilometers, wrap_angle
 
 __all__ = ["EXTERNAL", "Exporter", "Options", "export", "formats"]
 
-EXTERNAL = "external"
-"""As the ego of an export: another program drives it, from its place and speed in the scenario."""
+EXTERNAL = "external"  # as the ego of an export: another program drives it, from its place and speed in the scenario
 
 
 @dataclass(frozen=True)
@@ -31,16 +30,12 @@ class ExportPlacement:
 
     Positions of the scenario plus `offset_m` are coordinates of `projection`. With a `target` they are projected into
     it, else they stay on their axes; then `origin_m` is subtracted.
-
-    Attributes
-    ----------
-    origin_m, offset_m : (3,) tuple of float, m
-    projection, target : str or None
-        PROJ strings.
     """
 
+    # origin_m, offset_m: (3,), m.
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # projection, target: pROJ strings.
     projection: str | None = None
     target: str | None = None
 
@@ -153,21 +148,12 @@ BYTES_PER_STATE = 96
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """States of one agent at requested times (T,), zero where `valid` is False.
+    """States of one agent at requested times (T,), zero where `valid` is False."""
 
-    Attributes
-    ----------
-    valid : (T,) bool
-    position_m : (T, 3) float64
-        Box center.
-    yaw_rad : (T,) float64, in [-pi, pi)
-    velocity_mps, acceleration_mps2 : (T, 2) float64
-        Of the box center, on the axes of the positions.
-    """
-
-    valid: NDArray[np.bool_]
-    position_m: Array
-    yaw_rad: Array
+    valid: NDArray[np.bool_]  # (T,)
+    position_m: Array  # (T, 3) box center
+    yaw_rad: Array  # (T,), in [-pi, pi)
+    # velocity_mps, acceleration_mps2: (T, 2) of the box center, on the axes of the positions.
     velocity_mps: Array
     acceleration_mps2: Array
 
@@ -262,27 +248,13 @@ def file_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of an export; None leaves the choice to the format, which lists the options that it takes.
+    """Options of an export; None leaves the choice to the format, which lists the options that it takes."""
 
-    Attributes
-    ----------
-    revision : str or None
-        Of the format's standard.
-    map : Path or None
-        A road network to use in place of an inferred one.
-    mode : str or None
-        "exact" or "pid", for scripts that move agents.
-    log : Log or None
-        The opened log, for formats that also hold its images and points.
-    ego : str or None
-        `EXTERNAL`, for an ego without a trajectory.
-    """
-
-    revision: str | None = None
-    map: Path | None = None
-    mode: str | None = None
-    log: Log | None = None
-    ego: str | None = None
+    revision: str | None = None  # of the format's standard
+    map: Path | None = None  # A road network to use in place of an inferred one
+    mode: str | None = None  # "exact" or "pid", for scripts that move agents
+    log: Log | None = None  # the opened log, for formats that also hold its images and points
+    ego: str | None = None  # `EXTERNAL`, for an ego without a trajectory
 
 
 class Exporter(Protocol):

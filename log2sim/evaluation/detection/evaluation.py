@@ -33,29 +33,19 @@ from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, wrap_angle
 
 ROUNDING = 1e-9
-SAMPLES = 40
-"""Steps of recall of KITTI's published program."""
-NUSCENES_FLOOR = 0.1
-"""nuScenes leaves out what lies below this precision and this recall."""
+SAMPLES = 40  # steps of recall of KITTI's published program
+NUSCENES_FLOOR = 0.1  # nuScenes leaves out what lies below this precision and this recall
 
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecall:
-    """Precision and recall at each distinct score, greatest first.
+    """Precision and recall at each distinct score, greatest first."""
 
-    Attributes
-    ----------
-    score : (K,) float64
-        Boxes of this score and above are reported.
-    precision, recall : (K,) float64
-    truths : int
-        Number of counted true boxes.
-    """
-
-    score: Array
+    score: Array  # (K,) boxes of this score and above are reported
+    # precision, recall: (K,)
     precision: Array
     recall: Array
-    truths: int
+    truths: int  # number of counted true boxes
 
     def best_precision(self, recall: Array) -> Array:
         """Return the greatest precision at or beyond recalls (R,), 0 where none is reached."""
@@ -205,51 +195,33 @@ def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
 
 Mask = NDArray[np.bool_]
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
-POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))
-"""The last one joins the two before."""
+POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))  # the last one joins the two before
 
 
 @dataclass(frozen=True, eq=False)
 class ClassBoxes:
-    """Found and true boxes of one class.
+    """Found and true boxes of one class."""
 
-    Attributes
-    ----------
-    found, truth : SceneBoxes
-        M found and L true boxes; true ones are ignored where they never count.
-    far : (M,) bool
-        Found boxes out of range, which are not false where they match nothing.
-    unlabeled : (M,) bool
-        Those where nothing was labeled, likewise.
-    found_views, truth_views : ImageViews or None
-        In the reference camera, for KITTI's difficulties.
-    occlusion : (L,) int64 or None
-        As the log states it.
-    """
-
+    # found, truth: m found and L true boxes; true ones are ignored where they never count.
     found: SceneBoxes
     truth: SceneBoxes
-    far: Mask
-    unlabeled: Mask
+    far: Mask  # (M,) found boxes out of range, which are not false where they match nothing
+    unlabeled: Mask  # (M,) those where nothing was labeled, likewise
+    # found_views, truth_views: in the reference camera, for KITTI's difficulties.
     found_views: ImageViews | None = None
     truth_views: ImageViews | None = None
-    occlusion: NDArray[np.int64] | None = None
+    occlusion: NDArray[np.int64] | None = None  # (L,) as the log states it
 
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored.
-
-    Attributes
-    ----------
-    elsewhere : (M,) bool
-        Found boxes that are not false where they match nothing, since they are out of range or of other objects.
-    """
+    """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored."""
 
     name: str
     boxes: ClassBoxes
     found: SceneBoxes
     truth: SceneBoxes
+    # (M,) found boxes that are not false where they match nothing, since they are out of range or of other objects.
     elsewhere: Mask
 
     def matches(self, pairs: Pairs, criterion: Criterion) -> Matches:
@@ -501,24 +473,12 @@ DEFAULT_SCORE = 0.5
 
 @dataclass(frozen=True)
 class Options:
-    """What to evaluate.
+    """What to evaluate."""
 
-    Attributes
-    ----------
-    protocol : str
-        "kitti", "dair" or "center".
-    min_score : float
-        Score in [0, 1] from which boxes are reported, for precision and recall.
-    max_range_m : float or None
-        Objects farther away count for nothing.
-    classes : sequence of str or None
-        Names of classes or categories; None for all.
-    """
-
-    protocol: str
-    min_score: float = DEFAULT_SCORE
-    max_range_m: float | None = None
-    classes: Sequence[str] | None = None
+    protocol: str  # "kitti", "dair" or "center"
+    min_score: float = DEFAULT_SCORE  # score in [0, 1] from which boxes are reported, for precision and recall
+    max_range_m: float | None = None  # objects farther away count for nothing
+    classes: Sequence[str] | None = None  # names of classes or categories; None for all
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -582,7 +542,15 @@ def evaluate_boxes(
         raise LogError(f"the boxes of '{detected.log}' are of no sweep at all; detect them in a log with LiDAR sweeps")
     camera = _reference_camera(log, protocol)
     truth = truth_of_sweeps(log, detected.t_ns, progress=progress)
-    found = found_in_sweeps(detected, truth)
+    # Collect the found boxes of the labeled sweeps; their scenes are indices of sweeps.
+    tables = []
+    for k in np.flatnonzero(truth.labeled).tolist():
+        b = detected.boxes[k]
+        box = np.column_stack([b.center_m, b.size_m, b.yaw_rad])
+        away = np.hypot(*(b.center_m[:, :2] - truth.origin_m[k, :2]).T)
+        tables.append(SceneBoxes.of(box, b.category, b.score, points=b.points, range_m=away))
+    joined = SceneBoxes.join(tables)
+    found = replace(joined, scene=np.flatnonzero(truth.labeled)[joined.scene])
     sides = _sides(log, detected.t_ns, found, truth, camera)
     figures = {c.name: class_figures(_class_boxes(sides, c, options, protocol), c, options.min_score) for c in classes}
     return {
@@ -601,18 +569,6 @@ def evaluate_boxes(
         "overall": overall(figures),
         "classes": figures,
     }
-
-
-def found_in_sweeps(detected: DetectedBoxes, truth: SweepTruth) -> SceneBoxes:
-    """Collect the found boxes of the labeled sweeps; their scenes are indices of sweeps."""
-    tables = []
-    for k in np.flatnonzero(truth.labeled).tolist():
-        b = detected.boxes[k]
-        box = np.column_stack([b.center_m, b.size_m, b.yaw_rad])
-        away = np.hypot(*(b.center_m[:, :2] - truth.origin_m[k, :2]).T)
-        tables.append(SceneBoxes.of(box, b.category, b.score, points=b.points, range_m=away))
-    joined = SceneBoxes.join(tables)
-    return replace(joined, scene=np.flatnonzero(truth.labeled)[joined.scene])
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,25 +32,15 @@ def gate_m(length_m: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs within the gate, sorted by tick.
+    """Pairs within the gate, sorted by tick."""
 
-    Attributes
-    ----------
-    tick : (P,) int64
-    truth, other : (P,) int64
-        Indices of the truth agent and of the reconstructed agent.
-    distance_m : (P,) float64
-    similarity : (P,) float64
-        1 - distance / gate; 0 across groups of categories.
-    same_group : (P,) bool
-    """
-
-    tick: Index
+    tick: Index  # (P,)
+    # truth, other: (P,) indices of the truth agent and of the reconstructed agent.
     truth: Index
     other: Index
-    distance_m: Array
-    similarity: Array
-    same_group: Mask
+    distance_m: Array  # (P,)
+    similarity: Array  # (P,) 1 - distance / gate; 0 across groups of categories
+    same_group: Mask  # (P,)
 
     def take(self, index: Mask | Index) -> Pairs:
         """Return the rows at `index`."""
@@ -139,21 +129,11 @@ def assign(rows: Index, cols: Index, score: Array) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Matches of A truth agents and B reconstructed agents at T ticks.
+    """Matches of A truth agents and B reconstructed agents at T ticks."""
 
-    Attributes
-    ----------
-    match : (A, T) int64
-        Index of the reconstructed agent, -1 for none.
-    used : (B, T) bool
-        Reconstructed agents matched within their group of categories.
-    absorbed : (B, T) bool
-        Reconstructed agents without such a match that are at a labeled object of another group.
-    """
-
-    match: NDArray[np.int64]
-    used: Mask
-    absorbed: Mask
+    match: NDArray[np.int64]  # (A, T) index of the reconstructed agent, -1 for none
+    used: Mask  # (B, T) reconstructed agents matched within their group of categories
+    absorbed: Mask  # (B, T) reconstructed agents without such a match that are at a labeled object of another group
 
 
 def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association:
@@ -217,14 +197,12 @@ def mota(truth_ticks: int, missed: int, false: int, id_switches: int) -> float |
 
 
 MAX_TRUTH_GAP_S = 0.25
-MAX_SIMPLIFIED_GAP_S = 1.05
-"""Simplified trajectories omit waypoints of straight uniform motion for up to a second."""
-
+MAX_SIMPLIFIED_GAP_S = 1.05  # simplified trajectories omit waypoints of straight uniform motion for up to a second
+# Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself.
 MIN_TICK_S = 0.02
-"""Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself."""
 
+# A truth agent is extrapolated this far beyond its first and last label, without being counted there.
 TRUTH_MARGIN_S = 0.15
-"""A truth agent is extrapolated this far beyond its first and last label, without being counted there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,8 +379,7 @@ def _stack(rows: list[Array], shape: tuple[int, ...]) -> Array:
 
 
 MIN_REGION_SHARE = 0.5
-MAX_FRAME_LAG_S = 0.15
-"""A tick is compared with the nearest labeled frame of a camera within this time."""
+MAX_FRAME_LAG_S = 0.15  # a tick is compared with the nearest labeled frame of a camera within this time
 
 
 def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, candidates: Mask) -> Mask:
@@ -466,12 +443,11 @@ def _inside_any(uv: Array, regions: Array) -> Mask:
     return np.asarray(within.any(axis=1))
 
 
-MIN_COUNTED_S = 1.0
-"""A truth agent counts when its counted ticks make up at least this time."""
-
+MIN_COUNTED_S = 1.0  # a truth agent counts when its counted ticks make up at least this time
+# Of LiDARs on an object that some sensor hit. Waymo's first level of difficulty is drawn at as many.
 MIN_HIT_POINTS = 5
-"""Of LiDARs on an object that some sensor hit. Waymo's first level of difficulty is drawn at as many."""
 
+# Why a labeled object does not count at a tick; the first that applies.
 REASONS = {
     "other_category": "of a category that was not asked for",
     "out_of_range": "out of range",
@@ -480,7 +456,6 @@ REASONS = {
     "hidden": "hidden according to the truth",
     "short": f"in sight for less than {MIN_COUNTED_S:g} s",
 }
-"""Why a labeled object does not count at a tick; the first that applies."""
 
 COUNTED, NOT_LABELED = 0, -1
 
@@ -507,38 +482,21 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A truth agents and B reconstructed agents at T ticks, matched.
+    """A truth agents and B reconstructed agents at T ticks, matched."""
 
-    Attributes
-    ----------
-    truth, other : StateTable
-        Truth and reconstruction.
-    match : (A, T) int64
-        Index of the reconstructed agent, -1 for none.
-    counted : (A, T) bool
-        Ticks at which a truth agent counts.
-    why_not : (A, T) int64
-        Where it is labeled: 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not labeled.
-    switched : (A, T) bool
-        Identity switches.
-    selected : (B, T) bool
-        Ticks at which a reconstructed agent is present, within range and of a selected category.
-    false : (B, T) bool
-        Ticks at which a reconstructed agent is false.
-    ignored : (B, T) bool
-        Unmatched ticks in ignore regions.
-    """
-
+    # truth, other: truth and reconstruction.
     truth: StateTable
     other: StateTable
     pairs: Pairs
-    match: Index
-    counted: Mask
+    match: Index  # (A, T) index of the reconstructed agent, -1 for none
+    counted: Mask  # (A, T) ticks at which a truth agent counts
+    # (A, T) where it is labeled: 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not
+    # labeled.
     why_not: Index
-    switched: Mask
-    selected: Mask
-    false: Mask
-    ignored: Mask
+    switched: Mask  # (A, T) identity switches
+    selected: Mask  # (B, T) ticks at which a reconstructed agent is present, within range and of a selected category
+    false: Mask  # (B, T) ticks at which a reconstructed agent is false
+    ignored: Mask  # (B, T) unmatched ticks in ignore regions
 
     @property
     def asked_for(self) -> Mask:

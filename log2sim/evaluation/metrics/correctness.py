@@ -15,8 +15,8 @@ from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_
 from log2sim.geometry import Array
 
 BINS = 10
+# 95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05.
 CHI2_95 = {1: 3.841, 2: 5.991}
-"""95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05."""
 
 
 def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
@@ -82,40 +82,24 @@ def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
 
 
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
+# An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
+# Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009).
 MAX_WRONG_SHARE = 0.2
-"""An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
-Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009)."""
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedAgents:
-    """B reconstructed agents with verdicts at T ticks, with their confidence, doubts and sigma from the scenario.
-
-    Attributes
-    ----------
-    wrong : (B, T) bool
-    confidence : (B,) float64
-    reasons : tuple of tuple of str
-        Why the scenario doubts each agent; empty where it does not.
-    doubted : (B, T) bool
-        When it does.
-    sigma_m : (B, T) float64, m
-        Standard deviation of the position for each axis.
-    sigma_rad : (B, T) float64
-        Of the heading; NaN where the scenario states none, as in the next one.
-    sigma_mps : (B, T) float64, m/s
-        Of the speed.
-    """
+    """B reconstructed agents with verdicts at T ticks, with their confidence, doubts and sigma from the scenario."""
 
     states: StateTable
     verdicts: Verdicts
-    wrong: Mask
-    confidence: Array
-    reasons: tuple[tuple[str, ...], ...]
-    doubted: Mask
-    sigma_m: Array
-    sigma_rad: Array
-    sigma_mps: Array
+    wrong: Mask  # (B, T)
+    confidence: Array  # (B,)
+    reasons: tuple[tuple[str, ...], ...]  # why the scenario doubts each agent; empty where it does not
+    doubted: Mask  # (B, T) when it does
+    sigma_m: Array  # (B, T) standard deviation of the position for each axis
+    sigma_rad: Array  # (B, T) of the heading; NaN where the scenario states none, as in the next one
+    sigma_mps: Array  # (B, T) of the speed
 
 
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:

@@ -58,8 +58,8 @@ if TYPE_CHECKING:
     from log2sim.pipeline import Result
 
 
+# Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged.
 ALPHAS: Array = np.arange(1, 20) / 20
-"""Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,16 @@ def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
     pairs = pairs.take(present)
     truth_count, other_count = truth_present.sum(1), other_present.sum(1)
-    alignment = _alignment(pairs, truth_count, other_count, truth_present.shape[1])
+    # Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment.
+    ticks = truth_present.shape[1]
+    row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
+    np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
+    np.add.at(col_sum, (pairs.other, pairs.tick), pairs.similarity)
+    share = row_sum[pairs.truth, pairs.tick] + col_sum[pairs.other, pairs.tick] - pairs.similarity
+    potential = np.zeros((len(truth_count), len(other_count)))
+    np.add.at(potential, (pairs.truth, pairs.other), pairs.similarity / share)
+    union = truth_count[:, None] + other_count[None] - potential
+    alignment = np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
     matched = _matched_pairs(pairs, alignment[pairs.truth, pairs.other] * pairs.similarity, truth_present.shape[1])
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
@@ -114,18 +123,6 @@ def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
         ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
         det_a[k] = tpa.sum() / (total - tpa.sum())
     return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
-
-
-def _alignment(pairs: Pairs, truth_count: Array, other_count: Array, ticks: int) -> Array:
-    """Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment."""
-    row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
-    np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
-    np.add.at(col_sum, (pairs.other, pairs.tick), pairs.similarity)
-    share = row_sum[pairs.truth, pairs.tick] + col_sum[pairs.other, pairs.tick] - pairs.similarity
-    potential = np.zeros((len(truth_count), len(other_count)))
-    np.add.at(potential, (pairs.truth, pairs.other), pairs.similarity / share)
-    union = truth_count[:, None] + other_count[None] - potential
-    return np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
 
 
 def _matched_pairs(pairs: Pairs, score: Array, ticks: int) -> Pairs:
@@ -211,8 +208,8 @@ def rounded_tree(value: Any) -> Any:
     return value
 
 
+# Takes states (N, 4), x, y, z in m and heading in rad, at times (N,), s of the truth, to those in the other map.
 Move = Callable[[Array, Array], Array]
-"""Takes states (N, 4), x, y, z in m and heading in rad, at times (N,), s of the truth, to those in the other map."""
 
 
 def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str, Any]]:
@@ -423,6 +420,13 @@ def evaluate(
     ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
+    # The agent that each truth agent is matched with most often, by its id.
+    agents = {agent.id: agent for agent in scenario.others}
+    out = {}
+    for row, name in enumerate(compared.truth.ids):
+        hits = compared.match[row][compared.counted[row] & (compared.match[row] >= 0)]
+        if len(hits):
+            out[name] = agents[compared.other.ids[int(np.bincount(hits).argmax())]]
     result = {
         "metrics_version": VERSION,
         "scenario": scenario.name,
@@ -439,7 +443,7 @@ def evaluate(
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
         "map_features": map_figures(scenario, truth),
-        "colors": color_figures(truth.others, _matched(compared, scenario)),
+        "colors": color_figures(truth.others, out),
         "signals": signal_figures(scenario, truth),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
@@ -481,17 +485,6 @@ def compare_scenarios(
     stated = truth.provenance.get("visibility") != "computed"
     compared = compare(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
     return without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
-
-
-def _matched(c: Comparison, scenario: Scenario) -> dict[str, Agent]:
-    """Return the agent that each truth agent is matched with most often, by its id."""
-    agents = {agent.id: agent for agent in scenario.others}
-    out = {}
-    for row, name in enumerate(c.truth.ids):
-        hits = c.match[row][c.counted[row] & (c.match[row] >= 0)]
-        if len(hits):
-            out[name] = agents[c.other.ids[int(np.bincount(hits).argmax())]]
-    return out
 
 
 def _tick_s(ticks_s: Array) -> float:

@@ -26,8 +26,7 @@ _FAULTS = dict(CORRECTNESS_COLUMNS) | {
     k: f"wrong {n}" for k, n in CORRECTNESS_COLUMNS if k in ("wrong_speed", "wrong_motion", "wrong_size")
 }
 NEES = {"sigma": "NEES", "sigma_yaw": "yaw", "sigma_speed": "speed"}
-MAX_WORST = 6
-"""Agents that are named; the document has all."""
+MAX_WORST = 6  # agents that are named; the document has all
 
 
 def wrong_parts(found: Mapping[str, Any]) -> list[str]:
@@ -151,12 +150,8 @@ def _number(value: float | None, digits: int) -> str:
 
 
 MAX_COLUMNS = 100
-MAX_NAMED = 3
-"""Agents that a line of the verdict names; the tables have more, the document all."""
-
-MAX_NAME = 16
-"""Characters of the id of a labeled object; some logs use 36."""
-
+MAX_NAMED = 3  # agents that a line of the verdict names; the tables have more, the document all
+MAX_NAME = 16  # characters of the id of a labeled object; some logs use 36
 _COLUMNS = (
     ("recall", "recall %", 1), ("precision", "precis. %", 1), ("position_rmse_m", "rms m", 2), ("position_median_m", "med m", 2),
     ("yaw_median_deg", "yaw deg", 1), ("speed_rmse_mps", "m/s", 2), ("size_median_m", "size m", 2), ("id_switches", "id sw", 0),

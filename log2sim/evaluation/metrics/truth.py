@@ -96,21 +96,16 @@ def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arr
     so wide that a grid over all of it has no sample inside the image.
     """
     corners = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3)).reshape(-1, 8, 3)
-    low, high = _view(camera)
+    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
+    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
+    # Distortion widens a view on this plane to at most three times that of a pinhole.
+    low, high = (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
     found = []
     for box in corners:
         rays = _samples(convex_hull(outline(box)), low, high)
         uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
         found.append(uv[inside])
     return found
-
-
-def _view(camera: Camera) -> tuple[Array, Array]:
-    """Bound the view on the plane at depth 1 by corners (2,), (2,); exact without distortion."""
-    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
-    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
-    # Distortion widens a view on this plane to at most three times that of a pinhole.
-    return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
 
 
 def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
@@ -153,8 +148,7 @@ def _turn(a: list[float], b: list[float], c: list[float]) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-MAX_STAMP_LAG_NS = 50_000_000
-"""A region belongs to the frame nearest to its stamp within this time."""
+MAX_STAMP_LAG_NS = 50_000_000  # a region belongs to the frame nearest to its stamp within this time
 
 
 def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
@@ -203,8 +197,7 @@ def _label_view(log: Log, name: str, t0_ns: int) -> LabelView:
 
 MIN_POINTS = 20
 MIN_IMAGE_SHARE = 0.5
-MAX_LAG_S = 0.1
-"""A label is compared with the nearest sweep and frames within this time."""
+MAX_LAG_S = 0.1  # a label is compared with the nearest sweep and frames within this time
 SPEED_WINDOW_S = 0.25
 MAX_STATIC_REACH_M = 0.5
 MAX_STATIC_DRIFT_MPS = 0.2

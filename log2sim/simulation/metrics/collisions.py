@@ -15,8 +15,8 @@ from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, rectangles_overlap, separating_axes, wrap_angle
 from log2sim.simulation.vehicles.vehicle import Columns
 
+# A step that differs from both neighboring steps by more is a discontinuity: at 20 Hz it would take 400 m/s2.
 DISCONTINUITY_M = 1.0
-"""A step that differs from both neighboring steps by more is a discontinuity: at 20 Hz it would take 400 m/s2."""
 
 RowIndex = NDArray[np.intp]
 
@@ -123,39 +123,29 @@ def spacing_s(t_s: Array) -> float:
     return float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0
 
 
-MAX_STEPS = 64
-"""Most steps in an interval; a contact shorter than one step, 0.8 ms of 50 ms, may be missed."""
-
+MAX_STEPS = 64  # most steps in an interval; a contact shorter than one step, 0.8 ms of 50 ms, may be missed
 BISECTIONS = 8  # of the last step: 3 us of 50 ms
 
 
 @dataclass(frozen=True, eq=False)
 class RelativeMotion(Columns):
-    """Relative motion of N pairs of boxes over an interval.
+    """Relative motion of N pairs of boxes over an interval."""
 
-    Attributes
-    ----------
-    dx_m, dy_m, dz_m : (N,) float64
-        From box a to box b at the begin.
-    vx_m, vy_m, vz_m : (N,) float64
-        Change of these over the interval.
-    yaw_a_rad, yaw_b_rad : (N,) float64
-        At the begin.
-    turn_a_rad, turn_b_rad : (N,) float64
-        Change of these over the interval.
-    size_a_m, size_b_m : (3, N) float64
-    """
-
+    # dx_m, dy_m, dz_m: (N,) from box a to box b at the begin.
     dx_m: Array
     dy_m: Array
     dz_m: Array
+    # vx_m, vy_m, vz_m: (N,) change of these over the interval.
     vx_m: Array
     vy_m: Array
     vz_m: Array
+    # yaw_a_rad, yaw_b_rad: (N,) at the begin.
     yaw_a_rad: Array
     yaw_b_rad: Array
+    # turn_a_rad, turn_b_rad: (N,) change of these over the interval.
     turn_a_rad: Array
     turn_b_rad: Array
+    # size_a_m, size_b_m: (3, N)
     size_a_m: Array
     size_b_m: Array
 
@@ -239,39 +229,28 @@ def _gap_duration(gap: Array, rate: Array) -> Array:
     return np.where(gap < 0, 0.0, np.maximum(lasts, np.finfo(float).tiny))
 
 
-CHUNK = 20
-"""Rows in one broad phase."""
-
-BATCH = 100_000
-"""Pairs evaluated together, which bounds memory."""
-
-MAX_PAIRS = 50_000
-"""Pairs of agents whose motion over `CHUNK` rows is compared at once: a million rows."""
-
+CHUNK = 20  # rows in one broad phase
+BATCH = 100_000  # pairs evaluated together, which bounds memory
+MAX_PAIRS = 50_000  # pairs of agents whose motion over `CHUNK` rows is compared at once: a million rows
+# Contacts that are kept, some 80 MB: a thousand pairs that overlap for 100 s. More are no traffic.
 MAX_CONTACTS = 2_000_000
-"""Contacts that are kept, some 80 MB: a thousand pairs that overlap for 100 s. More are no traffic."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are closer in time form one collision
 SCENARIO_WINDOW_S = 0.5  # the scenario has a collision itself when its boxes overlap within this time of it,
 SCENARIO_MARGIN_M = 0.1  # or pass with a smaller gap than this, which is below the errors of boxes
 
+# Whose a collision is: new in the replay; or of the scenario, whose own boxes overlap, by its kind.
 REPLAY, RECONSTRUCTION, SCENARIO = "replay", "reconstruction", "scenario"
-"""Whose a collision is: new in the replay; or of the scenario, whose own boxes overlap, by its kind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts(Columns):
-    """Contacts (N,) of boxes a < b.
+    """Contacts (N,) of boxes a < b."""
 
-    Attributes
-    ----------
-    a, b : (N,) int
-    first_row, last_row : (N,) float64
-        Fractional rows of the first and last overlap within one step.
-    """
-
+    # a, b: (N,)
     a: RowIndex
     b: RowIndex
+    # first_row, last_row: (N,) fractional rows of the first and last overlap within one step.
     first_row: Array
     last_row: Array
 

@@ -26,14 +26,11 @@ A car reaches it at 3.3 m/s2 of lateral acceleration, a third of its tires' limi
 model: a consistent model for planning feasible trajectories for autonomous vehicles?", 2017) use it up to half the limit.
 """
 
+# Beyond this speed in reverse the models with slip follow worse than the kinematic one: the steered axle trails.
 FAST_REVERSE_MPS = 3.0
-"""Beyond this speed in reverse the models with slip follow worse than the kinematic one: the steered axle trails."""
 
-LOAD_ITERATIONS = 4
-"""Passes until slips, the drag of slips and the load transfer agree."""
-
-MAX_FRICTION_USE = 0.95
-"""Share of the friction limit beyond which slips are not predicted: they grow without bound."""
+LOAD_ITERATIONS = 4  # passes until slips, the drag of slips and the load transfer agree
+MAX_FRICTION_USE = 0.95  # share of the friction limit beyond which slips are not predicted: they grow without bound
 
 
 class ModelChoice(NamedTuple):

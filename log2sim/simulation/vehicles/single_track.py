@@ -30,16 +30,14 @@ from log2sim.simulation.vehicles.vehicle import (
     sinc,
 )
 
-MAX_INNER_STEP_S = 0.01
-"""Longest step of the integrator; the error is of second order."""
-
+MAX_INNER_STEP_S = 0.01  # longest step of the integrator; the error is of second order
+# Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander,
+# 1977).
 GAMMA = 1 - math.sqrt(0.5)
-"""Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander, 1977)."""
 
 STAGE_WEIGHT = (1 - GAMMA) / GAMMA
 
-MAX_LOAD_TRANSFER_SHARE = 0.9
-"""Largest share of an axle's load that acceleration and braking may transfer."""
+MAX_LOAD_TRANSFER_SHARE = 0.9  # largest share of an axle's load that acceleration and braking may transfer
 
 
 def step_single_track(
@@ -84,18 +82,13 @@ def step_single_track(
 
 @dataclass(frozen=True, eq=False)
 class Chassis:
-    """Lateral acceleration of the axles per lateral force and mass: of the rear by the rear, of either by the other, of the front.
+    """Lateral acceleration of the axles per lateral force and mass: of the rear by the rear, of either by the other, of the front."""
 
-    Attributes
-    ----------
-    rear, cross, front : (A,) float64
-    cg_to_front_m : (A,) float64
-    """
-
+    # rear, cross, front: (A,)
     rear: Array
     cross: Array
     front: Array
-    cg_to_front_m: Array
+    cg_to_front_m: Array  # (A,)
 
     @classmethod
     def of(cls, p: VehicleParameters) -> Chassis:
@@ -107,19 +100,13 @@ class Chassis:
 
 @dataclass(frozen=True, eq=False)
 class StepInput:
-    """Inputs of one step of the linear model.
+    """Inputs of one step of the linear model."""
 
-    Attributes
-    ----------
-    speed0_mps, speed1_mps : (A,) float64
-        At the begin and the end.
-    distance_m : (A,) float64
-    steer0_rad, mean_steer_rad, steer1_rad : (A,) float64
-    """
-
+    # speed0_mps, speed1_mps: (A,) at the begin and the end.
     speed0_mps: Array
     speed1_mps: Array
-    distance_m: Array
+    distance_m: Array  # (A,)
+    # steer0_rad, mean_steer_rad, steer1_rad: (A,)
     steer0_rad: Array
     mean_steer_rad: Array
     steer1_rad: Array
@@ -137,18 +124,14 @@ class LinearPair:
     """Two linear equations for the slips of an agent, a and b above c and d, solved by Cramer's rule.
 
     The unknowns are the slips in units of their own, which may be zero.
-
-    Attributes
-    ----------
-    a, b, c, d : (A,) float64
-    rear_factor, front_factor : (A,) float64
-        Unit over determinant.
     """
 
+    # a, b, c, d: (A,)
     a: Array
     b: Array
     c: Array
     d: Array
+    # rear_factor, front_factor: (A,) unit over determinant.
     rear_factor: Array
     front_factor: Array
 
@@ -225,8 +208,8 @@ def inner_steps(dt_s: float) -> tuple[int, float]:
     return count, dt_s / count
 
 
+# Share of the friction limit that drive and brakes may use: wheels that do not lock keep a third of it for steering.
 ANTILOCK_SHARE = 0.95
-"""Share of the friction limit that drive and brakes may use: wheels that do not lock keep a third of it for steering."""
 
 
 def step_dynamic(
@@ -262,17 +245,12 @@ def step_dynamic(
 
 @dataclass(frozen=True, eq=False)
 class DriveInput:
-    """Inputs of one step of the saturating model.
+    """Inputs of one step of the saturating model."""
 
-    Attributes
-    ----------
-    pedal_mps2, gear : (A,) float64
-    bend0, mean_bend, bend1 : (A,) float64
-        Tangent of the steering angle at the begin, on average and at the end.
-    """
-
+    # pedal_mps2, gear: (A,)
     pedal_mps2: Array
     gear: Array
+    # bend0, mean_bend, bend1: (A,) tangent of the steering angle at the begin, on average and at the end.
     bend0: Array
     mean_bend: Array
     bend1: Array
@@ -280,24 +258,15 @@ class DriveInput:
 
 @dataclass(frozen=True, eq=False)
 class BodyState:
-    """State of the rear axle.
+    """State of the rear axle."""
 
-    Attributes
-    ----------
-    x_m, y_m, yaw_rad : (A,) float64
-    speed_mps : (A,) float64
-        Along the heading.
-    lateral_mps : (A,) float64
-        To the left of the heading.
-    yaw_rate_radps : (A,) float64
-    """
-
+    # x_m, y_m, yaw_rad: (A,)
     x_m: Array
     y_m: Array
     yaw_rad: Array
-    speed_mps: Array
-    lateral_mps: Array
-    yaw_rate_radps: Array
+    speed_mps: Array  # (A,) along the heading
+    lateral_mps: Array  # (A,) to the left of the heading
+    yaw_rate_radps: Array  # (A,)
 
 
 def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> BodyState:

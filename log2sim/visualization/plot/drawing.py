@@ -26,8 +26,7 @@ from log2sim.visualization.plot.viewport import (
     paint_of,
 )
 
-BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
-"""z-order, from the bottom up."""
+BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)  # z-order, from the bottom up
 
 
 class Background(Protocol):

@@ -48,28 +48,17 @@ from log2sim.visualization.plot.viewport import (
     time_step_s,
 )
 
-Rows = list[tuple[Any, str]]
-"""Handles and texts of a legend."""
+Rows = list[tuple[Any, str]]  # handles and texts of a legend
 
 
 @dataclass(frozen=True, eq=False)
 class PictureBase:
-    """What stills and animations share.
-
-    Attributes
-    ----------
-    step_s : float, s
-        Between time marks.
-    charts : TimelineCharts or None
-        Of the replay; None without a driven agent.
-    labels : tuple of MapLabel
-        Of a still picture, not drawn yet.
-    """
+    """What stills and animations share."""
 
     layout: FigureLayout
-    step_s: float
-    charts: TimelineCharts | None
-    labels: tuple[MapLabel, ...] = ()
+    step_s: float  # between time marks
+    charts: TimelineCharts | None  # of the replay; None without a driven agent
+    labels: tuple[MapLabel, ...] = ()  # of a still picture, not drawn yet
 
 
 def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, moving: bool = False) -> PictureBase:
@@ -141,7 +130,9 @@ def _legend(
     scenario: Scenario, roles: AgentRoles, overlays: Overlays, mark_step_s: float | None, told: set[str]
 ) -> Rows:
     """List the rows of the legend; `told` agents are labeled on the map, and `mark_step_s` is None in animations."""
-    outside = _outside(roles, _view_of(roles, overlays.options))
+    view = _view_of(roles, overlays.options)
+    agents = [r.agent for r in roles.movers] + list(roles.stationary)
+    outside = sum(not view.contains(centers_xy(a)).any() for a in agents)
     shown = {"truth": overlays.truth is not None, "replay": overlays.replay is not None}
     collisions = len(new_collisions(overlays.replay)[0])
     rows = legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
@@ -167,12 +158,6 @@ def _subtitle(scenario: Scenario, roles: AgentRoles, span: TimeRange) -> str:
     if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
         parts.append(f"origin {scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°")
     return " · ".join(parts)
-
-
-def _outside(roles: AgentRoles, view: Viewport) -> int:
-    """Count the agents whose trajectories lie outside the view."""
-    agents = [r.agent for r in roles.movers] + list(roles.stationary)
-    return sum(not view.contains(centers_xy(a)).any() for a in agents)
 
 
 def _typical_speed(roles: AgentRoles) -> float:
