@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from test_appearance_colors import PAINTS, street
 
-from log2sim.datatypes import COLOR_NAMES
+from log2sim.datatypes import COLOR_NAMES, AgentTable
 from log2sim.datatypes.color_names import name_indices, name_of
 from log2sim.geometry import NS_PER_S, inverse, project_boxes
 from log2sim.road.color_picture import cells_of, color_of_picture, cut_out, explain_paint, paint_model, where_paint_is
-from log2sim.road.colors import boxes_at, choose_views
+from log2sim.road.colors import choose_views
 
 
 @pytest.mark.slow
@@ -20,9 +20,11 @@ def test_a_crop_of_a_scene_gets_the_name_of_its_paint(name: str) -> None:
     ((camera, frames),) = choose_views(log, truth, [name]).items()
     index = min(frames)
     t_ns = int(log.streams[camera].t_ns[index])
-    boxes = boxes_at([a for a in truth.others if a.id == name], np.array([(t_ns - truth.t0_ns) / NS_PER_S]))
+    boxes = AgentTable.of([a for a in truth.others if a.id == name], np.array([(t_ns - truth.t0_ns) / NS_PER_S]))
     cam_T_map = inverse(log.map_T_sensor(camera, t_ns)[0][0])
-    box_px = project_boxes(boxes.center[:, 0], boxes.size, boxes.yaw[:, 0], log.cameras[camera], cam_T_map).box_px[0]
+    box_px = project_boxes(
+        boxes.center_m[:, 0], boxes.size_m, boxes.yaw_rad[:, 0], log.cameras[camera], cam_T_map
+    ).box_px[0]
     found = color_of_picture(log.streams[camera].read(index), box_px)
     assert found is not None
     best = {COLOR_NAMES[k] for k in np.argsort(-found.probability)[:2]}

@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 from test_overlap import agent, candidate
 
-from log2sim.agents import evidence as box_table
+from log2sim.agents import conflicts
 from log2sim.agents.candidate import Timeline, name_agents
 from log2sim.agents.conflicts import (
     conflict_doubts,
     extend_static,
-    find_all_conflicts,
     find_conflicts,
     resolve_conflicts,
 )
-from log2sim.agents.evidence import BoxTable
-from log2sim.datatypes import Obstacles, Rays
+from log2sim.datatypes import AgentTable, Obstacles, Rays
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -40,9 +38,8 @@ def judged(*built, ego=None):
 
 def test_overlaps_have_the_shares_of_exact_rectangles() -> None:
     # 4.4 m long: 2.2 m apart they share half; crossed at right angles a square of 1.8 m.
-    (half, crossed) = find_conflicts(
-        BoxTable.of([agent(0.0), agent(2.2), agent(-50.0), agent(0.0, -50.0), agent(-50.0, yaw=np.pi / 2)], T)
-    )
+    agents = [agent(0.0), agent(2.2), agent(-50.0), agent(0.0, -50.0), agent(-50.0, yaw=np.pi / 2)]
+    (half, crossed), _ = find_conflicts(agents, T)
     assert (half.first, half.second, half.tick.tolist()) == (0, 1, [0, 1, 2, 3, 4])
     assert half.share == pytest.approx(0.5)
     assert half.depth_m == pytest.approx(1.8)
@@ -51,7 +48,7 @@ def test_overlaps_have_the_shares_of_exact_rectangles() -> None:
 
 
 def test_agents_of_other_times_or_places_have_no_conflict() -> None:
-    assert find_conflicts(BoxTable.of([agent(0.0, t=(0.0, 1.9)), agent(0.0, t=(2.0, 4.0)), agent(4.5)], T)) == []
+    assert find_conflicts([agent(0.0, t=(0.0, 1.9)), agent(0.0, t=(2.0, 4.0)), agent(4.5)], T)[0] == []
 
 
 def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters() -> None:
@@ -68,8 +65,7 @@ def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters() -> None:
 def test_nobody_drives_through_the_ego() -> None:
     through = agent(-10.0, 0.2, speed=9.0)
     ((cut, _),) = judged((through, 1e6), ego=agent(0.0))
-    boxes = BoxTable.of([cut, agent(0.0)], T)
-    assert find_conflicts(boxes) == []
+    assert find_conflicts([cut, agent(0.0)], T)[0] == []
     assert cut.waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
 
 
@@ -168,9 +164,9 @@ def test_whoever_is_seen_at_a_single_tick_stays_as_in_logs_of_one_frame() -> Non
 
 def test_conflicts_are_the_same_whether_ticks_are_looked_at_together_or_in_turn(monkeypatch):
     agents = [agent(0.0), agent(2.2), agent(0.0, t=(1.0, 2.0)), agent(-50.0), agent(-50.0, yaw=np.pi / 2, t=(0.0, 1.5))]
-    together = find_conflicts(BoxTable.of(agents, T))
-    monkeypatch.setattr(box_table, "TICKS_AT_A_TIME", 3)
-    in_turn, present = find_all_conflicts(agents, T)
+    together, _ = find_conflicts(agents, T)
+    monkeypatch.setattr(conflicts, "TICKS_AT_A_TIME", 3)
+    in_turn, present = find_conflicts(agents, T)
     assert len(together) > 2
     assert [(c.first, c.second, c.tick.tolist()) for c in in_turn] == [
         (c.first, c.second, c.tick.tolist()) for c in together
@@ -178,7 +174,7 @@ def test_conflicts_are_the_same_whether_ticks_are_looked_at_together_or_in_turn(
     for one, other in zip(in_turn, together):
         np.testing.assert_allclose(one.share, other.share)
         np.testing.assert_allclose(one.depth_m, other.depth_m)
-    np.testing.assert_array_equal(present, BoxTable.of(agents, T).present)
+    np.testing.assert_array_equal(present, AgentTable.of(agents, T).present)
 
 
 def static(x_m, t, *, confidence=0.9):

@@ -11,7 +11,6 @@ from worlds import rows_at
 
 from log2sim.agents.candidate import Support, Timeline
 from log2sim.agents.evidence import (
-    BoxTable,
     Ending,
     Recording,
     classify_rays,
@@ -24,7 +23,7 @@ from log2sim.agents.evidence import (
     weigh,
 )
 from log2sim.agents.judge import contradict, is_refuted, missing_nats, usual_detection_rate
-from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Rays, Stream, Track
+from log2sim.datatypes import AgentTable, Detections, Log, Measurements, Obstacles, Rays, Stream, Track
 from log2sim.geometry import NS_PER_S, Camera, transform
 from log2sim.perception.sync import Schedule
 
@@ -325,5 +324,5 @@ def test_an_image_shows_what_is_large_and_inside_of_its_borders(x_m, y_m, shown)
         frames = np.array([0, 1, 2, 3, -1])
         schedule = Schedule("front", TIMELINE.t_ns, {"front": frames}, {}, {})
         recording = Recording(log, schedule, clouds(fan(40.0)), TIMELINE)
-        boxes = BoxTable.of([over_map(agent(x_m, y_m))], recording.t_s)
+        boxes = AgentTable.of([over_map(agent(x_m, y_m))], recording.t_s)
         assert shown_in_images(boxes, recording)[0].tolist() == [seen] * 4 + [False]

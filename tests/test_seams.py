@@ -10,13 +10,14 @@ import pytest
 from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Stream
 from log2sim.evaluation.bench.runs import SeamBench
 from log2sim.geometry import Array, Camera, PoseTrack, apply_homography, ground_homography, rotation_from_rpy, transform
-from log2sim.perception.first_pass import Observations, base_pose
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography.rig import Rig, RigState, foot_homography, rotation_of
 from log2sim.perception.homography.rig_fit import RigFit
 from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.seams import (
     SeamPictures,
     SeamPlace,

@@ -252,15 +252,7 @@ class ExpectedAgents:
         movers = np.flatnonzero(~self._static)
         self._mover = np.full(len(table.agents), -1, dtype=np.intp)
         self._mover[movers] = np.arange(len(movers))
-        # Some rows of a table with the states at ticks of observation alone; who was lost begins anew.
-        there = known.observed[movers] & table.present[movers]
-        blank = np.where(there, 1.0, np.nan)
-        seen = MotionTable(
-            tuple(table.agents[k] for k in movers.tolist()), table.t_s, table.tick_s,
-            np.where(there, table.position_m[movers], np.nan), np.where(there, table.velocity_mps[movers], np.nan),
-            blank * table.yaw_rad[movers], blank * table.sigma_m[movers], there,
-            np.where(there, _numbered(table.piece[movers], known.piece[movers]), -1),
-        )  # fmt: skip
+        seen = _observed_table(table, known, movers)
         count = int(np.ceil((horizon_s + CONFIRMED_AGE_S) / LEAD_STEP_S))
         found = predict_table(seen, np.linspace(LEAD_STEP_S, count * LEAD_STEP_S, count), (DEFAULT_METHOD,))
         self._forecast = found.forecasts[DEFAULT_METHOD]
@@ -308,6 +300,18 @@ class ExpectedAgents:
         slope = np.sqrt(12.0 / (count * (count**2 - 1.0))) / self._interval_s
         drift = sigma0[:, 0, 0] * slope
         return position, yaw, course, np.sqrt(sigma**2 + (drift[:, None] * lead)[..., None] ** 2)
+
+
+def _observed_table(table: MotionTable, known: Known, rows: Index) -> MotionTable:
+    """Return some rows of a table with the states at ticks of observation alone; who was lost begins anew."""
+    there = known.observed[rows] & table.present[rows]
+    blank = np.where(there, 1.0, np.nan)
+    return MotionTable(
+        tuple(table.agents[k] for k in rows.tolist()), table.t_s,
+        blank[..., None] * table.center_m[rows], blank * table.yaw_rad[rows], blank * table.speed_mps[rows],
+        table.tick_s, np.where(there, table.velocity_mps[rows], np.nan), blank * table.sigma_m[rows], there,
+        np.where(there, _numbered(table.piece[rows], known.piece[rows]), -1),
+    )  # fmt: skip
 
 
 def _numbered(jumps: Index, pieces: Index) -> Index:
