@@ -74,8 +74,6 @@ def choose_detector(log: Log, config: Config) -> Config:
 def network_for(lidars: Iterable[Lidar]) -> str:
     """Return the shipped network that fits how LiDARs are mounted: the one for roadsides if all are fixed in the map and tilted.
 
-    Notes
-    -----
     A level LiDAR on a pole sees the sides of vehicles as one on a roof does, and finds more by the network for vehicles.
     """
     mounts = [(lidar.mount, float(lidar.mount_T_lidar[2, 2])) for lidar in lidars]
@@ -96,13 +94,9 @@ def image_detector_installed() -> bool:
 def select_sensors(log: Log, config: Config) -> Sensors:
     """Choose the sensors of a run and check their calibration.
 
-    Raises
-    ------
-    ConfigError
-        For a camera that the log does not have or that the detector does not use.
-    LogError
-        For a log without a sensor that the detector needs, with a calibration that no sensor can have, or with poses of the ego
-        at other times than the records.
+    Raises `ConfigError` for a camera that the log does not have or that the detector does not use. Raises `LogError`
+    for a log without a sensor that the detector needs, with a calibration that no sensor can have, or with poses of the
+    ego at other times than the records.
     """
     sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
     if config.cooperation.ends != "both" and not any(is_used(sensor, config) for sensor in sensors):

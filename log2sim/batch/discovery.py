@@ -31,26 +31,11 @@ def find_logs(
 ) -> list[FoundLog]:
     """Find all logs at and below a folder, in the order of their ids.
 
-    Parameters
-    ----------
-    root : Path
-        A folder, or the file of one log.
-    format : str
-        Name of the only format that is looked for, or "auto".
-    leave_out : Path, optional
-        Folder that is not looked into.
-    max_folders : int
-        That are looked into before the search is given up.
+    `root`: a folder, or the file of one log. `format`: name of the only format that is looked for, or "auto".
+    `leave_out`: folder that is not looked into. `max_folders`: that are looked into before the search is given up.
+    Raises `LogError` when the root is missing, or there is no log. Raises `ConfigError` for an unknown format, or more
+    folders than can be searched.
 
-    Raises
-    ------
-    LogError
-        When the root is missing, or there is no log.
-    ConfigError
-        For an unknown format, or more folders than can be searched.
-
-    Notes
-    -----
     A log is reported at the deepest folder that its reader accepts. Nothing below a folder that is a log itself is another one. Hidden
     folders are skipped, and links are followed only where that was asked for (`log2sim.files.inputs.following_links`).
     """

@@ -237,10 +237,8 @@ class BatchFolder:
     def start(cls, path: Path, wanted: BatchSettings, *, overwrite: bool) -> BatchFolder:
         """Go on with the batch in a folder, or begin one.
 
-        Raises
-        ------
-        ConfigError
-            When the folder holds something else, a batch of other settings, or is in use by another run.
+        Raises `ConfigError` when the folder holds something else, a batch of other settings, or is in use by another
+        run.
         """
         claim(path / SETTINGS_FILE, overwrite=False)
         if not is_batch(path):
@@ -335,10 +333,7 @@ COLUMNS = (
 def write_batch_page(path: Path, rows: Sequence[Row], settings: BatchSettings, *, total: int) -> None:
     """Write the page of a batch: sums, what failed and why, and the figures of each log.
 
-    Parameters
-    ----------
-    total : int
-        Logs of the batch; those without a row were not run yet.
+    `total`: logs of the batch; those without a row were not run yet.
     """
     with replaced(path) as temporary:
         temporary.write_text(html_of(rows, settings, total), encoding="utf-8")

@@ -130,10 +130,7 @@ def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractCo
 def local_workers(count: int) -> Iterator[Workers]:
     """Start so many worker processes on this machine, each with its share of the cores and of the memory; stop them at the end.
 
-    Raises
-    ------
-    MissingExtra
-        Without Dask.
+    Raises `MissingExtra` without Dask.
     """
     distributed, dask = import_dask()
     from distributed.system import MEMORY_LIMIT
@@ -170,12 +167,7 @@ def local_workers(count: int) -> Iterator[Workers]:
 def workers_of(address: str) -> Iterator[Workers]:
     """Use the workers of a scheduler that somebody started.
 
-    Raises
-    ------
-    MissingExtra
-        Without Dask.
-    ConfigError
-        When the address is none, or nobody answers there.
+    Raises `MissingExtra` without Dask. Raises `ConfigError` when the address is none, or nobody answers there.
     """
     if not address.startswith(PROTOCOLS):
         raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")

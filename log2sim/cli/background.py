@@ -22,10 +22,7 @@ def load_background(
 ) -> GroundMap:
     """Return the map of the ground in a PNG that `log2sim map` wrote, or that of a log, without the agents of the scenario.
 
-    Raises
-    ------
-    LogError
-        When the file is no such map, or the log has neither camera nor LiDAR.
+    Raises `LogError` when the file is no such map, or the log has neither camera nor LiDAR.
     """
     from log2sim.errors import LogError
     from log2sim.localization.choice import localize_like

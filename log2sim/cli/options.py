@@ -130,10 +130,7 @@ def say_written(*paths: Path | None, quiet: bool) -> None:
 def camera_names(text: str | None) -> tuple[str, ...]:
     """Split what `--cameras` takes; none stands for all.
 
-    Raises
-    ------
-    ConfigError
-        When it is empty.
+    Raises `ConfigError` when it is empty.
     """
     names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
     if text is not None and not names:

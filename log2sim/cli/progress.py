@@ -35,12 +35,7 @@ def progress(*, quiet: bool) -> Iterator[Report]:
 
 
 class Bars:
-    """A bar for each stage of a run; a stage ends when the next one begins.
-
-    Parameters
-    ----------
-    display : rich.progress.Progress
-    """
+    """A bar for each stage of a run; a stage ends when the next one begins."""
 
     def __init__(self, display: Progress) -> None:
         self._display = display

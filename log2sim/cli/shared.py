@@ -167,12 +167,8 @@ FollowLinks = Annotated[bool, typer.Option(OPTION, help="Follow links in logs th
 def add_command(app: typer.Typer, command: Callable[..., None], name: str | None = None) -> None:
     """Add a command to the program, with the shared options, and the examples of its docstring below its options.
 
-    Parameters
-    ----------
-    command : callable
-        Its docstring is the help. What stands below the heading "Examples" are lines for the shell.
-    name : str, optional
-        Default: that of the function.
+    `command`: its docstring is the help. What stands below the heading "Examples" are lines for the shell. `name`:
+    default: that of the function.
     """
     text, _, examples = (inspect.getdoc(command) or "").partition("\nExamples\n--------\n")
     app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=format_examples(examples))(

@@ -135,10 +135,7 @@ def _shows_ground(log: Log) -> bool:
 def _metrics(path: Path) -> tuple[str, str]:
     """Return title and table of a metrics file.
 
-    Raises
-    ------
-    LogError
-        When it is none.
+    Raises `LogError` when it is none.
     """
     from log2sim.errors import LogError
     from log2sim.evaluation.metrics.table import format_table, format_verdict

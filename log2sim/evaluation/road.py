@@ -38,10 +38,7 @@ class Area:
     def of(cls, scenario: Scenario, truth: Scenario, shift_m: Array) -> Area:
         """Take it from a truth that was moved into the scenario's map by `shift_m` (3,).
 
-        Raises
-        ------
-        ScenarioError
-            When the truth names cells in a way that cannot be read.
+        Raises `ScenarioError` when the truth names cells in a way that cannot be read.
         """
         ego = truth.ego or scenario.ego
         seen = seen_ground(truth, shift_m)
@@ -168,12 +165,10 @@ def nearest(samples: Samples, lines: Sequence[Line]) -> tuple[NDArray[np.int64],
 def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dict[str, Any]:
     """Compare found lines with true ones.
 
-    Returns
-    -------
-    dict
-        `precision` is the share of found length within `MATCH_M` of a true line, `recall` the share of true length within
-        that of a found one, where a sensor saw the ground; `recall_20_m` the same within 20 m of the path. The lateral errors are distances of found points to the nearest
-        true line within `LATERAL_REACH_M`. None where there is nothing to compute a figure from.
+    `precision` is the share of found length within `MATCH_M` of a true line, `recall` the share of true length
+    within that of a found one, where a sensor saw the ground; `recall_20_m` the same within 20 m of the path. The
+    lateral errors are distances of found points to the nearest true line within `LATERAL_REACH_M`. None where there is
+    nothing to compute a figure from.
     """
     ours = Samples.of(found)
     ours = ours.where(area.counts(ours.xy_m))
@@ -386,17 +381,10 @@ def _to_lanes(xy: Array, heading: Array, lanes: Sequence[MapLane]) -> tuple[Arra
 def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str, Any] | None:
     """Compare the colors of vehicles that were found with the true ones.
 
-    Parameters
-    ----------
-    found : mapping
-        The agent that each true one is matched with most often, by the true one's id.
-
-    Returns
-    -------
-    dict or None
-        `accuracy` is the share of right names among vehicles with a color whose true color has a name of the fixed list;
-        `ciede2000_median` the difference of the RGB values (Sharma et al., 2005; about 2 is just noticeable). None where the
-        truth has no colors.
+    `found`: the agent that each true one is matched with most often, by the true one's id. `accuracy` is the
+    share of right names among vehicles with a color whose true color has a name of the fixed list; `ciede2000_median`
+    the difference of the RGB values (Sharma et al., 2005; about 2 is just noticeable). None where the truth has no
+    colors.
     """
     colored = [a for a in true if a.color is not None and GROUP_OF.get(a.category) == "vehicle"]
     if not colored:
@@ -469,10 +457,8 @@ def signal_figures(scenario: Scenario, truth: Scenario) -> dict[str, Any] | None
 def map_figures(scenario: Scenario, truth: Scenario) -> dict[str, Any] | None:
     """Compare the map features of a scenario with those of its truth, wherever its map lies; None without either.
 
-    Raises
-    ------
-    ScenarioError
-        When a line is too long, or the truth says in a way that cannot be read which ground sensors saw.
+    Raises `ScenarioError` when a line is too long, or the truth says in a way that cannot be read which ground sensors
+    saw.
     """
     if scenario.map_features is None or truth.map_features is None:
         return None

@@ -96,8 +96,6 @@ def on_map(frame: MapFrame, projection: str | None, offset_m: tuple[float, float
 def geo_reference(projection: str) -> str:
     """Return a PROJ string with the same coordinates in the words that esmini reads, too; others stay as they are.
 
-    Notes
-    -----
     esmini requires lat_0 and lon_0, and knows neither R, south, no_defs nor type. UTM is the transverse Mercator projection
     about the middle of its zone, a sphere of radius R has both axes R, and PROJ takes 0 for an origin that is not given.
     """
@@ -161,8 +159,6 @@ class SampledMotion:
 def sample_motion(agent: Agent, t_s: Array, margin_s: float = ROUNDING_S) -> SampledMotion:
     """Sample an agent at times (T,); times within `margin_s` outside its lifetime take the nearest end.
 
-    Notes
-    -----
     The speed of waypoints is along the heading. Where an agent turns, its box center also moves laterally, by yaw rate
     times its distance from the rear axle; without that term velocities contradict the positions.
     """
@@ -217,10 +213,8 @@ def sample_steps(agent: Agent, t_s: Array, step_s: float, at_least: int = 1) -> 
 def step_times(start_s: float, stop_s: float, step_s: float, agents: int = 1) -> Array:
     """Return times (T,) from `start_s` in equal steps up to `stop_s`, at least one, at which a number of agents are sampled.
 
-    Raises
-    ------
-    ScenarioError
-        For more than `MAX_STEPS`, or states of all agents of more than `MAX_SAMPLED_BYTES`, before anything is allocated.
+    Raises `ScenarioError` for more than `MAX_STEPS`, or states of all agents of more than `MAX_SAMPLED_BYTES`, before
+    anything is allocated.
     """
     steps = (stop_s - start_s) / step_s + 1e-6
     if steps > MAX_STEPS:
@@ -331,10 +325,7 @@ def export(
 def with_ego(scenario: Scenario, agent: str) -> Scenario:
     """Call one of the agents "ego", as scenarios of roadside sensors need it for formats with an ego.
 
-    Raises
-    ------
-    ConfigError
-        When the scenario has another ego or no such agent.
+    Raises `ConfigError` when the scenario has another ego or no such agent.
     """
     ids = [a.id for a in scenario.agents]
     if agent not in ids:
@@ -349,10 +340,7 @@ def with_ego(scenario: Scenario, agent: str) -> Scenario:
 def with_doubtful(scenario: Scenario, choice: str) -> Scenario:
     """Return a scenario with its doubtful agents but the quarantined ("keep"), without ("drop"), or with all of them ("all").
 
-    Raises
-    ------
-    ConfigError
-        For another choice.
+    Raises `ConfigError` for another choice.
     """
     choices = {"keep": scenario.active, "drop": scenario.without_doubtful(), "all": scenario}
     if choice not in choices:

@@ -130,10 +130,7 @@ class ScenarioNet:
 def describe(scenario: Scenario) -> Value:
     """Return the scenario description as a dictionary of plain values and arrays with T steps of 0.1 s from the ego's first.
 
-    Raises
-    ------
-    ScenarioError
-        When the scenario has no ego.
+    Raises `ScenarioError` when the scenario has no ego.
     """
     ego = scenario.ego
     if ego is None:

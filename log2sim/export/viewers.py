@@ -91,10 +91,7 @@ def agent_steps(scenario: Scenario) -> AgentSteps:
 def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
     """Yield images and points of a log within the scenario's time, in order of time; each is read when requested.
 
-    Raises
-    ------
-    ConfigError
-        When the log has no record in that time.
+    Raises `ConfigError` when the log has no record in that time.
     """
     start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
     index = [

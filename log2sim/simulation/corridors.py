@@ -238,8 +238,6 @@ class Leaders(NamedTuple):
 def leaders(paths: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, margins: SafetyMargins) -> Leaders:
     """Find for each pair what the agent has to keep clear of in the other's box, now or within the horizon.
 
-    Notes
-    -----
     A box that is in the corridor and will stay there is followed. A crossing box counts if the agent, at its intended
     progress, comes near it while it is in the corridor. Boxes whose center is behind that of the agent never count. For a
     box that moves along the path while it enters, the gap is reduced by its motion until then, so a cut-in is a leader.

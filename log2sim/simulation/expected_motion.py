@@ -227,18 +227,9 @@ class ExpectedPaths:
 class ExpectedAgents:
     """Where agents (A,) are expected from any tick, by the observations up to then.
 
-    Parameters
-    ----------
-    table : MotionTable
-        States of the agents at all ticks.
-    known : Known
-        What is known of them at these ticks.
-    interval_s : float, s
-        Between observations.
-    horizon_s : float, s
+    `table`: states of the agents at all ticks. `known`: what is known of them at these ticks. `interval_s`: between
+    observations.
 
-    Notes
-    -----
     Movers are predicted by `log2sim.prediction` from the states at ticks at which they were observed. To its standard deviations
     comes that of a speed which a tracker has learned from few observations: of the slope of a line through n places with
     errors sigma, sigma sqrt(12 / (n (n^2 - 1))) per interval. Static agents stay where they are.
@@ -425,8 +416,6 @@ class Contacts(NamedTuple):
 def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Contacts:
     """Compare C ways of the ego with one of another agent each, at leads (H,).
 
-    Notes
-    -----
     The errors of an agent at different leads are one: who is faster than expected is so throughout. They are normal along and
     across its course, with those of the ego added, and each takes `QUANTILES` values of equal probability; the probability is
     the share of the pairs of values with which the boxes meet. Between leads both move straight, and the time is exact. A

@@ -77,8 +77,6 @@ def fit_trajectory(
 ) -> FeasibleTrajectory:
     """Fit a feasible trajectory to box centers and headings at evenly spaced times (K,), K >= 2.
 
-    Notes
-    -----
     Least squares over all knots at once, by Gauss-Newton steps with Levenberg-Marquardt damping. Rolling without slip is a
     residual as well (direct multiple shooting, Bock & Plitt, 1984), which makes every step a banded system: cost O(K).
     Headings and speeds enter by the pseudo-Huber loss, so outliers have little influence.

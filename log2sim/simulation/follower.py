@@ -81,13 +81,8 @@ def follow_vehicles(
 ) -> tuple[VehicleControls, ControllerMemory]:
     """Compute the controls of vehicles that follow their references.
 
-    Parameters
-    ----------
-    row : (C, A) float64
-        The references now, as `VEHICLE_COLUMNS`.
+    `row` (C, A): the references now, as `VEHICLE_COLUMNS`.
 
-    Notes
-    -----
     Two PID controllers with feed-forward, along and across the path, are the rows of (2, A) arrays: with up to a thousand
     agents the overhead of a NumPy call is as large as the computation. The correction across the path is a curvature that
     depends on distance and not on time, so nothing is divided by the speed.

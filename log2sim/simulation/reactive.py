@@ -72,8 +72,6 @@ def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
 def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_mps: Array) -> Array:
     """Return the share of the free acceleration that a leader takes: (s* / s)^2 of the model; 1 at the minimum gap at low speed.
 
-    Notes
-    -----
     Treiber, Hennecke and Helbing, "Congested traffic states in empirical observations and microscopic simulations", 2000.
     """
     closing = pace_mps * (pace_mps - leader_mps) / (2 * np.sqrt(driver.accel_mps2 * driver.comfort_mps2))
@@ -87,8 +85,6 @@ def rate_response(
 ) -> tuple[Array, Array]:
     """Return the rate and its slope in 1/s, (A,) each, of trajectories at `pace_mps` here, with demand `taken`.
 
-    Notes
-    -----
     The scenario's speed at a place is the model's desired speed, so the rate is its v / v0, and the model's
     acceleration is added to the scenario's. Braking that the scenario does anyway counts as a response to the leader.
     Without demand a rate of 1 stays 1: the agent follows the scenario.
@@ -378,19 +374,10 @@ SAME_DELAY_S = 1e-9  # delays that differ by rounding are the same
 class Traffic:
     """Decisions of the reactive agents among the A agents of a scenario; all columns are (A,) over all of them.
 
-    Parameters
-    ----------
-    agents, trajectories : sequences
-        All agents, and the trajectories of their box centers; for static agents one pose.
-    reactive : collection of str
-        Ids of the reactive agents.
-    driven : str, optional
-        Id of the agent whose states are given with each decision, since a policy drives it.
-    foresight : str
-        One of `FORESIGHTS`: what the reactive agents expect of others.
+    `agents`, `trajectories`: all agents, and the trajectories of their box centers; for static agents one pose.
+    `reactive`: ids of the reactive agents. `driven`: id of the agent whose states are given with each decision, since a
+    policy drives it. `foresight`: one of `FORESIGHTS`: what the reactive agents expect of others.
 
-    Notes
-    -----
     A pair of agents is evaluated only while it differs from the scenario: one is driven by a policy, or their delays
     differ, or they overlap in the scenario itself. The demand of a leader is compared with its demand in the scenario
     when the agent was at this place, and only the excess counts; so a scenario that drives closer than the model would

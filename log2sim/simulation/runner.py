@@ -66,10 +66,8 @@ def assign_drivers(
 def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, drives_ego: bool) -> frozenset[str]:
     """Return the ids of the agents that react: all that can for "reactive", none for "scenario", or those named.
 
-    Raises
-    ------
-    ConfigError
-        When a name is not known, or is that of an agent that cannot react: static, seen once, or driven by a policy.
+    Raises `ConfigError` when a name is not known, or is that of an agent that cannot react: static, seen once, or
+    driven by a policy.
     """
     able = [a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)]
     if isinstance(wanted, str):

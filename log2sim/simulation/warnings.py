@@ -133,15 +133,8 @@ class Watch:
 
     The ego is warned; `of_driver` gives the same watch for another vehicle.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        With what was observed when.
-    agents : sequence of Agent
-        All but the ego, where they are: as in the scenario, or in a replay of it.
-    settings : WarningSettings
-    t_s : (T,) float64, s
-        Ticks, `TICK_S` apart.
+    `scenario`: with what was observed when. `agents`: all but the ego, where they are: as in the scenario, or in a
+    replay of it. `t_s` (T,), s: ticks, `TICK_S` apart.
     """
 
     ego_path: EgoPath
@@ -169,12 +162,9 @@ class Watch:
     def courses(self, ego: EgoStates, ticks: Index, seen: tuple[Complex, Array] | None = None) -> Courses:
         """Find who may collide with the ego, whose states are those at ticks (T,).
 
-        Parameters
-        ----------
-        ticks : (T,) int
-        seen : (A,) complex128, m, and (A,) float64, m/s, optional
-            Where agents are, and how fast, if they may be elsewhere than in the table: then they are expected to do from there
-            what is expected in the table, as much faster as they are. NaN for those that are as in the table.
+        `ticks` (T,) int. `seen` (A,) complex128, m, and (A,), m/s, optional: where agents are, and how fast, if they
+        may be elsewhere than in the table: then they are expected to do from there what is expected in the table, as
+        much faster as they are. NaN for those that are as in the table.
         """
         row, agent = np.nonzero(self.known.source[:, ticks].T >= 0)
         kept = np.abs(ego.speed_mps[row]) >= MIN_EGO_MPS
@@ -295,10 +285,7 @@ def warn(
 def warnable(scenario: Scenario) -> list[Agent]:
     """Return who is warned: the ego, or in a scenario without one the vehicles that move.
 
-    Raises
-    ------
-    ConfigError
-        When there is nobody.
+    Raises `ConfigError` when there is nobody.
     """
     if scenario.ego is not None:
         return [scenario.ego]
@@ -437,10 +424,7 @@ CATCH_UP_S = 0.2  # after it has braked, the ego catches up with so much and no 
 class LateDriver:
     """Follows the ego's trajectory by the controller of `pid`, by the scenario's time less a delay.
 
-    Parameters
-    ----------
-    ego : Agent
-        On wheels.
+    `ego`: on wheels.
     """
 
     def __init__(self, ego: Agent) -> None:

@@ -239,10 +239,7 @@ class Picture:
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
         """Write the picture, in the format of the file's name.
 
-        Raises
-        ------
-        ConfigError
-            When the file exists and `overwrite` is False, or it cannot be written.
+        Raises `ConfigError` when the file exists and `overwrite` is False, or it cannot be written.
         """
         refuse_existing(path, overwrite=overwrite)
         with replaced(path) as temporary:

@@ -91,21 +91,10 @@ def read_moment(
 ) -> Moment:
     """Read the records of one tick.
 
-    Parameters
-    ----------
-    cameras : sequence of str
-        All of the log where it is empty.
-    at_s : float, optional
-        Time of the tick since the first one, s; by default in the middle of those with the most records.
-    t_ns : int, optional
-        Absolute stamp; the tick nearest to it is read, whatever `at_s` says.
-    labels : callable, optional
-        Returns for the stamp of the tick the 3D boxes that are drawn in place of those of the log.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown camera, and for a time outside the log.
+    `cameras`: all of the log where it is empty. `at_s`: time of the tick since the first one, s; by default in the
+    middle of those with the most records. `t_ns`: absolute stamp; the tick nearest to it is read, whatever `at_s` says.
+    `labels`: returns for the stamp of the tick the 3D boxes that are drawn in place of those of the log. Raises
+    `ConfigError` for an unknown camera, and for a time outside the log.
     """
     unknown = [name for name in cameras if name not in log.cameras]
     if unknown:
@@ -279,10 +268,8 @@ DPI = 150
 def write_overlay(moment: Moment, path: Path | str, *, overwrite: bool = False) -> None:
     """Write a moment as a .png.
 
-    Raises
-    ------
-    ConfigError
-        When the name has another suffix, the file exists and `overwrite` is False, or it cannot be written.
+    Raises `ConfigError` when the name has another suffix, the file exists and `overwrite` is False, or it cannot be
+    written.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":

@@ -40,10 +40,7 @@ BACK_RAD = np.radians(150.0)  # cameras that are turned farther from the front t
 def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Return the cameras to show, from left to right: those asked for, else those that the scenario was made with, else all.
 
-    Raises
-    ------
-    ConfigError
-        For a camera that the log does not have.
+    Raises `ConfigError` for a camera that the log does not have.
     """
     unknown = [name for name in asked if name not in log.cameras]
     if unknown:
@@ -65,10 +62,7 @@ def _place(camera: Camera) -> tuple[int, float]:
 def require_overlap(log: Log, scenario: Scenario) -> None:
     """Require that a log has records during a scenario.
 
-    Raises
-    ------
-    LogError
-        When it has none.
+    Raises `LogError` when it has none.
     """
     spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
     if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
@@ -137,10 +131,8 @@ class OutlineProjector:
     def outlines(self, camera: str, t_ns: int) -> list[list[int]]:
         """Project the agents into the frame of a camera at a stamp, the farthest first.
 
-        Returns
-        -------
-        list of [agent, kind, coordinates...]
-            Whole pixels of the camera; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not known.
+        Returns whole pixels of the camera; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not
+        known.
         """
         view = view_of(self._log, camera, t_ns)
         if view is None or not self.agents:
@@ -260,22 +252,10 @@ def picture_document(
 ) -> dict[str, Any]:
     """Return the pictures of cameras within a budget, with the outlines of the agents in them.
 
-    Parameters
-    ----------
-    budget_bytes : int
-        Of the pictures and outlines as text in a page.
-
-    Returns
-    -------
-    dict
-        "cameras": for each name, size in px, times in s, JPEGs as base64 and outlines; "ahead": which of them looks ahead;
-        "agents": ids that outlines refer to;
-        "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out.
-
-    Raises
-    ------
-    ConfigError
-        When not even one small picture of each camera fits.
+    `budget_bytes`: of the pictures and outlines as text in a page. Returns "cameras": for each name, size in px, times
+    in s, JPEGs as base64 and outlines; "ahead": which of them looks ahead; "agents": ids that outlines refer to;
+    "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out. Raises
+    `ConfigError` when not even one small picture of each camera fits.
     """
     projector = OutlineProjector(log, scenario)
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
@@ -420,17 +400,9 @@ def point_document(
 ) -> dict[str, Any] | None:
     """Return the points of a log's LiDARs within a budget; None where there are none during the scenario.
 
-    Returns
-    -------
-    dict
-        "t_s", "origin_m" and "points" of each moment, the last as base64 of deflated columns, see `pack`; "unit_m",
-        "height_m", the lowest height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and
-        "bytes" as chosen.
-
-    Raises
-    ------
-    ConfigError
-        When not even one sweep fits.
+    Returns "t_s", "origin_m" and "points" of each moment, the last as base64 of deflated columns, see `pack`; "unit_m",
+    "height_m", the lowest height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and
+    "bytes" as chosen. Raises `ConfigError` when not even one sweep fits.
     """
     lidars = [n for n in log.lidars if n in log.streams and len(records_within(log.streams[n].t_ns, scenario))]
     if not lidars:
@@ -467,8 +439,6 @@ def point_document(
 def pack(points: PointsAbove, cell_m: float, bright: float) -> str:
     """Keep the highest point of each cell and pack the rest as base64 of a zlib stream.
 
-    Notes
-    -----
     For N points in rows of cells from south to north, each from west to east: low bytes of the steps in x (N), their high
     bytes, the same of y, heights and intensities as bytes. Steps are in `UNIT_M`, modulo 2**16, the first from 0. Small steps
     in planes of bytes deflate to less than half.
@@ -577,18 +547,9 @@ class Recorded:
 def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int) -> dict[str, Any]:
     """Return the pictures and points of a log for a page, within a budget.
 
-    Returns
-    -------
-    dict
-        "pictures" and "points", see `picture_document` and `point_document`, None where there are none, and "notes": what
-        was chosen, in sentences.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown camera, or when the budget is too small for a single moment.
-    LogError
-        When none of the records asked for can be read.
+    Returns "pictures" and "points", see `picture_document` and `point_document`, None where there are none, and
+    "notes": what was chosen, in sentences. Raises `ConfigError` for an unknown camera, or when the budget is too small
+    for a single moment. Raises `LogError` when none of the records asked for can be read.
     """
     log, report = recorded.log, recorded.progress
     reader = RecordReader(log)

@@ -81,15 +81,8 @@ def detect_once(
 
     Detectors take turns on each frame, so that a change of the machine's speed affects all of them.
 
-    Returns
-    -------
-    dict, float
-        Recorded detections by the same names, and the seconds of decoding.
-
-    Raises
-    ------
-    LogError
-        When no frame of a camera can be read.
+    Returns recorded detections by the same names, and the seconds of decoding. Raises `LogError` when no frame of a
+    camera can be read.
     """
     recorded = {key: RecordedDetections(d.name, d.default_min_score) for key, d in detectors.items()}
     records, decoding_s = RecordReader(log), 0.0
@@ -396,10 +389,7 @@ DETECTOR = "lidar:vehicle"  # searches sweeps where the settings name no detecto
 def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: Scope) -> BenchContext:
     """Synchronize a log without cameras, of which the ends alone are compared.
 
-    Raises
-    ------
-    LogError
-        For a log without LiDARs at both ends.
+    Raises `LogError` for a log without LiDARs at both ends.
     """
     if not ends:
         raise LogError(

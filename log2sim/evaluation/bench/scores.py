@@ -68,8 +68,6 @@ class Score:
 def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: Scope = EVERYTHING) -> Score:
     """Score a scenario; without truth only by figures that need none.
 
-    Notes
-    -----
     - `error_m`: root mean square position error; a missed and a false object together count as one at `CUTOFF_M`.
     - `state_error_m`: position error after extrapolation by `HORIZON_S`, from the errors of position and speed.
     - `jitter_m`: see `jitter`.
@@ -95,8 +93,6 @@ def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, sc
 def _error_parts(found: Mapping[str, Any]) -> ErrorSums:
     """Compute the contribution of each object to `error_m`.
 
-    Notes
-    -----
     GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of objects so that it is a distance:
     0 for a perfect result, the cutoff for one without a match.
     """
@@ -126,8 +122,6 @@ def _state_parts(found: Mapping[str, Any]) -> ErrorSums:
 def jitter(scenario: Scenario, tick_s: float) -> float | None:
     """Estimate the noise of waypoints, m: median over moving agents; None when none moves for long enough.
 
-    Notes
-    -----
     Third differences vanish for constant acceleration; of white noise with variance s^2 they have variance 20 s^2. Between
     waypoints farther apart than a tick, motion is the cubic Hermite spline through their positions and velocities.
     """
@@ -189,13 +183,8 @@ def true_positions(
 ) -> list[KnownPositions]:
     """Find, for each tick, the true centers of the objects that its measurements are of.
 
-    Parameters
-    ----------
-    when : {"measured", "imaged"}
-        At the times of the measurements, or at the stamps of the images.
+    `when`: at the times of the measurements, or at the stamps of the images.
 
-    Notes
-    -----
     Measurements are matched with objects by IoU of their boxes in the image, independently of the measured position.
     """
     shift_m = np.array(truth.map.offset_m) - np.array(log.map.offset_m)

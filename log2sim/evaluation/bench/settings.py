@@ -51,8 +51,6 @@ def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) ->
 
     It is 0 with fewer than `MIN_OBJECTS` objects.
 
-    Notes
-    -----
     Paired bootstrap (Efron, 1979) over objects, because errors of one object at successive ticks are correlated. An object of
     one side only, such as a false one, adds nothing to the other.
     """
@@ -109,17 +107,9 @@ class Grid:
 def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     """List the settings to compare on a log, each differing from the present ones in one stage.
 
-    Parameters
-    ----------
-    config : Config
-        The present settings. `topdown.method` "off" is replaced by the first method.
-    detectors : sequence of str
-        Detectors to compare with the present one: names, or paths of ONNX files.
-
-    Raises
-    ------
-    ConfigError, MissingExtra
-        For a detector that cannot be loaded.
+    `config`: the present settings. `topdown.method` "off" is replaced by the first method. `detectors`: detectors to
+    compare with the present one: names, or paths of ONNX files. Raises `ConfigError` or `MissingExtra` for a detector that
+    cannot be loaded.
     """
     if config.detect.name == AUTO:
         config = with_changes(config, "detect", name=IMAGE_DETECTOR)
@@ -329,14 +319,8 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
 
     Another setting replaces the present one only when it finds and places as many objects and is no worse with `MIN_CONFIDENCE`.
 
-    Parameters
-    ----------
-    points : sequence of Point
-        One of them is the present setting.
-    unit : str
-        Of the error, for the reason.
-    whole_ms : float
-        Time of a whole run, ms a tick, which a stage's time is compared with.
+    `points`: one of them is the present setting. `unit`: of the error, for the reason. `whole_ms`: time of a whole run,
+    ms a tick, which a stage's time is compared with.
     """
     present = next(p for p in points if p.present)
     others = [p for p in points if p.error is not None and p is not present]

@@ -62,13 +62,9 @@ class SceneBoxes:
     ) -> Self:
         """Make a table from arrays; a single value holds for all rows.
 
-        Parameters
-        ----------
-        box : (M, 7), m and rad
-            x, y, z, length, width, height, yaw.
-        category, score, scene, points, ignored : (M,) or a single value
-        range_m : (M,) or a single value, optional
-            By default the distance from the origin of the boxes' frame.
+        `box` (M, 7), m and rad: x, y, z, length, width, height, yaw. `category`, `score`, `scene`, `points`, `ignored`
+        (M,) or a single value. `range_m` (M,) or a single value, optional: by default the distance from the origin of
+        the boxes' frame.
         """
         rows = np.asarray(box, dtype=np.float64).reshape(-1, 7)
         away = np.hypot(rows[:, 0], rows[:, 1]) if range_m is None else range_m
@@ -163,10 +159,7 @@ class DetectedBoxes:
     def from_dict(cls, document: Any) -> DetectedBoxes:
         """Build them from a document, which is checked against the schema.
 
-        Raises
-        ------
-        LogError
-            As for `load`.
+        Raises `LogError`: as for `load`.
         """
         _check(document)
         frames = document["frames"]

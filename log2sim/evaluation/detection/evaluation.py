@@ -56,11 +56,8 @@ class PrecisionRecall:
     def average(self, recall_points: int = 40) -> float | None:
         """Average the best precision over recalls; None without true boxes.
 
-        Parameters
-        ----------
-        recall_points : {40, 11}
-            40: recalls 1/40 to 1, KITTI's rule since 2019, which drops the first of 41 points (Simonelli et al., ICCV 2019);
-            11: recalls 0 to 1 (PASCAL VOC; Everingham et al., IJCV 2010), KITTI's rule before.
+        `recall_points`: 40: recalls 1/40 to 1, KITTI's rule since 2019, which drops the first of 41 points (Simonelli
+        et al., ICCV 2019); 11: recalls 0 to 1 (PASCAL VOC; Everingham et al., IJCV 2010), KITTI's rule before.
         """
         if recall_points not in (40, 11):
             raise ValueError(f"recall_points is {recall_points}, expected 40 or 11")
@@ -70,8 +67,6 @@ class PrecisionRecall:
     def nuscenes_average(self) -> float | None:
         """Average as nuScenes does (Caesar et al., CVPR 2020, section 3.1); None without true boxes.
 
-        Notes
-        -----
         Over recalls 0.11 to 1 in steps of 0.01, of the precision above 0.1, scaled to 1. The precision is the best one at or
         beyond each recall; nuScenes interpolates between neighbors instead.
         """
@@ -83,8 +78,6 @@ class PrecisionRecall:
     def sampled_average(self, recall_points: int = 40) -> float | None:
         """Average as KITTI's published program does; None without true boxes.
 
-        Notes
-        -----
         The program looks at no more than 41 of the scores of right boxes, those at which the recall is nearest to 0, 1/40 and
         so on; points that are not reached count 0, and the last right box counts as one more point, which adds up to 1/40. With
         fewer than 40 true boxes even a perfect detector gets less than 1: take `average` for small sets, and this figure to
@@ -122,10 +115,7 @@ def average_precision(
 ) -> float | None:
     """Compute the average precision of the boxes of one class; None without counted true boxes.
 
-    Parameters
-    ----------
-    recall_points : {40, 11}
-        As in `PrecisionRecall.average`.
+    `recall_points`: as in `PrecisionRecall.average`.
     """
     return precision_recall(found, match(found, truth, criterion)).average(recall_points)
 
@@ -133,12 +123,9 @@ def average_precision(
 def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> dict[str, Any]:
     """Count what is right when only boxes of at least a score are reported.
 
-    Returns
-    -------
-    dict
-        "true_positives", "false_positives", "false_negatives", and "precision", "recall", "f1" and
-        "precision_times_recall", which are None where nothing was reported or nothing was there to be found. Some authors
-        call the last one mean average precision, which it is not: it is one point of the curve.
+    Returns "true_positives", "false_positives", "false_negatives", and "precision", "recall", "f1" and
+    "precision_times_recall", which are None where nothing was reported or nothing was there to be found. Some authors
+    call the last one mean average precision, which it is not: it is one point of the curve.
     """
     reported = found.score >= min_score
     right, false = (int(np.count_nonzero(rows & reported)) for rows in (matches.right, matches.false))
@@ -164,14 +151,9 @@ def rates(right: int, false: int, missed: int) -> dict[str, Any]:
 def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
     """Compare scores with the share of right boxes.
 
-    Returns
-    -------
-    dict
-        "boxes", "expected_calibration_error" (None without boxes), and "bins" of equal width from 0 to 1 with "low", "high",
-        "boxes", "mean_score" and "precision" (None in empty bins).
+    Returns "boxes", "expected_calibration_error" (None without boxes), and "bins" of equal width from 0 to 1 with
+    "low", "high", "boxes", "mean_score" and "precision" (None in empty bins).
 
-    Notes
-    -----
     See `reliability`. Ignored boxes are left out.
     """
     judged = matches.right | matches.false
@@ -233,12 +215,8 @@ class Objects:
 def class_figures(boxes: ClassBoxes, of_class: ObjectClass, min_score: float) -> dict[str, Any]:
     """Compute all figures of a class.
 
-    Parameters
-    ----------
-    of_class : ObjectClass
-        The first of its criteria is that of the tables by range and by points.
-    min_score : float
-        Score from which boxes are reported, for precision and recall.
+    `of_class`: the first of its criteria is that of the tables by range and by points. `min_score`: score from which
+    boxes are reported, for precision and recall.
     """
     pairs = {c: candidate_pairs(boxes.found, boxes.truth, c) for c in of_class.criteria}
     everything, main = all_objects(boxes), of_class.criteria[0]
@@ -327,8 +305,6 @@ def figures(objects: Objects, pairs: Pairs, criterion: Criterion, min_score: flo
 def published(objects: Objects, pairs: Pairs, criterion: Criterion) -> dict[str, Any]:
     """Compute average precision as KITTI's published program does: sampled, and false in regions without labels too.
 
-    Notes
-    -----
     The program compares the 3D boxes of these regions, which do not exist, so that its figures for 3D boxes lack the rule.
     """
     found = assign(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
@@ -495,10 +471,7 @@ class Options:
     def chosen(self) -> tuple[ObjectClass, ...]:
         """Select the classes of the protocol.
 
-        Raises
-        ------
-        ConfigError
-            For a name that is neither a class of the protocol nor a category of one.
+        Raises `ConfigError` for a name that is neither a class of the protocol nor a category of one.
         """
         classes = PROTOCOLS[self.protocol].classes
         if self.classes is None:
@@ -518,24 +491,9 @@ def evaluate_boxes(
 ) -> dict[str, Any]:
     """Compute the figures of a detector on a log.
 
-    Parameters
-    ----------
-    log : Log
-        With labels; its sweeps are read to count points.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps).
-
-    Returns
-    -------
-    dict
-        A document of `schemas/detection-metrics-1.json`.
-
-    Raises
-    ------
-    LogError
-        For a log without labels, or none of these sweeps, and boxes of another log.
-    ConfigError
-        For a protocol that needs a camera and a log without.
+    `log`: with labels; its sweeps are read to count points. `progress`: called with (sweeps done, all sweeps). Returns
+    a document of `schemas/detection-metrics-1.json`. Raises `LogError` for a log without labels, or none of these
+    sweeps, and boxes of another log. Raises `ConfigError` for a protocol that needs a camera and a log without.
     """
     protocol, classes = PROTOCOLS[options.protocol], options.chosen()
     if len(detected.t_ns) == 0:

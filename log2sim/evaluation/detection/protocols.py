@@ -71,10 +71,7 @@ class Matches:
 def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches:
     """Match found and true boxes of all scenes one to one, best score first.
 
-    Parameters
-    ----------
-    found, truth : SceneBoxes
-        Of one class: categories are not compared.
+    `found`, `truth`: of one class: categories are not compared.
     """
     return assign(found, truth, candidate_pairs(found, truth, criterion), criterion)
 
@@ -82,8 +79,6 @@ def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches
 def assign(found: SceneBoxes, truth: SceneBoxes, pairs: Pairs, criterion: Criterion) -> Matches:
     """Choose among candidate pairs, which do not depend on what is ignored; see `match`.
 
-    Notes
-    -----
     A found box takes the best true box that is free, a counted one before an ignored one. Ignored found boxes come last. So
     the matches of the boxes above a score do not depend on those below. This is the order of PASCAL VOC and nuScenes; KITTI
     lets true boxes choose, which gives the same counts wherever a found box can match one true box only, as above an IoU of

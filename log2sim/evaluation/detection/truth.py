@@ -130,14 +130,9 @@ def image_views(
 ) -> ImageViews:
     """Project boxes into the images of a camera.
 
-    Parameters
-    ----------
-    t_ns : (F,) int64
-        Stamps of the scenes, absolute; the camera is taken where it was then.
-    boxes : SceneBoxes
-        Their scenes are indices into `t_ns`, the boxes are in the map frame.
-    truncation : bool
-        Whether to compute it, which takes a millisecond a box at the border of the image; 0 for all shown boxes otherwise.
+    `t_ns` (F,): stamps of the scenes, absolute; the camera is taken where it was then. `boxes`: their scenes are
+    indices into `t_ns`, the boxes are in the map frame. `truncation`: whether to compute it, which takes a millisecond
+    a box at the border of the image; 0 for all shown boxes otherwise.
     """
     count = len(boxes)
     shown, height, share = np.zeros(count, dtype=bool), np.zeros(count), np.zeros(count)
@@ -196,20 +191,9 @@ def truth_of_sweeps(
 ) -> SweepTruth:
     """Assign the labels of a log to sweeps and count the points in each.
 
-    Parameters
-    ----------
-    t_ns : (F,) int64
-        Stamps of the sweeps, absolute, increasing.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps); every sweep is read once.
+    `t_ns` (F,): stamps of the sweeps, absolute, increasing. `progress`: called with (sweeps done, all sweeps); every
+    sweep is read once. Raises `LogError` when the log has no labels, or none of these sweeps.
 
-    Raises
-    ------
-    LogError
-        When the log has no labels, or none of these sweeps.
-
-    Notes
-    -----
     A turning LiDAR sees objects at different times of a sweep, and labels may have the stamps of cameras. Each label is moved
     along its track to the mean time of the points in it, which is where a detector finds the object: at 15 m/s and 10 Hz it
     is up to 0.75 m off otherwise.
@@ -260,14 +244,8 @@ def _run_of(log: Log) -> Run | None:
 def labeled_sweeps(labels: Labels, middle_ns: NDArray[np.int64], period_s: float) -> NDArray[np.bool_]:
     """Mark (F,) the sweeps that are labeled: those near a label and, where every sweep is labeled, all between labels.
 
-    Parameters
-    ----------
-    labels : Labels
-        At least one; where they tell what was labeled, only sweeps near that are.
-    middle_ns : (F,) int64
-        Middles of the sweeps.
-    period_s : float
-        Time between labels of one object.
+    `labels`: at least one; where they tell what was labeled, only sweeps near that are. `middle_ns` (F,): middles of
+    the sweeps. `period_s`: time between labels of one object.
     """
     stamps = np.sort(labels.t_ns) if labels.labeled_ns is None else labels.labeled_ns
     near = np.abs(stamps[nearest_index(stamps, middle_ns)] - middle_ns) <= MAX_LAG_NS

@@ -22,8 +22,6 @@ GATE_PER_LENGTH = 0.25
 def gate_m(length_m: Array) -> Array:
     """Compute the gate (A,), m: the largest distance of matching box centers, by the truth's length (A,), m.
 
-    Notes
-    -----
     nuScenes matches within 2 m. The center of a partly visible bus or truck is uncertain by more, so the gate is at least a
     quarter of the length.
     """
@@ -61,12 +59,8 @@ class Pairs:
 def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mask) -> Pairs:
     """Collect the pairs within the gate.
 
-    Parameters
-    ----------
-    truth_xy, other_xy : (A, T, 2), (B, T, 2) float64, m
-        Box centers in one frame, NaN where an agent is absent.
-    gates_m : (A,) float64
-    same_group : (A, B) bool
+    `truth_xy`, `other_xy` (A, T, 2), (B, T, 2), m: box centers in one frame, NaN where an agent is absent. `gates_m`
+    (A,). `same_group` (A, B).
     """
     found: list[tuple[Index, ...]] = []
     distances = []
@@ -90,20 +84,9 @@ def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mas
 def assign(rows: Index, cols: Index, score: Array) -> Index:
     """Choose pairs one to one so that the sum of their scores is greatest.
 
-    Parameters
-    ----------
-    rows, cols : (P,) int64
-        The candidate pairs, each once.
-    score : (P,) float64
-        Greater than 0 for a pair that may be chosen.
+    `rows`, `cols` (P,): the candidate pairs, each once. `score` (P,): greater than 0 for a pair that may be chosen.
+    Returns (K,) indices of the chosen candidates.
 
-    Returns
-    -------
-    (K,) int64
-        Indices of the chosen candidates.
-
-    Notes
-    -----
     Pairs whose row and column have no other candidate, nearly all in a sparse scene, are chosen without the solver.
     """
     usable = np.flatnonzero(score > 0)
@@ -139,8 +122,6 @@ class Association:
 def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association:
     """Match agents tick by tick, keeping what was matched before while it is within the gate.
 
-    Notes
-    -----
     Bernardin and Stiefelhagen (2008), section 2.2.1: previous matches within the gate are kept, then the remaining agents
     are matched with the most pairs and the least total distance. A truth agent keeps its previous match over gaps. When two
     truth agents have the same previous match, the nearer one keeps it.
@@ -230,8 +211,6 @@ class StateTable(AgentTable):
 def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     """Choose the instants (T,), seconds of the scenario, at which to compare; all within the time of the truth.
 
-    Notes
-    -----
     These are the times of the ego's waypoints. When they are on average more than 0.25 s apart, which simplification does,
     the waypoints of all agents are added, and when that is not enough, those of the truth, at least `MIN_TICK_S` apart.
     """
@@ -281,8 +260,6 @@ def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Arra
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
     """Sample truth agents at the ticks (seconds of the truth), moved by `shift_m`.
 
-    Notes
-    -----
     `visible` is that of the nearest waypoint. In gaps longer than 0.25 s and outside the trajectory it is False: there an
     interpolated or extrapolated box only prevents a reconstructed agent from counting as false.
     """
@@ -336,17 +313,9 @@ MAX_FRAME_LAG_S = 0.15  # a tick is compared with the nearest labeled frame of a
 def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, candidates: Mask) -> Mask:
     """Mark (B, T) the boxes that no labeled camera shows in a labeled part of its image.
 
-    Parameters
-    ----------
-    t_s : (T,)
-        Ticks, seconds of the truth.
-    agents : StateTable
-        B agents at these ticks, the truth's map frame.
-    candidates : (B, T) bool
-        The boxes to decide on; all others are False.
+    `t_s` (T,): ticks, seconds of the truth. `agents`: B agents at these ticks, the truth's map frame. `candidates` (B,
+    T): the boxes to decide on; all others are False.
 
-    Notes
-    -----
     A camera shows a box in an ignore region when at least half of the visible outline lies in the union of the regions of
     the nearest frame. One camera that shows it in a labeled part suffices to keep it.
     """
@@ -368,8 +337,6 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
 def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
     """Find the nearest frame (T,), whether it is within `MAX_FRAME_LAG_S`, and the camera poses (T, 4, 4) at instants (T,).
 
-    Notes
-    -----
     Poses are interpolated: at 30 m/s a car moves 1.5 m in half a frame at 10 Hz.
     """
     if len(view.t_s) == 0:
@@ -459,12 +426,8 @@ def compare(
 ) -> Comparison:
     """Match agents and mark what counts.
 
-    Parameters
-    ----------
-    tick_s : float, s
-        Interval of the ticks.
-    visibility_stated : bool
-        Whether the truth states what is visible; else it follows from `MIN_POINTS` points and from pictures.
+    `tick_s`: interval of the ticks. `visibility_stated`: whether the truth states what is visible; else it follows from
+    `MIN_POINTS` points and from pictures.
     """
     same_group = truth.group[:, None] == other.group[None]
     pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
@@ -488,12 +451,9 @@ def compare(
 def coverage(c: Comparison, selected: Mask) -> dict[str, Any]:
     """Count what was labeled at the selected ticks (A, T) of the truth, what of it counts, and why the rest does not.
 
-    Returns
-    -------
-    dict
-        Agent-ticks: "labeled", "counted", "why_not" by the names in `REASONS`; "hit", those within range and of a selected
-        category with at least `MIN_HIT_POINTS` LiDAR points, counted or not, "hit_matched" and "hit_recall" of these; all
-        three None where nobody counted the points.
+    Returns agent-ticks: "labeled", "counted", "why_not" by the names in `REASONS`; "hit", those within range and of a
+    selected category with at least `MIN_HIT_POINTS` LiDAR points, counted or not, "hit_matched" and "hit_recall" of
+    these; all three None where nobody counted the points.
     """
     labeled = selected & (c.why_not != NOT_LABELED)
     wanted = selected & c.asked_for
@@ -514,13 +474,8 @@ def coverage(c: Comparison, selected: Mask) -> dict[str, Any]:
 def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
     """Move false ticks in ignore regions, and of categories never labeled, to the ignored ones.
 
-    Parameters
-    ----------
-    regions : IgnoreRegions or None
-        None where the labels are complete.
-    truth_ticks_s : (T,) float64, s
-    shift_m : (3,) float64, m
-        From the truth's map to the scenario's.
+    `regions`: None where the labels are complete. `truth_ticks_s` (T,), s. `shift_m` (3,), m: from the truth's map to
+    the scenario's.
     """
     if regions is None:
         return c

@@ -22,14 +22,9 @@ CHI2_95 = {1: 3.841, 2: 5.991}
 def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
     """Compare confidences (N,) in [0, 1] with what is right (N,).
 
-    Returns
-    -------
-    dict
-        "count", "expected_calibration_error" (None without any), and "bins" of equal width from 0 to 1 with "low", "high",
-        "count", "mean_confidence" and "right" (None in empty bins).
+    Returns "count", "expected_calibration_error" (None without any), and "bins" of equal width from 0 to 1 with "low",
+    "high", "count", "mean_confidence" and "right" (None in empty bins).
 
-    Notes
-    -----
     Expected calibration error (Naeini, Cooper, Hauskrecht, AAAI 2015; Guo et al., ICML 2017): the mean over all of the
     difference between the mean confidence and the share of right ones in their bin. What lies outside 0 to 1 is in the
     outermost bins. Bins of few have an error by chance alone: sqrt(p (1 - p) / count) for a share p.
@@ -56,15 +51,10 @@ def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
 
     Rows with an error of NaN are left out.
 
-    Returns
-    -------
-    dict
-        "count"; "without_sigma", those with a sigma of 0 or NaN, left out of all else; "nees", the mean of e^T P^-1 e / D
-        with P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", 0.69 = ln 2 for D = 2 and
-        0.45 for D = 1 where errors are Gaussian too; "within_95", the share inside of the 95 % circle or interval.
+    Returns "count"; "without_sigma", those with a sigma of 0 or NaN, left out of all else; "nees", the mean of e^T P^-1
+    e / D with P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", 0.69 = ln 2 for D = 2
+    and 0.45 for D = 1 where errors are Gaussian too; "within_95", the share inside of the 95 % circle or interval.
 
-    Notes
-    -----
     Normalized estimation error squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
     Navigation", 2001, section 5.4.2). A few gross errors dominate the mean, the other two describe the rest. The noise of
     the labels is part of the errors. Errors of positions end at the gate of the matching.
@@ -105,18 +95,8 @@ class JudgedAgents:
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
     """Judge the reconstructed agents and summarize by kind, category and range.
 
-    Parameters
-    ----------
-    agents : sequence of Agent
-        The B reconstructed agents of the comparison.
-    ticks_s : (T,) float64, s
-    ego : StateTable or None
-        One row; without it there are no figures by range.
-
-    Returns
-    -------
-    dict
-        The part `correctness` of a document of `schemas/metrics-1.json`.
+    `agents`: the B reconstructed agents of the comparison. `ticks_s` (T,), s. `ego`: one row; without it there are no
+    figures by range. Returns the part `correctness` of a document of `schemas/metrics-1.json`.
     """
     verdicts, ranged = judge(c, ego), ego is not None
     judged = JudgedAgents(

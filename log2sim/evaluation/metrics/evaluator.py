@@ -74,20 +74,9 @@ class Hota:
 def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     """Score the tracking.
 
-    Parameters
-    ----------
-    pairs : Pairs
-        Candidates; those of absent agents and those with similarity 0 are left out.
-    truth_present, other_present : (A, T), (B, T) bool
-        Which agents count at which ticks.
+    `pairs`: candidates; those of absent agents and those with similarity 0 are left out. `truth_present`,
+    `other_present` (A, T), (B, T): which agents count at which ticks. None when there is no truth.
 
-    Returns
-    -------
-    Hota or None
-        None when there is no truth.
-
-    Notes
-    -----
     Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize the sum of similarity times the global alignment of
     both identities. Without any reconstructed agent all figures are 0.
     """

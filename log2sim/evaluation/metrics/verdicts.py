@@ -56,8 +56,6 @@ class StateErrors:
 def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64], counted: Mask) -> StateErrors:
     """Compare matched states at the counted ticks.
 
-    Notes
-    -----
     Yaw counts for vehicles, two-wheelers and pedestrians of at least 0.5 m/s. The speed of a box turned by more than 90
     degrees is taken along the truth's heading, so that a flipped box is an error of yaw only.
     """
@@ -159,8 +157,6 @@ class Verdicts:
 def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     """Judge every selected tick of every reconstructed agent; `ego` has one row.
 
-    Notes
-    -----
     Agents are associated one to one with labeled objects of their kind (`GROUPS`), visible or hidden, as for recall and
     precision (`clear_mot.associate`): within 2 m, less than half a car's length, or a quarter of the true length where
     that is more.

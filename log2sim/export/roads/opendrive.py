@@ -190,10 +190,7 @@ GAP_M = 1e-4
 def require_roads(root: Element, where: str) -> None:
     """Raise unless every road has geometry without gaps along s, stations in order and lanes with a width.
 
-    Raises
-    ------
-    ScenarioError
-        Naming the file and the road.
+    Raises `ScenarioError` that names the file and the road.
     """
     if root.tag != "OpenDRIVE" or root.find("header") is None:
         raise ScenarioError(f"{where}: its root is <{root.tag[:40]}>, expected <OpenDRIVE> with a <header>")
@@ -254,12 +251,8 @@ FAR_M = 1000.0
 def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, ExportPlacement]:
     """Write the road of a scenario into a folder, or a copy of the user's; return its name and the placement of agents on it.
 
-    Raises
-    ------
-    ScenarioError
-        When the user's file is no OpenDRIVE file that players can use.
-    ConfigError
-        When its coordinates cannot be brought together with the scenario's.
+    Raises `ScenarioError` when the user's file is no OpenDRIVE file that players can use. Raises `ConfigError` when its
+    coordinates cannot be brought together with the scenario's.
     """
     if map_path is None:
         placement = near_origin(scenario)

@@ -157,10 +157,8 @@ def controller_data() -> dict[str, float]:
 def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
     """Describe agents as `player` reads them. Their positions should be near the origin: CARLA computes in float32.
 
-    Raises
-    ------
-    ScenarioError
-        When their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for them.
+    Raises `ScenarioError` when their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for
+    them.
     """
     _require_few_samples(agents)
     begin_s = min(float(a.waypoints.t_s[0]) for a in agents)

@@ -74,12 +74,8 @@ class CarlaSimulator:
     def open(self, groups: Sequence[AgentGroup], clock: StepClock, statics: Sequence[Agent]) -> None:
         """Connect, and take the groups over.
 
-        Raises
-        ------
-        MissingExtra
-            Without CARLA's client.
-        ConfigError
-            When no server answers, or it cannot load the world.
+        Raises `MissingExtra`: without CARLA's client. Raises `ConfigError` when no server answers, or it cannot load
+        the world.
         """
         self.clock = clock
         all_agents = [a for g in groups for a in g.agents] + list(statics)

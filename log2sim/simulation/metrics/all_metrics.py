@@ -142,18 +142,9 @@ LIMITS = {
 def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
     """Compute greatest and RMS acceleration, jerk and yaw rates, and whether all are within `LIMITS`.
 
-    Parameters
-    ----------
-    t_s, x_m, y_m, yaw_rad : (S,) float64, s, m and rad
-        Evenly spaced box centers without discontinuities.
+    `t_s`, `x_m`, `y_m`, `yaw_rad` (S,), s, m and rad: evenly spaced box centers without discontinuities. Returns none
+    for fewer than five rows.
 
-    Returns
-    -------
-    dict or None
-        None for fewer than five rows.
-
-    Notes
-    -----
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
     heading, lateral across it, both of the box center. Changes faster than the window are damped.
     """
@@ -220,16 +211,8 @@ MIN_SPEED_MPS = 0.05  # below this a vehicle stands, and what its acceleration i
 def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path: Trajectory) -> dict[str, Any]:
     """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`.
 
-    Parameters
-    ----------
-    index : int
-        Its column in `boxes`.
-    boxes : BoxTracks
-        Of all agents.
-    t_s : (S,) float64, s
-        Times of the rows of `boxes`.
-    path : Trajectory
-        Of the ego in the scenario.
+    `index`: its column in `boxes`. `boxes`: of all agents. `t_s` (S,), s: times of the rows of `boxes`. `path`: of the
+    ego in the scenario.
     """
     table = PathTable([path])
     gone_m = 0.0
@@ -409,14 +392,9 @@ def replay_metrics(
 ) -> dict[str, Any]:
     """Compute the metrics of `schemas/replay-1.json`, by agent and overall.
 
-    Parameters
-    ----------
-    stored : sequence of (S,) int
-        The steps of each agent's rows; of a static agent all stored steps at which it is present.
-    trajectories, errors : by id
-        Trajectories of the agents that move in the scenario, and how far they are from them.
-    source_kind : {"reconstruction", "scenario"}
-        Whose the collisions are that the boxes of the scenario have themselves.
+    `stored`: the steps of each agent's rows; of a static agent all stored steps at which it is present. `trajectories`,
+    `errors`: trajectories of the agents that move in the scenario, and how far they are from them. `source_kind`: whose
+    the collisions are that the boxes of the scenario have themselves.
     """
     ids = [a.id for a in agents]
     replayed, source = (_box_tracks(agents, stored, paths, clock) for paths in ({}, trajectories))

@@ -195,8 +195,6 @@ class RelativeMotion(Columns):
 def first_contact(motion: RelativeMotion) -> Array:
     """Return the share of the interval (N,) after which the boxes first overlap, NaN where they do not.
 
-    Notes
-    -----
     Conservative advancement (Mirtich, 1996) with separating axes in place of a distance: every step is as long as the
     boxes certainly stay apart, but at least 1 / `MAX_STEPS`; the last step is bisected.
     """
@@ -258,16 +256,11 @@ class Contacts(Columns):
 def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None = None) -> Contacts:
     """Find contacts of two boxes of which at least one moves, a step at a time; `only` (A,) restricts the agents.
 
-    Notes
-    -----
     Broad phase: axis-aligned hulls of the circles about the boxes over `CHUNK` rows, sorted. Narrow phase: `first_contact`,
     forward for the first overlap and backward for the last. Where an agent does not move continuously, the boxes are compared
     at the row alone. Cost: A log A and the pairs in reach, a chunk.
 
-    Raises
-    ------
-    ScenarioError
-        For more than `MAX_CONTACTS`, of agents that lie on top of each other.
+    Raises `ScenarioError` for more than `MAX_CONTACTS`, of agents that lie on top of each other.
     """
     found, count = [Contacts(*np.zeros((2, 0), dtype=np.intp), *np.zeros((2, 0)))], 0
     for k, a, b in _in_batches(_candidates(boxes, moves, only)):

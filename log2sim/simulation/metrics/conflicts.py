@@ -34,8 +34,6 @@ class TimesToCollision(Columns):
 def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: float) -> TimesToCollision:
     """Find the least time to collision of every pair of which at least one moves, up to `HORIZON_S`.
 
-    Notes
-    -----
     Time-to-collision of Hayward (1972) in the plane: both boxes keep their velocity and their heading; see `time_to_touch`.
     Boxes that overlap already have none. It is evaluated at every row and ignores the road: two agents that pass each other
     in a bend count as on a collision course. Cost: the pairs in reach for every `CHUNK` rows, then those on course.
@@ -201,8 +199,6 @@ class _Pairs(NamedTuple):
 def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachmentTimes:
     """Find the shortest post-encroachment time of every pair whose paths cross, up to `HORIZON_S`.
 
-    Notes
-    -----
     Allen, Shin and Cooper (1978): the time from the moment when the first road user has left the area that both cover
     until the second one reaches it. Here it is the least time between two moments at which the boxes of the first and
     of the second cover a place in common. Where two paths cross that is the same, and it is also defined in bends and

@@ -72,8 +72,6 @@ def understeer(p: VehicleParameters) -> Array:
 def slipping_reference(reference: Reference, p: VehicleParameters, model: str, ahead_s: float) -> Reference:
     """Add slip to the reference of a vehicle (`p` of shape (1,)); its curvature column is that of `ahead_s` later.
 
-    Notes
-    -----
     Inverse dynamics of the single-track model: the forces that move the vehicle along the trajectory, the slips of these
     forces, the heading that these slips add, and the steering angle; the latter as the curvature from which the controller
     computes that angle.

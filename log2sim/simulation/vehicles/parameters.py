@@ -101,8 +101,6 @@ def rear_axle_offset(agent: Agent) -> float:
 def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> VehicleParameters:
     """Return parameters (A,) of wheeled agents by category and size; with `published`, cars take the nearest published vehicle.
 
-    Notes
-    -----
     Yaw inertia over mass is the product of the distances from the center of gravity to the axles, which holds for the
     published vehicles within 10 %.
     """

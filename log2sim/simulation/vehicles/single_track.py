@@ -45,8 +45,6 @@ def step_single_track(
 ) -> VehicleState:
     """Move vehicles by `dt_s` with constant commands by the published single-track model with linear tires.
 
-    Notes
-    -----
     Equations: Althoff, Koschi & Manzinger, "CommonRoad: Vehicle Models", 2020, section "Single-Track Model", with the load
     transfer of braking and driving, small angles and no limit of friction. They have the speed of the center of gravity as
     `speed_mps`, and `lateral_mps` is speed times slip angle less what the yaw rate adds at the rear axle. They are published
@@ -152,8 +150,6 @@ class LinearPair:
 def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chassis, h: float) -> Slips:
     """Return the slip angles (rad, positive to the left) after a step of the published model.
 
-    Notes
-    -----
     Linear in the slips while speed and acceleration are the mean ones of the step, hence solved without iteration:
     |v| slips' = -(chassis) (stiffness) slips + (turn) (yaw rate / v) - |v| (0, steer').
     """
@@ -217,8 +213,6 @@ def step_dynamic(
 ) -> VehicleState:
     """Move vehicles by `dt_s` with constant commands by a single-track model whose tires saturate.
 
-    Notes
-    -----
     Angles are exact. Lateral force of an axle: the magic formula of Pacejka ("Tire and Vehicle Dynamics", 2012, chapter 4)
     with shape factor 1 and no curvature, D sin(arctan(C s)) = D C s / sqrt(1 + (C s)^2) with s the tangent of the slip
     angle: stiffness C at first, D at most. D is friction times load, less what drive and brakes take of it (friction
@@ -272,8 +266,6 @@ class BodyState:
 def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> BodyState:
     """Compute one step of the saturating model.
 
-    Notes
-    -----
     The unknowns are the lateral velocities at which the axles slip. Tires act by their secant stiffness, so a step of any
     length is dissipative; the stiffness is that at the middle of the step, from half a step of implicit Euler: second order.
     """

@@ -146,8 +146,6 @@ def step_bicycle(
 ) -> VehicleState:
     """Move vehicles by `dt_s` with constant commands.
 
-    Notes
-    -----
     Actuators (first-order lag, rate and saturation limits) are solved in closed form, and so is the arc of the rear axle at
     the mean steering angle of the step: exact for constant steering at any acceleration, of second order in the step
     otherwise, unconditionally stable. Braking ends at standstill; to reverse, the gear must change.

@@ -103,10 +103,8 @@ MAX_PREDICTIONS = 1_000_000  # of all agents together: 30 MB of a page for 3 s e
 def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[str, Any]]:
     """Predict agents while they move: by agent, paths relative to where it was, and the ellipse at their ends.
 
-    Raises
-    ------
-    ConfigError
-        For a horizon that predictions do not have, or more predictions than a browser can be expected to hold.
+    Raises `ConfigError` for a horizon that predictions do not have, or more predictions than a browser can be expected
+    to hold.
     """
     found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
     table, forecast = found.table, found.forecasts[DEFAULT_METHOD]
@@ -197,12 +195,8 @@ def page_document(
     With `predict_s`, s, movers of the scenario also hold where they were expected to go for as long.
     `background` is a map of the ground to show below everything, `metrics` are titles and texts.
 
-    Raises
-    ------
-    ConfigError
-        When there are more waypoints than a browser can be expected to hold, or for a horizon that predictions do not have.
-    ScenarioError
-        When the truth's map has another projection.
+    Raises `ConfigError` when there are more waypoints than a browser can be expected to hold, or for a horizon that
+    predictions do not have. Raises `ScenarioError` when the truth's map has another projection.
     """
     layers = {"scenario": list(_scenario(scenario))}
     if truth is not None:

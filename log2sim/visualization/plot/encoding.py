@@ -99,10 +99,7 @@ def write_with_av(frames: Iterator[Image], path: Path, fps: float, codec: str, c
 def write_with_opencv(frames: Iterator[Image], path: Path, fps: float) -> None:
     """Write a .webm with OpenCV.
 
-    Raises
-    ------
-    ConfigError
-        When this OpenCV has no such encoder.
+    Raises `ConfigError` when this OpenCV has no such encoder.
     """
     import cv2
 
@@ -197,8 +194,6 @@ def _silent_stderr() -> Iterator[None]:
 def _replace_track_number(path: Path) -> None:
     """Replace the random number by which a Matroska file names its track, so that the same frames give the same bytes.
 
-    Notes
-    -----
     RFC 9559: TrackUID has the id 73 C5 and TagTrackUID 63 C5, both followed here by 88, a length of 8 bytes. They are written
     before the first cluster (1F 43 B6 75), so nothing of the film itself can be mistaken for them.
     """

@@ -102,8 +102,6 @@ def place_labels(
 
     Labels keep clear of `sensors`, those of a scenario.
 
-    Notes
-    -----
     Short labels of all movers get their places before any is replaced by the full one, so that the long texts of some do not
     take the room of the others.
     """

@@ -81,10 +81,7 @@ NO_OPTIONS = PlotOptions()
 def parse_size(text: str | None) -> tuple[int, int] | None:
     """Read a size such as "1280x720"; None stays None.
 
-    Raises
-    ------
-    ConfigError
-        For anything but two whole numbers with an x between them.
+    Raises `ConfigError` for anything but two whole numbers with an x between them.
     """
     if text is None:
         return None
@@ -97,10 +94,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
     """Read two corners such as "-20,-10,60,40"; None stays None.
 
-    Raises
-    ------
-    ConfigError
-        For anything but four finite numbers.
+    Raises `ConfigError` for anything but four finite numbers.
     """
     if text is None:
         return None
@@ -116,10 +110,7 @@ def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
 def parse_ids(text: str | None) -> tuple[str, ...] | None:
     """Read ids separated by commas; None stays None.
 
-    Raises
-    ------
-    ConfigError
-        When it names nobody.
+    Raises `ConfigError` when it names nobody.
     """
     if text is None:
         return None
@@ -157,10 +148,7 @@ class TimeRange:
 def choose_span(scenario: Scenario, options: PlotOptions) -> TimeRange:
     """Return the range of time that the options ask for.
 
-    Raises
-    ------
-    ConfigError
-        When it is empty or none of it is in the scenario.
+    Raises `ConfigError` when it is empty or none of it is in the scenario.
     """
     start = 0.0 if options.start_s is None else options.start_s
     stop = scenario.duration_s if options.stop_s is None else min(options.stop_s, scenario.duration_s)
@@ -175,10 +163,7 @@ def choose_span(scenario: Scenario, options: PlotOptions) -> TimeRange:
 def select_shown(scenario: Scenario, replay: Any, options: PlotOptions) -> tuple[Scenario, Any]:
     """Return the scenario and its replay with the agents that the options name alone.
 
-    Raises
-    ------
-    ConfigError
-        For an id that no agent has.
+    Raises `ConfigError` for an id that no agent has.
     """
     if options.agents is None:
         return scenario, replay

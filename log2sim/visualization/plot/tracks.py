@@ -54,36 +54,15 @@ def plot_tracks(
 ) -> Path:
     """Draw a scenario from above into a file: a still for .png, .svg and .pdf, an animation for .gif, .mp4 and .webm.
 
-    Parameters
-    ----------
-    replay : log2sim.simulation.result.Replay or None
-        Drawn over the scenario; charts below the map show commands and errors of the ego, else of the agent farthest from
-        its path.
-    truth : Scenario or None
-        Brought to the scenario's start and map.
-    background : BirdsEyeView or None
-        A picture of the ground in the map frame, drawn below everything.
-    predict_s : float, s, or None
-        For how long predictions of the leading movers are drawn.
-    options : PlotOptions
-        Size, range of time, part of the map, agents, and the frames of a film.
-    dpi : int
-        Dots per inch of a .png without a size, which is 10 inches wide then.
-    progress : callable
-        `progress(stage, done, total)` is called for every frame of an animation.
-
-    Returns
-    -------
-    Path
-        The file that was written: a .webm where an .mp4 was asked for and H.264 is not installed.
-
-    Raises
-    ------
-    ConfigError
-        When the name has another suffix, an option does not fit, `predict_s` is no horizon of predictions, the file exists and
-        `overwrite` is False, or it cannot be written.
-    ScenarioError
-        When the truth's map has another projection.
+    `replay`: drawn over the scenario; charts below the map show commands and errors of the ego, else of the agent
+    farthest from its path. `truth`: brought to the scenario's start and map. `background`: a picture of the ground in
+    the map frame, drawn below everything. `predict_s`: for how long predictions of the leading movers are drawn.
+    `options`: size, range of time, part of the map, agents, and the frames of a film. `dpi`: dots per inch of a .png
+    without a size, which is 10 inches wide then. `progress`: `progress(stage, done, total)` is called for every frame
+    of an animation. Returns the file that was written: a .webm where an .mp4 was asked for and H.264 is not installed.
+    Raises `ConfigError` when the name has another suffix, an option does not fit, `predict_s` is no horizon of
+    predictions, the file exists and `overwrite` is False, or it cannot be written. Raises `ScenarioError` when the
+    truth's map has another projection.
     """
     film = resolve_picture(Path(out_path))
     suffix = film.path.suffix.lower()
@@ -141,10 +120,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
 def resolve_picture(requested: Path) -> FilmFile:
     """Tell which file is written for a name, and for an animation how.
 
-    Raises
-    ------
-    ConfigError
-        When no picture ends in its suffix.
+    Raises `ConfigError` when no picture ends in its suffix.
     """
     suffix = requested.suffix.lower()
     if suffix not in STILL + MOVING:

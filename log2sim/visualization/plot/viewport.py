@@ -138,8 +138,6 @@ class Viewport:
 def choose_viewport(roles: AgentRoles) -> Viewport:
     """Choose the smallest view of the ego's trajectory, all movers but far outliers, and stationary agents near them.
 
-    Notes
-    -----
     Points of movers are outliers when they are farther from the core than `REACH_M` and than three times the upper quartile
     of all movers' distances, or twice the median of many movers. The core is the ego's trajectory or, without an ego, the
     median of all movers.
