@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -68,9 +69,7 @@ def batch(
     say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
 
     with progress(quiet=quiet) as report_progress:
-        rows = run_batch(
-            planned, lambda: connect(jobs, scheduler), progress=lambda done, total: report_progress("logs", done, total)
-        )
+        rows = run_batch(planned, lambda: connect(jobs, scheduler), progress=partial(report_progress, "logs"))
     for line in _failure_lines(rows):
         say(line, quiet=quiet)
     say(f"{out / 'table.html'}: {_summary(rows)}", quiet=quiet)

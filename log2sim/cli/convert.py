@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -60,7 +61,7 @@ def convert(
             out,
             overwrite=overwrite,
             jpeg_quality=95,
-            progress=lambda done, total: report_progress("convert", done, total),
+            progress=partial(report_progress, "convert"),
             problems=problems,
         )
     for problem in problems:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -72,7 +73,7 @@ def detect(
     if weakness := describe_weakness(detector):
         say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        result = detect_log(opened, chosen, progress=lambda done, total: report_progress("detect", done, total))
+        result = detect_log(opened, chosen, progress=partial(report_progress, "detect"))
     result.found.save(out)
     for line in pose_notes(result.poses.to_dict()):
         say(line, quiet=quiet)

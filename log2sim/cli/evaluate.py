@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,7 +128,7 @@ def evaluate(
         with progress(quiet=quiet) as report_progress:
             known = load_truth(
                 truth, scenario, sequence=sequence, labels=labels, points=True,
-                progress=lambda done, total: report_progress("count points", done, total),
+                progress=partial(report_progress, "count points"),
             )  # fmt: skip
         for note in known.provenance.get("notes", ()) if labels is not None else ():
             say(f"note: {note}", quiet=quiet)
@@ -221,7 +222,7 @@ def _batch_figures(
             truth,
             lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
             Scope(max_range_m, categories),
-            progress=lambda done, total: report_progress("logs", done, total),
+            progress=partial(report_progress, "logs"),
         )
     table = f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
     return result, format_batch_verdict(result) + table
@@ -257,7 +258,5 @@ def _boxes_figures(
     except LogError as error:
         raise LogError(f"{path}: {error}") from None
     with progress(quiet=quiet) as report_progress:
-        result = evaluate_boxes(
-            detected, truth(), chosen, progress=lambda done, total: report_progress("count points", done, total)
-        )
+        result = evaluate_boxes(detected, truth(), chosen, progress=partial(report_progress, "count points"))
     return result, format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")

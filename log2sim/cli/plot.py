@@ -51,8 +51,8 @@ def plot(
     log2sim plot scenario.json -o tracks.png
     log2sim plot scenario.json -o film.mp4 --size 1280x720 --start 2 --stop 8
     """
+    from log2sim.cli.layers import load_background, load_placed_truth, load_replay
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario
     from log2sim.files.documents import check_targets
     from log2sim.visualization.plot.selection import PlotOptions, parse_extent, parse_ids, parse_size
@@ -66,20 +66,11 @@ def plot(
     check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
-    known = None
-    if truth is not None:
-        from log2sim.evaluation.metrics.evaluator import place_truth
-        from log2sim.evaluation.metrics.truth import load_truth
-
-        known = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
+    known = None if truth is None else load_placed_truth(truth, loaded, sequence)
     if picture.note is not None:
         say(f"note: {picture.note}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        ground = None
-        if background is not None:
-            from log2sim.cli.background import load_background
-
-            ground = load_background(background, loaded, sequence, report_progress)
+        ground = None if background is None else load_background(background, loaded, sequence, report_progress)
         plot_tracks(
             loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
             overwrite=overwrite, progress=report_progress,

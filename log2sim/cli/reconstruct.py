@@ -294,7 +294,7 @@ def reconstruct(
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
-    from log2sim.cli.background import CELL_M
+    from log2sim.cli.layers import CELL_M
     from log2sim.config import MapConfig
     from log2sim.perception.frames import RecordReader
     from log2sim.road.builder import map_ground

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -152,7 +153,7 @@ def replay(
     with progress(quiet=quiet) as report_progress:
         result = run(
             kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, foresight=foresight, host=moved_by,
-            quarantined=confidence is not None, progress=lambda done, total: report_progress("replay", done, total),
+            quarantined=confidence is not None, progress=partial(report_progress, "replay"),
         )  # fmt: skip
     warned = None if warning is None else find_warnings(kept, result, ends=warning.ends, settings=warning)
     result = changed(result, left_out=left_out, warnings=warned)

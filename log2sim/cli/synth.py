@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -99,7 +100,7 @@ def synth(
                 out,
                 seed=seed,
                 overwrite=overwrite,
-                progress=lambda done, total: report_progress("synthesize", done, total),
+                progress=partial(report_progress, "synthesize"),
             )
         elif traffic is not None:
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic
@@ -110,7 +111,5 @@ def synth(
                 None if light is None else light.value, None if weather is None else weather.value,
                 pictures=not no_pictures,
             )  # fmt: skip
-            write_traffic(
-                settings, out, overwrite=overwrite, progress=lambda done, total: report_progress("scenes", done, total)
-            )
+            write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
     say_written(out, quiet=quiet)

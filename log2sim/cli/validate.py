@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -43,7 +44,7 @@ def validate(
 
         opened = open_log(path, format=format, sequence=sequence)
         with progress(quiet=quiet) as report_progress:
-            problems = validate_log(opened, progress=lambda done, total: report_progress(VALIDATING, done, total))
+            problems = validate_log(opened, progress=partial(report_progress, VALIDATING))
         # Those of native logs are among the problems.
         for note in () if opened.format == READER.name else opened.notes:
             say(f"note: {note}", quiet=quiet)

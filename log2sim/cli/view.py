@@ -64,8 +64,8 @@ def view(
     log2sim view s.json --log samples/crossing -o s.html
     log2sim view s.json --replay replay.json --truth samples/crossing -o s.html
     """
+    from log2sim.cli.layers import load_background, load_placed_truth, load_replay, map_of
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario, say_agents
     from log2sim.errors import ConfigError
     from log2sim.files.documents import check_targets
@@ -80,14 +80,9 @@ def view(
     loaded = Scenario.load(scenario)
     layers: dict[str, Any] = {
         "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
-        "truth": None,
+        "truth": load_placed_truth(truth, loaded, sequence) if truth is not None else None,
         "metrics": [] if metrics is None else [_metrics(metrics)],
     }
-    if truth is not None:
-        from log2sim.evaluation.metrics.evaluator import place_truth
-        from log2sim.evaluation.metrics.truth import load_truth
-
-        layers["truth"] = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
@@ -96,12 +91,8 @@ def view(
             max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
             layers["recorded"] = _recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
         if background is not None:
-            from log2sim.cli.background import load_background
-
             layers["background"] = load_background(background, loaded, sequence, report_progress)
         elif log is not None and _shows_ground(opened := layers["recorded"].log):
-            from log2sim.cli.background import map_of
-
             layers["background"] = map_of(opened, loaded, report_progress)
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:

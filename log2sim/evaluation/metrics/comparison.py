@@ -42,14 +42,7 @@ class Pairs:
 
     def take(self, index: Mask | Index) -> Pairs:
         """Return the rows at `index`."""
-        return Pairs(
-            self.tick[index],
-            self.truth[index],
-            self.other[index],
-            self.distance_m[index],
-            self.similarity[index],
-            self.same_group[index],
-        )
+        return Pairs(*(column[index] for column in vars(self).values()))
 
     def bounds(self, ticks: int) -> Index:
         """Return row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""

@@ -42,15 +42,7 @@ class StateErrors:
 
     def take(self, index: Mask) -> StateErrors:
         """Return the rows at `index`."""
-        return StateErrors(
-            self.truth[index],
-            self.tick[index],
-            self.other[index],
-            self.position_m[index],
-            self.yaw_rad[index],
-            self.speed_mps[index],
-            self.size_m[index],
-        )
+        return StateErrors(*(column[index] for column in vars(self).values()))
 
 
 def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64], counted: Mask) -> StateErrors:
