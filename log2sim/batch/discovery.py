@@ -61,15 +61,7 @@ def _of_file(root: Path, format: str) -> list[FoundLog]:
 
 
 class _Search:
-    """A search below one root.
-
-    Attributes
-    ----------
-    root : Path
-    readers : mapping of str to Reader
-    leave_out : Path or None
-    max_folders : int
-    """
+    """A search below one root."""
 
     def __init__(self, root: Path, readers: Mapping[str, Reader], leave_out: Path | None, max_folders: int) -> None:
         self.root, self.readers, self.leave_out, self.max_folders = root, readers, leave_out, max_folders

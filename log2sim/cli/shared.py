@@ -27,10 +27,7 @@ SIGNAL_CODE = 128  # a shell adds the number of the signal to this as the exit c
 class Ended:
     """Which signal ended the process.
 
-    Attributes
-    ----------
-    signal : int
-        0 while there was none.
+    `signal`: 0 while there was none.
     """
 
     signal = 0

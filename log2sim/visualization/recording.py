@@ -111,16 +111,7 @@ CORNERS, SEGMENTS = 1, 0
 class OutlineProjector:
     """Projects the agents of a scenario, but for the ego, into the frames of a log.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses that the scenario was made with.
-    scenario : Scenario
-
-    Attributes
-    ----------
-    agents : tuple of Agent
-        Outlines name them by their place among these.
+    `log`: with the poses that the scenario was made with. `agents`: outlines name them by their place among these.
     """
 
     def __init__(self, log: Log, scenario: Scenario) -> None:

@@ -183,16 +183,9 @@ TRUTH_MARGIN_S = 0.15
 class StateTable(AgentTable):
     """Agents at T ticks with what makes them count.
 
-    Attributes
-    ----------
-    range_m : (A, T) float64, m
-        From the ego's center; infinite without an ego.
-    visible : (A, T) bool
-        False where the truth does not count.
-    labeled : (A, T) bool
-        False where the truth's state is interpolated over a gap of its labels or extrapolated.
-    lidar_points : (A, T) float64
-        LiDAR points in the truth's box; NaN where they were not counted.
+    `range_m` (A, T), m: from the ego's center; infinite without an ego. `visible` (A, T): False where the truth does
+    not count. `labeled` (A, T): False where the truth's state is interpolated over a gap of its labels or extrapolated.
+    `lidar_points` (A, T): LiDAR points in the truth's box; NaN where they were not counted.
     """
 
     range_m: Array

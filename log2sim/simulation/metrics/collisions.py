@@ -25,12 +25,8 @@ RowIndex = NDArray[np.intp]
 class BoxTracks:
     """Boxes of A agents at S times; between two rows a box moves straight and turns evenly.
 
-    Attributes
-    ----------
-    x_m, y_m, z_m : (S, A) float64, m
-        Box centers; NaN where an agent is absent.
-    yaw_rad, speed_mps : (S, A) float64
-    size_m : (A, 3) float64
+    `x_m`, `y_m`, `z_m` (S, A), m: box centers; NaN where an agent is absent. `yaw_rad`, `speed_mps` (S, A). `size_m`
+    (A, 3).
     """
 
     x_m: Array
