@@ -228,7 +228,7 @@ def _agent(
                 f"{where}: has neither a trajectory nor a position at the start; nothing says where it is"
             )
         pose = _pose(start, where)
-        vertices: Array = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
+        vertices = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
     return {
         "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _agent_id(name, properties),
         "category": properties.get(PREFIX + "category") or _category(body),
