@@ -38,7 +38,6 @@ from log2sim.perception.seams import (
     with_mounts,
 )
 from log2sim.perception.sync import Schedule
-from log2sim.road.mosaic import fuse_tick
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 T0_NS = 1_700_000_000_000_000_000
@@ -222,28 +221,6 @@ def test_mounts_are_turned_until_the_pictures_agree() -> None:
         assert after[name].rig is not None
         feet = foot_homography(after[name].rig.rig, after[name].rig.state, name)
         np.testing.assert_allclose(feet, before[name].fit.ground_H_image, rtol=1e-4, atol=1e-4)
-
-
-def test_the_picture_of_a_tick_shows_the_ground_without_a_step_between_cameras() -> None:
-    log, schedule, _ = log_of(dict(CAMERAS), speed_mps=8.0)
-    dark = {n: 0.75 if n == "b" else 1.0 for n in CAMERAS}
-    base = {n: base_pose(log, int(log.streams[n].t_ns[4])) for n in CAMERAS}
-    shots = {n: shoot(c, noise=0.0, gain=dark[n], base=base[n]) for n, c in CAMERAS.items()}
-    log = log.changed(streams={n: replace(s, read=lambda k, n=n: shots[n]) for n, s in log.streams.items()})
-    fits = homographies_of(rig_of(CAMERAS))
-    picture = fuse_tick(log, schedule, fits, 4, RecordReader(log), reach_m=14.0, cell_m=0.1)
-    x0, _, _, y1 = picture.extent_m
-    rows, columns = np.nonzero(picture.alpha > 200)
-    xy = np.column_stack([x0 + (columns + 0.5) * 0.1, y1 - (rows + 0.5) * 0.1])
-    true = brightness(xy + base_pose(log, int(schedule.t_ns[4]))[:2, 3])
-    ratio = picture.image_bgr[rows, columns, 0] / true
-    bearing = np.degrees(np.arctan2(*(xy - MIDDLE).T[::-1]))
-    near = np.hypot(*(xy - MIDDLE).T) < 10
-    sides = [np.median(ratio[near & (bearing > low) & (bearing < low + 15)]) for low in (5.0, 45.0)]
-    assert picture.frame == "ego"
-    assert abs(np.log(sides[0] / sides[1])) < 0.04  # the step was a quarter
-    assert np.median(np.abs(ratio[near] / np.median(ratio[near]) - 1)) < 0.03
-    assert not fuse_tick(log, schedule, {}, 4, RecordReader(log), reach_m=2.0).coverage.any()
 
 
 @pytest.mark.slow

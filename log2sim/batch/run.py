@@ -389,14 +389,17 @@ def _run_once(
 
 
 def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
-    """Run a job; what that needs is imported by workers alone."""
-    # Reconstruct a log and write its folder.
+    """Reconstruct a log and write its folder.
+
+    Returns the row of the log, and whether another run may succeed: it failed by something else than what is wrong with it
+    or with the settings. Raises `ConfigError` where the folder of the batch is not visible, or of another version.
+    """
     folder, config = _batch_of(job.out, job.token)
     target, spent = folder.log_folder(job.name), _stopwatch()
     try:
         with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
             log = open_log(job.path, format=job.format, sequence=job.sequence)
-            result = reconstruct(log, config, cache=job.cache)
+            result = reconstruct(log, config, cache=job.cache, jobs=1)
             result.scenario.save(unfinished / SCENARIO_FILE)
             write_json(unfinished / REPORT_FILE, result.report)
             row = done_row(job, result.report, spent())
