@@ -10,7 +10,7 @@ import matplotlib
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
-from log2sim.visualization.plot import drawing, layers
+from log2sim.visualization.plot import drawing
 from log2sim.visualization.plot.encoding import FilmFile, choose_film_file
 from log2sim.visualization.plot.layers import (
     NO_OVERLAYS,
@@ -19,12 +19,11 @@ from log2sim.visualization.plot.layers import (
     draw_observers,
     draw_predictions,
     draw_warnings,
-    new_collisions,
     tells_ends,
     warned_places,
 )
 from log2sim.visualization.plot.layout import FigureLayout, draw_labels
-from log2sim.visualization.plot.scene import draw_base
+from log2sim.visualization.plot.scene import draw_base, draw_moving
 from log2sim.visualization.plot.selection import (
     MOVING,
     NO_OPTIONS,
@@ -96,16 +95,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
     """Draw a still picture."""
     base = draw_base(scenario, roles, overlays)
     layout, ax, replay = base.layout, base.layout.ax, overlays.replay
-    overlaid = overlays.truth is not None or replay is not None
-    drawing.draw_tracks(ax, roles, layout.view, base.step_s, alpha=0.45 if overlaid else 1.0)
-    ghosts = None if overlaid or drawing.view_is_crowded(roles) else base.step_s
-    drawing.draw_ends(ax, roles, layout.view, ghosts_step_s=ghosts)
-    layers.hatch_movers(ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
-    if overlays.truth is not None:
-        drawing.draw_truth(ax, overlays.truth)
-    if replay is not None:
-        drawing.draw_replay(ax, replay, roles)
-        drawing.draw_collisions(ax, new_collisions(replay)[1])
+    draw_moving(ax, roles, layout.view, base.step_s, overlays.truth, replay, ghosts=True)
     if tells_ends(scenario):
         draw_observers(ax, roles, layout.view)
     draw_warnings(ax, warned_places(replay))
