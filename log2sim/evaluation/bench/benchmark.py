@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -45,6 +44,7 @@ from log2sim.evaluation.bench.settings import (
     recommend,
     short,
 )
+from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.files.documents import check, replaced
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.version import __version__
@@ -590,9 +590,9 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
                 "present": p.present,
                 "on_front": on_front,
                 "ms_per_tick": round(p.ms_per_tick, 4),
-                "error": _finite(p.error),
+                "error": rounded_tree(p.error),
                 "error_interval": _interval(p),
-                "figures": _finite(p.figures),
+                "figures": rounded_tree(p.figures),
             }
             for p, on_front in zip(panel.points, panel.on_front, strict=True)
         ],
@@ -608,15 +608,6 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
 def _interval(point: Point) -> list[float] | None:
     found = error_interval(point.by_object) if point.error is not None else None
     return None if found is None else [round(value, 6) for value in found]
-
-
-def _finite(value: Any) -> Any:
-    """Round nested figures to six decimals; None for a number that is not finite."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, float):
-        return round(value, 6) if math.isfinite(value) else None
-    return value
 
 
 def format_table(result: Benchmark) -> str:

@@ -88,11 +88,11 @@ def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
     """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
     across = np.abs(errors.across_m)
     return {
-        "cross_track_rms_m": _rms(errors.across_m),
+        "cross_track_rms_m": round(_rms(errors.across_m), 6),
         "cross_track_max_m": round(float(np.max(across)), 6),
-        "along_track_rms_m": _rms(errors.along_m),
-        "speed_rms_mps": _rms(errors.speed_mps),
-        "yaw_rms_rad": _rms(errors.yaw_rad),
+        "along_track_rms_m": round(_rms(errors.along_m), 6),
+        "speed_rms_mps": round(_rms(errors.speed_mps), 6),
+        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6),
         "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
     }
 
@@ -117,7 +117,7 @@ def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
 
 
 def _rms(values: Array) -> float:
-    return round(float(np.sqrt(np.mean(values**2))), 6)
+    return float(np.sqrt(np.mean(values**2)))
 
 
 ACCEL_WINDOW_S = 0.75
@@ -160,11 +160,11 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     out = {
         "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0),
         "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
-        "lon_accel_rms_mps2": _rms_of_columns(lon_accel),
+        "lon_accel_rms_mps2": _rms(lon_accel),
         "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
-        "lat_accel_rms_mps2": _rms_of_columns(lat_accel),
+        "lat_accel_rms_mps2": _rms(lat_accel),
         "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
-        "lon_jerk_rms_mps3": _rms_of_columns(lon_jerk),
+        "lon_jerk_rms_mps3": _rms(lon_jerk),
         "jerk_max_mps3": float(np.hypot(jx, jy).max()),
         "yaw_rate_max_radps": float(np.abs(yaw_rate).max()),
         "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
@@ -198,10 +198,6 @@ def _weights(half: int, order: int, spacing_s: float) -> Array:
         (math.perm(k, order) * np.outer(at_s ** (k - order), fit[k]) for k in range(order, 4)),
         start=np.zeros((len(at_s), len(at_s))),
     )
-
-
-def _rms_of_columns(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 MAX_PAIRS = 100_000  # pairs of boxes whose distance is computed at once, which bounds memory
