@@ -17,7 +17,7 @@ from log2sim.perception.detect import ssd_mobilenet
 from log2sim.perception.detect import ssd_mobilenet as ssd_convert
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.detect.layouts import COCO_91
-from log2sim.perception.detect.ssd_mobilenet import fields, read_graph, read_tensor
+from log2sim.perception.detect.ssd_mobilenet import message_class, read_graph, read_tensor
 
 LOG = Log("empty", "log2sim", {}, {}, {})
 DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync/image_02/data"
@@ -211,6 +211,7 @@ def field(number: int, value: int | bytes) -> bytes:
 
 
 def test_graph_reader_reads_what_the_wire_format_says() -> None:
+    pytest.importorskip("google.protobuf")
     shape = b"".join(field(2, field(1, d)) for d in (2, 3))
     filled = field(1, 1) + field(2, shape) + field(5, np.array([7.5], "<f4").tobytes())
     attribute = field(1, b"value") + field(2, field(8, filled))
@@ -218,18 +219,20 @@ def test_graph_reader_reads_what_the_wire_format_says() -> None:
     node = field(1, b"weights") + field(2, b"Const") + field(3, b"^other:1") + field(5, attribute) + field(5, strides)
     [(name, read)] = read_graph(field(1, node)).items()
     assert (name, read.op, read.inputs) == ("weights", "Const", ("other",))
-    np.testing.assert_array_equal(read.tensor("value"), np.full((2, 3), 7.5, np.float32))
+    np.testing.assert_array_equal(read_tensor(read.attributes["value"].tensor), np.full((2, 3), 7.5, np.float32))
     assert read.integers("strides") == [1, 300, -1]
-    assert read.text("padding") == ""
+    assert read.integers("padding") == []
 
 
-@pytest.mark.parametrize("data", [b"\x0a\xff\x01x", b"\xff", b"\x0b", b"\x0a\x80"], ids=str)
+@pytest.mark.parametrize("data", [b"\x0a\xff\x01x", b"\xff", b"\x0a\x80"], ids=str)
 def test_graph_reader_refuses_broken_bytes(data: bytes) -> None:
-    with pytest.raises(ValueError, match="byte"):
-        list(fields(data))
+    pytest.importorskip("google.protobuf")
+    with pytest.raises(ValueError, match="not a graph"):
+        read_graph(data)
 
 
 def test_tensor_with_more_values_than_its_shape_is_refused() -> None:
+    pytest.importorskip("google.protobuf")
     data: Any = field(1, 3) + field(2, field(2, field(1, 1))) + field(7, b"\x01\x02")
     with pytest.raises(ValueError, match="2 values"):
-        read_tensor(data)
+        read_tensor(message_class("Tensor").FromString(data))

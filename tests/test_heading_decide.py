@@ -120,8 +120,10 @@ def test_what_drives_off_or_stops_had_its_front_where_it_has_it_then(yaw):
 
 def test_the_doubts_of_a_car_that_is_turned_round_are_those_of_its_new_motion():
     backward = candidate(30.0, 40.0, 0.0, -8.0)
-    doubted = backward.doubted([Doubt("reversing", "reverses"), Doubt("jump", "jumps")])
+    doubted = backward.doubted([Doubt("jump", "jumps")])
     assert [d.flag for d in decided(doubted)[1][0].doubts] == ["jump"]
+    too_fast = candidate(30.0, 40.0, 0.0, -80.0)
+    assert [d.flag for d in decided(too_fast)[1][0].doubts] == ["speed"]
 
 
 def test_a_lone_car_is_doubted_and_says_so_in_its_quality():

@@ -129,11 +129,12 @@ def test_installed_packages_are_listed_once(tmp_path: Path, monkeypatch: pytest.
 def test_stamps_far_from_all_others_are_left_out() -> None:
     stamps = np.array([3, 1, 0, 2, 2, 9], dtype=np.int64) * 10**8 + 1_700_000_000 * NS_PER_S
     stamps[[2, 5]] = 0, np.iinfo(np.int64).max
-    rows, notes = strictly_increasing(stamps, "a")
+    notes = list[str]()
+    rows = strictly_increasing(stamps, "a", notes)
     assert rows.tolist() == [1, 3, 0]
     assert notes[0] == "a: 2 of 6 records have stamps more than 1000000 s off the others, first 0; left out"
     assert len(notes) == 3
-    assert strictly_increasing(stamps[:0], "a")[0].tolist() == []
+    assert strictly_increasing(stamps[:0], "a", notes).tolist() == []
 
 
 def test_a_pose_of_another_time_does_not_hinder_a_summary() -> None:

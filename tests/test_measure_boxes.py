@@ -18,10 +18,9 @@ from log2sim.agents.size import (
     moving_geometry,
     static_geometry,
     typical_box_size,
-    weighted_median,
 )
 from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
-from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, weighted_quantile, wrap_angle
 from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure_boxes, outside_ego
@@ -160,7 +159,7 @@ def test_the_axis_of_boxes_does_not_mind_flips_and_the_median_no_outlier() -> No
     sizes = m.box_size_m.copy()
     sizes[:3] = 40.0
     np.testing.assert_allclose(typical_box_size(replace(m, box_size_m=sizes)), CARS[0].size_m)
-    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([10.0, 1.0, 1.0])) == 3.0
+    assert weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([10.0, 1.0, 1.0]), 0.5) == 3.0
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -25,7 +25,6 @@ from log2sim.files.documents import check_targets, refuse_below_file, replaced, 
 from log2sim.files.outputs import (
     claim,
     holding_claims,
-    refusing_to_replace,
     replaced_folder,
     temporary_beside,
     together,
@@ -84,17 +83,17 @@ def test_one_that_cannot_be_renamed_takes_the_others_along(tmp_path: Path) -> No
 
 def test_what_another_run_wrote_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     out = tmp_path / "a.json"
-    with refusing_to_replace():
+    with holding_claims():
         check_targets(out, overwrite=False)
         out.write_text("of another")
         with pytest.raises(ConfigError, match=r"a\.json: another run has written it meanwhile"):
             write_json(out, 1)
         assert out.read_text() == "of another"
-        assert names(tmp_path) == ["a.json"]
         check_targets(out, overwrite=True)
+    assert names(tmp_path) == ["a.json"]
     write_json(out, 2)  # a library call replaces as it always did
     assert out.read_text() == "2\n"
-    with refusing_to_replace():
+    with holding_claims():
         check_targets(tmp_path / "b.json", overwrite=False)
         write_json(tmp_path / "b.json", 3)
         write_json(tmp_path / "b.json", 4)  # its own
@@ -107,7 +106,7 @@ def test_without_hard_links_files_are_renamed(tmp_path: Path, monkeypatch: pytes
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(outputs.os, "link", no_links)
-    with refusing_to_replace():
+    with holding_claims():
         check_targets(tmp_path / "a.json", tmp_path / "b.json", overwrite=False)
         write_json(tmp_path / "a.json", 1)
         (tmp_path / "b.json").write_text("of another")

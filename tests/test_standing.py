@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from test_size import measured
 
-from log2sim.agents.hypotheses import is_static, robust_line
+from log2sim.agents.hypotheses import explain_track
+from log2sim.agents.static import robust_line
 
 TRUCK = (18.0, 2.55, 3.8)
 
@@ -36,7 +37,7 @@ def test_a_long_truck_of_which_ever_more_shows_stands_and_a_slow_one_does_not():
     # The center that a typical length gives moves as more of the truck is seen.
     grown = standing.measurements.center_m.copy()
     grown[:, 0] = np.linspace(24.0, 20.0, 30)
-    assert is_static(standing)
+    assert explain_track(standing)[0].static
     object.__setattr__(standing.measurements, "center_m", grown)
-    assert is_static(standing)
-    assert not is_static(creeping)
+    assert explain_track(standing)[0].static
+    assert not explain_track(creeping)[0].static

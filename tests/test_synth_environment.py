@@ -165,7 +165,7 @@ def test_a_shadow_has_a_sharp_edge_that_lies_where_its_outline_does() -> None:
 def test_buildings_throw_shadows_away_from_the_sun_where_they_are_asked_to() -> None:
     building = {"center": [20.0, -15.0], "size_m": [10.0, 10.0, 12.0]}
     without, thrown = (
-        Backdrop(tiny_scene([], building=[{**building, "shadow": on}]), 0).shadows for on in (False, True)
+        Backdrop.of(tiny_scene([], building=[{**building, "shadow": on}]), 0).shadows for on in (False, True)
     )
     assert without == ()
     reach = np.array([20.0, -15.0]) - np.array(NOON.sun[:2]) / NOON.sun[2] * 12.0

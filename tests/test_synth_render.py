@@ -10,7 +10,7 @@ from log2sim.datatypes import Log
 from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.ground import ASPHALT, GROUND_M_PER_PX, MARKING, MAX_TILES, MEADOW, TILE_PX, Ground, GroundPlan
-from log2sim.synth.raster import NEAR_M, first_hit, rasterize
+from log2sim.synth.raster import NEAR_M, Samples, first_hit, nearest_of
 from log2sim.synth.render import Body, SceneInstant, render
 from log2sim.synth.scene import Road
 from log2sim.synth.shapes import block
@@ -44,7 +44,7 @@ def test_a_road_of_three_kilometers_looks_the_same_wherever_the_ego_is() -> None
         means.append([image[-60:, 200:280].mean(), image[-60:, :20].mean(), image[160:180].mean()])
     assert np.ptp(means, axis=0).max() < 10.0  # by stains; a meadow is 45 brighter
     # The road is darker than the meadow beside it.
-    backdrop = Backdrop(tiny_scene([], road=[{"line": [[-50, 0], [3000, 0]], "width_m": 4.0, "sidewalk_m": 0.0}]), 0)
+    backdrop = Backdrop.of(tiny_scene([], road=[{"line": [[-50, 0], [3000, 0]], "width_m": 4.0, "sidewalk_m": 0.0}]), 0)
     image = picture(backdrop, looking(2500.0, height_m=3.0)).astype(float)
     assert image[250:, 225:255].mean() < image[250:, :40].mean() - 20
 
@@ -76,7 +76,7 @@ def test_markings_lie_where_the_road_says_at_every_level(level: int) -> None:
 
 def test_a_picture_of_the_ground_agrees_with_the_geometry() -> None:
     road = {"line": [[0.0, 0.0], [80.0, 0.0]], "width_m": 6.0, "marking": "none", "sidewalk_m": 0.0}
-    backdrop = Backdrop(tiny_scene([], road=[road]), 0)
+    backdrop = Backdrop.of(tiny_scene([], road=[road]), 0)
     for roll in (0.0, 4.0):
         pose = looking(0.0, height_m=4.0, pitch_deg=-12.0, roll_deg=roll)
         image = picture(backdrop, pose).astype(float).mean(2)
@@ -97,7 +97,7 @@ def test_a_wall_beside_the_camera_that_reaches_behind_it_is_drawn_whole() -> Non
     box = block([-1.0, 1.0, -1.0], [12.0, 3.0, 2.0], 0)
     vertices = (box.vertices_m - [4.0, 0.0, 0.0]) @ FORWARD  # from 5 m behind to 8 m ahead, 1 m to the left
     K = np.array([[120.0, 0, 80], [0, 120.0, 60], [0, 0, 1]])
-    seen = rasterize(vertices, box.faces, K, 160, 120)
+    seen = nearest_of(Samples.of(vertices, box.faces, K, 160, 120))
     v, u = np.divmod(np.arange(160 * 120), 160)
     rays = np.column_stack([(u - 80) / 120, (v - 60) / 120, np.ones(len(u))])
     expected = first_hit(np.zeros_like(rays), rays, vertices[box.faces])
@@ -113,7 +113,7 @@ def test_the_outline_of_a_body_is_soft_and_its_middle_hides_what_is_behind() -> 
     scene = tiny_scene([{"id": "a", "category": "truck", "pose": [15.0, 0.0, 90.0], "color": [250, 250, 250]}])
     from log2sim.synth.actors import actors_of
 
-    backdrop = Backdrop(scene, 0)
+    backdrop = Backdrop.of(scene, 0)
     empty = picture(backdrop, looking(0.0)).astype(float)
     K = np.array([[400.0, 0, 239.5], [0, 400.0, 149.5], [0, 0, 1]])
     bodies = [Body.of(actor, 0.0) for actor in actors_of(scene)]

@@ -8,7 +8,7 @@ import pytest
 from log2sim.geometry import Array
 from log2sim.synth import shapes
 from log2sim.synth.paint import Appearance, paint
-from log2sim.synth.raster import first_hit, rasterize
+from log2sim.synth.raster import Samples, first_hit, nearest_of
 from log2sim.synth.shapes import Mesh, block, ellipsoid
 
 SIZES = {"car": (4.4, 1.8, 1.5), "truck": (7.2, 2.4, 3.0), "bus": (11.0, 2.5, 3.1), "cyclist": (1.76, 0.6, 1.76)}
@@ -87,7 +87,7 @@ def test_the_rasterizer_and_the_ray_caster_see_the_same_surface() -> None:
     K = np.array([[300.0, 0, 100], [0, 300.0, 60], [0, 0, 1]])
     cam_R_agent = np.array([[-0.6, 0.8, 0], [0, 0, -1], [-0.8, -0.6, 0]])
     vertices = mesh.vertices_m @ cam_R_agent.T + [0.3, 0.2, 8.0]
-    seen = rasterize(vertices, mesh.faces, K, 200, 120)
+    seen = nearest_of(Samples.of(vertices, mesh.faces, K, 200, 120))
     v, u = np.divmod(np.arange(200 * 120), 200)
     rays = np.column_stack([(u - 100) / 300, (v - 60) / 300, np.ones(len(u))])
     depth = first_hit(np.zeros_like(rays), rays, vertices[mesh.faces])
@@ -104,5 +104,5 @@ def test_what_lies_behind_or_too_near_is_not_rasterized() -> None:
     box = block([-1, -1, -1], [1, 1, 1], 0)
     K = np.array([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]])
     behind, ahead = box.vertices_m - np.array([0, 0, 5]), box.vertices_m + np.array([0, 0, 5])
-    assert len(rasterize(behind, box.faces, K, 100, 100).u) == 0
-    assert len(rasterize(ahead, box.faces, K, 100, 100).u) == pytest.approx(50**2, rel=0.05)
+    assert len(nearest_of(Samples.of(behind, box.faces, K, 100, 100)).u) == 0
+    assert len(nearest_of(Samples.of(ahead, box.faces, K, 100, 100)).u) == pytest.approx(50**2, rel=0.05)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -30,11 +30,12 @@ from log2sim.cli import (
     validate,
     view,
 )
-from log2sim.cli.options import fail, option, say
+from log2sim.cli.options import fail, say
 from log2sim.cli.shared import (
     DEBUG,
     SIGNAL_CODE,
     Debug,
+    Ended,
     FollowLinks,
     add_command,
     ending_by_signals,
@@ -42,7 +43,7 @@ from log2sim.cli.shared import (
 )
 from log2sim.errors import Log2SimError
 from log2sim.files.inputs import OPTION, following_links
-from log2sim.files.outputs import holding_claims, refusing_to_replace
+from log2sim.files.outputs import holding_claims
 from log2sim.version import __version__
 
 INTERRUPTED = 130
@@ -59,8 +60,8 @@ Exit codes:
     7  some logs of a batch failed
   130  interrupted"""
 
-# Flags that typer adds without a default: it would load pydantic to check them, which takes as long as all of --help.
 UNSET = {"help": False, "install_completion": False, "show_completion": False}
+"""Flags that typer adds without a default: it would load pydantic to check them, which takes as long as all of --help."""
 
 app = typer.Typer(
     name="log2sim",
@@ -74,7 +75,7 @@ app = typer.Typer(
 
 @app.callback(invoke_without_command=True)
 def root(
-    version: Annotated[bool, option("Print the version.", None, "--version")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     debug: Debug = False,
     follow_links: FollowLinks = False,
 ) -> None:
@@ -95,36 +96,38 @@ add_command(app, map.map_, "map")
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
-    with tolerating_lost_output(), ending_by_signals() as ended, refusing_to_replace(), holding_claims():
-        # Taken off here, too: before the name of a command they mean the same.
-        arguments = [a for a in sys.argv[1:] if a not in (DEBUG, OPTION)]
-        debug = DEBUG in sys.argv
-        try:
-            with following_links(OPTION in sys.argv):
-                code = app(args=arguments, prog_name="log2sim", standalone_mode=False)
-        except Log2SimError as error:
+    with tolerating_lost_output(), ending_by_signals() as ended, holding_claims():
+        _run(ended)
+
+
+def _run(ended: Ended) -> NoReturn:
+    # Taken off here, too: before the name of a command they mean the same.
+    arguments = [a for a in sys.argv[1:] if a not in (DEBUG, OPTION)]
+    debug = DEBUG in sys.argv
+    try:
+        with following_links(OPTION in sys.argv):
+            code = app(args=arguments, prog_name="log2sim", standalone_mode=False)
+    except Log2SimError as error:
+        if debug:
+            raise
+        fail(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except OSError as error:
+        if debug:
+            raise
+        fail(f"{error.filename or 'a file'}: {error.strerror or error}; check the name and the permissions", 3)
+    except Exception as error:
+        format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
+        if format_message is None:
             if debug:
                 raise
-            fail(str(error), error.exit_code)
-        except (KeyboardInterrupt, typer.Abort):
-            code = INTERRUPTED
-        except OSError as error:
-            if debug:
-                raise
-            fail(f"{error.filename or 'a file'}: {error.strerror or error}; check the name and the permissions", 3)
-        except Exception as error:
-            format_message: Callable[[], str] | None = getattr(
-                error, "format_message", None
-            )  # click's own usage errors
-            if format_message is None:
-                if debug:
-                    raise
-                fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
-            if not arguments:
-                sys.stderr.write(format_message() + "\n")
-                sys.exit(2)
-            fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
-        if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
-            word, code = ("terminated", SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
-            fail(f"{word}; no incomplete file was left", code)
-        sys.exit(code if isinstance(code, int) else 0)
+            fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
+        if not arguments:
+            sys.stderr.write(format_message() + "\n")
+            sys.exit(2)
+        fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
+    if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
+        word, code = ("terminated", SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
+        fail(f"{word}; no incomplete file was left", code)
+    sys.exit(code if isinstance(code, int) else 0)
