@@ -13,7 +13,7 @@ from log2sim.agents.size import TrackGeometry, independent, independent_along
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Doubt, Track, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.fusion import logit
+from log2sim.perception.lidar.measure import logit
 
 
 def spans_of(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
@@ -89,6 +89,8 @@ HIDDEN_S = 1.0
 MATCH_NATS = float(np.log(0.8 / 0.1))
 # Over so many ticks, half a second of usual logs, errors of positions average to less than the length of a person.
 SMOOTHED_TICKS = 5
+# Stamps of cameras and sweeps jitter; ticks are not nearer to each other than this.
+MIN_PERIOD_S = 0.01
 
 
 def is_confirmed(track: Track, *, typical: bool, followed: float = 0.0) -> bool:
@@ -197,7 +199,7 @@ def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded:
     if len(ticks) == 0:
         return 1.0
     # Not the time between detections: something that is detected at every fifth tick has a rate of a fifth.
-    period_s = float(np.median(np.diff(t_ns[first]) / NS_PER_S / ticks))
+    period_s = max(float(np.median(np.diff(t_ns[first]) / NS_PER_S / ticks)), MIN_PERIOD_S)
     recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
     hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
     return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))
