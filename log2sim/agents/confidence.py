@@ -15,7 +15,7 @@ from log2sim.agents.candidate import AgentCandidate, Timeline, image_confidence,
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import Array
-from log2sim.perception.fusion import logit
+from log2sim.perception.lidar.measure import logit
 
 WITH_LIDAR = {
     "image": 0.1081,

@@ -27,7 +27,7 @@ from log2sim.perception.boxes import oriented_covariance, rotate
 from log2sim.perception.detect3d.boxes import Rectangles, suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure import measure_boxes
+from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
 from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
 
@@ -111,7 +111,7 @@ MIN_REFINED_POINTS = 20
 def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     """Move and turn boxes (M,) to the sides that points of a viewpoint show; they grow to hold them."""
     mine = np.flatnonzero(boxes.points >= MIN_REFINED_POINTS)
-    rows = measure_boxes(boxes.take(mine), view)
+    rows = measure([], boxes.take(mine), view)
     size, yaw, center = boxes.size_m.copy(), boxes.yaw_rad.copy(), boxes.center_m.copy()
     # The yaw of points is known up to half turns.
     turned = np.cos(rows.yaw_rad - yaw[mine]) < 0

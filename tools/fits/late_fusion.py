@@ -4,11 +4,12 @@
 
 Every scene is made with the seed and its truth; a pair of an image box and a projected box of the sweep is right where an
 agent of that group is at its place. The weights are the most likely ones of a logistic function, with those of independent
-evidence as prior, and are printed as `log2sim/perception/fusion.py` holds them.
+evidence as prior, and are printed as `log2sim/perception/lidar/measure.py` holds them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,10 @@ from entry import parser_of
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import GROUP_OF, Measurements, Scenario
+from log2sim.datatypes import GROUP_OF, Boxes3D, Measurements, Scenario
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception import observe_tick
-from log2sim.perception.fusion import PAIR_WEIGHTS, ImageMatches, PairWeights, logit
+from log2sim.perception.lidar import measure
+from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, PairWeights, logit
 from log2sim.perception.lidar.projection import View
 from log2sim.pipeline import observe_log, start
 from log2sim.synth.scene import load_scene
@@ -28,36 +29,34 @@ from log2sim.synth.synthesis import synthesize
 # A box is right when its center is this near to an agent's.
 MAX_OFFSET_M = {"vehicle": 1.5, "two_wheeler": 1.0, "pedestrian": 0.7, "other": 1.0}
 # Standard deviation of the weights around those of independent evidence, before any pair is seen.
-PRIOR_SIGMA = np.array([1.0, 0.5, 0.5, 2.0, 0.3])
+PRIOR_SIGMA = np.array([1.0, 0.5, 0.5, 2.0])
 
 
 def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Features (P, 5) of all pairs in a scene, and whether they are right (P,)."""
+    """Features (P, 4) of all pairs in a scene, and whether they are right (P,)."""
     log, truth = synthesize(load_scene(scene), seed=seed)
-    found: list[tuple[Measurements, ImageMatches]] = []
-    original = observe_tick.match_boxes
+    found: list[tuple[Boxes3D, Measurements, Pairs]] = []
+    original = measure.match_boxes
 
-    def match(boxes: Measurements, rows: Measurements, view: View) -> ImageMatches:
-        matches = original(boxes, rows, view)
-        found.append((boxes, matches))
-        return matches
+    def match(boxes: Boxes3D, images: Measurements, frame: NDArray[np.intp], views: Sequence[View]) -> Pairs:
+        pairs = original(boxes, images, frame, views)
+        found.append((boxes, images, pairs))
+        return pairs
 
-    observe_tick.match_boxes = match
+    measure.match_boxes = match
     try:
         observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
     finally:
-        observe_tick.match_boxes = original
-    parts = [_features(boxes, matches, truth) for boxes, matches in found]
+        measure.match_boxes = original
+    parts = [_features(*of_tick, truth) for of_tick in found]
     return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
 
 
-def _features(boxes: Measurements, matches: ImageMatches, truth: Scenario) -> tuple[Array, NDArray[np.bool_]]:
-    k = np.flatnonzero(matches.partner >= 0)
-    range_m = np.hypot(*(boxes.center_m[k] - boxes.sensor_m[k])[:, :2].T)
-    image = matches.rows.score[matches.partner[k]]
-    x = np.column_stack([np.ones(len(k)), logit(image), logit(boxes.score[k]), matches.iou[k], range_m / 10.0])
-    right = np.zeros(len(k), dtype=bool)
-    for n, row in enumerate(k):
+def _features(boxes: Boxes3D, images: Measurements, pairs: Pairs, truth: Scenario) -> tuple[Array, NDArray[np.bool_]]:
+    scores = logit(images.score[pairs.image]), logit(boxes.score[pairs.box])
+    x = np.column_stack([np.ones(len(pairs.box)), *scores, pairs.iou])
+    right = np.zeros(len(x), dtype=bool)
+    for n, row in enumerate(pairs.box):
         group = GROUP_OF[str(boxes.category[row])]
         at_s = np.array([(int(boxes.t_ns[row]) - truth.t0_ns) / NS_PER_S])
         for agent in truth.others:
@@ -70,7 +69,7 @@ def _features(boxes: Measurements, matches: ImageMatches, truth: Scenario) -> tu
 
 
 def fit(x: Array, right: NDArray[np.bool_]) -> Array:
-    """Find the most likely weights (5,) for features (P, 5) of pairs that are right or wrong (P,)."""
+    """Find the most likely weights (4,) for features (P, 4) of pairs that are right or wrong (P,)."""
     from scipy.optimize import minimize
 
     prior = np.array(list(vars(PAIR_WEIGHTS).values()))
@@ -82,7 +81,7 @@ def fit(x: Array, right: NDArray[np.bool_]) -> Array:
 
 
 def loss_of(x: Array, right: NDArray[np.bool_], w: Array) -> float:
-    """Negative log-likelihood of weights (5,)."""
+    """Negative log-likelihood of weights (4,)."""
     return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (x @ w)).sum())
 
 
