@@ -9,8 +9,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from kitti_boxes import Boxes
-from kitti_map import View, hidden_share, project
+from kitti.boxes import Boxes
+from kitti.map import View, hidden_share, project
 
 PERSON_HWL = (1.75, 0.65, 0.75)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
+from benchmarks.registration import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
 
 from log2sim.config import Config
 from log2sim.datatypes import Log

@@ -29,11 +29,9 @@ from cooperation_worlds.hidden_traffic import HiddenTraffic, row, seen  # noqa: 
 from cooperation_worlds.hidden_traffic import _drawn as draw_traffic  # noqa: E402
 from cooperation_worlds.hidden_traffic import figures as traffic_figures  # noqa: E402
 from cooperation_worlds.overlap_measures import shares  # noqa: E402
-from cooperation_worlds.perturb import RoadError, disturb  # noqa: E402
 from cooperation_worlds.range_measures import figures as range_figures  # noqa: E402
-from cooperation_worlds.rows import Rows  # noqa: E402
-from cooperation_worlds.runs import Found  # noqa: E402
-from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast, log_of  # noqa: E402
+from cooperation_worlds.runs import Found, Rows  # noqa: E402
+from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, RoadError, World, cast, disturb, log_of  # noqa: E402
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
 SEEDS = (1, 5)  # the first one drawn for 5 shows the walker too early

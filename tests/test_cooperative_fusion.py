@@ -46,7 +46,7 @@ from log2sim.perception.lidar.cloud import (
     group_by_viewpoint,
     join_parts,
 )
-from log2sim.perception.lidar.measure import follow_box, measure_boxes
+from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
 from log2sim.tracking.tracker import merge_tracks, track_ends, velocities
@@ -377,7 +377,7 @@ def test_both_ends_share_the_life_of_a_short_track() -> None:
 
 def test_a_row_keeps_the_view_of_the_other_end(both_ends) -> None:
     cloud = assemble_views(both_ends, sweeps_at(both_ends), origin=np.zeros(3), ground_z=0.0, max_range_m=80.0)
-    rows = measure_boxes(boxes_at((14.0, -4.0, 0.75, 4.2, 1.8, 1.5, np.deg2rad(10))), cloud)
+    rows = measure([], boxes_at((14.0, -4.0, 0.75, 4.2, 1.8, 1.5, np.deg2rad(10))), cloud)
     (other,) = rows.others
     assert rows.seen_by.tolist() == [[True, True]]
     places = [view.sensor + view.origin for view in cloud.views]
@@ -437,7 +437,7 @@ def test_boxes_are_sought_where_the_other_end_sees_them_later() -> None:
     nothing = view_of(outline_points(30.0, 0.0), [20, 5, 3], end="road", stamp_ns=50_000_000)
     assert np.array_equal(follow_box(box, nothing).center_m, box.center_m)
     cloud = join_parts([view_of(outline_points(0.0, 0.0), [-15, -5, 2]), later])
-    rows = measure_boxes(box, cloud)
+    rows = measure([], box, cloud)
     assert rows.points[0] == len(cloud.xyz)
 
 
@@ -575,7 +575,7 @@ def test_boxes_that_the_road_alone_sees_are_moved_with_the_others() -> None:
 
 def test_the_scale_of_errors_is_found_by_their_likelihood() -> None:
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-    from fit_box_errors import fit_sigma
+    from fits.box_errors import fit_sigma
 
     rng = np.random.default_rng(0)
     terms = np.column_stack([np.ones(4000), rng.uniform(0, 5, 4000)])

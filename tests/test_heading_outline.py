@@ -15,7 +15,7 @@ from log2sim.datatypes import Waypoints
 from log2sim.perception.boxes import rotate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import fit_outline
+from fits import outline as fit_outline
 
 
 @pytest.fixture(scope="module")

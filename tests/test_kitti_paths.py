@@ -15,7 +15,7 @@ from log2sim.tracking.forward import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_v
 from log2sim.tracking.tracker import track
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-from kitti_paths import smooth_paths
+from kitti.paths import smooth_paths
 
 
 def a_track(ticks: list[int], t_ns: np.ndarray, seed: int = 0, category: str = "car", sigma_m: float = 0.3) -> Track:

@@ -17,7 +17,7 @@ from log2sim.files import arrays
 from log2sim.pipeline import infer_scenario, observe_log, start
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-from looped_log import loop_log
+from benchmarks.memory import loop_log
 
 
 def held_after(log: Log, times: int) -> tuple[int, int]:

@@ -23,7 +23,7 @@ from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
 from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, weighted_quantile, wrap_angle
 from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure import measure_boxes, outside_ego
+from log2sim.perception.lidar.measure import measure, outside_ego
 from log2sim.tracking.tracker import mark_unrecorded
 
 ORIGIN = np.array([500.0, -200.0, 3.0])
@@ -58,7 +58,7 @@ CARS = [standing(12.0, 5.0, 20.0), standing(-15.0, 3.0, 170.0), standing(4.0, -1
 
 
 def test_boxes_have_their_points_and_places_all_around() -> None:
-    rows = measure_boxes(boxes_of(CARS), cloud_of(CARS))
+    rows = measure([], boxes_of(CARS), cloud_of(CARS))
     assert (rows.source == "lidar").all()
     assert (rows.camera == "").all()
     for k, car in enumerate(CARS):
@@ -69,14 +69,14 @@ def test_boxes_have_their_points_and_places_all_around() -> None:
 
 
 def test_points_correct_a_yaw_that_is_somewhat_wrong_and_keep_its_direction() -> None:
-    rows = measure_boxes(boxes_of(CARS, yaw_error_rad=np.deg2rad(6)), cloud_of(CARS))
+    rows = measure([], boxes_of(CARS, yaw_error_rad=np.deg2rad(6)), cloud_of(CARS))
     for k, car in enumerate(CARS):
         assert abs(wrap_angle(rows.yaw_rad[k] - car.yaw_rad)) < np.deg2rad(2)
 
 
 def test_a_box_without_points_keeps_its_own_place() -> None:
     ghost = [standing(30.0, 30.0)]
-    rows = measure_boxes(boxes_of(ghost), cloud_of(CARS))
+    rows = measure([], boxes_of(ghost), cloud_of(CARS))
     assert len(rows.cluster[0]) == 0
     np.testing.assert_allclose(rows.center_m, boxes_of(ghost).center_m)
     assert rows.points[0] == 40
@@ -85,7 +85,7 @@ def test_a_box_without_points_keeps_its_own_place() -> None:
 
 def test_a_point_belongs_to_one_box_only() -> None:
     cars = [standing(12.0, 5.0), standing(12.0, 6.95)]
-    rows = measure_boxes(boxes_of(cars), cloud_of(cars))
+    rows = measure([], boxes_of(cars), cloud_of(cars))
     one, other = ({tuple(p) for p in cluster.round(4)} for cluster in rows.cluster)
     assert one
     assert other
@@ -96,8 +96,8 @@ def test_a_point_belongs_to_one_box_only() -> None:
 @pytest.mark.parametrize(("turn_deg", "flip"), [(73.0, 1.0), (180.0, 1.0), (0.0, -1.0), (-140.0, -1.0)])
 def test_turning_and_mirroring_the_world_turns_and_mirrors_the_rows(turn_deg: float, flip: float) -> None:
     turn = float(np.deg2rad(turn_deg))
-    here = measure_boxes(boxes_of(CARS), cloud_of(CARS))
-    there = measure_boxes(boxes_of(CARS, turn_rad=turn, flip=flip), cloud_of(CARS, turn_rad=turn, flip=flip))
+    here = measure([], boxes_of(CARS), cloud_of(CARS))
+    there = measure([], boxes_of(CARS, turn_rad=turn, flip=flip), cloud_of(CARS, turn_rad=turn, flip=flip))
     expected = ((here.center_m - ORIGIN) * [1.0, flip, 1.0]) @ rotation_from_rpy(0, 0, turn).T + ORIGIN
     np.testing.assert_allclose(there.center_m, expected, atol=0.03)
     np.testing.assert_allclose(wrap_angle(there.yaw_rad - (flip * here.yaw_rad + turn)), 0.0, atol=0.01)
@@ -130,7 +130,7 @@ def track_of(
     ticks: int, score: float | np.ndarray = 0.8, *, heading: float = 0.9, camera: str = "", **moved: float
 ) -> Track:
     """A track of one car by boxes of sweeps, which turns by `flip` radians at a share `flipped` of its ticks."""
-    rows = Measurements.join([measure_boxes(boxes_of(CARS[:1]), cloud_of(CARS[:1]))] * ticks)
+    rows = Measurements.join([measure([], boxes_of(CARS[:1]), cloud_of(CARS[:1]))] * ticks)
     yaw = rows.box_yaw_rad.copy()
     yaw[: round(ticks * moved.get("flipped", 0.0))] += np.pi
     t_ns = NS_PER_S + np.arange(ticks) * NS_PER_S // 10
@@ -165,7 +165,7 @@ def test_the_axis_of_boxes_does_not_mind_flips_and_the_median_no_outlier() -> No
 @pytest.mark.parametrize("moving", [False, True])
 def test_sides_never_seen_have_the_size_of_the_boxes(moving: bool) -> None:
     van = [standing(14.0, 0.0, 0.0, (5.6, 2.0, 2.1))]
-    row = measure_boxes(boxes_of(van), cloud_of(van))
+    row = measure([], boxes_of(van), cloud_of(van))
     track = Track("car", np.arange(8), Measurements.join([row] * 8))
     shape = moving_geometry(track, np.zeros(8)) if moving else static_geometry(track)
     assert shape.size_m[0] == pytest.approx(5.6, abs=0.15)

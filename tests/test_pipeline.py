@@ -23,7 +23,7 @@ from log2sim.pipeline import Result
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from extremes.small_log import rows_changed
+from extremes.table import rows_changed
 
 UTM_M = (691_000.0, 5_334_000.0, 0.0)
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)

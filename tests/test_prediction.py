@@ -34,8 +34,8 @@ from log2sim.prediction.prediction import (
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
-import bench_prediction  # noqa: E402
-import prediction_worlds  # noqa: E402
+from benchmarks import prediction as bench_prediction  # noqa: E402
+from benchmarks import prediction as prediction_worlds  # noqa: E402
 
 Array = np.ndarray
 

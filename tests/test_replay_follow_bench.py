@@ -21,7 +21,7 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_rows_are_those_of_the_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import bench_replay
+    from benchmarks import replay as bench_replay
 
     scene = scenario_of(MANEUVERS["lane change"]())
     scene.save(tmp_path / "scene.json")
@@ -46,7 +46,7 @@ def test_rows_are_those_of_the_replay(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_an_error_beyond_its_limit_is_told_and_ends_with_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import bench_replay
+    from benchmarks import replay as bench_replay
 
     monkeypatch.setitem(bench_replay.LIMITS, "cross_track_max_m", 1e-4)
     path = tmp_path / "scene.json"
@@ -57,7 +57,7 @@ def test_an_error_beyond_its_limit_is_told_and_ends_with_1(
 
 def test_cars_on_rings_drive_what_their_speeds_say() -> None:
     import numpy as np
-    from bench_replay import ring_car
+    from benchmarks.replay import ring_car
 
     for index in (0, 7):
         w = ring_car(index, 20.0).waypoints

@@ -17,7 +17,6 @@ from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography.rig import Rig, RigState, foot_homography, rotation_of
 from log2sim.perception.homography.rig_fit import RigFit
 from log2sim.perception.homography_stage import CameraHomography
-from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.seams import (
     SeamPictures,
     SeamPlace,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_section_is_replaced_between_its_markers_and_nothing_else_changes(tmp_path: Path) -> None:
-    from bench_table import replace_section
+    from benchmarks.table import replace_section
 
     file = tmp_path / "B.md"
     replace_section(file, "one", "first")
@@ -35,7 +34,7 @@ def test_a_section_is_replaced_between_its_markers_and_nothing_else_changes(tmp_
 
 
 def test_the_world_of_homographies_is_what_its_truth_says() -> None:
-    from bench_homography import FAR_M, NEAR_M, Case, camera, errors_m, limit, make_stream, mapped
+    from benchmarks.homography import FAR_M, NEAR_M, Case, camera, errors_m, limit, make_stream, mapped
 
     stream = make_stream(Case(noise_px=0.0, outliers=0.4, nod_deg=0.2), seed=1)
     again = make_stream(Case(noise_px=0.0, outliers=0.4, nod_deg=0.2), seed=1)
@@ -56,7 +55,7 @@ def test_the_world_of_homographies_is_what_its_truth_says() -> None:
 
 
 def test_maneuvers_are_integrals_of_their_velocities() -> None:
-    from bench_smoothing import STEP_S, errors, maneuver
+    from benchmarks.smoothing import STEP_S, errors, maneuver
 
     for name in ("lane change", "turn", "stop and go", "slalom"):
         truth = maneuver(name)
@@ -68,7 +67,7 @@ def test_maneuvers_are_integrals_of_their_velocities() -> None:
 
 
 def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
-    from bench_projection import make_boxes, make_sweep, make_views, with_log2sim, with_numpy, with_opencv
+    from benchmarks.projection import make_boxes, make_sweep, make_views, with_log2sim, with_numpy, with_opencv
 
     rng, views = np.random.default_rng(0), make_views()
     xyz, boxes = make_sweep(6400, rng), [make_boxes(rng) for _ in views]
@@ -79,9 +78,34 @@ def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
     assert np.nanmedian(np.abs(np.subtract(ours, plain))) < 1e-3
 
 
-def test_an_unknown_section_names_the_known_ones() -> None:
-    found = subprocess.run(
-        [sys.executable, str(TOOLS / "bench.py"), "tracks"], capture_output=True, text=True, check=False
-    )
-    assert found.returncode == 2
-    assert "homography, projection, smoothing" in found.stderr
+def test_one_command_lists_the_benchmarks_runs_them_and_refuses_unknown_ones(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from entry import commands_in, run_named
+
+    assert run_named("benchmarks", []) == 0
+    listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    assert {"agents", "lanes", "large_vehicles", "homography"} <= {name for name, _ in listed}
+    assert all(len(title) > 10 for _, title in listed)
+    assert run_named("benchmarks", ["tracks"]) == 2
+    assert {"kitti", "confidence"} <= set(commands_in("fits"))
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "fits"])
+def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from entry import commands_in, run_named
+
+    for name in commands_in(folder):
+        if name == "zou2021":
+            pytest.importorskip("torch")
+        with pytest.raises(SystemExit, match="0"):
+            run_named(folder, [name, "--help"])
+        assert "usage" in capsys.readouterr().out
+
+
+def test_every_tool_can_be_imported() -> None:
+    pytest.importorskip("torch")
+    modules = {".".join(path.relative_to(TOOLS).with_suffix("").parts) for path in TOOLS.rglob("*.py")}
+    assert len(modules) > 50
+    for name in modules:
+        importlib.import_module(name.removesuffix(".__init__"))

@@ -10,7 +10,7 @@ import pytest
 from worlds import tiny_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import bench_lanes
+from benchmarks import lanes as bench_lanes
 
 pytestmark = pytest.mark.slow
 

@@ -19,7 +19,7 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_minibus_at_the_curb_neither_slides_nor_turns_nor_grows() -> None:
-    from bench_large_vehicles import measured
+    from benchmarks.large_vehicles import measured
 
     (found,) = next(measured(["minibus"], ["curb"], "labels", 0))
     assert found.recall == 1.0
@@ -40,7 +40,7 @@ def test_a_minibus_at_the_curb_neither_slides_nor_turns_nor_grows() -> None:
     [("sedan", "curb"), ("box_truck", "beside"), ("bus", "start"), ("road_train", "curb"), ("road_train", "start")],
 )
 def test_whoever_is_seen_from_both_ends_is_within_a_foot_and_three_degrees(kind: str, pose: str) -> None:
-    from bench_large_vehicles import measured
+    from benchmarks.large_vehicles import measured
 
     for rows in measured([kind], [pose], "labels", 0):
         (found,) = (f for f in rows if f.vehicle == "target")
@@ -56,7 +56,7 @@ def test_whoever_is_seen_from_both_ends_is_within_a_foot_and_three_degrees(kind:
     ("kind", "pose"), [("bus", "oncoming"), ("road_train", "overtaking"), ("road_train", "overtaken")]
 )
 def test_who_passes_the_ego_is_there_though_the_only_camera_looks_ahead(kind: str, pose: str) -> None:
-    from bench_large_vehicles import measured
+    from benchmarks.large_vehicles import measured
 
     (found,) = next(measured([kind], [pose], "labels", 0, cameras=1))
     assert found.recall > 0.95
@@ -68,7 +68,7 @@ def test_who_passes_the_ego_is_there_though_the_only_camera_looks_ahead(kind: st
 
 
 def test_the_sweep_is_where_the_boxes_are() -> None:
-    from bench_large_vehicles import KINDS, log_of, scene_of
+    from benchmarks.large_vehicles import KINDS, log_of, scene_of
 
     log, truth = log_of(scene_of("bus", "end_on", False, exact=True), seed=0)
     sweep = log.streams["top"].read(0)

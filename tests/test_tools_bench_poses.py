@@ -1,4 +1,4 @@
-"""tools/bench_poses.py: figures against closed forms, and its table of a log."""
+"""tools/bench.py poses: figures against closed forms, and its table of a log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from log2sim.geometry import PoseTrack, rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import bench_poses
+from benchmarks import poses as bench_poses
 
 
 def straight(step_m: float, bend_rad: float = 0.0) -> PoseTrack:

@@ -19,7 +19,7 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_equations_given_to_all_are_the_published_ones() -> None:
     pytest.importorskip("vehiclemodels", reason="needs commonroad-vehicle-models, the published model")
-    from vehicle_maneuvers import SWITCH_MPS, Case, single_track_rates
+    from benchmarks.vehicle import SWITCH_MPS, Case, single_track_rates
     from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
     from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
 
@@ -37,8 +37,7 @@ def test_the_equations_given_to_all_are_the_published_ones() -> None:
 @pytest.mark.parametrize("model", ["single-track", "kinematic"])
 @pytest.mark.parametrize("index", range(4))
 def test_steps_of_20_ms_are_within_a_centimeter_one_by_one_and_known_ahead(model: str, index: int) -> None:
-    from bench_vehicle import known_ahead, solved, stepped
-    from vehicle_maneuvers import CASES, kinematic_rates, single_track_rates
+    from benchmarks.vehicle import CASES, kinematic_rates, known_ahead, single_track_rates, solved, stepped
 
     case = CASES[index]
     rates = kinematic_rates(case) if model == "kinematic" else single_track_rates(case, 0.0)
@@ -51,7 +50,7 @@ def test_steps_of_20_ms_are_within_a_centimeter_one_by_one_and_known_ahead(model
 
 
 def test_speed_is_compared_at_the_same_error() -> None:
-    from bench_vehicle import Row, faster
+    from benchmarks.vehicle import Row, faster
 
     peer = [Row("m", "c", "LSODA", str(e), e, ms) for e, ms in ((1e-2, 1.0), (1e-4, 4.0))]
     assert faster(peer, Row("m", "c", "ours", "", 1e-3, 0.5), "LSODA") == pytest.approx(4.0)

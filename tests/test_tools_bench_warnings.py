@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
-import bench_warnings  # noqa: E402
-from labeled_drives import CAMERA_AHEAD_M, kitti_tracking  # noqa: E402
+from benchmarks import warnings as bench_warnings  # noqa: E402
+from benchmarks.warnings import CAMERA_AHEAD_M, kitti_tracking  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import confidence_logs
-import fit_confidence
+from fits import confidence as fit_confidence
+from fits import confidence_logs
 
 from log2sim.datatypes import Frame
 

@@ -14,7 +14,7 @@ from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import map_repeatability as tool
+from benchmarks import map_repeatability as tool
 
 pytestmark = pytest.mark.slow
 

@@ -19,13 +19,12 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import mutate
-from mutation import killing, verdict
+from mutation import killing, running
+from mutation.binaries import MESSAGES
 from mutation.damage import Damage, Mutation
-from mutation.messages import MESSAGES
-from mutation.running import Outcome, Ran, Watched, measured
+from mutation.running import ROOT, Outcome, Ran, Watch, Watched, measured
 from mutation.supervising import ALL, CYCLE, Harness, Row, indices, kind_of, run_many
-from mutation.text_lines import cut_is_visible
-from mutation.watch import ROOT, Watch
+from mutation.texts import cut_is_visible
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks, and reads /proc")
 INPUTS, KILLS = 64, 10
@@ -161,11 +160,11 @@ def test_more_memory_than_the_limit_is_found(harness: Harness, monkeypatch: pyte
     ],
 )
 def test_classes(outcome: Outcome, visible: bool, expected: str) -> None:
-    assert verdict.judge(Ran([outcome]), SOUND, visible=visible)[0] == expected
+    assert running.judge(Ran([outcome]), SOUND, visible=visible)[0] == expected
 
 
 def test_the_peak_of_memory_counts() -> None:
-    assert verdict.judge(Ran([SOUND], peak_bytes=3 * 1024**3), SOUND, visible=True)[0] == "memory"
+    assert running.judge(Ran([SOUND], peak_bytes=3 * 1024**3), SOUND, visible=True)[0] == "memory"
 
 
 def test_the_same_seed_and_index_make_the_same_input(tmp_path: Path) -> None:
@@ -206,7 +205,7 @@ def test_a_watch_lets_python_and_the_package_be_read(tmp_path: Path) -> None:
     code = f"""
 import sys; sys.path.insert(0, {str(ROOT / "tools")!r})
 from pathlib import Path
-from mutation.watch import Watch
+from mutation.running import Watch
 watch = Watch()
 watch.allow(read=[], write=[Path({str(tmp_path)!r})])
 with watch.watching():
@@ -269,11 +268,11 @@ def test_nothing_crashes_hangs_or_is_swallowed(tmp_path: Path) -> None:
     bad = [
         f"{row.verdict}: {row.replay} {row.kind}: {row.damage}: {row.reason}"
         for row in rows
-        if row.verdict in verdict.BAD
+        if row.verdict in running.BAD
     ]
     assert not bad, "\n".join(bad)
     assert sum(counts.values()) == INPUTS
-    assert min(counts[name] for name in verdict.GOOD) > 1
+    assert min(counts[name] for name in running.GOOD) > 1
 
 
 @pytest.mark.slow

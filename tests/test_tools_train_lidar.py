@@ -18,12 +18,28 @@ sys.path.insert(0, str(TOOLS))
 
 import train_lidar  # noqa: E402
 from lidar_training import fitting  # noqa: E402
-from lidar_training.clouds import draw_example  # noqa: E402
+from lidar_training.clouds import (  # noqa: E402
+    CATEGORIES,
+    Sample,
+    Shard,
+    augmented,
+    draw_example,
+    draw_sample,
+    grid_of,
+    write_shard,
+)
 from lidar_training.export import calibrate, describe, description, export_onnx, logistic  # noqa: E402
-from lidar_training.losses import loss_of  # noqa: E402
-from lidar_training.network import BOX, CATEGORY, HEAT, OUT_CHANNELS, SEGMENT, VOTE, BevNetwork  # noqa: E402
-from lidar_training.samples import CATEGORIES, Sample, Shard, augmented, draw_sample, grid_of, write_shard  # noqa: E402
-from lidar_training.targets import targets_of  # noqa: E402
+from lidar_training.network import (  # noqa: E402
+    BOX,
+    CATEGORY,
+    HEAT,
+    OUT_CHANNELS,
+    SEGMENT,
+    VOTE,
+    BevNetwork,
+    loss_of,
+    targets_of,
+)
 
 from log2sim.config import LidarConfig  # noqa: E402
 from log2sim.errors import LogError  # noqa: E402

@@ -15,10 +15,11 @@ pytest.importorskip("onnx")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 import torch
-from lidar_training import fitting, real_logs, two_stream
-from lidar_training import two_stream_boxes as boxes_of
-from lidar_training import two_stream_inputs as inputs
-from lidar_training.pairs import Pair, ground_plane, pair_of, pairs_of
+from lidar_training import fitting, real_logs
+from two_stream import network as boxes_of
+from two_stream import network as inputs
+from two_stream import network as two_stream
+from two_stream.network import Pair, ground_plane, pair_of, pairs_of
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.geometry import Camera, project, project_boxes, rotation_from_rpy, transform

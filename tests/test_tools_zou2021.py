@@ -16,12 +16,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 import torch
 from lidar_networks import INFO
-from lidar_training import fitting, mixing, real_logs, table_rows
-from lidar_training import zou2021 as z
-from lidar_training.cluster_boxes import ClusterBoxDetector
-from lidar_training.samples import CATEGORIES, Sample, write_shard
-from lidar_training.zou2021_export import export_zou2021
-from lidar_training.zou2021_targets import IGNORED, CellTargets, cell_targets
+from lidar_training import fitting, real_logs
+from lidar_training.clouds import CATEGORIES, Sample, write_shard
+from zou2021 import network as mixing
+from zou2021 import network as z
+from zou2021 import table_rows
+from zou2021.cluster_boxes import ClusterBoxDetector
+from zou2021.network import IGNORED, CellTargets, cell_targets, export_zou2021
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D
@@ -254,7 +255,7 @@ def test_a_fit_that_was_cut_off_goes_on_to_the_same_weights(tmp_path: Path, monk
 
 @pytest.mark.slow
 def test_one_command_trains_from_shards_and_exports(sample: Sample, tmp_path: Path) -> None:
-    import train_zou2021
+    from zou2021 import train as train_zou2021
 
     (tmp_path / "data").mkdir()
     write_shard(tmp_path / "data" / "roadside-1-0000.npz", [sample, sample])
@@ -336,7 +337,7 @@ def test_figures_count_all_groups_together_at_one_score(sample: Sample) -> None:
 
 
 def test_rows_of_the_table_are_made_once_and_written(tmp_path: Path) -> None:
-    import zou2021_table as t
+    from benchmarks import zou2021 as t
 
     table = t.Table(tmp_path, {}, {}, {}, [], scenes=1, every=1, steps=1)
     assert table.row("a", lambda: {"value": 1}) == table.row("a", lambda: {"value": 2}) == {"value": 1}

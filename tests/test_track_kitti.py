@@ -13,17 +13,21 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
 import evaluate_kitti  # noqa: E402
-import fit_kitti  # noqa: E402
 import track_kitti  # noqa: E402
 from conftest import SHARED  # noqa: E402
 from evaluate_kitti import evaluate, recall_thresholds  # noqa: E402
-from kitti_boxes import Boxes, overlap_3d, read_detections, read_tracks, write_tracks  # noqa: E402
-from kitti_choice import labeled_probability  # noqa: E402
+from fits import kitti as fit_kitti  # noqa: E402
+from kitti.boxes import (  # noqa: E402
+    Boxes,
+    Rows,
+    overlap_3d,
+    read_detections,
+    read_tracks,
+    write_tracks,
+)
+from kitti.choice import find_pairs, join_tracks, labeled_probability  # noqa: E402
+from kitti.map import EGO_R_CAM, View, from_map, hidden_share, read_view, to_measurements  # noqa: E402
 from kitti_crowd import walking_crowd  # noqa: E402
-from kitti_joining import join_tracks  # noqa: E402
-from kitti_map import EGO_R_CAM, View, from_map, hidden_share, read_view, to_measurements  # noqa: E402
-from kitti_people import find_pairs  # noqa: E402
-from kitti_rows import Rows  # noqa: E402
 
 from log2sim.errors import LogError  # noqa: E402
 from log2sim.geometry import bev_iou, box_corners_bev, rotation_from_rpy, transform  # noqa: E402
