@@ -262,7 +262,7 @@ def _with_ego(truth: Scenario, scenario: Scenario) -> Scenario:
 
     def to_refined(_states: Array, t_s: Array) -> Array:
         s = ego.at(np.clip(t_s + since_s, w.t_s[0], w.t_s[-1]))
-        return np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1) - [*shift_m, 0.0]
+        return np.asarray(np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1) - [*shift_m, 0.0])
 
     return _moved(truth, _around(truth.ego, to_refined), lambda states, _t_s: states)
 

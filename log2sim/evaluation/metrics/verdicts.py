@@ -170,7 +170,7 @@ def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     """
     truth, other = c.truth, c.other
     i, t = np.nonzero(c.match >= 0)
-    matched = np.full(c.false.shape, -1, dtype=np.int64)
+    matched: Index = np.full(c.false.shape, -1, dtype=np.int64)
     matched[c.match[i, t], t] = i
     same = c.pairs.take(c.pairs.same_group)
     near, near_labeled = (_marked(c.false.shape, same.other[k], same.tick[k]) for k in (slice(None), _labeled_rows(c)))
