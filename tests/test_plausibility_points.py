@@ -97,7 +97,7 @@ def clouds(cloud):
 
 def counted(built, cloud):
     counts, _ = count_rays([over_map(built)], clouds(cloud), TIMELINE)
-    return [int(v.sum()) // 5 for v in (counts.inside, counts.through, counts.before)]
+    return [int(v.sum()) // 5 for v in counts]
 
 
 def test_rays_that_go_on_to_ground_and_wall_behind_say_that_a_place_is_empty() -> None:
@@ -133,8 +133,8 @@ def test_moving_agents_are_where_they_are_at_the_time_of_a_ray() -> None:
     drives = over_map(replace(agent(10.0), waypoints=agent(10.0, speed=20.0).waypoints))
     late = fan(60.0, things=[(9.8, -0.9, 0.9, 1.5)], t_s=0.1)
     counts, _ = count_rays([drives], [late, None, None, None, None], TIMELINE)
-    assert counts.inside[0, 0] >= 5
-    assert counts.through[0, 0] == 0
+    assert counts[0, 0, 0] >= 5
+    assert counts[1, 0, 0] == 0
 
 
 @pytest.mark.parametrize(

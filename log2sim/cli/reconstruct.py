@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from log2sim.pipeline import Result
 
 
+# Stages without which something is missing in a scenario; the others save time.
 LOOKED_FOR = (
     "image decoding",
     "detection in LiDAR sweeps",
@@ -44,7 +45,6 @@ LOOKED_FOR = (
     "colors of vehicles",
     "traffic lights",
 )
-"""Stages without which something is missing in a scenario; the others save time."""
 
 
 def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
@@ -307,7 +307,7 @@ def reconstruct(
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
-    from log2sim.cli.background import CELL_M
+    from log2sim.cli.layers import CELL_M
     from log2sim.config import MapConfig
     from log2sim.perception.frames import RecordReader
     from log2sim.road.builder import map_ground
