@@ -464,7 +464,10 @@ def test_one_camera_gives_the_same_scenario_with_fusion(tiny: Log, monkeypatch: 
     without = run(tiny)
     step = entry(without, "fusion of cameras")
     assert not step["kept"]
-    monkeypatch.setattr(log2sim.plan, "_fusion", lambda cameras: Decision(Stage.FUSION, True, "as a test"))
+    decide = log2sim.plan._decide
+    monkeypatch.setattr(
+        log2sim.plan, "_decide", lambda stage, *why: decide(stage, *(why[:1] if stage is Stage.FUSION else why))
+    )
     full = run(tiny)
     assert_same_agents(without.scenario, full.scenario, within=0.0)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Lidar, Log, Stream, Sweep
+from log2sim.datatypes import Log, Stream
 from log2sim.errors import RecordError
 from log2sim.geometry import Camera
-from log2sim.perception.frames import KeepingReader, RecordReader, look_again
+from log2sim.perception.frames import RecordReader, look_again
 
 SIZE = (64, 48)
 K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1.0]])
@@ -73,30 +73,3 @@ def test_nothing_is_read_for_nobody() -> None:
     log = log_of(reads)
     assert look_again(log, RecordReader(log), []) == 0 == look_again(log, RecordReader(log), [Wants()])
     assert reads == []
-
-
-def test_kept_sweeps_are_read_once_and_stay_as_they_are() -> None:
-    reads: list[int] = []
-
-    def read(i: int) -> Sweep:
-        reads.append(i)
-        return Sweep(
-            i, np.full((4, 3), i, np.float32), t_ns=np.arange(4) + i, intensity=None if i else np.ones(4, np.float32)
-        )
-
-    lidar = Lidar("top", "map", np.eye(4))
-    log = Log("l", "synthetic", {}, {"top": lidar}, {"top": Stream("top", np.arange(5, dtype=np.int64), read)})
-    reader = KeepingReader(log, 2)
-    for _ in range(2):
-        for i in (0, 1, 2):
-            sweep = reader.get("top", i)
-            assert (sweep.stamp_ns, sweep.xyz_m.tolist(), sweep.t_ns.tolist()) == (
-                i,
-                [[i] * 3] * 4,
-                [i, i + 1, i + 2, i + 3],
-            )
-            assert (sweep.intensity is None) == (i > 0)
-    assert reads == [0, 1, 2, 2]
-    reader.forget()
-    reader.get("top", 0)
-    assert reads[-1] == 0

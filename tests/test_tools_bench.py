@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -100,3 +101,11 @@ def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFix
         with pytest.raises(SystemExit, match="0"):
             run_named(folder, [name, "--help"])
         assert "usage" in capsys.readouterr().out
+
+
+def test_every_tool_can_be_imported() -> None:
+    pytest.importorskip("torch")
+    modules = {".".join(path.relative_to(TOOLS).with_suffix("").parts) for path in TOOLS.rglob("*.py")}
+    assert len(modules) > 50
+    for name in modules:
+        importlib.import_module(name.removesuffix(".__init__"))

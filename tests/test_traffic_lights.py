@@ -11,7 +11,7 @@ import pytest
 from log2sim.datatypes import Detections, Log, Scenario, Signal
 from log2sim.geometry import box_corners, inverse, project
 from log2sim.perception.detect.layouts import COCO_80, COCO_91, TRAFFIC_LIGHT, classes_from_names
-from log2sim.perception.detection_cache import LightBox, crop_lights, with_ranges
+from log2sim.perception.traffic_light_boxes import LightBox, crop_lights, with_ranges
 from log2sim.road.signals import (
     STATES,
     changes_of,

@@ -1,12 +1,10 @@
-"""Detections of earlier runs: the same results bit for bit, nothing searched or decoded twice, nothing damaged believed."""
+"""The first pass of earlier runs: the same results bit for bit, nothing searched or decoded twice, nothing damaged believed."""
 
 from __future__ import annotations
 
 import copy
 import os
-import shutil
 import signal
-import struct
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
@@ -16,31 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Detections, Frame, Log, Stream
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.files import plugins
 from log2sim.files.documents import check
-from log2sim.geometry import Camera
-from log2sim.perception import detection_cache
-from log2sim.perception.detection_cache import (
-    DetectionCache,
-    LightBox,
-    PictureFindings,
-    from_bytes,
-    open_cache,
-    to_bytes,
-)
+from log2sim.perception import first_pass, first_pass_cache
 from log2sim.perception.first_pass import Observations
+from log2sim.perception.first_pass_cache import open_cache
 from log2sim.pipeline import Run, observe_log, start
 
 ROOT = Path(__file__).resolve().parents[1]
-KEY = bytes(range(16))
 TICKS = 6
+# Ticks that are kept together: as many as frames of an empty camera may be skipped in a row.
+PART = 3
 # A part of the log, no second look at its pictures, and nothing that the cache has nothing to do with.
 QUICK = {"map": {"lanes": False}, "appearance": {"colors": False}, "calibration": {"check": False}, "stop_s": 0.55}
 
@@ -81,7 +69,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[Seeing]:
-    """All detectors of the name "seeing" that runs make."""
+    """All detectors of the name "seeing" that runs make; as few ticks as can be are kept together."""
+    monkeypatch.setattr(first_pass, "PART_TICKS", 1)
     detectors: list[Seeing] = []
     module = ModuleType("seeing_package")
     module.create = lambda log, **_: detectors.append(Seeing(log)) or detectors[-1]  # type: ignore[attr-defined, func-returns-value]
@@ -112,7 +101,8 @@ def untimed(report: dict[str, Any]) -> dict[str, Any]:
     out = copy.deepcopy(report)
     for key in ("seconds", "ticks_per_second", "ticks_per_second_without_detector", "detection_cache"):
         out.pop(key)
-    out["stages"] = [stage["stage"] for stage in out["stages"]]
+    first_pass = ("recall", "decode", "detect", "cloud", "measure")
+    out["stages"] = [stage["stage"] for stage in out["stages"] if stage["stage"] not in first_pass]
     for step in out["plan"]:
         step.pop("saved_s"), step.pop("saved_how")
     return out
@@ -181,12 +171,14 @@ def test_another_setting_of_the_detector_searches_everything(
 ) -> None:
     log = open_log(tiny_folder)
     look(log)
-    look(log, config(track={"max_gap_s": 1.0}, measure={"max_range_m": 30.0}))
+    look(log, config(track={"max_gap_s": 1.0}, smooth={"enabled": False}))
     assert len(made[-1].seen) == 0
+    look(log, config(measure={"max_range_m": 30.0}))
+    assert len(made[-1].seen) == TICKS
     monkeypatch.setitem(STATED, "cache_key", "seeing 2")
     look(log)
     assert len(made[-1].seen) == TICKS
-    monkeypatch.setattr(detection_cache, "software_key", lambda: "another version")
+    monkeypatch.setattr(first_pass_cache, "software_key", lambda: "another version")
     look(log)
     assert len(made[-1].seen) == TICKS
 
@@ -194,19 +186,57 @@ def test_another_setting_of_the_detector_searches_everything(
 def test_one_changed_picture_is_searched_again(log_folder: Path, folder: Path, made: list[Seeing]) -> None:
     look(open_log(log_folder))
     pictures = sorted(p for p in log_folder.rglob("*") if p.suffix in (".png", ".jpg"))
-    shutil.copy(pictures[0], pictures[4])
-    look(open_log(log_folder))
-    assert len(made[-1].seen) == 0  # known, from another moment
-    pictures[4].write_bytes(pictures[4].read_bytes()[:-30])
+    pictures[4].write_bytes(pictures[4].read_bytes()[:-30])  # a file that cannot be decoded
     run, observations = look(open_log(log_folder))
-    assert len(made[-1].seen) == 0  # a file that cannot be decoded
+    assert len(made[-1].seen) == PART - 1
     assert observations.records is not None
     assert observations.records.summary()["front"]["count"] == 1
     assert run.detectors.cache is not None
-    assert run.detectors.cache.found == TICKS - 1
+    assert run.detectors.cache.found == TICKS - PART
     pictures[4].write_bytes(recoded(pictures[0]))
     look(open_log(log_folder))
-    assert len(made[-1].seen) == 1
+    assert len(made[-1].seen) == PART
+
+
+def test_a_changed_sweep_a_moved_sensor_and_other_poses_are_measured_anew(
+    tiny_folder: Path, folder: Path, made: list[Seeing]
+) -> None:
+    log = open_log(tiny_folder)
+    look(log)
+    (lidar,) = log.lidars
+    read = log.streams[lidar].read
+
+    def moved(i: int) -> Any:
+        sweep = read(i)
+        return replace(sweep, xyz_m=sweep.xyz_m + 0.01) if i == 3 else sweep
+
+    changed = log.changed(streams={**log.streams, lidar: Stream(lidar, log.streams[lidar].t_ns, moved)})
+    run, observations = look(changed)
+    assert run.detectors.cache is not None
+    assert 0 < run.detectors.cache.found < TICKS
+    assert_same_observations(look(changed, cache=False)[1], observations)
+    mount = log.lidars[lidar].mount_T_lidar.copy()
+    mount[2, 3] += 0.01
+    look(log.changed(lidars={lidar: replace(log.lidars[lidar], mount_T_lidar=mount)}))
+    assert len(made[-1].seen) == TICKS
+    assert log.ego is not None
+    look(log.changed(ego=replace(log.ego, map_T_ego=log.ego.map_T_ego + 0.0, extrapolate_s=0.1)))
+    assert len(made[-1].seen) == TICKS
+
+
+def test_what_repeats_is_judged_by_all_before_it_whoever_knows_it(
+    tiny_folder: Path, folder: Path, made: list[Seeing]
+) -> None:
+    log = open_log(tiny_folder)
+    stream = log.streams["front"]
+    assert stream.encoded is not None
+    frozen = Stream("front", stream.t_ns, lambda i: stream.read(min(i, 2)), lambda i: stream.encoded(min(i, 2)))  # type: ignore[misc]
+    log = log.changed(streams={**log.streams, "front": frozen})
+    runs = [look(log, cache=cache)[1] for cache in (False, True, True)]
+    for other in runs[1:]:
+        assert_same_observations(runs[0], other)
+        assert other.unseen == runs[0].unseen
+        assert [f.to_dict(0) for f in other.faults] == [f.to_dict(0) for f in runs[0].faults]
 
 
 def recoded(picture: Path) -> bytes:
@@ -279,7 +309,7 @@ def test_damaged_entries_are_made_again(tiny_folder: Path, folder: Path, made: l
         flipped = content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :]
         path.write_bytes([content[:-1], flipped, contents[k - 1], b""][k % 4])
     _, after = look(log)
-    assert len(made[-1].seen) == len(paths) == TICKS
+    assert (len(made[-1].seen), len(paths)) == (TICKS, TICKS // PART)
     assert_same_observations(before, after)
     assert [path.read_bytes() for path in entries(folder)] == contents
 
@@ -297,7 +327,7 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(
         with pytest.raises(KeyboardInterrupt):
             look(log)
     _, resumed = look(log)
-    assert len(made[-1].seen) == TICKS - 4
+    assert len(made[-1].seen) == TICKS - PART
     assert_same_observations(look(log, cache=False)[1], resumed)
 
 
@@ -305,7 +335,7 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
 def test_a_run_that_was_killed_goes_on_where_it_was(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
     code = (
-        "import os, signal, sys, test_detection_cache as t\n"
+        "import os, signal, sys, test_first_pass_cache as t\n"
         "from log2sim import open_log\n"
         "from log2sim.files import plugins\n"
         "def kill(seeing):\n"
@@ -322,45 +352,10 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tiny_folder: Path, folder: P
     assert ended.returncode == -signal.SIGKILL
     run, _ = look(open_log(tiny_folder))
     assert run.detectors.cache is not None
-    assert (run.detectors.cache.found, len(made[-1].seen)) == (4, TICKS - 4)
+    assert (run.detectors.cache.found, len(made[-1].seen)) == (PART, TICKS - PART)
 
 
 # --- keys
-
-
-def camera(width: int = 60, height: int = 40) -> Camera:
-    return Camera("front", width, height, np.eye(3), "ego", np.eye(4))
-
-
-def frame(content: bytes = b"file", **size: int) -> Frame:
-    return Frame(camera(**size), 7, lambda: np.zeros((40, 60, 3), np.uint8), lambda: content)
-
-
-def cache_of(tmp_path: Path, cache_key: str = "a") -> DetectionCache:
-    from log2sim.files.cache import DiskCache
-
-    return DetectionCache(DiskCache(tmp_path), "name", cache_key)
-
-
-def test_keys_differ_by_everything_that_the_result_depends_on(tmp_path: Path) -> None:
-    cache = cache_of(tmp_path)
-    pixels = [Frame(camera(), 7, lambda v=v: np.full((40, 60, 3), v, np.uint8)) for v in (0, 1)]
-    keys = {
-        cache.key_of(frame()),
-        cache.key_of(frame(b"file2")),
-        cache.key_of(frame(width=61)),
-        cache.key_of(frame(height=41)),
-        cache_of(tmp_path, "b").key_of(frame()),
-        *(cache.key_of(f) for f in pixels),
-    }
-    assert len(keys) == 7
-    assert cache.key_of(frame()) == cache_of(tmp_path).key_of(replace(frame(), t_ns=8))
-    assert None not in keys
-
-    def torn() -> bytes:
-        raise RecordError("torn")
-
-    assert cache.key_of(replace(frame(), encoded=torn)) is None
 
 
 def test_the_key_of_a_network_changes_with_its_weights_and_settings(
@@ -385,105 +380,9 @@ def test_the_key_of_a_network_changes_with_its_weights_and_settings(
     model.graph.initializer.append(big)
     onnx.save(model, tmp_path / "d.onnx", save_as_external_data=True, location="d.bin", size_threshold=0)
     assert key(tmp_path / "d.onnx") is None  # its weights are in another file
-    assert open_cache(create_detector(str(tmp_path / "d.onnx"), LOG)) is None
-
-
-# --- bytes
-
-
-FINITE = st.floats(-1e6, 1e6)
-
-
-@st.composite
-def findings(draw: st.DrawFn) -> PictureFindings:
-    m, k = draw(st.integers(0, 4)), draw(st.integers(0, 3))
-    category = np.array(draw(st.lists(st.text(max_size=5), min_size=m, max_size=m)), dtype="<U16")
-    found = Detections(
-        draw(arrays(np.float64, (m, 4), elements=FINITE)),
-        draw(arrays(np.float64, (m,), elements=st.floats(0, 1))),
-        category,
-        draw(arrays(np.float64, (k, 5), elements=FINITE)),
-    )
-    thumbnail = draw(
-        arrays(np.float32, (draw(st.integers(1, 5)), draw(st.integers(1, 5))), elements=st.floats(0, 255, width=32))
-    )
-    lights = [
-        LightBox("front", 7, row[:4], float(row[4]), draw(arrays(np.uint8, (draw(st.integers(1, 4)), 3, 3))))
-        for row in found.traffic_lights[: draw(st.integers(0, k))]
-    ]
-    return PictureFindings(found, thumbnail, tuple(lights))
-
-
-def assert_same(one: PictureFindings, other: PictureFindings) -> None:
-    for name in ("box_px", "score", "category", "traffic_lights"):
-        a, b = getattr(one.detections, name), getattr(other.detections, name)
-        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
-        assert b.flags.writeable
-    assert one.thumbnail.tobytes() == other.thumbnail.tobytes()
-    for x, y in zip(one.lights, other.lights, strict=True):
-        assert (x.box_px.tobytes(), x.score, x.crop.tobytes()) == (y.box_px.tobytes(), y.score, y.crop.tobytes())
-        assert x.crop.shape == y.crop.shape
-
-
-@settings(max_examples=40, deadline=None)
-@given(findings())
-def test_findings_come_back_bit_for_bit(given_: PictureFindings) -> None:
-    content = to_bytes(given_, KEY)
-    assert content is not None
-    back = from_bytes(content, KEY, "left", 9)
-    assert back is not None
-    assert_same(given_, back)
-    assert all((light.camera, light.t_ns) == ("left", 9) for light in back.lights)
-    assert from_bytes(content, KEY[::-1], "left", 9) is None
-    assert from_bytes(content[:-1], KEY, "left", 9) is None
-    assert from_bytes(content + b"\0", KEY, "left", 9) is None
-
-
-def sealed(counts: tuple[int, ...], body: bytes) -> bytes:
-    """An entry with a right check sum, whatever is in it."""
-    import hashlib
-
-    rest = struct.pack("=6I", *counts) + body
-    return struct.pack("=8s16s16s", b"l2sfound", KEY, hashlib.blake2b(rest, digest_size=16).digest()) + rest
-
-
-THUMBNAIL = np.ones((1, 1), np.float32).tobytes()
-
-
-def test_a_right_check_sum_does_not_make_a_wrong_entry_right() -> None:
-    box = np.zeros(4).tobytes()
-    word = np.array(["car"], "<U3").tobytes()
-    assert (
-        from_bytes(sealed((1, 3, 0, 1, 1, 0), box + np.array([0.5]).tobytes() + word + THUMBNAIL), KEY, "", 0)
-        is not None
-    )
-    wrong = {
-        "more boxes than bytes": sealed((9000, 3, 0, 1, 1, 0), b""),
-        "more boxes than may be": sealed((2**32 - 1, 3, 0, 1, 1, 0), b""),
-        "a huge thumbnail": sealed((0, 3, 0, 2**31, 2**31, 0), b""),
-        "no thumbnail": sealed((0, 3, 0, 0, 0, 0), b""),
-        "long words": sealed((1, 10**9, 0, 1, 1, 0), b""),
-        "a score of 2": sealed((1, 3, 0, 1, 1, 0), box + np.array([2.0]).tobytes() + word + THUMBNAIL),
-        "a score that is none": sealed((1, 3, 0, 1, 1, 0), box + np.array([np.nan]).tobytes() + word + THUMBNAIL),
-        "a letter that is none": sealed((1, 3, 0, 1, 1, 0), box + np.array([0.5]).tobytes() + b"\xff" * 12 + THUMBNAIL),
-        "a crop without a light": sealed((0, 3, 0, 1, 1, 1), THUMBNAIL),
-        "an empty crop": sealed((0, 3, 1, 1, 1, 1), np.zeros(5).tobytes() + THUMBNAIL + bytes(4) + bytes(40)),
-        "nothing": b"",
-        "another file": b"PK\3\4" * 50,
-    }
-    assert [what for what, content in wrong.items() if from_bytes(content, KEY, "", 0) is not None] == []
-
-
-def test_what_would_not_come_back_is_not_kept() -> None:
-    kept = PictureFindings(Detections.empty(), np.ones((2, 2), np.float32))
-    assert to_bytes(kept, KEY) is not None
-    single = replace(Detections.empty(), box_px=np.zeros((0, 4), np.float32))
-    assert to_bytes(replace(kept, detections=single), KEY) is None  # type: ignore[arg-type]
-    assert to_bytes(replace(kept, thumbnail=np.zeros((0, 0), np.float32)), KEY) is None
-    far = replace(Detections.empty(), traffic_lights=np.full((1, 5), np.inf))
-    assert to_bytes(replace(kept, detections=far), KEY) is None
+    assert open_cache(create_detector(str(tmp_path / "d.onnx"), LOG), None) is None
 
 
 def test_the_keys_hold_the_code_that_they_are_named_after() -> None:
-    package = Path(detection_cache.__file__).resolve().parents[1]
-    assert all(list(package.glob(pattern)) for pattern in detection_cache.SOURCES)
+    package = Path(first_pass_cache.__file__).resolve().parents[1]
+    assert all(list(package.glob(pattern)) for pattern in first_pass_cache.SOURCES)
