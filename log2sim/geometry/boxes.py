@@ -152,16 +152,16 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     along, across = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
     around_camera = (np.abs(np.stack([along, across, offset[:, 2]], axis=1)) <= size_m / 2).all(axis=1)
-    shown = np.flatnonzero(inside.any(axis=1).all(axis=1) & ~around_camera)
+    shown = np.flatnonzero(np.all(inside.any(axis=1), axis=1) & ~around_camera)
     vertices = [corners_cam[i] if inside[i].all() else clip_box(corners_cam[i], planes) for i in shown]
     shown = shown[[len(of_box) > 0 for of_box in vertices]]
     if not len(shown):
         return ProjectedBoxes(valid, box, range_m)
     uv, _ = project(camera, np.concatenate(vertices))
-    known = np.isfinite(uv).all(axis=1)
+    known = np.all(np.isfinite(uv), axis=1)
     uv = np.clip(uv, 0, limit)
-    count = np.array([len(of_box) for of_box in vertices if len(of_box)])
-    first = np.cumsum(count) - count
+    vertex_count = np.array([len(of_box) for of_box in vertices if len(of_box)])
+    first = np.cumsum(vertex_count) - vertex_count
     low = np.minimum.reduceat(np.where(known[:, None], uv, np.inf), first)
     high = np.maximum.reduceat(np.where(known[:, None], uv, -np.inf), first)
     large = (np.add.reduceat(known.astype(np.intp), first) >= 3) & (high > low).all(axis=1)
