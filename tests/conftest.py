@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
 
 from log2sim.config import Config

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cooperation_worlds.blind_area_measures import STOPPING_M, collides
+from cooperation_worlds.draw_blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S, draw_blind_area, keeps_promise
+from cooperation_worlds.draw_blind_area import _drawn as draw_first
+from cooperation_worlds.draw_overlap import draw_overlap
+from cooperation_worlds.draw_range import distances_m, draw_range
+from cooperation_worlds.hidden_traffic import HiddenTraffic, row, seen
+from cooperation_worlds.hidden_traffic import _drawn as draw_traffic
+from cooperation_worlds.hidden_traffic import figures as traffic_figures
+from cooperation_worlds.overlap_measures import shares
+from cooperation_worlds.perturb import RoadError, disturb
+from cooperation_worlds.range_measures import figures as range_figures
+from cooperation_worlds.rows import Rows
+from cooperation_worlds.runs import Found
+from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast, log_of
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Boxes3D
@@ -18,22 +31,6 @@ from log2sim.synth.synthesis import synthesize
 from log2sim.synth.traffic_data import START_NS
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tools"))
-
-from cooperation_worlds.blind_area_measures import STOPPING_M, collides  # noqa: E402
-from cooperation_worlds.draw_blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S, draw_blind_area, keeps_promise  # noqa: E402
-from cooperation_worlds.draw_blind_area import _drawn as draw_first  # noqa: E402
-from cooperation_worlds.draw_overlap import draw_overlap  # noqa: E402
-from cooperation_worlds.draw_range import distances_m, draw_range  # noqa: E402
-from cooperation_worlds.hidden_traffic import HiddenTraffic, row, seen  # noqa: E402
-from cooperation_worlds.hidden_traffic import _drawn as draw_traffic  # noqa: E402
-from cooperation_worlds.hidden_traffic import figures as traffic_figures  # noqa: E402
-from cooperation_worlds.overlap_measures import shares  # noqa: E402
-from cooperation_worlds.perturb import RoadError, disturb  # noqa: E402
-from cooperation_worlds.range_measures import figures as range_figures  # noqa: E402
-from cooperation_worlds.rows import Rows  # noqa: E402
-from cooperation_worlds.runs import Found  # noqa: E402
-from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast, log_of  # noqa: E402
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
 SEEDS = (1, 5)  # the first one drawn for 5 shows the walker too early

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import fit_outline
 import numpy as np
 import pytest
 from test_size import bare
@@ -13,9 +12,6 @@ from test_size import bare
 from log2sim.agents import heading
 from log2sim.datatypes import Waypoints
 from log2sim.perception.boxes import rotate
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-import fit_outline
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import imports
 import pytest
 
 import log2sim
@@ -16,8 +17,6 @@ from log2sim.cli import app
 from log2sim.files import plugins
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-import imports  # noqa: E402
 
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (

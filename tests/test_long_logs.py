@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import gc
-import sys
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
+from looped_log import loop_log
 from worlds import tiny_log
 
 from log2sim import Config
 from log2sim.datatypes import Log
 from log2sim.files import arrays
 from log2sim.pipeline import infer_scenario, observe_log, start
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-from looped_log import loop_log
 
 
 def held_after(log: Log, times: int) -> tuple[int, int]:

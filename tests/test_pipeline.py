@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from extremes.small_log import rows_changed
 from plain_settings import AGENTS_ALONE
 from worlds import PARKED, tiny_log
 
@@ -20,10 +20,6 @@ from log2sim.errors import ConfigError, LogError, NothingToReconstruct, Scenario
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check, write_json
 from log2sim.pipeline import Result
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-
-from extremes.small_log import rows_changed
 
 UTM_M = (691_000.0, 5_334_000.0, 0.0)
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import bench_prediction
 import numpy as np
+import prediction_worlds
 import pytest
 from command_line import run
 from hypothesis import given, settings
@@ -33,10 +34,6 @@ from log2sim.prediction.prediction import (
 )
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-import bench_prediction  # noqa: E402
-import prediction_worlds  # noqa: E402
-
 Array = np.ndarray
 
 
