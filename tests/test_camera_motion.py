@@ -12,9 +12,9 @@ from worlds import tiny_log
 
 from log2sim import Config, reconstruct
 from log2sim.datatypes import ImageLabels, Log, Stream
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.geometry import PoseTrack, inverse
-from log2sim.localization.camera_motion import follow_camera, motion_camera
+from log2sim.localization.camera_motion import follow_camera
 from log2sim.localization.choice import localize
 
 CAMERA = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [640, 400], "pitch_deg": -6.0}
@@ -64,55 +64,9 @@ def test_the_path_of_the_camera_is_that_of_the_ego_within_some_percent() -> None
     assert not found.predicted.any()
 
 
-@pytest.mark.slow
-def test_nodding_of_the_car_is_not_taken_for_motion() -> None:
-    nodding, stamps = street(0.4).streams["front"], street().streams["front"].t_ns[:7]
-    images = [nodding.read(i) if i % 2 else frames()[i] for i in range(len(stamps))]
-    log = replace(filmed(), streams={"front": Stream("front", stamps, lambda i: images[i])})
-    found = follow_camera(log, "front")
-    true, _ = street().ego.at(stamps)
-    steps = np.linalg.norm(np.diff(found.start_T_ego[:, :2, 3], axis=0), axis=1)
-    true_steps = np.linalg.norm(np.diff(true[:, :2, 3], axis=0), axis=1)
-    assert np.abs(steps - true_steps).max() < 0.12  # the nods alone move the road at 8 m by 0.3 m
-
-
 def test_images_that_do_not_change_show_an_ego_that_stands() -> None:
     found = follow_camera(filmed(lambda image, i: frames()[0]), "front")
     np.testing.assert_array_equal(found.start_T_ego, np.tile(np.eye(4), (len(found.t_ns), 1, 1)))
-
-
-@pytest.mark.slow
-def test_missing_and_blank_images_are_bridged() -> None:
-    def change(image: np.ndarray, i: int) -> np.ndarray:
-        if i == 4:
-            raise RecordError("gone")
-        return image if i != 8 else np.full_like(image, 128)
-
-    found = follow_camera(filmed(change), "front")
-    true, _ = street().ego.at(found.t_ns)
-    true = inverse(true[0]) @ true
-    assert len(found.t_ns) == found.frames - 1
-    assert found.predicted.sum() == 2  # into the blank image and out of it
-    assert np.linalg.norm(found.start_T_ego[-1, :2, 3] - true[-1, :2, 3]) < 1.2
-
-
-@pytest.mark.slow
-def test_a_log_of_a_camera_alone_gets_a_path_and_says_what_it_is_worth() -> None:
-    log, choice = localize(filmed(), Config())
-    assert choice.source == "camera"
-    assert choice.reason == "the log has no poses and no LiDAR on the ego"
-    assert choice.notes[0].startswith("camera motion is planar")
-    assert choice.to_dict()["estimate"]["frames"] == len(frames())
-    np.testing.assert_allclose(log.ego.map_T_ego[0], np.eye(4), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_camera_motion_that_is_asked_for_lies_in_the_map_of_the_given_poses() -> None:
-    given = replace(filmed(), ego=street().ego)
-    log, choice = localize(given, Config.load(poses={"source": "camera"}))
-    assert choice.source == "camera"
-    at, _ = street().ego.at(log.ego.t_ns)
-    assert np.linalg.norm(log.ego.map_T_ego[:, :2, 3] - at[:, :2, 3], axis=1).max() < 1.0
 
 
 @pytest.mark.parametrize(
@@ -134,14 +88,6 @@ def test_a_camera_of_unknown_height_has_no_scale() -> None:
     flat = replace(log.cameras["front"], mount_T_cam=np.eye(4))
     with pytest.raises(LogError, match=r"camera 'front' is mounted 0.00 m above the ground"):
         localize(replace(log, cameras={"front": flat}), Config())
-
-
-def test_a_log_without_any_sensor_that_shows_motion_is_refused() -> None:
-    log = replace(
-        filmed(), streams={"front": Stream("front", street().streams["front"].t_ns[:1], lambda i: frames()[0])}
-    )
-    with pytest.raises(LogError, match="no ego poses, no LiDAR and no camera"):
-        motion_camera(log)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from log2sim.files import stages
-from log2sim.files.stages import StageClock, peak_memory_mib
+from log2sim.files.stages import StageClock
 
 
 class Hand:
@@ -28,16 +28,6 @@ def hand(monkeypatch):
     return made
 
 
-def test_blocks_of_one_stage_add_up_and_time_between_them_is_nobodys(hand):
-    watch = StageClock()
-    for seconds in (1.0, 2.5):
-        with watch.stage("detect"):
-            hand.move(seconds)
-        hand.move(10.0)
-    assert watch.seconds == {"detect": 3.5}
-    assert watch.total() == 23.5
-
-
 def test_an_inner_stage_stops_the_clock_of_the_outer_one(hand):
     watch = StageClock()
     with watch.stage("outer"):
@@ -50,16 +40,6 @@ def test_an_inner_stage_stops_the_clock_of_the_outer_one(hand):
         hand.move(2.0)
     assert watch.seconds == {"outer": 3.0, "inner": 36.0, "innermost": 16.0}
     assert sum(watch.seconds.values()) == watch.total()
-
-
-def test_a_stage_inside_itself_counts_its_time_once(hand):
-    watch = StageClock()
-    with watch.stage("read"):
-        hand.move(1.0)
-        with watch.stage("read"):
-            hand.move(2.0)
-        hand.move(4.0)
-    assert watch.seconds == {"read": 7.0}
 
 
 def fail(watch, hand):
@@ -87,16 +67,3 @@ def test_the_table_holds_ticks_per_second_and_none_for_a_stage_that_took_no_time
     assert (none["stage"], none["seconds"], none["ticks_per_second"]) == ("sync", 0.0, None)
     assert (some["stage"], some["seconds"], some["ticks_per_second"]) == ("detect", 4.0, 2.5)
     assert StageClock().table(ticks=10) == []
-
-
-@pytest.mark.slow
-def test_peak_memory_is_of_this_process_and_never_falls(hand):
-    watch = StageClock()
-    before = peak_memory_mib()
-    with watch.stage("allocate"):
-        block = bytearray(b"\1") * (int(before + 40) << 20)
-    assert watch.peak_mib["allocate"] >= before + 30
-    del block
-    with watch.stage("after"):
-        pass
-    assert watch.table(1)[1]["peak_memory_mib"] >= watch.table(1)[0]["peak_memory_mib"]

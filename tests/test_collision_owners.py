@@ -10,12 +10,10 @@ import pytest
 from export_worlds import straight, world
 
 from log2sim.datatypes import Agent, Scenario
-from log2sim.edit.apply import edit
-from log2sim.edit.edits import Remove
 from log2sim.errors import CheckFailed
 from log2sim.simulation import Controls, Observation
 from log2sim.simulation.metrics.all_metrics import require_strict, summarize
-from log2sim.simulation.result import Replay, to_scenario
+from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
 RECONSTRUCTED = {"history": ["reconstruct"], "detector": "labels"}
@@ -59,20 +57,6 @@ def test_overlaps_of_its_own_boxes_are_the_scenarios_and_new_ones_the_replays(pr
     with pytest.raises(CheckFailed, match=r"ego and wall collide at .* the scenario has no such collision") as failed:
         require_strict(result)
     assert "parked" not in str(failed.value)
-
-
-def test_no_collision_is_said_to_be_nobodys() -> None:
-    assert summarize(replay(world(straight("ego")), dt_s=0.1)).splitlines()[1].startswith("0 collisions · ")
-
-
-def test_what_was_edited_or_replayed_is_no_longer_the_reconstruction() -> None:
-    made = scene(**RECONSTRUCTED)
-    assert made.is_reconstruction
-    assert Scenario.from_dict(made.to_dict()).is_reconstruction
-    assert not edit(made, [Remove("wall")]).scenario.is_reconstruction
-    assert not to_scenario(replay(made, mode="exact", dt_s=0.1), made).is_reconstruction
-    for other in ({}, {"imported_from": "a.xosc"}, {"history": "reconstruct"}, {"source": "labels"}):
-        assert not scene(**other).is_reconstruction
 
 
 def test_older_files_that_only_say_in_log_are_read_and_written() -> None:

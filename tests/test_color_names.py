@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib import colors as mcolors
-from skimage.color import rgb2lab
 
 from log2sim.datatypes import COLOR_NAMES
-from log2sim.datatypes.color_names import name_indices, name_of, name_probabilities, to_lab, to_rgb
+from log2sim.datatypes.color_names import name_indices, name_of, name_probabilities, to_lab
 
 channel = st.integers(0, 255)
 
@@ -40,14 +39,6 @@ def test_the_names_agree_with_a_survey() -> None:
 
 @given(channel, channel, channel)
 @settings(max_examples=50, deadline=None)
-def test_lab_is_that_of_scikit_image_and_returns(r: int, g: int, b: int) -> None:
-    lab = to_lab((r, g, b))
-    np.testing.assert_allclose(lab[0], rgb2lab(np.array([[[r, g, b]]]) / 255)[0, 0])
-    assert to_rgb(lab)[0].tolist() == [r, g, b]
-
-
-@given(channel, channel, channel)
-@settings(max_examples=50, deadline=None)
 def test_probabilities_sum_to_one_and_settle_on_the_name(r: int, g: int, b: int) -> None:
     lab = to_lab((r, g, b))[0]
     assert name_probabilities(lab, np.array([9.0, 6.0, 5.0])).sum() == pytest.approx(1.0)
@@ -55,10 +46,3 @@ def test_probabilities_sum_to_one_and_settle_on_the_name(r: int, g: int, b: int)
         sure = name_probabilities(lab, np.full(3, 1e-3))
         assert COLOR_NAMES[int(np.argmax(sure))] == name_of((r, g, b))
         assert sure.max() == 1.0
-
-
-def test_between_two_names_both_are_likely() -> None:
-    at_border = name_probabilities(np.array([60.0, 0.0, 0.0]), np.array([5.0, 2.0, 2.0]))
-    gray, silver = (at_border[COLOR_NAMES.index(name)] for name in ("gray", "silver"))
-    assert gray == pytest.approx(0.5, abs=0.08)
-    assert silver == pytest.approx(0.5, abs=0.08)

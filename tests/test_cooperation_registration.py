@@ -37,22 +37,8 @@ def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: World) -> Non
 
 
 @pytest.mark.slow
-def test_a_healthy_log_comes_out_as_it_is(street: World) -> None:
-    found = register(street.log)
-    assert found.log is street.log
-    assert found.faults == ()
-    assert found.figures[0]["verified"]
-
-
-@pytest.mark.slow
 def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World) -> None:
     found = register(misplaced(street.log, POLE, 8.0, 90.0))
     assert [(fault.kind, fault.sensor, fault.treatment) for fault in found.faults] == [
         ("wrong_road_pose", POLE, "left_out")
     ]
-
-
-def test_nothing_is_read_of_a_log_with_one_end(street: World) -> None:
-    vehicle_alone = street.log.changed(lidars={"vehicle": street.log.lidars["vehicle"]}, streams={})
-    assert register(vehicle_alone).log is vehicle_alone
-    assert register(street.log, register_road=False).figures == []

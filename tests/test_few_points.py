@@ -46,15 +46,6 @@ def test_people_with_few_points_are_placed_as_far_as_their_points(far, fewest):
     assert all(len(after.cluster[k]) == 0 for k in np.flatnonzero(new))
 
 
-def test_rows_with_points_and_vehicles_stay_as_they_are():
-    solids = [standing(9, 1, 0, PERSON), standing(26, -4, 0, PERSON)]
-    rows, after, _ = measured(solids, [0], noise_m=0.01)
-    assert rows.source.tolist() == ["lidar"]
-    assert after is rows
-    rows, after, _ = measured(solids, [1], category="car")
-    assert after is rows
-
-
 def test_a_picture_on_a_wall_a_fence_or_a_pole_is_no_body():
     person = standing(26, 1, 0, PERSON)
     for other in (standing(26, 1, 0, (0.3, 6.0, 2.5)), standing(26, 1, 0, (0.2, 0.2, 4.0))):
@@ -63,14 +54,6 @@ def test_a_picture_on_a_wall_a_fence_or_a_pole_is_no_body():
         rows = measure_view(view, boxes(view, [person], ["pedestrian"]), cloud)
         after = measure_few_points(rows, view, cloud)
         assert (after.source == rows.source).all()
-
-
-def test_points_at_a_depth_where_the_box_is_no_person_are_left_out():
-    # A low wall at a third of the distance covers the lower half of the box.
-    person, wall = standing(27, 0, 0, PERSON), standing(9, 0, 0, (0.2, 0.3, 1.2))
-    _, after, count = measured([person, wall], [0], noise_m=0.01)
-    assert count[0] >= 2
-    assert after.center_m[0, 0] == pytest.approx(27.0, abs=0.5)
 
 
 def test_people_side_by_side_hide_no_one_as_a_wall_does():

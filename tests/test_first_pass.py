@@ -11,11 +11,10 @@ from worlds import camera_ahead, outline_px, scan, standing
 
 from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import base_pose, observe
-from log2sim.perception.frames import RecordReader
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.sync import synchronize
@@ -132,25 +131,6 @@ def test_obstacles_are_the_points_above_the_ground_at_their_places():
         assert world[:, 2].min() > 0.1
 
 
-def test_obstacles_are_thinned_evenly_and_nothing_is_lost_of_an_object():
-    log, _ = driving_log()
-    out, _ = run(log)
-    world = out.obstacles[0].xyz + out.obstacles[0].origin
-    gap = np.linalg.norm(world[:, None] - world[None], axis=2) + np.eye(len(world))
-    full, owner = scan(SOLIDS, noise_m=0.01, seed=0)
-    full = full[(owner >= 0) & (full[:, 2] > 0.25)]
-    assert len(world) < 0.8 * len(full)
-    assert np.linalg.norm(full[:, None] - world[None], axis=2).min(axis=1).max() < 0.12 * np.sqrt(3) + 1e-3
-    assert np.median(gap.min(axis=1)) > 0.03
-
-
-def test_what_is_out_of_range_is_left_out():
-    log, _ = driving_log()
-    out, _ = run(log, max_range_m=14.0)
-    # The car is 16.3 m away at first and comes within 14 m after half a second; the person is 12.6 m away.
-    assert [m.category[m.source == "lidar"].tolist() for m in out.measurements] == [["pedestrian"]] * TICKS
-
-
 def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     log, reads = driving_log(cameras=("front", "left"))
     detector = Truth(log)
@@ -163,37 +143,6 @@ def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     log, reads = driving_log(cameras=("front", "left"))
     run(log, Truth(log, looks=True), reads=reads)
     assert reads == {(s, i): 1 for s in ("front", "left", "top") for i in range(TICKS)}
-
-
-def test_cameras_that_are_searched_now_and_then_take_turns_and_say_nothing_in_between():
-    log, reads = driving_log(cameras=("front", "left"))
-    sensors = select_sensors(log, Config())
-    schedule = synchronize(log, sensors.cameras)
-    plan = replace(make_plan(log, Config.load(), sensors, schedule.t_ns), picture_stride=2, detector_stride=1)
-    detector = Truth(log, looks=True)
-    reads.clear()
-    out = observe(
-        log, schedule, detector, plan, mode="robust", max_range_m=80.0, clock=StageClock(), progress=lambda *_: None
-    )
-    asked = [("left" if i % 2 else "front", int(STAMPS[i])) for i in range(TICKS)]
-    assert detector.frames == asked
-    assert {name: sorted(i for n, i in reads if n == name) for name in ("front", "left")} == {
-        "front": [0, 2],
-        "left": [1, 3],
-    }
-    assert [set(m.camera.tolist()) for m in out.measurements] == [{"front"}, {"left"}, {"front"}, {"left"}]
-    assert out.unseen == {"front": [1, 3], "left": [0, 2]}
-    assert (out.frames_detected, out.frames_skipped) == (TICKS, {"front": 2, "left": 2})
-    assert out.recorded(schedule)["front"].tolist() == [True, False, True, False]
-
-
-def test_what_only_one_of_two_cameras_sees_is_kept():
-    log, _ = driving_log(cameras=("front", "left"))
-    detector, every = Truth(log), Truth(log)
-    detector.detect = lambda frame: every.detect(frame).take([0] if frame.camera.name == "front" else [1])
-    out, _ = run(log, detector)
-    for m in out.measurements:
-        assert sorted(zip(m.camera.tolist(), m.category.tolist())) == [("front", "car"), ("left", "pedestrian")]
 
 
 def test_one_torn_image_and_one_torn_sweep_are_counted_and_cost_only_their_tick():
@@ -209,39 +158,6 @@ def test_one_torn_image_and_one_torn_sweep_are_counted_and_cost_only_their_tick(
         "front": {"count": 1, "first": "front 1: torn"},
         "top": {"count": 1, "first": "top 2: torn"},
     }
-
-
-def test_an_empty_sweep_counts_as_one_that_cannot_be_read():
-    log, _ = driving_log(empty={("top", 1)})
-    out, _ = run(log)
-    assert out.records.summary()["top"]["count"] == 1
-    assert str(STAMPS[1]) in out.records.summary()["top"]["first"]
-    assert out.obstacles[1] is None
-
-
-@pytest.mark.parametrize("stream", ["front", "left"])
-def test_a_stream_of_which_nothing_can_be_read_is_an_error_that_names_it(stream):
-    log, _ = driving_log(broken={(stream, i) for i in range(TICKS)}, cameras=("front", "left"))
-    with pytest.raises(LogError, match=f"stream '{stream}': none of the {TICKS} records asked for can be read.*torn"):
-        run(log, Truth(log, looks=True))
-
-
-def test_records_count_what_was_read_and_what_was_not():
-    log, _ = driving_log(broken={("top", 0)})
-    records = RecordReader(log)
-    assert records.get("top", 0) is None
-    with pytest.raises(LogError, match="stream 'top'"):
-        records.require_some()
-    assert isinstance(records.get("top", 1), Sweep)
-    records.require_some()
-    assert (records.read, records.failed) == ({"top": 1}, {"top": ["top 0: torn"]})
-
-
-def test_a_log_without_lidar_gives_rows_without_a_place():
-    log, _ = driving_log()
-    out, _ = run(replace(log, lidars={}))
-    assert [m.source.tolist() for m in out.measurements] == [["", ""]] * TICKS
-    assert list(out.obstacles) == [None] * TICKS
 
 
 def roadside(log):
@@ -268,13 +184,6 @@ def test_sensors_on_a_post_need_no_ego():
     origin, ground = cloud_origin(log, T0_NS)
     np.testing.assert_allclose(origin, [0.0, 0.0, (1.9 + 1.6) / 2])
     assert ground == 0.0
-
-
-def test_ticks_at_which_the_ego_is_not_known_have_no_measurements():
-    log, _ = driving_log()
-    known = PoseTrack(log.ego.t_ns[:3], log.ego.map_T_ego[:3], extrapolate_s=0.0)
-    out, _ = run(replace(log, ego=known))
-    assert [len(m) for m in out.measurements] == [2, 0, 0, 0]
 
 
 def test_the_ground_under_the_ego_turns_with_its_pitch():
@@ -329,15 +238,6 @@ def test_a_repeated_sweep_counts_as_not_recorded_and_is_told():
     ]
 
 
-def test_pictures_that_repeat_while_the_ego_drives_are_not_used_and_told():
-    log, _ = driving_log()
-    picture = np.random.default_rng(0).integers(0, 255, (60, 120, 3), dtype=np.uint8).repeat(10, 0).repeat(10, 1)
-    out, _ = run(with_records(log, front=lambda i: picture))
-    assert out.unseen == {"front": [1, 2, 3]}
-    assert [len(m) for m in out.measurements] == [2, 0, 0, 0]
-    assert [(f.kind, f.sensor, f.values["count"]) for f in out.faults] == [("frozen_images", "front", 3)]
-
-
 @pytest.mark.parametrize("finds", [True, False])
 def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
     log, _ = driving_log()
@@ -347,10 +247,3 @@ def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
     out, _ = run(log, detector)
     assert out.unseen == ({} if finds else {"front": [0, 1, 2, 3]})
     assert [f.kind for f in out.faults] == ([] if finds else ["black_images"])
-
-
-def test_with_boxes_from_the_log_no_picture_is_looked_at():
-    log, _ = driving_log()
-    out, _ = run(log, labels=True)
-    assert out.unseen == {}
-    assert out.faults == ()

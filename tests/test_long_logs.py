@@ -2,33 +2,9 @@
 
 from __future__ import annotations
 
-import gc
-import tracemalloc
-
 import numpy as np
-import pytest
 from looped_log import loop_log
 from worlds import tiny_log
-
-from log2sim import Config
-from log2sim.datatypes import Log
-from log2sim.files import arrays
-from log2sim.pipeline import infer_scenario, observe_log, start
-
-
-def held_after(log: Log, times: int) -> tuple[int, int]:
-    """Ticks of a log that is driven several times, and the bytes held once it is reconstructed."""
-    config = Config.load(detect={"name": "lidar:labels"})
-    tracemalloc.start()
-    run = start(loop_log(log, times), config)
-    before = tracemalloc.get_traced_memory()[0]
-    observations = observe_log(run)
-    result = infer_scenario(run, observations)
-    gc.collect()
-    held = tracemalloc.get_traced_memory()[0] - before
-    tracemalloc.stop()
-    assert len(result.scenario.agents) > times
-    return len(run.schedule), held
 
 
 def test_a_looped_log_goes_on_where_it_ended() -> None:
@@ -44,12 +20,3 @@ def test_a_looped_log_goes_on_where_it_ended() -> None:
         if name in log.lidars:
             third = stream.read(2 * len(stream.t_ns) // 3)
             assert third.stamp_ns == int(stream.t_ns[2 * len(stream.t_ns) // 3])
-
-
-@pytest.mark.slow
-def test_what_is_held_of_a_tick_is_far_less_than_what_is_kept_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, _ = tiny_log()
-    monkeypatch.setattr(arrays, "MEMORY_BYTES", 0)
-    (few, short), (many, long) = held_after(log, 2), held_after(log, 6)
-    # All in memory, it is 90 KB a tick.
-    assert (long - short) / (many - few) < 20_000
