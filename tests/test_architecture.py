@@ -4,32 +4,14 @@ from __future__ import annotations
 
 import importlib
 import re
-import sys
 from itertools import pairwise
-from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import pytest
-from lidar_networks import write_network
 from test_layers import RANKED, ROOT
 
-from log2sim import Config
-from log2sim.datatypes import Log
 from log2sim.files import plugins
-from log2sim.perception.detect3d.detectors import create_lidar_detector
 
 TEXT = (ROOT / "log2sim" / "README.md").read_text(encoding="utf-8")
-EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
-
-
-def example(defines: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Import the example that defines a name as the module `my_package`."""
-    (code,) = [code for code in EXAMPLES if re.search(rf"^(class|def) {defines}\b", code, re.MULTILINE)]
-    module = ModuleType("my_package")
-    monkeypatch.setitem(sys.modules, "my_package", module)
-    exec(compile(code, "log2sim/README.md", "exec"), vars(module))
-    return module
 
 
 def test_the_picture_shows_every_room_in_the_order_of_its_rank() -> None:
@@ -61,12 +43,3 @@ def test_the_pipeline_calls_the_functions_of_the_table_in_their_order() -> None:
 def test_every_kind_of_plug_in_is_explained() -> None:
     for kind in plugins.BUILT_IN:
         assert f"kind `{kind}`" in TEXT
-
-
-def test_the_network_describes_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module: Any = example("describe", monkeypatch)
-    bare = write_network(tmp_path / "bare.onnx")
-    module.describe(str(bare), str(tmp_path / "mine.onnx"))
-    log = Log("made", "log2sim", {}, {}, {})
-    detector: Any = create_lidar_detector(f"lidar:{tmp_path / 'mine.onnx'}", log, Config().lidar)
-    assert detector.network.info.name == "mine"

@@ -38,40 +38,6 @@ def test_a_car_straight_behind_is_as_one_ahead():
     assert ends_of([standing(-12, 0, 10), pole], azimuth_deg=(135, 225)) == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("azimuth_deg", "seen"), [((-45, 4), [True, False]), ((-4, 45), [False, True]), ((-4, 4), [False, False])]
-)
-def test_where_the_sensor_does_not_look_the_car_may_go_on(azimuth_deg, seen):
-    assert ends_of([standing(12, 0, 90)], azimuth_deg=azimuth_deg) == seen
-
-
-@pytest.mark.parametrize(("y", "seen"), [(0.9, [True, False]), (-0.9, [False, True]), (8.0, [True, True])])
-def test_where_something_nearer_stands_the_car_may_go_on(y, seen):
-    assert ends_of([standing(14, 0, 90), standing(7, y, 0, (1.0, 0.8, 3.0)), WALL]) == seen
-
-
-def test_a_part_of_a_wall_has_no_ends():
-    assert ends_of([WALL], only=lambda p: np.abs(p[:, 1]) < 2.2) == [False, False]
-
-
-def test_a_neighbor_beyond_a_gap_is_no_continuation():
-    row = [standing(10, 0, 90), standing(10, 5.4, 90), standing(10, -5.4, 90)]
-    assert ends_of(row) == [True, True]
-
-
-def test_a_roof_above_what_hides_the_body_ends_where_it_is_seen_to_end():
-    # Seen over a low wall right before it: rays beside its roof go on, those that the wall stops are lower.
-    low_wall = standing(10.5, 0.0, 0.0, (0.3, 40.0, 1.0))
-    assert ends_of([standing(13, 0, 90, (4.4, 1.85, 1.8)), low_wall, WALL]) == [True, True]
-
-
-def test_a_cloud_of_nothing_else_shows_no_ends():
-    xyz, owner = scan([standing(12, 0, 0)])
-    alone = xyz[owner == 0].astype(np.float32)
-    index = AzimuthIndex.of(alone, SENSOR, np.zeros(len(alone), dtype=bool))
-    assert index.ends_visible([np.arange(len(alone))])[0].tolist() == [False, False]
-
-
 def test_the_turned_world_shows_the_same_ends():
     xyz, owner = scan([standing(12, 3, 40), standing(7, 2.4, 0, (0.5, 0.5, 3.0))])
     members = np.flatnonzero((owner == 0) & (xyz[:, 2] > 0.2))

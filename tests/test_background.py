@@ -11,10 +11,6 @@ from log2sim.perception.frames import AHEAD, work_ahead
 PATIENCE_S = 20.0
 
 
-def test_results_come_in_the_order_of_their_items() -> None:
-    assert list(work_ahead(lambda n: n * n, range(40))) == [n * n for n in range(40)]
-
-
 def test_no_more_is_made_ahead_than_asked_for() -> None:
     begun: list[int] = []
     results = work_ahead(begun.append, range(100), ahead=3)

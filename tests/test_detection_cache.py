@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
-import shutil
-import signal
-import struct
-import subprocess
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,13 +27,11 @@ from log2sim.perception.detection_cache import (
     LightBox,
     PictureFindings,
     from_bytes,
-    open_cache,
     to_bytes,
 )
 from log2sim.perception.first_pass import Observations
 from log2sim.pipeline import Run, observe_log, start
 
-ROOT = Path(__file__).resolve().parents[1]
 KEY = bytes(range(16))
 TICKS = 6
 # A part of the log, no second look at its pictures, and nothing that the cache has nothing to do with.
@@ -168,14 +161,6 @@ def test_runs_with_and_without_the_cache_give_the_same(tiny_folder: Path, folder
     assert len(without.scenario.others) >= 2
 
 
-def test_the_first_pass_takes_the_same_from_a_picture(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
-    log = open_log(tiny_folder)
-    (_, one), (_, other) = look(log), look(log)
-    assert len(one.lights) == 2 * len(one.measurements) > 0  # two traffic lights in each picture
-    assert_same_observations(one, other)
-    assert len(made[-1].seen) == 0
-
-
 def test_another_setting_of_the_detector_searches_everything(
     tiny_folder: Path, folder: Path, made: list[Seeing], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,84 +174,6 @@ def test_another_setting_of_the_detector_searches_everything(
     monkeypatch.setattr(detection_cache, "software_key", lambda: "another version")
     look(log)
     assert len(made[-1].seen) == TICKS
-
-
-def test_one_changed_picture_is_searched_again(log_folder: Path, folder: Path, made: list[Seeing]) -> None:
-    look(open_log(log_folder))
-    pictures = sorted(p for p in log_folder.rglob("*") if p.suffix in (".png", ".jpg"))
-    shutil.copy(pictures[0], pictures[4])
-    look(open_log(log_folder))
-    assert len(made[-1].seen) == 0  # known, from another moment
-    pictures[4].write_bytes(pictures[4].read_bytes()[:-30])
-    run, observations = look(open_log(log_folder))
-    assert len(made[-1].seen) == 0  # a file that cannot be decoded
-    assert observations.records is not None
-    assert observations.records.summary()["front"]["count"] == 1
-    assert run.detectors.cache is not None
-    assert run.detectors.cache.found == TICKS - 1
-    pictures[4].write_bytes(recoded(pictures[0]))
-    look(open_log(log_folder))
-    assert len(made[-1].seen) == 1
-
-
-def recoded(picture: Path) -> bytes:
-    """A picture that is darker than the given one."""
-    import cv2
-
-    image = cv2.imread(str(picture))
-    assert image is not None
-    return bytes(cv2.imencode(picture.suffix, image // 2)[1])
-
-
-def test_pictures_without_files_are_known_by_their_pixels(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
-    log = open_log(tiny_folder)
-    stream = log.streams["front"]
-    bare = log.changed(streams={**log.streams, "front": replace_read(stream, stream.read, encoded=False)})
-    (_, one), (_, other) = look(bare), look(bare)
-    assert len(made[-1].seen) == 0
-    assert_same_observations(one, other)
-
-
-def test_detectors_that_do_not_say_what_they_depend_on_are_asked_again(
-    tiny_folder: Path, folder: Path, made: list[Seeing], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(STATED, "cache_key", None)
-    log = open_log(tiny_folder)
-    runs = [look(log)[0], look(log)[0], look(log, config(detect={"name": "labels"}))[0]]
-    assert [len(d.seen) for d in made] == [TICKS, TICKS]
-    assert [run.detectors.cache for run in runs] == [None, None, None]
-    assert not folder.exists()
-
-
-def test_a_function_is_asked_once_where_it_states_what_it_depends_on(tiny_folder: Path, folder: Path) -> None:
-    asked: list[int] = []
-
-    def find(image: Any) -> list[tuple[float, float, float, float, float, str]]:
-        asked.append(len(image))
-        return [(10.0, 20.0, 60.0, 80.0, 0.9, "car")]
-
-    log = open_log(tiny_folder)
-    for expected in (TICKS, 2 * TICKS):
-        observe_log(start(log, config(), detector=find))
-        assert len(asked) == expected
-    find.cache_key = "find 1"  # type: ignore[attr-defined]
-    for min_score, expected in ((0.0, 3 * TICKS), (0.0, 3 * TICKS), (0.5, 4 * TICKS)):
-        detect = {"name": "seeing", "min_score": min_score}
-        observe_log(start(log, config(detect=detect), detector=find))
-        assert len(asked) == expected
-
-
-def test_a_folder_that_cannot_be_used_costs_the_cache_alone(
-    tiny_folder: Path, folder: Path, made: list[Seeing]
-) -> None:
-    folder.parent.mkdir()
-    folder.write_text("a file")
-    log = open_log(tiny_folder)
-    run, observations = look(log)
-    assert_same_observations(look(log, cache=False)[1], observations)
-    assert run.detectors.cache is not None
-    assert run.detectors.cache.kept == 0
-    assert str(folder) in str(run.detectors.cache.problem)
 
 
 def test_damaged_entries_are_made_again(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
@@ -299,30 +206,6 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(
     _, resumed = look(log)
     assert len(made[-1].seen) == TICKS - 4
     assert_same_observations(look(log, cache=False)[1], resumed)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
-def test_a_run_that_was_killed_goes_on_where_it_was(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
-    code = (
-        "import os, signal, sys, test_detection_cache as t\n"
-        "from log2sim import open_log\n"
-        "from log2sim.files import plugins\n"
-        "def kill(seeing):\n"
-        "    if len(seeing.seen) == 4: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "t.STATED['before'] = kill\n"
-        "create = lambda log, **_: t.Seeing(log)\n"
-        "sys.modules['seeing_package'] = sys.modules['__main__']\n"
-        "plugins.BUILT_IN['detector']['seeing'] = 'seeing_package:create'\n"
-        "t.look(open_log(sys.argv[1]))\n"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", code, tiny_folder], cwd=ROOT / "tests", env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
-    assert ended.returncode == -signal.SIGKILL
-    run, _ = look(open_log(tiny_folder))
-    assert run.detectors.cache is not None
-    assert (run.detectors.cache.found, len(made[-1].seen)) == (4, TICKS - 4)
 
 
 # --- keys
@@ -361,31 +244,6 @@ def test_keys_differ_by_everything_that_the_result_depends_on(tmp_path: Path) ->
         raise RecordError("torn")
 
     assert cache.key_of(replace(frame(), encoded=torn)) is None
-
-
-def test_the_key_of_a_network_changes_with_its_weights_and_settings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
-    from test_detect_onnx import LOG, save_model, yolov8, yolox
-
-    from log2sim.perception.detect.detectors import create_detector
-
-    def key(path: Path, **settings: Any) -> str | None:
-        return create_detector(str(path), LOG, **settings).cache_key  # type: ignore[attr-defined, no-any-return]
-
-    one, same = (save_model(tmp_path / f"{n}.onnx", {"o": yolox()}) for n in "ab")
-    other = save_model(tmp_path / "c.onnx", {"o": yolov8()})
-    changed = [key(one, min_score=0.3), key(one, tiles=2), key(one, max_overlap=0.6), key(other), key(one)]
-    assert len(set(changed)) == 5
-    assert None not in changed
-    assert key(one) == key(same)  # the name of a file says nothing
-    model = onnx.load(one)
-    big = onnx.helper.make_tensor("w", 1, [600], np.zeros(600, np.float32).tobytes(), raw=True)
-    model.graph.initializer.append(big)
-    onnx.save(model, tmp_path / "d.onnx", save_as_external_data=True, location="d.bin", size_threshold=0)
-    assert key(tmp_path / "d.onnx") is None  # its weights are in another file
-    assert open_cache(create_detector(str(tmp_path / "d.onnx"), LOG)) is None
 
 
 # --- bytes
@@ -437,53 +295,3 @@ def test_findings_come_back_bit_for_bit(given_: PictureFindings) -> None:
     assert from_bytes(content, KEY[::-1], "left", 9) is None
     assert from_bytes(content[:-1], KEY, "left", 9) is None
     assert from_bytes(content + b"\0", KEY, "left", 9) is None
-
-
-def sealed(counts: tuple[int, ...], body: bytes) -> bytes:
-    """An entry with a right check sum, whatever is in it."""
-    import hashlib
-
-    rest = struct.pack("=6I", *counts) + body
-    return struct.pack("=8s16s16s", b"l2sfound", KEY, hashlib.blake2b(rest, digest_size=16).digest()) + rest
-
-
-THUMBNAIL = np.ones((1, 1), np.float32).tobytes()
-
-
-def test_a_right_check_sum_does_not_make_a_wrong_entry_right() -> None:
-    box = np.zeros(4).tobytes()
-    word = np.array(["car"], "<U3").tobytes()
-    assert (
-        from_bytes(sealed((1, 3, 0, 1, 1, 0), box + np.array([0.5]).tobytes() + word + THUMBNAIL), KEY, "", 0)
-        is not None
-    )
-    wrong = {
-        "more boxes than bytes": sealed((9000, 3, 0, 1, 1, 0), b""),
-        "more boxes than may be": sealed((2**32 - 1, 3, 0, 1, 1, 0), b""),
-        "a huge thumbnail": sealed((0, 3, 0, 2**31, 2**31, 0), b""),
-        "no thumbnail": sealed((0, 3, 0, 0, 0, 0), b""),
-        "long words": sealed((1, 10**9, 0, 1, 1, 0), b""),
-        "a score of 2": sealed((1, 3, 0, 1, 1, 0), box + np.array([2.0]).tobytes() + word + THUMBNAIL),
-        "a score that is none": sealed((1, 3, 0, 1, 1, 0), box + np.array([np.nan]).tobytes() + word + THUMBNAIL),
-        "a letter that is none": sealed((1, 3, 0, 1, 1, 0), box + np.array([0.5]).tobytes() + b"\xff" * 12 + THUMBNAIL),
-        "a crop without a light": sealed((0, 3, 0, 1, 1, 1), THUMBNAIL),
-        "an empty crop": sealed((0, 3, 1, 1, 1, 1), np.zeros(5).tobytes() + THUMBNAIL + bytes(4) + bytes(40)),
-        "nothing": b"",
-        "another file": b"PK\3\4" * 50,
-    }
-    assert [what for what, content in wrong.items() if from_bytes(content, KEY, "", 0) is not None] == []
-
-
-def test_what_would_not_come_back_is_not_kept() -> None:
-    kept = PictureFindings(Detections.empty(), np.ones((2, 2), np.float32))
-    assert to_bytes(kept, KEY) is not None
-    single = replace(Detections.empty(), box_px=np.zeros((0, 4), np.float32))
-    assert to_bytes(replace(kept, detections=single), KEY) is None  # type: ignore[arg-type]
-    assert to_bytes(replace(kept, thumbnail=np.zeros((0, 0), np.float32)), KEY) is None
-    far = replace(Detections.empty(), traffic_lights=np.full((1, 5), np.inf))
-    assert to_bytes(replace(kept, detections=far), KEY) is None
-
-
-def test_the_keys_hold_the_code_that_they_are_named_after() -> None:
-    package = Path(detection_cache.__file__).resolve().parents[1]
-    assert all(list(package.glob(pattern)) for pattern in detection_cache.SOURCES)

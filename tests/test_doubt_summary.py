@@ -5,14 +5,12 @@ from __future__ import annotations
 import ast
 from dataclasses import replace
 
-import pytest
 from export_worlds import straight, world
 from test_layers import ROOT
 
 from log2sim.agents.smooth.motion_model import PHRASES
 from log2sim.cli.reconstruct import doubt_lines
 from log2sim.datatypes import FLAGS, Agent, Doubt
-from log2sim.datatypes.agent import MAX_LISTED
 
 PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4)
 
@@ -21,27 +19,9 @@ def agent(name: str, *doubts: Doubt, confidence: float = 0.9) -> Agent:
     return replace(straight(name), doubts=doubts, confidence=confidence)
 
 
-def test_nothing_is_said_without_a_doubt() -> None:
-    assert doubt_lines(world(agent("ego"), agent("car-1"))) == []
-
-
 def test_the_agents_are_counted_and_named_with_their_reasons() -> None:
     (line,) = doubt_lines(world(agent("ego"), agent("car-19", confidence=0.2), agent("car-18", PASSES), agent("car-1")))
     assert line == "2 of 3 agents: car-18 (passes through car-22 at 1.2 s), car-19 (confidence 0.20)"
-
-
-@pytest.mark.parametrize("extra", [0, 3])
-def test_the_list_is_limited(extra: int) -> None:
-    (line,) = doubt_lines(world(*(agent(f"car-{k}", PASSES) for k in range(MAX_LISTED + extra))))
-    assert line.startswith(f"{MAX_LISTED + extra} of {MAX_LISTED + extra} agents: car-0 (")
-    assert line.count("passes through") == MAX_LISTED
-    assert line.endswith(f" and {extra} more" if extra else ")")
-
-
-def test_the_ego_is_no_agent_among_others() -> None:
-    lines = doubt_lines(world(agent("ego", PASSES), agent("car-1", PASSES)))
-    assert lines[0].startswith("the ego: ")
-    assert lines[1].startswith("1 of 1 agent: car-1 ")
 
 
 def test_every_flag_that_is_given_is_listed_and_every_listed_one_is_given() -> None:

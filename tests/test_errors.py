@@ -54,12 +54,3 @@ def test_elsewhere_the_advice_names_the_origin_of_the_installation(
 ) -> None:
     installed_from(origin, monkeypatch, tmp_path)
     assert install_command("osi") == command
-
-
-def test_without_a_distribution_the_advice_is_the_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def nothing(name: str) -> Installed:
-        raise metadata.PackageNotFoundError(name)
-
-    installed_from(None, monkeypatch, tmp_path)
-    monkeypatch.setattr(metadata, "distribution", nothing)
-    assert install_command("osi") == "pip install 'log2sim[osi]'"

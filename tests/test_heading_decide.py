@@ -13,7 +13,7 @@ from log2sim.agents.heading import decide_headings
 from log2sim.agents.moving import turn_to_courses
 from log2sim.agents.size import TrackGeometry
 from log2sim.config import Config
-from log2sim.datatypes import TYPICAL_SIZE_M, Boxes3D, Doubt, Track, Waypoints
+from log2sim.datatypes import TYPICAL_SIZE_M, Boxes3D, Track, Waypoints
 
 T_NS = np.arange(20) * 100_000_000
 TIMELINE = Timeline(T_NS, 0)
@@ -70,33 +70,12 @@ def test_a_queue_on_the_own_lane_points_ahead():
     assert min(a.quality["heading_confidence"] for a in agents) > 0.8
 
 
-def test_cars_on_a_side_street_and_in_a_yard_do_not_follow_the_traffic():
-    for x, y, yaw in ((10.0, -9.0, np.pi / 2), (10.0, -25.0, np.pi), (10.0, -8.0, 0.8)):
-        _, (agent,) = decided(candidate(x, y, yaw))
-        assert agent.quality["heading_confidence"] < 0.6
-        assert ambiguous(agent)
-
-
 def test_a_car_park_is_decided_by_each_car_alone_with_a_weak_say_of_its_neighbors():
     known = [
         candidate(2.7 * k - 8, -20.0, np.pi / 2, front=np.pi / 2 * (-1 if k == 2 else 1), score=0.97) for k in range(6)
     ]
     headings, _ = decided(*known, candidate(2.7 * 6 - 8, -20.0, np.pi / 2))
     assert headings == [90, 90, 270, 90, 90, 90, 90]
-
-
-def test_boxes_that_are_sure_outweigh_the_side_of_the_road_and_unsure_ones_do_not():
-    sure, unsure = (decided(candidate(8.0, -3.0, 0.0, front=np.pi, score=s))[0] for s in (0.99, 0.6))
-    assert (sure, unsure) == ([180], [0])
-
-
-def test_what_drives_fast_drives_forward_and_a_slow_maneuver_may_reverse():
-    backward = candidate(30.0, 40.0, 0.0, -8.0)
-    headings, (agent,) = decided(backward)
-    assert headings == [180]
-    np.testing.assert_allclose(agent.waypoints.speed_mps, 8.0)
-    assert agent.quality["heading_confidence"] > 0.99
-    assert decided(candidate(30.0, 40.0, 0.0, -0.8, front=0.0, score=0.99))[0] == [0]
 
 
 def cut(c, rows):
@@ -118,30 +97,11 @@ def test_what_drives_off_or_stops_had_its_front_where_it_has_it_then(yaw):
     assert decided(cut(candidate(31.0, 44.0, yaw), slice(0, 5)), driving)[1][0].quality["heading_confidence"] < 0.6
 
 
-def test_the_doubts_of_a_car_that_is_turned_round_are_those_of_its_new_motion():
-    backward = candidate(30.0, 40.0, 0.0, -8.0)
-    doubted = backward.doubted([Doubt("reversing", "reverses"), Doubt("jump", "jumps")])
-    assert [d.flag for d in decided(doubted)[1][0].doubts] == ["jump"]
-
-
 def test_a_lone_car_is_doubted_and_says_so_in_its_quality():
     (heading,), (agent,) = decided(candidate(30.0, 40.0, 1.0), path=np.zeros((0, 3)))
     assert heading == 57
     assert agent.quality["heading_confidence"] == 0.5
     assert ambiguous(agent)
-
-
-def test_a_car_without_an_axis_is_laid_along_its_street_and_only_there():
-    (beside, away), agents = decided(candidate(8.0, -3.0, 1.3, axis=False), candidate(8.0, -30.0, 1.3, axis=False))
-    assert (beside, away) == (0, 74)
-    assert agents[0].waypoints.sigma_yaw_rad[0] > 0.1
-
-
-def test_people_and_things_keep_their_yaw_and_nothing_is_lost():
-    person = candidate(8.0, -3.0, np.pi, category="pedestrian")
-    assert decided(person)[0] == [180]
-    assert "heading_confidence" not in decided(person)[1][0].quality
-    assert decided() == ([], [])
 
 
 def test_headings_do_not_depend_on_the_map_or_on_the_order():
@@ -190,15 +150,3 @@ def test_boxes_of_sweeps_point_where_their_object_goes(category, speed, rate_hz)
     assert all(np.cos(b.yaw_rad[0] - course) > 0.99 for b in turned)
     assert np.mean([b.heading_score[0] for b in turned]) > 0.85
     assert all(np.array_equal(a.center_m, b.center_m) for a, b in zip(found, turned))
-
-
-def test_boxes_of_what_stands_maneuvers_or_is_seen_once_keep_their_headings():
-    for velocity, surely in (((0.0, 0.0), 0.8), ((-0.4, 0.0), 0.99)):
-        t_ns, found = boxes_of_sweeps("car", velocity, 0.0, turned=0.0)
-        found = [replace(b, heading_score=np.array([surely])) for b in found]
-        for a, b in zip(found, turn_to_courses(found, t_ns, Config().track)):
-            assert np.array_equal(a.yaw_rad, b.yaw_rad)
-    t_ns, [one, *_] = boxes_of_sweeps("car", (9.0, 0.0), np.pi, turned=0.0)
-    [same] = turn_to_courses([one], t_ns[:1], Config().track)
-    assert np.array_equal(same.yaw_rad, one.yaw_rad)
-    assert np.array_equal(same.heading_score, one.heading_score)

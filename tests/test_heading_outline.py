@@ -72,13 +72,3 @@ def test_neighbors_behind_a_gap_and_the_ground_are_no_part_of_it():
         for p in (side, np.vstack([side, others]))
     )
     np.testing.assert_array_equal(alone.cells, among.cells)
-
-
-def test_few_points_say_nothing():
-    assert heading.outline_of(np.ones((5, 3)), np.array([4.4, 1.8, 1.5]), np.array([9.0, 9.0])) is None
-    track = bare([(5.0, 5.0)] * 3)
-    w = Waypoints(
-        t_s=np.zeros(1), x_m=np.ones(1), y_m=np.ones(1), z_m=np.ones(1), yaw_rad=np.ones(1), speed_mps=np.zeros(1),
-        observed=np.ones(1, dtype=bool), sigma_xy_m=np.ones(1),
-    )  # fmt: skip
-    assert heading.outline_log_odds(track, w, np.arange(3.0), (4.4, 1.8, 1.5)) == 0.0
