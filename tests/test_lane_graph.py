@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,16 +119,6 @@ def test_left_hand_traffic_is_the_mirror_image() -> None:
         np.testing.assert_allclose(one.points_m * [-1, 1, 1], two.points_m, atol=1e-6)
 
 
-def test_a_change_of_lane_makes_no_lane() -> None:
-    lanes = lanes_of(motorway())
-    assert {lane.junction for lane in lanes} == {None}
-    assert len(lanes) == 3
-    left, middle, right = (next(lane for lane in lanes if (lane.left_lane is None, lane.right_lane is None) == ends) for ends in ((True, False), (False, False), (False, True)))  # fmt: skip
-    assert (left.right_lane, right.left_lane) == (middle.id, middle.id)
-    radius = 800.0 - np.hypot(middle.points_m[:, 0], middle.points_m[:, 1] - 800.0)
-    np.testing.assert_allclose(radius, 0.1, atol=0.15)
-
-
 @settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(turn=st.floats(-3.1, 3.1), east=st.floats(-5e5, 5e5), north=st.floats(-5e6, 5e6))
 def test_lanes_turn_and_move_with_the_world(turn: float, east: float, north: float) -> None:
@@ -146,37 +135,6 @@ def test_lanes_turn_and_move_with_the_world(turn: float, east: float, north: flo
         )  # a sample of a path at a threshold
 
 
-@pytest.mark.slow
-@settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
-@given(order=st.permutations(range(6)))
-def test_the_order_of_agents_does_not_matter(order: list[int]) -> None:
-    world = WORLDS["crossing"]
-    lanes = lanes_of(world)
-    others = lanes_of(replace(world, agents=tuple(world.agents[k] for k in order)))
-    for one, two in zip(lanes, others, strict=True):
-        assert one.to_dict() == two.to_dict()
-
-
-def test_where_nobody_moves_there_is_no_lane() -> None:
-    still = agent(np.zeros((5, 2)), yaw_rad=0.3)
-    walker = agent(line(20.0, 21), "walker", category="pedestrian")
-    assert infer_lanes((), (), scenario(still, walker)) == (
-        (),
-        ("no lanes between markings: none were found", "no lanes from paths: no vehicle moves"),
-    )
-
-
-def test_a_cyclist_beside_cars_makes_no_lane_and_alone_makes_one() -> None:
-    cyclist = agent(line(40.0, 41, start=(5.0, -1.9)), "cyclist", category="cyclist", size_m=(1.8, 0.6, 1.7))
-    assert len(lanes_of(scenario(agent(line(60.0, 61)), cyclist))) == 1
-    assert len(lanes_of(scenario(agent(line(60.0, 61), yaw_rad=0.0), replace(cyclist, id="a"), agent(line(30.0, 31, 1.0, (0.0, 30.0)), "b", category="cyclist")))) == 2  # fmt: skip
-
-
-def test_lanes_lead_the_way_that_a_reversing_vehicle_faces() -> None:
-    (lane,) = lanes_of(scenario(agent(line(), yaw_rad=np.pi)))
-    np.testing.assert_allclose(lane.points_m[[0, -1], 0], [30.0, 0.0], atol=1e-6)
-
-
 def test_paths_of_several_vehicles_in_one_lane_make_one_middle() -> None:
     rng = np.random.default_rng(4)
     world = scenario(
@@ -186,17 +144,3 @@ def test_paths_of_several_vehicles_in_one_lane_make_one_middle() -> None:
     middle = np.median([a.waypoints.y_m[0] for a in world.agents])
     np.testing.assert_allclose(lane.points_m[:, 1], middle, atol=0.01)
     assert lane.confidence == 0.95
-
-
-@pytest.mark.real
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["pandaset/002", "kitti_tracking"])
-def test_lanes_of_recorded_traffic_hold_every_path(name: str, real_data: Path) -> None:
-    from log2sim.evaluation.metrics.truth import truth_at
-
-    world = truth_at(real_data / name, None, None)
-    lanes = lanes_of(world)
-    require_consistent(lanes)
-    for path in collect_paths(world):
-        if path.rank < 2:
-            assert find_covered(lanes, path.line).all(), path.agent

@@ -47,20 +47,6 @@ def test_a_change_of_lane_is_told_once_and_to_its_side() -> None:
     assert [c.side for c in find_lane_changes(locate_in_lanes(back, road()), road())] == ["right"]
 
 
-def test_noise_at_the_line_between_is_no_change() -> None:
-    x = np.linspace(0.0, 100.0, 201)
-    y = 3.4 + np.random.default_rng(0).uniform(-0.15, 0.15, 201)
-    position = locate_in_lanes(agent(np.column_stack([x, y]), yaw_rad=0.0), road())
-    assert find_lane_changes(position, road()) == []
-
-
-def test_who_is_beside_the_road_or_comes_towards_it_is_in_no_lane() -> None:
-    for driver in (agent(line(50.0, 51, 0.0, (0.0, -3.0))), agent(line(50.0, 51, np.pi, (60.0, 1.75)))):
-        assert not locate_in_lanes(driver, road()).known.any()
-        assert summarize_lane_keeping(driver, road()) is None
-    assert not locate_in_lanes(agent(line()), ()).known.any()
-
-
 def test_the_summary_tells_how_far_over_the_line_a_vehicle_is() -> None:
     summary = summarize_lane_keeping(agent(line(90.0, 91, 0.0, (5.0, 2.75)), size_m=(4.6, 1.9, 1.6)), road())
     assert summary is not None
@@ -76,8 +62,3 @@ def test_inspect_describes_a_scenario(tmp_path: Path) -> None:
     assert document["lanes"] == {"count": 4, "junctions": 0, "inferred_from": {"markings": 4}, "in_file": True}
     assert document["ego_in_lane"]["aside_m"]["mean"] == pytest.approx(0.25, abs=1e-3)
     assert document["notes"] == ["night"]
-
-
-def test_inspect_draws_no_scenario(tmp_path: Path) -> None:
-    scenario(agent(line())).save(tmp_path / "scenario.json")
-    assert "log2sim plot does" in run("inspect", tmp_path / "scenario.json", "--overlay", tmp_path / "a.png").err

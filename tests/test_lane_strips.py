@@ -13,7 +13,6 @@ from log2sim.datatypes import MapFeatures, MapLane, Marking, RoadBorder, Scenari
 from log2sim.geometry import Array
 from log2sim.road.lane_graph import find_side_of_traffic, infer_lanes
 from log2sim.road.polyline import collect_paths
-from log2sim.road.strips import find_strips
 
 
 def along(y_m: float, first_m: float = 0.0, last_m: float = 100.0, radius_m: float = np.inf) -> Array:
@@ -60,29 +59,6 @@ def test_two_lanes_between_three_lines(radius_m: float) -> None:
         np.testing.assert_allclose(lane.width_m, 3.5, atol=0.03)
 
 
-def test_lines_that_belong_together_make_no_lane() -> None:
-    """A double line, a curb beside the edge line, and a strip too narrow and one too wide for a lane."""
-    lines = [*country_road(), paint("double", 7.3), paint("far", 13.0), paint("narrow", -1.9)]
-    curb = RoadBorder("curb", "curb", along(-0.5), 0.9)
-    strips = find_strips(lines, [curb])
-    assert {frozenset((s.left, s.right)) for s in strips} == {
-        frozenset(("left", "middle")),
-        frozenset(("middle", "right")),
-    }
-    assert len(strips) == 2
-
-
-def test_worn_lines_are_bridged_and_long_gaps_are_not() -> None:
-    lines = [
-        paint("right", 0.0),
-        paint("a", 3.5, "dashed", span=(0, 40)),
-        paint("b", 3.5, "dashed", span=(52, 100), turn=True),
-    ]
-    assert [round(s.line.length_m) for s in find_strips(lines, [])] == [100]
-    lines[2] = paint("b", 3.5, "dashed", span=(60, 100))
-    assert sorted(round(s.line.length_m) for s in find_strips(lines, [])) == [40, 40]
-
-
 @pytest.mark.parametrize(("side", "expected"), [(1.0, 1), (-1.0, -1)])
 def test_the_side_of_traffic_is_that_of_who_comes_towards_each_other(side: float, expected: int) -> None:
     world = scenario(agent(line() * [1, side]), agent(line(30.0, 31, np.pi, (35.0, 3.6)) * [1, side], "oncoming"))
@@ -113,22 +89,6 @@ def test_an_empty_lane_towards_oncoming_traffic_leads_as_the_line_says(
     assert (driven.opposite == empty.id) is not same
 
 
-def test_a_median_is_no_lane() -> None:
-    """Between two carriageways, behind solid lines that nobody crosses."""
-    lines = [paint("a", 0.0), paint("b", 3.5), paint("c", 6.5), paint("d", 10.0)]
-    there = agent(line(100.0, 101, 0.0, (0.0, 1.75)))
-    back = agent(line(100.0, 101, np.pi, (100.0, 8.25)), "back")
-    assert len(inferred(lines, [], scenario(there, back))) == 2
-    assert len(inferred(lines, [], scenario(there))) == 3  # who could tell
-
-
-def test_without_traffic_the_direction_is_doubtful() -> None:
-    lanes, notes = infer_lanes(country_road(), [], scenario(agent(np.zeros((3, 2)), yaw_rad=0.0)))
-    assert [lane.inferred_from for lane in lanes] == ["markings"] * 2
-    assert all(lane.confidence < 0.5 for lane in lanes)
-    assert notes == ("no lanes from paths: no vehicle moves",)
-
-
 def test_a_lane_goes_on_along_the_path_where_its_lines_end() -> None:
     lanes = inferred(country_road(), [], scenario(agent(line(140.0, 141, 0.0, (-20.0, 1.6)))))
     own = sorted((lane for lane in lanes if lane.points_m[0, 1] < 3.0), key=lambda lane: lane.points_m[0, 0])
@@ -136,15 +96,3 @@ def test_a_lane_goes_on_along_the_path_where_its_lines_end() -> None:
     assert own[0].successors == (own[1].id,)
     assert own[1].successors == (own[2].id,)
     np.testing.assert_allclose([own[1].points_m[0, 0], own[1].points_m[-1, 0]], [0.0, 100.0], atol=0.6)
-
-
-def test_a_change_between_marked_lanes_makes_no_lane() -> None:
-    x = np.linspace(0.0, 100.0, 101)
-    change = np.column_stack([x, 1.75 + 3.5 * np.clip((x - 30.0) / 40.0, 0.0, 1.0)])
-    lanes = inferred(country_road(), [], scenario(agent(change)))
-    assert sorted(lane.junction or "" for lane in lanes) == ["", ""]
-
-
-def test_lines_at_one_side_are_named_at_lanes_of_paths() -> None:
-    (lane,) = inferred([paint("middle", 3.5, "dashed")], [], scenario(agent(line(100.0, 101, 0.0, (0.0, 1.6)))))
-    assert (lane.left, lane.right, lane.inferred_from) == ("middle", None, "paths")

@@ -11,7 +11,7 @@ from worlds import camera_ahead, outline_px, rows_at, standing
 
 from log2sim.datatypes import Boxes3D, Measurements
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.fusion import PAIR_WEIGHTS, ImageMatches, if_missed, join_with_images, match_boxes
+from log2sim.perception.fusion import PAIR_WEIGHTS, join_with_images, match_boxes
 from log2sim.perception.lidar.projection import View
 
 CAMERA = camera_ahead()
@@ -65,23 +65,6 @@ def test_every_box_gets_its_own_partner_and_the_best_pair_is_matched_first() -> 
     assert twice.partner.tolist() == [0, -1]
 
 
-@pytest.mark.parametrize(("one", "other", "same"), [("pedestrian", "cyclist", True), ("pedestrian", "car", False)])
-def test_only_what_is_confused_can_be_the_same(one: str, other: str, same: bool) -> None:
-    found = match_boxes(in_sweep((20, 2), category=one), in_image((20, 2), category=other), VIEW)
-    assert (found.partner[0] >= 0) == same
-
-
-def test_long_names_are_not_cut() -> None:
-    short = replace(in_sweep((20, 2)), category=np.array(["car"]))
-    assert joined(short, in_image((20, 2), category="truck")).category.tolist() == ["truck"]
-
-
-def test_a_shift_too_far_for_the_image_is_another_object() -> None:
-    found = joined(in_sweep((20, 2)), in_image((20, -2)))
-    assert len(found) == 2
-    assert sorted(found.camera.tolist()) == ["", "front"]
-
-
 def test_the_category_of_the_image_counts_only_where_the_boxes_agree() -> None:
     loose = in_image((20, 3.2), category="truck")
     match = match_boxes(in_sweep((20, 2)), loose, VIEW)
@@ -97,24 +80,6 @@ def test_an_object_in_view_that_the_image_misses_is_doubted_and_one_outside_is_n
     assert score[1:].tolist() == [0.6, 0.6]
 
 
-def test_a_small_object_is_doubted_less_than_a_large_one() -> None:
-    near, far, farther = joined(in_sweep((15, 0), (40, 4), (140, 8), score=0.6), in_image()).score
-    assert near < far < farther
-    assert farther == 0.6
-
-
-def test_an_image_box_that_the_sweep_should_show_is_doubted_by_its_points() -> None:
-    rows = in_image((20, 2), (20, -4), (20, 7), (70, 0), points=np.array([200, 10, 0, 200]))
-    many, few, none, far = joined(in_sweep(), rows).score
-    assert many < few < none
-    assert none == far == 0.7
-
-
-def test_a_row_without_a_position_keeps_its_score() -> None:
-    rows = in_image((20, 2), points=np.array([200]), center_m=np.full((1, 3), np.nan))
-    assert joined(in_sweep(), rows).score.tolist() == [0.7]
-
-
 def test_two_even_chances_that_agree_are_three_to_one() -> None:
     half, iou, near = np.array([0.5]), np.array([0.7]), np.array([0.0])
     assert PAIR_WEIGHTS.score(half, half, iou, near)[0] == pytest.approx(0.75, abs=0.01)
@@ -124,27 +89,6 @@ def test_two_even_chances_that_agree_are_three_to_one() -> None:
     ]  # fmt: skip
     assert min(better) > 0.75
     assert PAIR_WEIGHTS.score(np.ones(1), np.ones(1), np.ones(1), near)[0] < 1
-
-
-def test_a_miss_counts_as_much_as_hits_are_likely() -> None:
-    np.testing.assert_allclose(if_missed(np.array([0.5, 0.5, 1.0]), np.array([0.0, 0.5, 0.0])), [0.5, 1 / 3, 1.0])
-
-
-def test_of_two_cameras_the_better_fit_is_kept() -> None:
-    boxes, exact, loose = in_sweep((20, 2)), in_image((20, 2)), replace(in_image((20, 2.8)), camera=np.array(["side"]))
-    for frames in ([exact, loose], [loose, exact]):
-        found = join_with_images(boxes, [match_boxes(boxes, rows, VIEW) for rows in frames])
-        assert found.camera.tolist() == ["front"]
-
-
-def test_without_cameras_boxes_stay_as_they_are() -> None:
-    boxes = in_sweep((20, 2), (5, 5))
-    found = join_with_images(boxes, [])
-    assert found.score.tolist() == boxes.score.tolist()
-    assert (
-        len(join_with_images(in_sweep(), [ImageMatches(in_image(), *(np.zeros(0, t) for t in (int, float, float)))]))
-        == 0
-    )
 
 
 @pytest.mark.parametrize("turn_deg", [37.0, 90.0, 180.0])

@@ -10,13 +10,10 @@ import pytest
 
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.estimate import spans_of_ticks
-from log2sim.config import Config
-from log2sim.datatypes import Agent, Scenario, Waypoints, retime_spans
+from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.edit.apply import edit
 from log2sim.edit.edits import Shift, Speed
-from log2sim.errors import ConfigError
 from log2sim.logs.opening import open_log
-from log2sim.plan import choose_detector, select_sensors
 from log2sim.tracking.forward import MAX_MISSES
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"
@@ -28,11 +25,6 @@ def test_a_span_goes_on_over_missed_ticks_and_ends_at_longer_gaps() -> None:
     last = (3 + MAX_MISSES + 1) / 10
     alone = float(timeline.seconds(timeline.t_ns[tick[-1:]])[0])
     assert spans_of_ticks(tick, timeline) == (pytest.approx((0.2, last)), (alone, alone))
-
-
-def test_spans_are_moved_and_cut() -> None:
-    observed_by = {"vehicle": ((0.0, 1.0), (2.0, 3.0)), "road": ((0.5, 0.75),)}
-    assert retime_spans(observed_by, lambda t: t - 1.5, begin_s=0.0) == {"vehicle": ((0.5, 1.5),), "road": ()}
 
 
 def agent() -> Agent:
@@ -51,10 +43,3 @@ def test_edits_in_time_move_the_spans(tmp_path: Path) -> None:
     path = tmp_path / "s.json"
     replace(source, agents=(moved,)).save(path)
     assert Scenario.load(path).agents[0].observed_by == moved.observed_by
-
-
-def test_an_end_without_sensors_is_refused() -> None:
-    log = open_log(SAMPLE)
-    config = Config.load(cooperation={"ends": "road"}, detect={"name": "lidar:vehicle"})
-    with pytest.raises(ConfigError, match="no sensor is at the road"):
-        select_sensors(log, choose_detector(log, config))

@@ -49,32 +49,11 @@ def test_neighbors_bumper_to_bumper_both_stay_and_are_numbered_by_their_start():
     assert [a.waypoints.x_m[0] for a in ordered] == [50.0, 30.0]
 
 
-@pytest.mark.parametrize(("y_m", "count"), [(0.3, 0), (3.5, 1)])
-def test_what_shares_the_place_of_the_ego_is_dropped(y_m, count):
-    ego = agent(0.0, speed=8.0)
-    assert len(names((agent(1.0, y_m, yaw=0.8, speed=8.0), 9.0), ego=ego)) == count
-
-
-def test_those_who_were_there_at_different_times_share_a_place():
-    assert len(names((agent(10.0, t=(0.0, 1.9)), 5.0), (agent(10.0, t=(2.0, 4.0)), 4.0))) == 2
-
-
-def test_ways_that_cross_are_no_doubles():
-    crossing = agent(-10.0, speed=5.0)
-    across = agent(0.0, y_m=-9.0, yaw=np.pi / 2)
-    assert len(names((crossing, 5.0), (across, 4.0))) == 2
-
-
 @pytest.mark.parametrize(("apart_m", "count"), [(0.2, 1), (0.5, 2)])
 def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, count):
     body = (0.7, 0.6, 1.75)
     pair = [(agent(x, category="pedestrian", size=body), 1.0) for x in (5.0, 5.0 + apart_m)]
     assert len(names(*pair)) == count
-
-
-def test_a_person_on_the_back_seat_is_not_another_agent_beside_the_car():
-    person = agent(10.5, category="pedestrian", size=(0.7, 0.6, 1.5))
-    assert names((agent(10.0), 9.0), (person, 2.0)) == ["car-1"]
 
 
 @pytest.mark.parametrize(("y_m", "count"), [(0.0, 1), (0.85, 1), (1.0, 2)])

@@ -60,21 +60,6 @@ def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
     assert steps == [(k + 1, 4) for k in range(4)]
 
 
-def test_black_and_unreadable_pictures_do_not_come() -> None:
-    log = log_of([], black=1, broken=2)
-    reader, taker = RecordReader(log), Wants(left=[0, 1, 2, 3])
-    look_again(log, reader, [taker])
-    assert [index for _, index, _ in taker.got] == [0, 3]
-    assert reader.summary()["left"]["count"] == 1
-
-
-def test_nothing_is_read_for_nobody() -> None:
-    reads: list[tuple[str, int]] = []
-    log = log_of(reads)
-    assert look_again(log, RecordReader(log), []) == 0 == look_again(log, RecordReader(log), [Wants()])
-    assert reads == []
-
-
 def test_kept_sweeps_are_read_once_and_stay_as_they_are() -> None:
     reads: list[int] = []
 

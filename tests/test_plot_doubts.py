@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +12,9 @@ from matplotlib.collections import LineCollection
 from log2sim.datatypes import Agent, Doubt, Scenario
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.visualization.plot import layers, viewport
-from log2sim.visualization.plot.animation import AnimatedArtists
-from log2sim.visualization.plot.layers import NO_OVERLAYS
 from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.scene import draw_base
-from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import Viewport, assign_roles
-
-VIEW = Viewport(-20.0, 20.0, -20.0, 20.0, 0.1)
+from log2sim.visualization.plot.tracks import still
+from log2sim.visualization.plot.viewport import assign_roles
 
 
 def doubted(agent: Agent, *spans: tuple[float | None, float | None]) -> Agent:
@@ -73,13 +67,6 @@ def test_a_track_is_striped_where_it_is_doubtful() -> None:
     assert moment[-1, 0] - moment[0, 0] == pytest.approx(5.0 * layers.MIN_SHOWN_S)  # a moment could not be seen
 
 
-def test_an_agent_is_doubted_while_a_doubt_holds() -> None:
-    agent = doubted(straight("car"), (1.0, 2.0))
-    assert [layers.is_doubted_at(agent, t) for t in (0.9, 1.0, 2.0, 2.1)] == [False, True, True, False]
-    assert not layers.is_doubted_at(straight("car"), 1.0)
-    assert layers.is_doubted_at(replace(straight("car"), confidence=0.49), 1e9)
-
-
 def test_boxes_are_hatched_where_they_are_doubtful() -> None:
     places = striped(drawn(scene()))
     for hatched in ([15.0, 12.0], [15.0, 18.0], [20.0, -8.0]):  # the ends of "end" and "unsure", and what is parked
@@ -89,51 +76,3 @@ def test_boxes_are_hatched_where_they_are_doubtful() -> None:
     assert (
         striped(drawn(replace(clean, agents=tuple(replace(a, doubts=(), confidence=1.0) for a in clean.agents)))) == []
     )
-
-
-def test_legend_labels_and_title_name_them() -> None:
-    layout = drawn(scene())
-    rows = [t.get_text().replace("\n", " ") for t in layout.figure.legends[0].get_texts()]
-    assert "middle is doubtful: reverses at 7.4 m/s" in rows
-    assert "unsure is doubtful: confidence 0.20" in rows
-    assert not [row for row in rows if row.startswith("sure is")]
-    labels = {t.get_text() for t in layout.ax.texts}
-    assert {"middle? · 18 km/h", "end? · 18 km/h", "unsure? · 18 km/h", "sure · 18 km/h"} <= labels
-    assert "parked? reverses at 7.4 m/s" in labels
-    assert not [row for row in rows if row.startswith("parked")]
-    assert any("4 doubtful" in t.get_text() for t in layout.figure.texts)
-
-
-def test_many_and_long_reasons_leave_the_legend_beside_the_map() -> None:
-    long = "slides " * 60
-    agents = [
-        replace(straight(f"car-{k}", start=(0.0, 3.0 * k)), doubts=(Doubt("sideways", long),)) for k in range(1, 30)
-    ]
-    layout = drawn(world(straight("ego"), *agents))
-    rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
-    assert f"and {len(agents) - layers.MAX_NAMED} more doubtful" in rows
-    assert all(len(line) <= layers.LINE_LETTERS for row in rows for line in row.split("\n") if "doubtful" in row)
-    layout.canvas.draw()
-    assert layout.figure.legends[0].get_window_extent().y0 >= 0
-
-
-def test_an_animation_hatches_only_while_the_doubt_holds() -> None:
-    scenario = world(straight("ego"), doubted(straight("car", start=(0.0, 6.0)), (1.0, 2.0)))
-    roles = assign_roles(scenario)
-    layout = draw_base(scenario, roles, NO_OVERLAYS, moving=True).layout
-    layout.canvas.draw()
-    artists = AnimatedArtists(layout, roles, NO_OVERLAYS)
-    counts = []
-    for t in (0.5, 1.5, 2.5):
-        artists.show(t)
-        counts.append(len(artists.hatches.get_segments()))
-    assert counts[0] == counts[2] == 0
-    assert counts[1] >= 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".svg", ".png"])
-def test_the_same_doubts_give_the_same_bytes(suffix: str, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        plot_tracks(scene(), tmp_path / f"{name}{suffix}", dpi=50)
-    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from command_line import names, run
 from matplotlib.collections import LineCollection, PolyCollection
-from test_prediction import circle, corner, line, parked, scene
+from test_prediction import corner, line, parked, scene
 
 from log2sim.datatypes import STANDSTILL_MPS
-from log2sim.errors import ConfigError
 from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
-from log2sim.visualization.page import document as page_predictions
-from log2sim.visualization.page.document import EVERY_TICKS, SCALES, page_document, predicted_columns
-from log2sim.visualization.plot.layers import Overlays, PredictedPaths, draw_predictions
+from log2sim.visualization.page.document import EVERY_TICKS, SCALES, page_document
+from log2sim.visualization.plot.layers import PredictedPaths, draw_predictions
 from log2sim.visualization.plot.tracks import still
 from log2sim.visualization.plot.viewport import assign_roles
 
@@ -43,47 +38,6 @@ def test_a_still_picture_shows_every_way_from_the_track_to_its_ellipse() -> None
         assert along > across > 0.0
 
 
-def test_who_stands_or_is_absent_has_no_way() -> None:
-    stops = line("a", 0.0, speed=0.0, duration_s=9.0)
-    ways = PredictedPaths(scene(stops, line("b", 0.0, 9.0, duration_s=2.0)), 3.0)
-    assert ways.at("a", 5.0) is None
-    assert ways.at("b", 1.0) is not None
-    assert ways.at("b", 3.0) is None
-    assert ways.at("b", -1.0) is None
-
-
-@pytest.mark.slow
-def test_the_legend_tells_what_is_drawn(tmp_path: Path) -> None:
-    world = scene(corner("ego", 3.0), corner("a", 0.0))
-    legend = still(world, assign_roles(world), Overlays(predicted=PredictedPaths(world, 2.5))).figure.legends[0]
-    assert "predicted for 2.5 s, 1 sigma" in [text.get_text() for text in legend.get_texts()]
-    world.save(tmp_path / "scenario.json")
-    sizes = {}
-    for name, options in (("plain.png", []), ("one.png", ["--predict", 3]), ("two.png", ["--predict", 3])):
-        assert run("plot", tmp_path / "scenario.json", "--out", tmp_path / name, *options).code == 0
-        sizes[name] = (tmp_path / name).read_bytes()
-    assert sizes["one.png"] == sizes["two.png"] != sizes["plain.png"]
-
-
-def test_a_wrong_horizon_leaves_no_file(tmp_path: Path) -> None:
-    scene(corner("a", 0.0)).save(tmp_path / "scenario.json")
-    for command, out in (("plot", "a.png"), ("view", "a.html")):
-        ran = run(command, tmp_path / "scenario.json", "--out", tmp_path / out, "--predict", 99)
-        assert "horizon: 99 s, expected 0.1 to 10 s" in ran.line
-    assert names(tmp_path) == ["scenario.json"]
-
-
-@pytest.mark.slow
-def test_animations_show_what_is_expected_at_each_moment(tmp_path: Path) -> None:
-    world = scene(circle(12.0, 5.0, 1.0), duration_s=1.0)
-    world.save(tmp_path / "scenario.json")
-    sizes = []
-    for name, options in (("a.gif", []), ("b.gif", ["--predict", 2])):
-        assert run("plot", tmp_path / "scenario.json", "--out", tmp_path / name, *options).code == 0
-        sizes.append((tmp_path / name).stat().st_size)
-    assert sizes[1] > sizes[0]
-
-
 def test_the_page_holds_the_predictions_of_movers() -> None:
     world = scene(corner("ego", 3.0), corner("a", 0.0), parked("b", 0.0, 9.0))
     found = predict_scenario(world, 3.0)
@@ -99,9 +53,3 @@ def test_the_page_holds_the_predictions_of_movers() -> None:
         restored = np.array([np.cumsum(np.cumsum(c)) for c in columns[name]]).T / SCALES[name]
         assert restored == pytest.approx(part, abs=0.0051)
     assert np.cumsum(np.cumsum(columns["t_s"])) / SCALES["t_s"] == pytest.approx(found.table.t_s[found.tick[rows]])
-
-
-def test_more_predictions_than_a_page_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_predictions, "MAX_PREDICTIONS", 50)
-    with pytest.raises(ConfigError, match="101 predictions are more than the 50"):
-        predicted_columns(scene(line("a", 0.0)), 3.0)
