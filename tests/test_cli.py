@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -96,68 +95,12 @@ def test_the_same_seed_gives_the_same_bytes(tiny_folder: Path, tmp_path: Path) -
     assert (tmp_path / "a.replay").read_bytes() == (tmp_path / "b.replay").read_bytes()
 
 
-@pytest.mark.slow
-def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text('seed = 5\n[measure]\nmode = "paper"\nmax_range_m = 30.0\n')
-    ran = run(
-        "reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--report", tmp_path / "r.json",
-        "--config", tmp_path / "c.toml", "--set", "measure.max_range_m=40", "--set", "topdown.method=off",
-        "--detector", "labels", "--start", "0.2", "--stop", "0.7", "--cameras", "front", "--format", "log2sim",
-        "--sequence", tiny_folder.name, "--quiet",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    config = read(tmp_path / "s.json")["provenance"]["config"]
-    assert config["seed"] == 5
-    assert config["measure"] == {"mode": "paper", "max_range_m": 40.0}
-    assert config["detect"]["name"] == "labels"
-    assert config["cameras"] == ["front"]
-    report = read(tmp_path / "r.json")
-    assert report["ticks"] == 6
-    assert report["homography"] == {}
-    homography = next(p for p in report["plan"] if p["stage"] == "homography")
-    assert not homography["kept"]
-    assert "topdown.method=off" in homography["reason"]
-    decoding = next(p for p in report["plan"] if p["stage"] == "image decoding")
-    assert not decoding["kept"]
-
-
-@pytest.mark.slow
-def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> None:
-    import cv2
-
-    run(
-        "reconstruct",
-        tiny_folder,
-        "--out",
-        tmp_path / "s.json",
-        "--detector",
-        "labels",
-        "--topdown",
-        tmp_path / "t.png",
-    )
-    picture = cv2.imread(str(tmp_path / "t.png"), cv2.IMREAD_UNCHANGED)
-    assert picture.ndim == 3
-    assert (picture[..., 3] > 0).mean() > 0.02  # part of the ground was seen, and it is not one color
-    assert picture[picture[..., 3] > 0][:, :3].std() > 5
-
-
 @pytest.mark.matrix
 @pytest.mark.parametrize(("name", "magic"), [("t.png", PNG), ("t.gif", GIF), ("t.svg", b"<?xml"), ("t.pdf", b"%PDF")])
 def test_plot_writes_what_the_suffix_says(tiny_scenario: Path, tmp_path: Path, name: str, magic: bytes) -> None:
     assert run("plot", tiny_scenario, "--out", tmp_path / name).code == 0
     assert (tmp_path / name).read_bytes().startswith(magic)
     assert names(tmp_path) == [name]
-
-
-@pytest.mark.slow
-def test_plot_takes_the_cameras_as_background(tiny_scenario: Path, tiny_folder: Path, tmp_path: Path) -> None:
-    assert run("plot", tiny_scenario, "--out", tmp_path / "plain.png").code == 0
-    assert run("plot", tiny_scenario, "--out", tmp_path / "t.png", "--background", tiny_folder).code == 0
-    assert (tmp_path / "t.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
-    document = read(tiny_scenario) | {"cameras": []}  # truth names no cameras: all of the log paint
-    (tmp_path / "truth.json").write_text(json.dumps(document))
-    assert run("plot", tmp_path / "truth.json", "--out", tmp_path / "b.png", "--background", tiny_folder).code == 0
-    assert (tmp_path / "b.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
 
 
 def test_replay_prints_errors_and_exact_has_none(tiny_scenario: Path, tmp_path: Path) -> None:
@@ -222,17 +165,6 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     assert read(tmp_path / "d.json")["position_rmse_m"] == 0.0
 
 
-def test_evaluate_takes_labels_where_a_log_has_no_truth_file(
-    log_folder: Path, tiny_scenario: Path, tmp_path: Path
-) -> None:
-    (log_folder / "truth.json").unlink()
-    ran = run("evaluate", tiny_scenario, "--truth", log_folder, "--out", tmp_path / "m.json")
-    assert ran.code == 0, ran.err
-    metrics = read(tmp_path / "m.json")
-    assert metrics["recall"] == 1.0
-    assert metrics["position_rmse_m"] < 0.4
-
-
 def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
     log_folder: Path, tiny_scenario: Path, tmp_path: Path
 ) -> None:
@@ -257,24 +189,6 @@ def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
     assert metrics["coverage"]["hit"] >= metrics["coverage"]["counted"] > 0
     truth = log_folder / "truth.json"
     assert run("evaluate", tiny_scenario, "--truth", truth, "--labels", tmp_path / "cars.csv").code == 2
-
-
-def test_inspect_prints_json(tiny_folder: Path) -> None:
-    document = json.loads(run("inspect", tiny_folder, "--json").out)
-    assert document["format"] == "log2sim"
-    assert document["cameras"]["front"]["records"] == 10
-    assert document["cameras"]["front"]["rate_hz"] == 10.0
-    assert list(document["lidars"]) == ["top"]
-    assert document["labels"]["tracks"] == 3
-
-
-def test_config_prints_toml_that_it_reads_again(tmp_path: Path) -> None:
-    first = run("config", "--set", "measure.mode=paper", "--set", "seed=9")
-    assert "seed = 9" in first.out
-    assert 'mode = "paper"' in first.out
-    (tmp_path / "c.toml").write_text(first.out)
-    assert run("config", "--config", tmp_path / "c.toml").out == first.out
-    assert run("config").out != first.out
 
 
 @pytest.mark.slow
@@ -362,54 +276,6 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
 
-@pytest.mark.slow
-def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
-    source = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
-    arguments = ("edit", source, "--lateral", "ego=3.5", "--overwrite", "--out", tmp_path / "e.json")
-    ran = run(*arguments)
-    assert ran.code == 0
-    assert "warning: agents 'ego' and 'bus_1' collide at" in ran.out
-    strict = run(*arguments, "--strict", "--quiet")
-    assert strict.code == 6
-    assert "'ego' and 'bus_1' collide" in strict.err
-    replayed = run("replay", tmp_path / "e.json", "--out", tmp_path / "r.json")
-    assert replayed.code == 0, replayed.err
-    assert run("validate", tmp_path / "r.json").code == 0
-
-
-def test_a_replay_never_replaces_its_scenario(tiny_scenario: Path) -> None:
-    before = tiny_scenario.read_bytes()
-    ran = run("replay", tiny_scenario, "--out", tiny_scenario, "--overwrite")
-    assert ran.code == 2
-    assert "is the scenario itself" in ran.err
-    assert tiny_scenario.read_bytes() == before
-
-
-def test_who_reacts_is_named_by_ids_even_if_they_hold_a_comma(tiny_scenario: Path, tmp_path: Path) -> None:
-    document = read(tiny_scenario)
-    movers = [a for a in document["agents"] if not a["static"]]
-    movers[-1]["id"] = "a, b"
-    (tmp_path / "s.json").write_text(json.dumps(document))
-    ran = run("replay", tmp_path / "s.json", "--react", "a, b", "--out", tmp_path / "r.json", "--quiet")
-    assert (ran.code, ran.err) == (0, "")
-    drivers = {a["id"]: a["driver"] for a in read(tmp_path / "r.json")["agents"]}
-    assert [k for k, v in drivers.items() if v == "reactive"] == ["a, b"]
-
-
-@pytest.mark.slow
-def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Path, tmp_path: Path) -> None:
-    other = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
-    run("replay", other, "--mode", "exact", "--out", tmp_path / "r.json")
-    for command, name in (("plot", "p.png"), ("view", "v.html")):
-        ran = run(command, tiny_scenario, "--replay", tmp_path / "r.json", "--out", tmp_path / name)
-        assert ran.code == 0
-        assert "r.json replays 'crossing', not 'tiny'" in ran.out
-        assert "warning" not in run(command, other, "--replay", tmp_path / "r.json", "--out", tmp_path / f"o{name}").out
-        run("edit", other, "--remove", "bus_1", "--out", tmp_path / "e.json", "--overwrite")
-        fewer = run(command, tmp_path / "e.json", "--replay", tmp_path / "r.json", "--out", tmp_path / f"e{name}")
-        assert "another version of 'crossing': 1 of its 11 agents is not in it" in fewer.out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -470,32 +336,3 @@ def test_every_command_names_the_files_it_wrote(
         new = set(names(tmp_path)) - set(before)
         assert new
         assert [name for name in new if name not in ran.out] == [], command
-
-
-def test_files_are_replaced_where_the_command_or_the_environment_says_so(
-    tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    export = ("export", tiny_scenario, "--to", "csv", "-o", tmp_path / "csv", "-q")
-    assert run(*export).code == 0
-    assert run(*export).code == 2
-    assert run(*export, "-f").code == 0
-    monkeypatch.setenv("LOG2SIM_OVERWRITE", "1")
-    assert run(*export).code == 0
-    monkeypatch.setenv("LOG2SIM_OVERWRITE", "0")
-    assert run(*export).code == 2
-
-
-def test_a_folder_of_logs_is_told_from_a_folder_without_any(tiny_folder: Path, tmp_path: Path) -> None:
-    for name in ("a/x/y/z", "b/x/y/z", "c/x/y/z"):
-        (tmp_path / name).parent.mkdir(parents=True)
-        shutil.copytree(tiny_folder, tmp_path / name)
-    ran = run("inspect", tmp_path)
-    assert (ran.code, "3 logs below: `log2sim batch`" in ran.line) == (3, True)
-    assert str(tmp_path / "b/x/y/z") in ran.line
-
-
-def test_an_unknown_detector_is_told_before_the_log_is_opened_with_all_there_are(tmp_path: Path) -> None:
-    ran = run("reconstruct", tmp_path / "no log", "--detector", "lidr:vehicle", "-o", tmp_path / "s.json")
-    assert ran.code == 2
-    for name in (*BUILT_IN["detector"], *(f"lidar:{name}" for name in BUILT_IN["lidar_detector"])):
-        assert name in ran.line

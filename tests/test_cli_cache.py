@@ -48,22 +48,3 @@ def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
     assert f"{TICKS} by seeing" in run("cache").out
     assert run("cache", "--clear").out == f"{folder}: {TICKS} pictures removed\n"
     assert entries(folder) == []
-
-
-def test_the_limit_is_kept_for_later_runs(tiny_folder: Path, folder: Path, made: list[Seeing], tmp_path: Path) -> None:
-    assert json.loads(run("cache", "--max-mb", "0", "--json").out)["max_mb"] == 0
-    reconstruct(tiny_folder, tmp_path / "a.json")
-    assert entries(folder) == []
-    assert run("cache", "--max-mb", "-1").code == 2
-
-
-def test_a_folder_that_cannot_be_written_is_told_in_one_note(
-    tiny_folder: Path, folder: Path, made: list[Seeing], tmp_path: Path
-) -> None:
-    folder.parent.mkdir()
-    folder.write_text("a file")
-    out, _ = reconstruct(tiny_folder, tmp_path / "a.json")
-    assert [line for line in out.splitlines() if str(folder) in line] == [
-        f"note: detections are not kept for later runs: {folder}: File exists"
-    ]
-    assert run("cache", "--max-mb", "5").line.startswith("log2sim: the limit of the cache cannot be kept")

@@ -21,6 +21,7 @@ from log2sim.geometry import (
     homography_jacobian,
     inverse,
     project,
+    rotation_from_rpy,
     transform,
 )
 from log2sim.perception.homography.correspondences import Correspondences, foot_points
@@ -152,6 +153,27 @@ def test_time_aware_comes_near_to_what_all_frames_together_allow(
     assert rms[1] < 0.5 * rms[2]  # one frame has a thirtieth of the data
 
 
+def test_error_is_the_median_distance_on_the_ground() -> None:
+    world = make_world(4, outliers=0.2)
+    fit = world.fit()
+    mapped, _ = apply_homography(fit.ground_H_image, world.uv)
+    assert fit.error_m == pytest.approx(np.median(np.hypot(*(mapped - world.xy)[fit.inliers].T)), rel=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_too_few_correspondences_are_refused(method: str) -> None:
+    for count in range(4):
+        world = make_world(0, ticks=1, each=max(count, 1))
+        first = World(world.truth, *(a[:count] for a in (world.uv, world.xy, world.tick, world.clean)))
+        fit = first.fit(method)
+        assert not fit.ok
+        assert f"{count} correspondences" in fit.reason
+        assert np.isnan(fit.ground_H_image).all()
+        assert fit.inliers.shape == (count,)
+        assert np.isnan(fit.jitter_m)
+        assert fit.condition == np.inf
+
+
 def degenerate_worlds() -> dict[str, World]:
     base, rng = make_world(1, ticks=10, each=8, noise_px=0.0, noise_m=0.0), np.random.default_rng(1)
     count = len(base.xy)
@@ -188,6 +210,17 @@ def degenerate_worlds() -> dict[str, World]:
 
 
 @pytest.mark.parametrize("method", FROM_LIDAR)
+def test_rows_that_are_not_finite_change_nothing(method: str) -> None:
+    world = make_world(2, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
+    uv, xy = world.uv.copy(), world.xy.copy()
+    uv[3], uv[17, 1], xy[40, 0], xy[77] = np.nan, np.inf, -np.inf, np.nan
+    fit = World(world.truth, uv, xy, world.tick, world.clean).fit(method)
+    bad = np.isin(np.arange(100), [3, 17, 40, 77])
+    assert error_m(world.truth, fit.ground_H_image) < 1e-8
+    np.testing.assert_array_equal(fit.inliers, world.clean & ~bad)
+
+
+@pytest.mark.parametrize("method", FROM_LIDAR)
 def test_moving_ground_or_pixels_moves_the_homography_alike(method: str) -> None:
     world = make_world(3, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
     for shift_m, shift_px in (((1e6, -5e6), (0.0, 0.0)), ((0.0, 0.0), (3000.0, -900.0))):
@@ -197,6 +230,17 @@ def test_moving_ground_or_pixels_moves_the_homography_alike(method: str) -> None
         mapped, _ = apply_homography(fit.ground_H_image, to_image(world.truth, PROBES_M) + shift_px)
         np.testing.assert_allclose(mapped - shift_m, PROBES_M, atol=2e-5)
         np.testing.assert_array_equal(fit.inliers, world.clean)
+
+
+@pytest.mark.parametrize("method", FROM_LIDAR)
+def test_order_of_rows_and_names_of_ticks_do_not_matter(method: str) -> None:
+    world = make_world(5, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
+    order = np.random.default_rng(0).permutation(100)
+    shuffled = World(world.truth, world.uv[order], world.xy[order], 1000 - 7 * world.tick[order], world.clean[order])
+    fit = shuffled.fit(method)
+    assert error_m(world.truth, fit.ground_H_image) < 1e-8
+    np.testing.assert_array_equal(fit.inliers, world.clean[order])
+    np.testing.assert_array_equal(fit.ticks, 1000 - 7 * np.arange(10)[::-1])
 
 
 def test_noise_in_the_image_counts_for_more_far_away() -> None:
@@ -230,6 +274,17 @@ def test_condition_is_that_of_the_normalized_design_matrix() -> None:
     assert fit.condition == pytest.approx(s[0] / s[7], rel=1e-6)
 
 
+def test_frames_of_less_than_four_help_only_the_time_aware() -> None:
+    world = make_world(10, ticks=60, each=3, noise_px=0.5)
+    fit = world.fit(sigma_px=0.5)
+    assert fit.ok
+    assert error_m(world.truth, fit.ground_H_image) < 0.01
+    for method in ("per-frame", "min-frame"):
+        refused_fit = world.fit(method)
+        assert not refused_fit.ok
+        assert "no frame" in refused_fit.reason
+
+
 def test_per_frame_keeps_one_homography_a_tick_and_nan_where_there_is_none() -> None:
     world = make_world(11, ticks=6, each=10, noise_px=0.0, noise_m=0.0)
     keep = ~((world.tick == 2) & (np.arange(60) % 10 >= 3))  # tick 2 keeps three
@@ -240,6 +295,15 @@ def test_per_frame_keeps_one_homography_a_tick_and_nan_where_there_is_none() -> 
     assert max(error_m(world.truth, fit.per_tick[k]) for k in (0, 1, 3, 4, 5)) < 1e-8
     for method in ("time-aware", "min-frame"):
         assert world.fit(method).per_tick is None
+
+
+def test_a_fixed_camera_does_not_jitter() -> None:
+    world = make_world(12, each=10)
+    assert world.fit("time-aware").jitter_m == 0.0
+    assert world.fit("min-frame").jitter_m == 0.0
+    assert world.fit("per-frame").jitter_m > 0.05  # one pixel of noise a frame shows
+    exact = make_world(12, each=10, noise_px=0.0, noise_m=0.0)
+    assert exact.fit("per-frame").jitter_m < 1e-7
 
 
 def test_jitter_of_a_nodding_camera_is_how_far_the_ground_moves() -> None:
@@ -282,6 +346,16 @@ def test_jacobian_is_that_of_differences() -> None:
         aside = np.eye(2)[axis] * step
         slope = (apply_homography(h, uv + aside)[0] - apply_homography(h, uv - aside)[0]) / (2 * step)
         np.testing.assert_allclose(homography_jacobian(h, uv)[:, :, axis], slope, rtol=1e-4, atol=1e-7)
+
+
+def test_shapes_and_methods_that_do_not_fit_are_the_callers_mistake() -> None:
+    five, tick = np.zeros((5, 2)), np.zeros(5, dtype=np.int64)
+    with pytest.raises(ValueError, match=r"\(N, 2\)"):
+        Correspondences(five, five[:4], tick)
+    with pytest.raises(ValueError, match=r"\(N, 2\)"):
+        Correspondences(five, five, tick[:4])
+    with pytest.raises(ValueError, match="time-aware"):
+        estimate_homography(Correspondences(five, five, tick), EstimationOptions("frame"), rng=np.random.default_rng(0))
 
 
 def a_camera_with_lens() -> Camera:
@@ -336,6 +410,19 @@ def test_the_covariance_of_a_located_obstacle_lies_along_the_ray_and_grows() -> 
         assert sigma[-1][1] == pytest.approx(np.hypot(deep, 0.2), rel=0.03)
         assert sigma[-1][0] == pytest.approx(np.hypot(FOOT_SIGMA_PX * x / 1000, 0.2), rel=0.03)
     assert sigma[0][1] < sigma[1][1] < sigma[2][1]
+
+
+def test_obstacles_at_the_horizon_and_far_away_are_not_located() -> None:
+    camera, h = make_camera()
+
+    def at(u: float, v: float) -> object:
+        return place_obstacle(h, camera, np.array([u - 5, v - 10, u + 5, v]), "car", CAMERA_M)
+
+    assert at(640.0, 200.0) is None
+    assert at(640.0, 291.0) is None  # a hand's breadth below the horizon, kilometers away
+    assert at(*foot_pixel(camera, *np.add(CAMERA_M, [59.5, 0.0]))) is not None
+    assert at(*foot_pixel(camera, *np.add(CAMERA_M, [60.5, 0.0]))) is None
+    assert at(np.nan, 600.0) is None
 
 
 def as_correspondences(world: World) -> Correspondences:
@@ -413,6 +500,20 @@ def test_only_whole_obstacles_with_enough_lidar_points_of_that_camera_give_feet(
     assert foot_points(camera, Measurements.empty(), EGO_T_MAP, 0).uv.shape == (0, 2)
 
 
+def test_feet_lie_on_the_ground_below_the_obstacle_when_the_ego_tilts() -> None:
+    camera, tilted = make_camera()[0], transform(rotation_from_rpy(0.1, -0.05, 0.3), [-100.0, -40.0, 1.0])
+    feet = foot_points(camera, measured(camera), tilted, 0)
+    expected = apply(tilted, [[x + 100.0, 50.2, 0.0] for x in (12.0, 20.0, 30.0, 40.0)])[:, :2]
+    np.testing.assert_allclose(feet.xy_ego, expected, atol=1e-9)
+
+
+def test_four_points_almost_on_a_line_are_refused() -> None:
+    truth = make_camera()[1]
+    xy = np.array([[10.0, 1.0], [20.0, 1.001], [30.0, 0.999], [40.0, 1.001]])
+    fit = World(truth, to_image(truth, xy), xy, np.zeros(4, dtype=int), np.ones(4, dtype=bool)).fit()
+    assert "line" in fit.reason
+
+
 @pytest.mark.parametrize(("count", "agree", "needed"), [(8, 5, 6), (100, 15, 20)])
 def test_a_handful_that_agrees_among_many_that_do_not_is_refused(count: int, agree: int, needed: int) -> None:
     world, rng = make_world(30, ticks=1, each=count, noise_px=0.0, noise_m=0.0), np.random.default_rng(0)
@@ -420,6 +521,23 @@ def test_a_handful_that_agrees_among_many_that_do_not_is_refused(count: int, agr
     fit = World(world.truth, uv, world.xy, world.tick, world.clean).fit()
     assert not fit.ok
     assert fit.reason.endswith(f"at least {needed} are needed")
+
+
+def test_feet_know_where_average_sizes_would_put_them() -> None:
+    camera = make_camera()[0]
+    good = measured(camera)
+    ego_T_cam = camera.mount_T_cam
+    feet_m = np.array([[12.0, 0.2], [20.0, 0.2], [30.0, 0.2], [40.0, 0.2]])
+    depth = apply(inverse(ego_T_cam), np.column_stack([feet_m, np.zeros(4)]))[:, 2]
+    box = good.box_px.copy()
+    box[:, 1] = box[:, 3] - K[1, 1] * TYPICAL_SIZE_M["car"][2] / depth
+    feet = foot_points(camera, measured(camera, box_px=box), EGO_T_MAP, 0)
+    assert feet.xy_by_size is not None
+    np.testing.assert_allclose(feet.xy_by_size, feet_m, atol=1e-6)
+    box[:, 1] = box[:, 3] - 2 * K[1, 1] * TYPICAL_SIZE_M["car"][2] / depth  # twice as high is half as far
+    near = foot_points(camera, measured(camera, box_px=box), EGO_T_MAP, 0).xy_by_size
+    assert near is not None
+    np.testing.assert_allclose(near - CAMERA_M, (feet_m - CAMERA_M) / 2, rtol=0.02, atol=0.05)
 
 
 @settings(max_examples=20, deadline=None)

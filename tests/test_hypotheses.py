@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from log2sim.agents.hypotheses import explain_track
+from log2sim.agents.hypotheses import explain_track, main_place
 from log2sim.agents.smooth.fixed_interval import (
     PLACE_SIGMA_M,
     REPEATED_SHARE,
@@ -87,6 +87,15 @@ def test_people_who_walk_are_not_people_who_stand_in_turn(rate_hz):
     assert not part.static
 
 
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_at_rest_is_rest(rate_hz, seed):
+    t = times(rate_hz)
+    (part,) = explain_track(track_of(t, view_noise(t, seed)))
+    assert part.static
+    assert len(part.track) == len(t)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_jump_to_another_moving_car_splits_the_track(seed):
     t = times(10.0, 5.0)
@@ -95,6 +104,28 @@ def test_a_jump_to_another_moving_car_splits_the_track(seed):
     parts = explain_track(track_of(t, way + view_noise(t, seed)))
     assert [part.static for part in parts] == [False, False]
     assert [len(part.track) for part in parts] == pytest.approx([25, 25], abs=2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_split_no_track(seed):
+    t = times(10.0)
+    way = along(6.0 * t) + view_noise(t, seed)
+    way[[7, 23, 41]] += [[3.0, 2.0], [-4.0, 1.0], [2.0, -5.0]]
+    (part,) = explain_track(track_of(t, way))
+    assert (part.static, len(part.track)) == (False, 60)
+
+
+def test_what_is_shown_in_between_is_no_object_of_its_own():
+    t = times(10.0, 4.0)
+    other = np.isin(np.arange(40), [8, 9, 17, 18, 25, 30, 31])
+    (part,) = explain_track(track_of(t, along(np.where(other, 5.0, 0.0)) + view_noise(t, 1)))
+    assert part.static
+    assert part.at_place is not None
+    assert len(part.track) == 40
+    assert np.abs(part.at_place.measurements.center_m[:, 0]).max() < 2.0
+    main = main_place(part.track)
+    assert main is not None
+    assert 20 <= len(main) <= 33
 
 
 @pytest.mark.parametrize("turn", [0.7, np.pi / 2, 3.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ import pytest
 from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
 from log_encoders.world import RED, labels_at, world_log
 
-from log2sim.datatypes import Labels, Log, Stream, Sweep
-from log2sim.errors import ConfigError, RecordError
+from log2sim.datatypes import CATEGORIES, Labels, Log, Stream, Sweep
+from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError
 from log2sim.files import plugins
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
 from log2sim.logs.opening import open_log
+from log2sim.logs.records import decode_image
 from log2sim.perception.lidar.cloud import deskew, has_motion, transform_rigidly
 
 # Opening may read the index, and where a size is stated nowhere else the first image; images are nearly all of a log.
@@ -142,6 +144,17 @@ def files_of(path: Path) -> list[Path]:
     return [path] if path.is_file() else [p for p in sorted(path.rglob("*")) if p.is_file()]
 
 
+def truth_ns(case: Encoder, log: Log, t_ns: Any) -> Any:
+    """Stamps of the world for those of a log."""
+    if case.stamps:
+        return t_ns
+    camera = next(n for n, w in case.sensors.items() if w == "front")
+    start = int(world_log().streams["front"].t_ns[0])
+    if case.motion:
+        return t_ns - int(log.streams[camera].t_ns[0]) + start
+    return world_log().streams["front"].t_ns[np.searchsorted(log.streams[camera].t_ns, t_ns)]
+
+
 def points_in_map(log: Log, lidar: str, i: int) -> tuple[Array, np.ndarray]:
     """Points of a sweep in the map frame, each by the pose of its own time, and these times."""
     sweep: Sweep = log.streams[lidar].read(i)
@@ -222,12 +235,39 @@ def test_several_sequences_are_listed_and_each_opens(name: str, case: Encoder, t
         open_log(root, sequence="three")
 
 
+def test_stamps_are_increasing_whole_nanoseconds_of_the_world(case: Encoder, log: Log) -> None:
+    world = world_log()
+    for name, stream in log.streams.items():
+        assert stream.name == name
+        assert stream.t_ns.dtype == np.int64
+        assert (np.diff(stream.t_ns) > 0).all()
+        known = case.sensors.get(name)
+        if known is not None:
+            assert len(stream.t_ns) == len(world.streams[known].t_ns)
+    if case.stamps:
+        camera = next(n for n, w in case.sensors.items() if w == "front")
+        # Float seconds of some formats keep a quarter of a microsecond.
+        assert np.abs(log.streams[camera].t_ns - world.streams["front"].t_ns).max() <= 1000
+
+
 def test_sensors_and_streams_have_the_same_names(case: Encoder, log: Log) -> None:
     assert set(log.streams) == set(log.cameras) | set(log.lidars)
     assert set(case.sensors) <= set(log.streams)
     assert all(camera.name == name for name, camera in log.cameras.items())
     assert all(lidar.name == name for name, lidar in log.lidars.items())
     assert log.reference_camera is None or log.reference_camera in log.cameras
+
+
+def test_images_have_the_size_of_their_calibration(log: Log) -> None:
+    for name, camera in log.cameras.items():
+        stream = log.streams[name]
+        for i in (0, len(stream.t_ns) - 1):
+            image = stream.read(i)
+            assert image.shape == (camera.height_px, camera.width_px, 3)
+            assert image.dtype == np.uint8
+            if stream.encoded is not None:
+                decoded = decode_image(stream.encoded(i), name, (camera.width_px, camera.height_px))
+                np.testing.assert_array_equal(decoded, image)
 
 
 def test_sweeps_are_finite_points_with_times_of_their_turn(log: Log) -> None:
@@ -247,6 +287,54 @@ def test_sweeps_are_finite_points_with_times_of_their_turn(log: Log) -> None:
                 assert sweep.t_ns.dtype == np.int64
                 assert sweep.t_ns.shape == (len(sweep.xyz_m),)
                 assert np.abs(sweep.t_ns - sweep.stamp_ns).max() <= 0.11 * NS_PER_S
+
+
+def test_sensors_move_as_in_the_world(case: Encoder, log: Log) -> None:
+    """From its place at its first record, as the map frames of log and world differ."""
+    if not case.motion:
+        pytest.skip("the layout has single frames")
+    for name, known in case.sensors.items():
+        t_ns = log.streams[name].t_ns[1:-1]
+        ours, valid = log.map_T_sensor(name, t_ns)
+        assert valid.all()
+        theirs, _ = world_log().map_T_sensor(known, truth_ns(case, log, t_ns))
+        if known == "top":  # the mounts of some formats are fixed: positions alone
+            ours, theirs = ours[:, :3, 3], theirs[:, :3, 3]
+            np.testing.assert_allclose(distances(ours), distances(theirs), atol=0.03)
+        else:
+            np.testing.assert_allclose(inverse(ours[:1]) @ ours, inverse(theirs[:1]) @ theirs, atol=0.02)
+
+
+def distances(points: Array) -> Array:
+    return np.asarray(np.linalg.norm(points[:, None] - points, axis=-1))
+
+
+def test_the_road_is_where_the_ego_stands(case: Encoder, log: Log) -> None:
+    assert log.ego is not None
+    for name in case.sensors.keys() & log.lidars.keys():
+        xyz, _ = points_in_map(log, name, 4)
+        map_T_ego = log.ego.at(log.streams[name].t_ns[4])[0][0]
+        ego = apply(inverse(map_T_ego), xyz)
+        around = np.hypot(ego[:, 0], ego[:, 1]) < 15
+        assert np.median(ego[around, 2]) == pytest.approx(log.ground_z_ego_m, abs=0.05)
+
+
+def test_labels_are_of_the_world(case: Encoder, log: Log) -> None:
+    if not case.labels:
+        assert log.labels is None or len(log.labels.t_ns) == 0
+        return
+    labels = log.labels
+    assert labels is not None
+    assert labels.t_ns.dtype == np.int64
+    assert (labels.size_m > 0).all()
+    assert set(labels.category.tolist()) <= set(CATEGORIES)
+    assert {"car", "pedestrian"} <= set(labels.category.tolist())
+    for track in np.unique(labels.track_id):
+        assert (np.diff(labels.t_ns[labels.track_id == track]) > 0).all()
+    for column in (labels.center_m, labels.size_m, labels.yaw_rad):
+        assert np.isfinite(column).all()
+    sizes = {tuple(np.round(size, 1)) for size in labels.size_m}
+    assert {(4.4, 1.8, 1.5), (4.2, 1.7, 1.6)} <= sizes
 
 
 @pytest.mark.matrix
@@ -381,8 +469,38 @@ def is_readable(stream: Stream, i: int) -> bool:
     return True
 
 
+@pytest.mark.matrix
+def test_threads_read_what_one_reads(name: str, path: Path, log: Log) -> None:
+    fresh = open_log(path, format=name)
+    asked = [(s, i) for s, stream in fresh.streams.items() for i in range(len(stream.t_ns))] * 2
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda record: content(fresh.streams[record[0]].read(record[1])), asked))
+    expected = [content(log.streams[s].read(i)) for s, i in asked]
+    assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
 def content(record: Any) -> np.ndarray:
     return np.asarray(record.xyz_m if isinstance(record, Sweep) else record)
+
+
+def test_other_folders_and_files_are_refused_in_one_line(name: str, case: Encoder, path: Path, tmp_path: Path) -> None:
+    reader = plugins.load("log", name)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "words.txt").write_text("no log")
+    for other in (tmp_path / "empty", tmp_path / "words.txt", tmp_path / "nothing"):
+        if not other.is_file():
+            assert not reader.matches(other)
+            assert reader.sequences(other) == []
+        with pytest.raises(LogError) as caught:
+            open_log(other, format=name)
+        assert str(other) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    for suffix in reader.suffixes:
+        file = tmp_path / f"words{suffix}"
+        file.write_text("no log")
+        with pytest.raises(Log2SimError) as refused:
+            open_log(file, format=name)
+        assert "\n" not in str(refused.value)
 
 
 def test_the_red_of_the_world_is_what_the_test_calls_red() -> None:

@@ -13,12 +13,14 @@ from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
 from log2sim.datatypes import CATEGORIES, Agent, Doubt, Scenario
 from log2sim.errors import ScenarioError
+from log2sim.evaluation.metrics.comparison import Selection, compare, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import format_table, format_verdict
-from log2sim.evaluation.metrics.verdicts import REPORTED
+from log2sim.evaluation.metrics.verdicts import REPORTED, judge
 from log2sim.files.documents import check
 
 TICKS = len(T_S)
+WALK = {"category": "pedestrian", "size_m": (0.6, 0.6, 1.7)}
 
 
 def judged(ours, truth, **kwargs):
@@ -58,6 +60,21 @@ def test_invented_is_what_has_no_labeled_object_within_2_m(offset, invented):
     assert found["invented"] == {"share": float(invented), "ticks": TICKS * invented, "agents": int(invented)}
 
 
+def test_around_a_long_vehicle_the_gate_is_a_quarter_of_its_length():
+    bus = [agent("a", 0.0, category="bus", size_m=(12.0, 2.5, 3.0))]
+    bus_like = {"category": "bus", "size_m": (12.0, 2.5, 3.0)}
+    assert faults(judged([agent("x", 2.9, **bus_like)], bus)) == {}
+    assert faults(judged([agent("x", 3.1, **bus_like)], bus)) == {"invented": TICKS, "wrong": TICKS}
+
+
+def test_a_second_agent_at_an_object_is_a_duplicate_even_where_the_object_is_hidden():
+    for visible in (True, False):
+        truth = [agent("a", 0.0, visible=visible), agent("b", 30.0)]
+        found = judged([agent("x", 0.0), agent("y", 1.5)], truth)
+        assert faults(found) == {"duplicate": TICKS, "wrong": TICKS}
+        assert [(r["id"], r["taken_for"]) for r in found["judged_agents"]] == [("x", {"a": TICKS}), ("y", {"a": TICKS})]
+
+
 def test_an_object_of_another_kind_is_no_object_of_the_kind():
     found = judged([agent("x", 0.0, category="cyclist")], [agent("a", 0.0, category="pedestrian")])
     assert faults(found) == {"invented": TICKS, "wrong_class": TICKS, "wrong": TICKS}
@@ -67,10 +84,33 @@ def test_an_object_of_another_kind_is_no_object_of_the_kind():
     }
 
 
+def test_the_matched_object_tells_the_class_not_a_nearer_one_of_another_kind():
+    truth = [agent("a", 1.0), agent("b", 0.1, category="pedestrian")]
+    assert faults(judged([agent("x", 0.0)], truth)) == {}
+
+
+def test_a_duplicate_is_taken_for_what_it_doubles_not_for_a_nearer_object_of_another_kind():
+    truth = [agent("a", 0.0), agent("b", 1.6, category="pedestrian")]
+    found = judged([agent("x", 0.0), agent("y", 1.5)], truth)
+    assert faults(found) == {"duplicate": TICKS, "wrong": TICKS}
+
+
 @pytest.mark.parametrize(("speed", "wrong"), [(4.01, {}), (5.99, {}), (3.99, 1), (6.01, 1)])
 def test_a_speed_is_wrong_from_1_mps(speed, wrong):
     expected = {"wrong_speed": TICKS, "wrong": TICKS} if wrong else {}
     assert faults(judged([driving("x", speed)], [driving("a", 5.0)])) == expected
+
+
+def test_turned_round_with_the_right_motion_is_backwards_only():
+    found = judged([driving("x", -5.0, yaw=np.pi)], [driving("a", 5.0)])
+    assert faults(found) == {"backwards": TICKS, "wrong": TICKS}
+
+
+def test_reversing_where_the_truth_drives_is_wrong_motion():
+    found = judged([driving("x", -5.0)], [driving("a", 5.0)])
+    assert faults(found) == {"wrong_speed": TICKS, "wrong_motion": TICKS, "wrong": TICKS}
+    turned = judged([driving("x", 5.0, yaw=np.pi)], [driving("a", 5.0)])
+    assert faults(turned) == {"wrong_speed": TICKS, "wrong_motion": TICKS, "backwards": TICKS, "wrong": TICKS}
 
 
 @pytest.mark.parametrize(
@@ -93,6 +133,12 @@ def test_backwards_is_more_than_90_degrees_the_short_way_round(degrees, wrong):
     assert faults(found) == ({"backwards": TICKS, "wrong": TICKS} if wrong else {})
 
 
+def test_standing_pedestrians_have_no_heading():
+    assert faults(judged([agent("x", 0.0, yaw=3.0, **WALK)], [agent("a", 0.0, **WALK)])) == {}
+    truth = agent("a", T_S, speed=1.0, **WALK)
+    assert faults(judged([agent("x", T_S, yaw=np.pi, speed=-1.0, **WALK)], [truth])) == {"backwards": 31, "wrong": 31}
+
+
 @pytest.mark.parametrize(
     ("size", "wrong"),
     [((5.49, 1.8, 1.5), False), ((5.51, 1.8, 1.5), True), ((3.29, 1.8, 1.5), True), ((4.4, 2.26, 1.5), True),
@@ -101,6 +147,28 @@ def test_backwards_is_more_than_90_degrees_the_short_way_round(degrees, wrong):
 def test_a_size_is_wrong_by_a_quarter_of_length_or_width(size, wrong):
     found = judged([agent("x", 0.0, size_m=size)], [agent("a", 0.0)])
     assert faults(found) == ({"wrong_size": TICKS, "wrong": TICKS} if wrong else {})
+
+
+@pytest.mark.parametrize(("length", "wrong"), [(0.89, False), (0.91, True)])
+def test_a_small_size_is_never_wrong_by_less_than_30_cm(length, wrong):
+    ours = agent("x", 0.0, category="pedestrian", size_m=(length, 0.6, 1.7))
+    assert ("wrong_size" in faults(judged([ours], [agent("a", 0.0, **WALK)]))) == wrong
+
+
+@pytest.mark.parametrize(("gap", "inside"), [(0.01, False), (-0.01, True)])
+@pytest.mark.parametrize("turned", [0.0, np.pi / 2])
+def test_an_agent_in_the_ego_is_wrong(gap, inside, turned):
+    """An ego that drives, and an agent beside it, parallel or across, that may pass through it."""
+    reach = 1.8 if turned == 0 else (1.8 + 4.4) / 2
+    ego = agent("ego", 5 * T_S, speed=5.0)
+    found = judged([ego, agent("x", 5 * T_S, reach + gap, yaw=turned)], [ego, agent("far", 99.0)])
+    assert faults(found) == {"invented": 31, "wrong": 31} | ({"in_ego": 31} if inside else {})
+
+
+def test_an_agent_in_the_ego_is_right_where_its_truth_is_in_it_and_else_wrong():
+    ego = agent("ego", 0.0)
+    assert faults(judged([ego, agent("x", 0.0, 1.5)], [ego, agent("a", 0.0, 1.75)])) == {}
+    assert faults(judged([ego, agent("x", 0.0, 1.5)], [ego, agent("a", 0.0, 1.85)])) == {"in_ego": 31, "wrong": 31}
 
 
 @pytest.mark.parametrize(("ticks", "agents"), [(2, 0), (3, 1)])
@@ -129,6 +197,24 @@ def test_doubt_is_a_flag_or_a_confidence_below_one_half():
     }  # fmt: skip
 
 
+def test_a_doubt_counts_while_it_holds():
+    half = np.where(np.arange(TICKS) < 10, 50.0, 0.0)
+    hidden = Doubt("hidden", "hidden at first", None, float(T_S[9]))
+    found = judged([agent("x", 0.0, half, doubts=(hidden,))], [agent("a", 0.0)])
+    assert (found["doubted"]["wrong_ticks"], found["doubted"]["right_ticks"]) == (1.0, 0.0)
+
+
+def test_confidence_is_compared_with_right_ticks_and_right_agents():
+    half = np.where(np.arange(TICKS) < 10, 0.0, 50.0)
+    found = judged(
+        [agent("x", 0.0, half, confidence=0.75), agent("y", 20.0, confidence=0.95)], [agent("a", 0.0), agent("b", 20.0)]
+    )
+    ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
+    assert ticks["expected_calibration_error"] == pytest.approx((0.75 - 10 / 31 + 0.05) / 2, abs=1e-6)
+    assert agents["expected_calibration_error"] == pytest.approx((0.75 + 0.05) / 2)
+    assert [(b["low"], b["count"], b["right"]) for b in agents["bins"] if b["count"]] == [(0.7, 1, 0.0), (0.9, 1, 1.0)]
+
+
 def test_sigma_is_compared_with_the_errors_by_range():
     def with_sigma(a, first, last):
         return replace(a, waypoints=replace(a.waypoints, sigma_xy_m=np.linspace(first, last, TICKS)))
@@ -152,6 +238,39 @@ def test_sigma_is_compared_with_the_errors_by_range():
     assert judged([ours[0], thinned], truth)["sigma"]["nees"] == pytest.approx(expected, rel=1e-4)
 
 
+def test_sigmas_of_yaw_and_speed_are_compared_with_their_errors():
+    truth = [agent("ego", 0.0), agent("a", 10.0), agent("b", 40.0)]
+    found = judged([agent("ego", 0.0), agent("x", 10.0), agent("y", 40.0)], truth)
+    assert (found["sigma_yaw"]["count"], found["sigma_yaw"]["nees"], found["sigma_speed"]["nees"]) == (0, None, None)
+
+    def off(a, yaw_rad, speed_mps):
+        w = a.waypoints
+        columns = {"sigma_yaw_rad": np.full(TICKS, 0.05), "sigma_speed_mps": np.full(TICKS, 0.25)}
+        turned = replace(w, yaw_rad=w.yaw_rad + yaw_rad, speed_mps=w.speed_mps + speed_mps, **columns)
+        return replace(a, waypoints=turned)
+
+    # Turned round, a heading has no error that sigma_yaw should tell.
+    found = judged(
+        [agent("ego", 0.0), off(agent("x", 10.0), 0.1, 0.5), off(agent("y", 40.0), np.pi - 0.05, 0.0)], truth
+    )
+    assert found["by_range"]["0-15"]["sigma_yaw"]["nees"] == pytest.approx(4.0)
+    assert found["by_range"]["0-15"]["sigma_speed"]["nees"] == pytest.approx(4.0)
+    assert found["by_range"]["30-50"]["sigma_yaw"]["nees"] == pytest.approx(1.0)
+    assert found["sigma_speed"]["nees"] == pytest.approx(2.0)
+
+
+def test_ranges_are_those_of_the_reconstructed_agent_and_end_where_the_next_begins():
+    ego = agent("ego", 0.0)
+    xs = (5.0, 15.0, 29.9, 30.0, 50.0, 90.0)
+    found = judged([ego, *(agent(f"x{k}", x) for k, x in enumerate(xs))], [ego, agent("a", 0.0, 60.0)])
+    assert {k: v["agents"] for k, v in found["by_range"].items()} == {"0-15": 1, "15-30": 2, "30-50": 1, "50-": 2}
+    limited = judged(
+        [ego, *(agent(f"x{k}", x) for k, x in enumerate(xs))], [ego, agent("a", 0.0, 60.0)], max_range_m=30.0
+    )
+    assert (limited["agents"], limited["by_range"]["50-"]["ticks"]) == (4, 0)
+    assert judged([agent("x", 0.0)], [agent("a", 0.0)])["by_range"] is None
+
+
 def test_gaps_of_the_labels_say_nothing_of_states_nor_of_presence():
     kept = (T_S < 1.05) | (T_S > 1.95)
     truth = [agent("ego", 0.0), agent("a", T_S[kept], 5.0, speed=1.0, t_s=T_S[kept])]
@@ -159,6 +278,19 @@ def test_gaps_of_the_labels_say_nothing_of_states_nor_of_presence():
     gap = int((~kept).sum())
     assert (found["ticks"], found["undecided_ticks"]) == (2 * (TICKS - gap), 2 * gap)
     assert faults(found)["duplicate"] == faults(found)["wrong_speed"] == TICKS - gap
+
+
+def test_what_is_not_selected_is_not_judged_at_all():
+    ego_xy = np.zeros((TICKS, 2))
+    ours = reconstructed_states((driving("x", 9.0, yaw=np.pi), agent("y", 0.0, 9.0, category="truck")), T_S, ego_xy)
+    truth = truth_states((driving("a", 5.0), agent("b", 0.0, 9.0)), T_S, np.zeros(3), ego_xy)
+    found = judge(compare(truth, ours, 0.1, Selection(8.0, frozenset(["car"]))), None)
+    near = np.array([5 * T_S <= 8.0, np.zeros(TICKS, dtype=bool)])
+    assert np.array_equal(found.judged, near)
+    assert np.array_equal(found.wrong, near)
+    assert np.array_equal(np.isfinite(found.error_m[..., 0]), near)
+    for mask in (*found.measures.values(), found.matched >= 0, found.taken_for >= 0, found.undecided):
+        assert not np.any(mask & ~near)
 
 
 def broken():
@@ -181,6 +313,23 @@ def test_a_result_keeps_its_schema_and_the_worst_agents_are_named():
     assert "ghost: invented in 31 of 31 ticks, confidence 1.00, doubted (jump)" in text
     assert text.index("car-18:") < text.index("car-10:") < text.index("ghost:")
     assert "expected calibration error" in text
+
+
+def test_a_document_without_its_figures_breaks_the_schema():
+    result = evaluate(broken(), world())
+    for path in (
+        ("invented",),
+        ("by_kind", "vehicle", "sigma"),
+        ("calibration", "agents"),
+        ("judged_agents", 0, "doubted"),
+    ):
+        spoiled = json.loads(json.dumps(result))
+        part = spoiled["correctness"]
+        for key in path[:-1]:
+            part = part[key]
+        del part[path[-1]]
+        with pytest.raises(ScenarioError):
+            check(spoiled, "metrics-1", ScenarioError)
 
 
 def without_names(found):
@@ -248,3 +397,13 @@ def scenes(draw) -> list[Agent]:
 def test_doubting_everything_doubts_all_that_is_wrong_and_all_that_is_right(ours, truth):
     found = judged([replace(a, confidence=0.2) for a in ours], truth)
     assert all(s in (None, 1.0) for s in found["doubted"].values())
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes())
+def test_false_ticks_are_invented_or_duplicate(ours):
+    # Precision does not count what is at an object of another kind.
+    truth = [agent("a", 0.0), agent("b", 3.0, 1.0, category="cyclist")]
+    whole = evaluate(scenario(*ours), scenario(*truth))
+    found = whole["correctness"]
+    assert whole["counts"]["false_ticks"] <= found["invented"]["ticks"] + found["duplicate"]["ticks"]

@@ -7,15 +7,12 @@ import pytest
 from replay_maneuvers import agent_from, scenario_of
 from scipy.optimize import brentq
 
-from log2sim.errors import ScenarioError
 from log2sim.geometry import rectangles_overlap, wrap_angle
-from log2sim.simulation.metrics import collisions as collisions_module
 from log2sim.simulation.metrics.collisions import (
     MAX_STEPS,
     BoxTracks,
     RelativeMotion,
     collisions,
-    contacts,
     first_contact,
 )
 from log2sim.simulation.runner import replay
@@ -78,14 +75,6 @@ def test_two_that_cross_at_right_angles_touch_while_both_cover_the_crossing(late
     assert event["relative_speed_mps"] == pytest.approx(np.hypot(50, 30), abs=1e-3)
 
 
-def test_one_that_leaves_the_crossing_before_the_other_comes_is_not_hit():
-    a = (lambda t: 50 * (t - 1.013), 0.0, 0.0)
-    missed = 3 / 50 + 3 / 30
-    for late_s, count in ((missed + 0.001, 0), (missed - 0.002, 1), (-missed - 0.001, 0)):
-        b = (0.0, lambda t, late_s=late_s: 30 * (t - 1.013 - late_s), np.pi / 2)
-        assert len(events_of(boxes_of(a, b))) == count
-
-
 @pytest.mark.parametrize("view", [0.0, 0.5, -2.0])
 @pytest.mark.parametrize("rate", [1.5, -6.0])
 def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate, view):
@@ -139,22 +128,6 @@ def test_first_touches_are_those_of_a_thousand_moments():
     assert np.mean(np.abs(late) < 2 / 1024) > 0.99  # the others graze for less than a step before
 
 
-def test_backward_the_first_touch_is_the_last():
-    motion = random_motions(300, seed=5)
-    touched = ~np.isnan(first_contact(motion))
-    last = 1 - first_contact(motion.reversed())
-    assert np.mean(touched == ~np.isnan(last)) > 0.99
-    both = touched & ~np.isnan(last)
-    assert np.all(last[both] >= first_contact(motion)[both] - 1e-3)
-
-
-def test_one_that_leaps_over_another_does_not_hit_it():
-    b = (20.0, 0.0, 0.0)
-    assert events_of(boxes_of((lambda t: 5 * t + np.where(t > 1.02, 40.0, 0.0), 0.0, 0.0), b)) == []
-    (event,) = events_of(boxes_of((lambda t: 5 * t + np.where(t > 1.02, 16.0, 0.0), 0.0, 0.0), b))
-    assert event["t_s"] == pytest.approx(1.05)  # it lands in it
-
-
 def test_boxes_that_appear_inside_each_other_say_so_and_those_of_other_times_do_not_meet():
     stands, passes = (0.0, 0.0, 0.0), (lambda t: -8 + 4 * t, 0.0, 0.0)
     (event,) = events_of(boxes_of(stands, (*passes, 1.5, 4.0)))
@@ -167,19 +140,6 @@ def test_boxes_that_appear_inside_each_other_say_so_and_those_of_other_times_do_
     assert events_of(boxes_of((*stands, 0.0, 2.0), (0.0, 0.0, 0.0, 2.05, 4.0))) == []
 
 
-def test_one_alone_and_nobody_hit_nothing():
-    assert events_of(boxes_of((lambda t: 5 * t, 0.0, 0.0))) == []
-    none = np.zeros((len(T_S), 0))
-    assert events_of(BoxTracks(none, none, none, none, none, np.zeros((0, 3)))) == []
-
-
-def test_the_order_of_agents_does_not_matter():
-    a, b = (lambda t: 17 * t, 0.3, 0.1), (30.0, lambda t: 20 - 13 * t, -1.2)
-    one, other = contacts(boxes_of(a, b), np.ones(2, bool)), contacts(boxes_of(b, a), np.ones(2, bool))
-    np.testing.assert_allclose(one.first_row, other.first_row, atol=1e-3)
-    assert len(one.a) > 1
-
-
 @pytest.mark.parametrize("mode", ["exact", "pid"])
 def test_a_collision_does_not_depend_on_the_step(mode):
     t = np.arange(0, 41) * 0.1
@@ -189,36 +149,3 @@ def test_a_collision_does_not_depend_on_the_step(mode):
         (event,) = replay(scenario_of(a, b), mode=mode, dt_s=dt_s).metrics["collisions"]
         assert event["t_s"] == pytest.approx((131.0 - 4.4) / 60, abs=2e-4)
         assert event["relative_speed_mps"] == pytest.approx(60.0, abs=0.01)
-
-
-def test_batches_of_pairs_find_the_same_contacts(monkeypatch):
-    rng = np.random.default_rng(4)
-    tracks = [
-        (lambda t, x=x, v=v: x + v * t, lambda t, y=y, w=w: y + w * t, float(yaw))
-        for x, y, v, w, yaw in rng.uniform([0, 0, -9, -9, -3], [60, 60, 9, 9, 3], (40, 5))
-    ]
-    boxes, moves = boxes_of(*tracks), np.ones(40, bool)
-    whole = contacts(boxes, moves)
-    assert len(whole.a) > 50
-    monkeypatch.setattr(collisions_module, "MAX_PAIRS", 7)
-    monkeypatch.setattr(collisions_module, "BATCH", 11)
-    parts = contacts(boxes, moves)
-    for name in ("a", "b", "first_row", "last_row"):
-        one, two = (getattr(c, name)[np.lexsort((c.first_row, c.b, c.a))] for c in (whole, parts))
-        np.testing.assert_allclose(one, two)
-
-
-@pytest.mark.slow
-def test_agents_on_top_of_each_other_are_refused_before_all_pairs_are_kept(monkeypatch):
-    import tracemalloc
-
-    monkeypatch.setattr(collisions_module, "MAX_CONTACTS", 200_000)
-    count = 1500
-    still = np.zeros((len(T_S), count))
-    boxes = BoxTracks(still, still, still, still, still, np.tile([4.0, 2.0, 1.5], (count, 1)))
-    tracemalloc.start()
-    with pytest.raises(ScenarioError, match="1500 agents touch in more than 200000 pairs and steps: they lie on top"):
-        contacts(boxes, np.ones(count, bool))
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak_bytes < 800_000_000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from replay_maneuvers import agent_from
 
-from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for, rear_axle_offset
+from log2sim.simulation.vehicles.parameters import STEER_LAG_S, parameters_for
 from log2sim.simulation.vehicles.vehicle import (
     POINT_MAX_ACCEL_MPS2,
     PointControls,
@@ -52,12 +52,6 @@ def test_constant_steering_drives_a_circle_of_wheelbase_over_tangent(dt_s, speed
     assert state.y_m[0] == pytest.approx(radius * (1 - np.cos(turned)), abs=1e-6)
 
 
-def test_reversing_with_left_lock_turns_the_heading_right():
-    state = run(at_rest(speed=-2.0, steer=0.3), command(steer=0.3), 1.0, 0.01)
-    assert state.yaw_rad[0] == pytest.approx(-2.0 * np.tan(0.3) / CAR.wheelbase_m[0], abs=1e-9)
-    assert state.x_m[0] < -1.5
-
-
 @pytest.mark.parametrize("dt_s", [0.003, 0.01, 0.09])
 def test_braking_stops_after_the_stopping_distance_and_stays(dt_s):
     speed, brake = 10.0, 5.0
@@ -66,24 +60,12 @@ def test_braking_stops_after_the_stopping_distance_and_stays(dt_s):
     assert state.x_m[0] == pytest.approx(speed**2 / (2 * brake), abs=1e-6)
 
 
-def test_the_pedal_follows_its_command_as_a_first_order_lag():
-    state = run(at_rest(speed=10.0), command(pedal=1.0), 0.25, 0.01)
-    assert state.pedal_mps2[0] == pytest.approx(1 - np.exp(-0.25 / PEDAL_LAG_S), abs=1e-9)
-    gained = 0.25 - PEDAL_LAG_S * (1 - np.exp(-0.25 / PEDAL_LAG_S))
-    assert state.speed_mps[0] == pytest.approx(10 + gained, abs=1e-9)
-
-
 def test_the_wheels_turn_no_faster_than_their_rate_and_no_further_than_the_lock():
     early = run(at_rest(), command(steer=5.0), 0.2, 0.01)
     late = run(at_rest(), command(steer=5.0), 5.0, 0.01)
     assert early.steer_rad[0] == pytest.approx(0.2 * CAR.max_steer_rate_radps[0], abs=1e-9)
     assert late.steer_rad[0] == pytest.approx(CAR.max_steer_rad[0], abs=1e-6)
     assert np.all(CAR.steer_lag_s == STEER_LAG_S)
-
-
-def test_throttle_in_reverse_gear_drives_backward_from_rest_only():
-    assert run(at_rest(), command(pedal=1.0, reverse=True), 1.0, 0.01).speed_mps[0] < -0.5
-    assert run(at_rest(speed=3.0), command(pedal=1.0, reverse=True), 1.0, 0.01).speed_mps[0] > 3.5
 
 
 def test_a_step_in_one_or_in_two_halves_is_the_same_while_the_steering_is_constant():
@@ -106,12 +88,3 @@ def test_a_point_follows_the_parabola_and_its_acceleration_is_limited():
     pushed = step_point(state, PointControls(column(300.0), column(400.0)), 0.1)
     gained = np.hypot(pushed.velocity_x_mps - state.velocity_x_mps, pushed.velocity_y_mps - state.velocity_y_mps)
     assert gained[0] == pytest.approx(POINT_MAX_ACCEL_MPS2 * 0.1)
-
-
-def test_an_unknown_rear_axle_lies_behind_the_center_of_what_has_wheels():
-    def agent(category, offset_m):
-        return agent_from([0.0], [0.0], [0.0], [0.0], [0.0], category=category, offset_m=offset_m)
-
-    assert rear_axle_offset(agent("car", 1.1)) == 1.1
-    assert 1.0 < rear_axle_offset(agent("car", 0.0)) < 2.2
-    assert rear_axle_offset(agent("pedestrian", 1.1)) == 0.0

@@ -76,13 +76,3 @@ def test_the_default_detector_keeps_the_limits(by_default: Result) -> None:
     metrics = replay(by_default.scenario).metrics
     assert metrics["cross_track_rms_m"] <= 0.10
     assert [c for c in metrics["collisions"] if not c["in_log"]] == []
-
-
-@pytest.mark.slow
-def test_the_default_detector_sees_who_is_there_with_the_right_size(by_default: Result) -> None:
-    found = figures(by_default)
-    assert found["size_median_m"] <= 0.3
-    assert found["ego"]["position_rmse_m"] <= 0.1
-    # Bus, truck, cars, cyclists and pedestrians: none of them is called something else throughout.
-    truth = {a.category for a in Scenario.load(SAMPLE / "truth.json").others}
-    assert truth <= {a.category for a in by_default.scenario.others}

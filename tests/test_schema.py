@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -42,14 +40,3 @@ def test_a_column_is_judged_as_by_the_plain_validator(
             documents.check({"values": values}, "any", ScenarioError)
         assert problem.message in str(caught.value)
         assert str(caught.value).startswith("values")
-
-
-@pytest.mark.parametrize("file", sorted((Path(__file__).parents[1] / "schemas").glob("*.json")), ids=lambda f: f.stem)
-def test_every_top_field_of_a_document_is_described(file: Path) -> None:
-    schema = json.loads(file.read_text(encoding="utf-8"))
-
-    def described(field: dict[str, Any]) -> bool:
-        target = schema["$defs"][field["$ref"].rpartition("/")[2]] if "$ref" in field else {}
-        return bool({"description", "const"} & {*field, *target})
-
-    assert [name for name, field in schema["properties"].items() if not described(field)] == []

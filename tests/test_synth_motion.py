@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from log2sim.errors import ConfigError
-from log2sim.geometry import wrap_angle
 from log2sim.synth.motion import TimedPath
 
 TURN = [[0.0, 0.0, 5.0], [30.0, 0.0, 4.0], [30.0, 30.0, 6.0]]
@@ -16,36 +15,12 @@ def turning(**changes: object) -> TimedPath:
     return TimedPath(TURN, rounding_m=26.0, where="agent 'a'", **changes)  # type: ignore[arg-type]
 
 
-def test_heading_is_the_tangent_of_the_path() -> None:
-    trajectory = turning()
-    t, step = np.linspace(0.5, 10.0, 200), 1e-4
-    motion = trajectory.at(t)
-    difference = trajectory.at(t + step).xy_m - trajectory.at(t - step).xy_m
-    tangent = np.arctan2(difference[:, 1], difference[:, 0])
-    assert np.abs(wrap_angle(motion.yaw_rad - tangent)).max() < 1e-5
-    assert np.ptp(motion.yaw_rad) > 1.4
-
-
-def test_speed_is_the_change_of_the_position() -> None:
-    trajectory = turning()
-    t, step = np.linspace(-1.0, 12.0, 300), 1e-4
-    difference = trajectory.at(t + step).xy_m - trajectory.at(t - step).xy_m
-    assert np.allclose(np.linalg.norm(difference, axis=1) / (2 * step), trajectory.at(t).speed_mps, atol=2e-4)
-
-
 def test_speed_at_each_waypoint_is_the_one_asked_for() -> None:
     trajectory = turning()
     t = np.linspace(0, 20, 20001)
     way = trajectory.at(t).distance_m
     at_turn = np.argmin(np.abs(way - trajectory.path.at_waypoint_m[1]))
     assert trajectory.at(t[at_turn]).speed_mps[0] == pytest.approx(4.0, abs=0.01)
-
-
-def test_curvature_and_acceleration_are_those_of_a_vehicle() -> None:
-    trajectory = turning()
-    assert np.abs(trajectory.path.curvature_1pm()).max() < 0.25
-    speed = trajectory.at(np.arange(0, 12, 0.01)).speed_mps
-    assert np.abs(np.diff(speed) / 0.01).max() <= 3.0
 
 
 def test_a_stop_keeps_place_and_heading_and_then_goes_on() -> None:
@@ -58,14 +33,6 @@ def test_a_stop_keeps_place_and_heading_and_then_goes_on() -> None:
     assert np.ptp(standing.xy_m, axis=0).max() == 0
     assert trajectory.at(7.0).speed_mps[0] > 0.1
     assert trajectory.at(3.0).speed_mps[0] > 0.1
-
-
-def test_before_the_start_an_agent_comes_along_straight_or_stands() -> None:
-    moving = turning(start_s=1.0).at([0.0, 1.0])
-    assert np.allclose(moving.xy_m, [[-5.0, 0.0], [0.0, 0.0]], atol=1e-6)
-    standing = TimedPath([[0, 0, 0], [9, 0, 3]], rounding_m=2.0, start_s=2.0, where="a").at([0.0, 1.9, 3.0])
-    assert np.allclose(standing.xy_m[:2], 0.0, atol=1e-6)
-    assert standing.xy_m[2, 0] > 0.05
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ import pytest
 from worlds import CAR, tiny_table
 
 from log2sim.errors import ConfigError
-from log2sim.files.documents import load_schema
-from log2sim.synth.scene import load_scene, scene_from_table, scene_schema
+from log2sim.synth.scene import load_scene, scene_from_table
 
 SAMPLE = Path(__file__).resolve().parent.parent / "samples" / "crossing.toml"
 
@@ -50,26 +49,3 @@ def test_the_sample_has_the_agents_that_a_junction_needs() -> None:
 def test_a_wrong_entry_is_named(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         scene_from_table(tiny_table(**changes))
-
-
-def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
-        load_scene(tmp_path / "none.toml")
-    broken = tmp_path / "broken.toml"
-    broken.write_text("name = ", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML"):
-        load_scene(broken)
-
-
-def test_the_stored_schema_is_the_one_of_the_models() -> None:
-    assert load_schema("scene-1") == scene_schema(), "write it again with tools/write_schemas.py"
-
-
-def test_every_key_has_a_description_and_every_quantity_a_unit() -> None:
-    tables = [scene_schema(), *scene_schema()["$defs"].values()]
-    for table in tables:
-        for name, key in table["properties"].items():
-            assert key.get("description"), name
-            suffix = name.rpartition("_")[2]
-            if suffix in {"m", "s", "ns", "hz", "deg", "px"} and name != "wait_s":
-                assert key["unit"].lower() == suffix, name

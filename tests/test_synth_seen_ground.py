@@ -42,14 +42,3 @@ def test_what_stands_there_hides_the_ground_behind_it() -> None:
         assert not shapely.contains_xy(hidden, x, y)
     assert shapely.contains_xy(hidden, 9.5, -2.5)
     assert free.buffer(1e-9).contains(hidden)
-
-
-def test_beams_show_where_they_meet_the_ground_and_the_map_may_be_moved() -> None:
-    area = seen(camera=[])
-    # The lowest channel, 18 degrees down from 1.9 m, meets the ground 5.85 m ahead of the sensor at x = 1.2.
-    assert not shapely.contains_xy(area, 5.5, 0.5)
-    assert shapely.contains_xy(area, 7.0, 0.3)
-    _, truth = tiny_log([], duration_s=0.6, camera=[])
-    moved = seen_ground(truth, np.array([100.0, -50.0, 0.0]))
-    there = seen_ground(truth, np.zeros(3))
-    assert np.allclose(np.array(moved.bounds) - there.bounds, [100.0, -50.0, 100.0, -50.0])

@@ -72,10 +72,3 @@ def test_beams_meet_the_housing_and_the_pole_and_no_other_return_moves() -> None
     assert np.ptp(own[:, 0]) < DEPTH_M + 0.4  # of the pole behind it, and noise
     theirs = {tuple(p) for p in sweeps[1].sweep.xyz_m.tolist()}
     assert all(tuple(p) in theirs for p in sweeps[0].sweep.xyz_m[~hit].tolist())
-
-
-def test_an_id_twice_and_an_unknown_state_are_errors() -> None:
-    with pytest.raises(Exception, match="traffic light 'a' occurs twice"):
-        tiny_scene([], traffic_light=[LIGHT, LIGHT])
-    with pytest.raises(Exception, match="program"):
-        tiny_scene([], traffic_light=[{**LIGHT, "program": [["blue", 1.0]]}])
