@@ -38,6 +38,7 @@ def test_yaw_of_a_rectangle_is_found_whatever_sides_are_seen(yaw_deg, sides):
     assert contrast > 0.3
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_the_fit_turns_with_the_points(seed):
     rng = np.random.default_rng(seed)

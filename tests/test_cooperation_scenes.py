@@ -37,6 +37,7 @@ def points_on_target(world: World, lidar: str, t_s: float) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_walker_hides_from_the_vehicle_and_not_from_the_pole(seed: int) -> None:
     world = drawn("blind_area", seed)

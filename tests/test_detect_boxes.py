@@ -47,6 +47,7 @@ def suppressed_by_definition(d: Detections, max_overlap: float) -> list[int]:
     return kept
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(5))
 def test_suppression_equals_its_definition(seed: int) -> None:
     d = crowd(seed)

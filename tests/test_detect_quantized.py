@@ -70,6 +70,7 @@ def test_convolutions_are_folded_with_what_follows_them() -> None:
     }
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_a_quantized_network_differs_by_steps_of_its_levels(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -29,6 +29,7 @@ def test_cars_along_a_curb_are_one_row_and_so_are_those_side_by_side():
     assert len(lot.members) == 5
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_probabilities_are_those_of_all_cases_enumerated(seed):
     rng = np.random.default_rng(seed)

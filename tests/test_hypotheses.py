@@ -57,6 +57,7 @@ def along(x_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_two_parked_cars_seen_in_turn_are_two_that_stand(rate_hz, seed):
     t = times(rate_hz)
@@ -69,6 +70,7 @@ def test_two_parked_cars_seen_in_turn_are_two_that_stand(rate_hz, seed):
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_a_motion_is_one_moving_object(rate_hz, seed):
     t = times(rate_hz)
@@ -88,6 +90,7 @@ def test_people_who_walk_are_not_people_who_stand_in_turn(rate_hz):
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_at_rest_is_rest(rate_hz, seed):
     t = times(rate_hz)
@@ -96,6 +99,7 @@ def test_noise_at_rest_is_rest(rate_hz, seed):
     assert len(part.track) == len(t)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_a_jump_to_another_moving_car_splits_the_track(seed):
     t = times(10.0, 5.0)
@@ -106,6 +110,7 @@ def test_a_jump_to_another_moving_car_splits_the_track(seed):
     assert [len(part.track) for part in parts] == pytest.approx([25, 25], abs=2)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_outliers_split_no_track(seed):
     t = times(10.0)

@@ -205,6 +205,7 @@ def test_the_height_in_the_image_is_the_objects_height():
 # Mode "paper"
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_paper_mode_is_the_point_nearest_to_the_box_center_and_the_extent_of_all(seed):
     rng = np.random.default_rng(seed)

@@ -38,6 +38,7 @@ def there(xy):
     return np.isfinite(xy[..., 0])
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(5))
 def test_counts_equal_those_of_motmetrics(seed):
     motmetrics = pytest.importorskip("motmetrics")
@@ -61,6 +62,7 @@ def test_counts_equal_those_of_motmetrics(seed):
     assert mota(int(there(truth).sum()), missed, false, switched) == pytest.approx(expected["mota"], abs=1e-12)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(5))
 def test_hota_equals_that_of_trackeval(seed):
     reference = pytest.importorskip("trackeval.metrics.hota", exc_type=ImportError)

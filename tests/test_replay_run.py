@@ -126,6 +126,7 @@ def test_one_waypoint_is_one_state():
 
 
 @pytest.mark.matrix
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(6))
 def test_nonsense_gives_finite_states(seed):
     rng = np.random.default_rng(seed)

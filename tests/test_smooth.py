@@ -179,6 +179,7 @@ def noisy_stop(seed: int, sigma: float = 0.15) -> SmoothedTrack:
     return smooth_track(t, stop(t) + np.random.default_rng(seed).normal(0, sigma, (150, 2)), sigma_m=sigma)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_heading_is_held_at_a_standstill(seed: int) -> None:
     path = noisy_stop(seed)
@@ -579,6 +580,7 @@ def test_sigma_grows_beyond_both_ends_as_vehicles_move() -> None:
 
 
 @pytest.mark.parametrize("pulled_m", [0.6, 0.9])
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_what_comes_to_rest_does_not_turn_where_its_last_boxes_are_pulled_aside(pulled_m: float, seed: int) -> None:
     """Of a car that is hidden little by little, one corner is left, with which the center of its box seems to drive off."""

@@ -37,6 +37,7 @@ def log_of(cameras, lidars=None, *, read=None, **changes):
     )
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_nearest_records_are_those_of_a_full_search(seed):
     rng = np.random.default_rng(seed)

@@ -135,6 +135,7 @@ def test_noise_of_a_center_is_the_sensors_and_that_of_the_view() -> None:
     np.testing.assert_allclose(r[1], np.array([[2.0, 0.5], [0.5, 1.0]]) + np.eye(2) * CENTER_SIGMA_M["pedestrian"] ** 2)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_every_way_becomes_one_track_with_all_its_measurements(seed: int) -> None:
     ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0), "d": line(5, 30, 3, -6)}
@@ -147,6 +148,7 @@ def test_every_way_becomes_one_track_with_all_its_measurements(seed: int) -> Non
         assert t.category == "car"
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("apart_m", [1.5, 3.0])
 def test_tracks_that_cross_keep_their_identities(apart_m: float, seed: int) -> None:
