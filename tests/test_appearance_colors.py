@@ -98,16 +98,17 @@ def test_agents_of_any_distance_hide_and_those_beside_the_rays_are_not_asked() -
     origin = map_T_cam[0, :3, 3]
     view = view_of(log, camera, int(log.streams[camera].t_ns[indices[0]]))
     assert view is not None
-    boxes = sampler._boxes_in(camera)[int(indices[0])]
+    boxes = sampler._boxes_in(camera)
+    first = boxes.center_m[:, 0]
     none = np.zeros((0, 3), np.uint8)
-    scene = _Scene(view, boxes, np.zeros((2, 2, 3), np.uint8), none, none)
-    for k, center in enumerate(boxes.center[:, 0]):
+    scene = _Scene(view, boxes, 0, np.zeros((2, 2, 3), np.uint8), none, none)
+    for k, center in enumerate(first):
         ray = (center - origin)[None]
         found = scene._near(origin, ray, np.ones(1))
         assert k in found
         away = scene._others(origin, ray, np.ones(1))
-        everyone = [hit_block(-boxes.size[j] / 2, boxes.size[j] / 2, *_to_box(
-            origin, ray, boxes.center[j, 0], boxes.yaw[j, 0]))[0] for j in range(len(boxes.agents))]  # fmt: skip
+        everyone = [hit_block(-boxes.size_m[j] / 2, boxes.size_m[j] / 2, *_to_box(
+            origin, ray, first[j], boxes.yaw_rad[j, 0]))[0] for j in range(len(boxes.agents))]  # fmt: skip
         np.testing.assert_array_equal(away, np.min(everyone, axis=0))
         assert away[0] < 1
-    assert len(scene._near(origin, origin - boxes.center[0, 0][None], np.ones(1))) < len(boxes.agents)
+    assert len(scene._near(origin, origin - first[0][None], np.ones(1))) < len(boxes.agents)

@@ -14,9 +14,10 @@ from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream
 from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.first_pass import base_pose, observe
+from log2sim.perception.first_pass import observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan, select_sensors

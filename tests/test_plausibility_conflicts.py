@@ -15,7 +15,6 @@ from log2sim.agents.conflicts import (
     find_conflicts,
     resolve_conflicts,
 )
-from log2sim.agents.evidence import BoxTable
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -37,9 +36,8 @@ def judged(*built, ego=None):
 
 def test_overlaps_have_the_shares_of_exact_rectangles() -> None:
     # 4.4 m long: 2.2 m apart they share half; crossed at right angles a square of 1.8 m.
-    (half, crossed) = find_conflicts(
-        BoxTable.of([agent(0.0), agent(2.2), agent(-50.0), agent(0.0, -50.0), agent(-50.0, yaw=np.pi / 2)], T)
-    )
+    agents = [agent(0.0), agent(2.2), agent(-50.0), agent(0.0, -50.0), agent(-50.0, yaw=np.pi / 2)]
+    (half, crossed), _ = find_conflicts(agents, T)
     assert (half.first, half.second, half.tick.tolist()) == (0, 1, [0, 1, 2, 3, 4])
     assert half.share == pytest.approx(0.5)
     assert half.depth_m == pytest.approx(1.8)

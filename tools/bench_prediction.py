@@ -99,17 +99,9 @@ def difference_table(truth: MotionTable, courses, seed: int) -> MotionTable:
 
 def _with(truth: MotionTable, position, velocity, courses) -> MotionTable:
     sigma = np.array([worlds.SIGMA_M[c.category] for c in courses])[:, None] * np.ones(position.shape)
-    return MotionTable(
-        truth.agents,
-        truth.t_s,
-        truth.tick_s,
-        position,
-        velocity,
-        np.angle(velocity),
-        sigma,
-        truth.observed,
-        truth.piece,
-    )
+    center = np.stack([position.real, position.imag, 0.0 * sigma], axis=-1)
+    states = truth.t_s, center, np.angle(velocity), np.abs(velocity)
+    return MotionTable(truth.agents, *states, truth.tick_s, velocity, sigma, truth.observed, truth.piece)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Measurements, Scenario
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception import first_pass
+from log2sim.perception import observe_tick
 from log2sim.perception.fusion import PAIR_WEIGHTS, ImageMatches, PairWeights, logit
 from log2sim.perception.lidar.projection import View
 from log2sim.pipeline import observe_log, start
@@ -35,18 +35,18 @@ def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, N
     """Features (P, 5) of all pairs in a scene, and whether they are right (P,)."""
     log, truth = synthesize(load_scene(scene), seed=seed)
     found: list[tuple[Measurements, ImageMatches]] = []
-    original = first_pass.match_boxes
+    original = observe_tick.match_boxes
 
     def match(boxes: Measurements, rows: Measurements, view: View) -> ImageMatches:
         matches = original(boxes, rows, view)
         found.append((boxes, matches))
         return matches
 
-    first_pass.match_boxes = match
+    observe_tick.match_boxes = match
     try:
         observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
     finally:
-        first_pass.match_boxes = original
+        observe_tick.match_boxes = original
     parts = [_features(boxes, matches, truth) for boxes, matches in found]
     return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
 

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, spans_of
-from log2sim.agents.evidence import MIN_TICK_RAYS, SAME_S, BoxTable, count_at
-from log2sim.datatypes import Agent, Doubt, Obstacles, Waypoints
+from log2sim.agents.evidence import MIN_TICK_RAYS, count_at
+from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Doubt, Obstacles, Waypoints
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
+# Of a long log, so that the memory does not grow with agents times ticks.
+TICKS_AT_A_TIME = 256
 # Boxes that share less than this of the smaller one only touch: their errors.
 TOUCHING = 0.05
 # Less is rounding: 4 mm of the length of a car.
@@ -49,46 +51,45 @@ class Conflict:
     depth_m: Array
 
 
-def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict]:
-    """Find the pairs of A agents whose boxes share more than `touching` of the smaller one, with the ticks at which they do."""
-    first, second = np.triu_indices(len(boxes.present), 1)
-    radius = np.hypot(boxes.size_m[:, 0], boxes.size_m[:, 1]) / 2
-    low, high = (f(boxes.center_m[..., :2], axis=1) for f in (np.nanmin, np.nanmax))
-    reach = (radius[first] + radius[second])[:, None]
-    meet = ((low[first] - high[second] <= reach) & (low[second] - high[first] <= reach)).all(axis=1)
-    first, second = first[meet], second[meet]
-    apart = np.hypot(*np.moveaxis(boxes.center_m[first, :, :2] - boxes.center_m[second, :, :2], -1, 0))
-    pair, tick = np.nonzero(apart < (radius[first] + radius[second])[:, None])
-    rectangles = [
-        np.column_stack([boxes.center_m[row, tick, :2], boxes.size_m[row, :2], boxes.yaw_rad[row, tick]])
-        for row in (first[pair], second[pair])
-    ]
-    share = overlap_of_smaller(*rectangles)
-    over = share > touching
-    pair, tick, share, depth = pair[over], tick[over], share[over], _depths(*(r[over] for r in rectangles))
-    return [
-        Conflict(int(first[p]), int(second[p]), *(column[pair == p] for column in (tick, share, depth)))
-        for p in np.unique(pair).tolist()
-    ]
-
-
-def find_all_conflicts(
+def find_conflicts(
     agents: Sequence[Agent], t_s: Array, touching: float = TOUCHING
 ) -> tuple[list[Conflict], NDArray[np.bool_]]:
-    """Find the conflicts of A agents at ticks (T,) as `find_conflicts` does, and mark (A, T) when each agent is there."""
+    """Find the pairs of A agents whose boxes share more than `touching` of the smaller one at ticks (T,), rising.
+
+    Marks (A, T), too, when each agent is there.
+    """
     present = np.zeros((len(agents), len(t_s)), dtype=bool)
-    parts: dict[tuple[int, int], list[Conflict]] = {}
-    for rows, first, boxes in BoxTable.in_turn(agents, t_s):
-        present[rows, first : first + boxes.present.shape[1]] = boxes.present
-        for found in find_conflicts(boxes, touching):
-            pair = int(rows[found.first]), int(rows[found.second])
-            parts.setdefault(pair, []).append(replace(found, tick=found.tick + first))
-    return [
-        Conflict(
-            *pair, *(np.concatenate([getattr(c, name) for c in parts[pair]]) for name in ("tick", "share", "depth_m"))
-        )
-        for pair in sorted(parts)
-    ], present
+    parts: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
+    life = np.array([agent.waypoints.t_s[[0, -1]] for agent in agents]).reshape(-1, 2)
+    for begin in range(0, len(t_s), TICKS_AT_A_TIME):
+        some = t_s[begin : begin + TICKS_AT_A_TIME]
+        rows = np.flatnonzero((life[:, 0] <= some[-1] + MARGIN_S) & (life[:, 1] >= some[0] - MARGIN_S))
+        boxes = AgentTable.of([agents[k] for k in rows.tolist()], some)
+        there = np.flatnonzero(boxes.present.any(axis=1))
+        rows, boxes = rows[there], boxes.take(there)
+        present[rows, begin : begin + len(some)] = boxes.present
+        first, second, tick, share, depth = _overlaps(boxes, touching)
+        for i, j in np.unique(np.column_stack([first, second]), axis=0).tolist():
+            pair = (first == i) & (second == j)
+            parts.setdefault((int(rows[i]), int(rows[j])), []).append((tick[pair] + begin, share[pair], depth[pair]))
+    return [Conflict(*pair, *map(np.concatenate, zip(*parts[pair]))) for pair in sorted(parts)], present
+
+
+def _overlaps(boxes: AgentTable, touching: float) -> tuple[NDArray[np.intp], ...]:
+    """Return agents, agents, ticks, shares and depths (n,) of boxes that share more than `touching` of the smaller one."""
+    first, second = np.triu_indices(len(boxes.present), 1)
+    radius = np.hypot(boxes.size_m[:, 0], boxes.size_m[:, 1]) / 2
+    low, high = (f(boxes.xy_m, axis=1) for f in (np.nanmin, np.nanmax))
+    reach = radius[first] + radius[second]
+    meet = ((low[first] - high[second] <= reach[:, None]) & (low[second] - high[first] <= reach[:, None])).all(axis=1)
+    first, second, reach = first[meet], second[meet], reach[meet]
+    apart = np.hypot(*np.moveaxis(boxes.xy_m[first] - boxes.xy_m[second], -1, 0))
+    pair, tick = np.nonzero(apart < reach[:, None])
+    first, second = first[pair], second[pair]
+    share = overlap_of_smaller(boxes.rectangles(first, tick), boxes.rectangles(second, tick))
+    over = share > touching
+    first, second, tick = first[over], second[over], tick[over]
+    return first, second, tick, share[over], _depths(boxes.rectangles(first, tick), boxes.rectangles(second, tick))
 
 
 def _depths(a: Array, b: Array) -> Array:
@@ -119,7 +120,7 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
     evidence = [c.evidence for c in candidates]
     if ego is not None:
         agents, evidence = [*agents, ego], [*evidence, np.inf]
-    conflicts, present = find_all_conflicts(agents, t_s)
+    conflicts, present = find_conflicts(agents, t_s)
     alive = present.copy()
     for conflict in sorted(conflicts, key=lambda c: -max(evidence[c.first], evidence[c.second])):
         of_ego = ego is not None and conflict.second == len(candidates)
@@ -158,7 +159,7 @@ def _during(agent: Agent, w: Waypoints, first_s: float, last_s: float) -> Waypoi
     if agent.static:
         ends = w.take(np.array([0, len(w) - 1])[: 1 + (last_s > first_s)])
         return replace(ends, t_s=np.array([first_s, last_s])[: len(ends)])
-    return w.take((w.t_s >= first_s - SAME_S) & (w.t_s <= last_s + SAME_S))
+    return w.take((w.t_s >= first_s - MARGIN_S) & (w.t_s <= last_s + MARGIN_S))
 
 
 def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[list[Doubt]]:
@@ -168,7 +169,7 @@ def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s
     """
     agents = [c.agent for c in candidates] + ([ego] if ego is not None else [])
     doubts: list[list[Doubt]] = [[] for _ in agents]
-    for conflict in find_all_conflicts(agents, t_s, touching=ROUNDING)[0]:
+    for conflict in find_conflicts(agents, t_s, touching=ROUNDING)[0]:
         a, b = conflict.first, conflict.second
         if b == len(candidates):
             doubts[a].append(_doubt(conflict, t_s, "in_ego", "touches the ego", agents[a]))
@@ -186,7 +187,7 @@ def _doubt(conflict: Conflict, t_s: Array, flag: str, words: str, agent: Agent) 
     worst_s, first_s, last_s = (
         float(t_s[k]) for k in (conflict.tick[conflict.share.argmax()], conflict.tick[0], conflict.tick[-1])
     )
-    if first_s <= agent.waypoints.t_s[0] + SAME_S and last_s >= agent.waypoints.t_s[-1] - SAME_S:
+    if first_s <= agent.waypoints.t_s[0] + MARGIN_S and last_s >= agent.waypoints.t_s[-1] - MARGIN_S:
         return Doubt(flag, words)
     return Doubt(flag, f"{words} at {worst_s:.1f} s", first_s, last_s)
 
@@ -236,25 +237,16 @@ def _free_places(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], t_
     free = np.zeros((len(agents), len(t_s)), dtype=bool)
     if not agents:
         return free
-    first = [a.waypoints.take(slice(0, 1)) for a in agents]
-    center = np.array([(w.x_m[0], w.y_m[0], w.z_m[0]) for w in first])
-    yaw, size = np.array([w.yaw_rad[0] for w in first]), np.array([a.size_m for a in agents])
-    life = np.array([(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in agents])
+    boxes = AgentTable.of(agents, t_s[:1], margin_s=np.inf)
+    life = np.array([a.waypoints.t_s[[0, -1]] for a in agents])
     for tick, cloud in enumerate(clouds):
         if cloud is None or cloud.free is None or not len(cloud.free):
             continue
         outside = (t_s[tick] < life[:, 0]) | (t_s[tick] > life[:, 1])
-        near = np.hypot(*(center[:, :2] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M
+        near = np.hypot(*(boxes.xy_m[:, 0] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M
         rows = np.flatnonzero(outside & near)
         if len(rows):
-            boxes = BoxTable(
-                np.ones((len(rows), 1), dtype=bool),
-                center[rows, None],
-                np.zeros((len(rows), 1, 2)),
-                yaw[rows, None],
-                size[rows],
-            )
-            inside, through, _ = count_at(boxes, 0, cloud.origin, cloud.free)[0]
+            inside, through, _ = count_at(boxes.take(rows), 0, cloud.origin, cloud.free)[0]
             free[rows, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
     return free
 
@@ -269,10 +261,7 @@ def _occupied(agent: Agent, others: Sequence[Agent], t_s: Array) -> NDArray[np.b
         v = other.waypoints
         if np.hypot(v.x_m - place[0], v.y_m - place[1]).min() > reach_m + np.hypot(np.ptp(v.x_m), np.ptp(v.y_m)):
             continue
-        s = other.at(t_s)
-        rows = np.flatnonzero(s.valid & ~(np.hypot(s.x_m - place[0], s.y_m - place[1]) > reach_m))
-        if len(rows):
-            sides = (np.full(len(rows), side) for side in other.size_m[:2])
-            boxes = np.column_stack([s.x_m[rows], s.y_m[rows], *sides, s.yaw_rad[rows]])
-            occupied[rows] |= overlap_of_smaller(np.tile(place, (len(rows), 1)), boxes) > TOUCHING
+        boxes = AgentTable.of([other], t_s)
+        rows = np.flatnonzero(np.hypot(*(boxes.xy_m[0] - place[:2]).T) <= reach_m)
+        occupied[rows] |= overlap_of_smaller(np.tile(place, (len(rows), 1)), boxes.rectangles(0, rows)) > TOUCHING
     return occupied

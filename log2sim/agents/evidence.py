@@ -6,8 +6,8 @@ behind it contradict it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -16,69 +16,10 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Support, Timeline
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, Doubt, Log, Measurements, Obstacles, Rays
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Doubt, Log, Measurements, Obstacles, Rays
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
 from log2sim.perception.boxes import rotate
 from log2sim.perception.sync import Schedule
-
-# Of a long log, so that the memory does not grow with agents times ticks.
-TICKS_AT_A_TIME = 256
-# Stamps of ticks and waypoints are the same up to rounding.
-SAME_S = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class BoxTable:
-    """Boxes of A agents at T times, map frame; NaN where an agent is absent.
-
-    Attributes
-    ----------
-    present : (A, T) bool
-    center_m : (A, T, 3) float64
-    velocity_mps : (A, T, 2) float64
-    yaw_rad : (A, T) float64
-    size_m : (A, 3) float64
-    """
-
-    present: NDArray[np.bool_]
-    center_m: Array
-    velocity_mps: Array
-    yaw_rad: Array
-    size_m: Array
-
-    @classmethod
-    def of(cls, agents: Sequence[Agent], t_s: Array, *, margin_s: float = SAME_S) -> BoxTable:
-        """Evaluate agents at times (T,); up to `margin_s` before and after its life an agent moves on as it starts and ends."""
-        at = [agent.at(t_s, margin_s=margin_s) for agent in agents]
-        x, y, z, yaw, speed = (
-            np.array([getattr(s, key) for s in at]).reshape(len(at), len(t_s))
-            for key in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")
-        )
-        velocity = np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], axis=-1)
-        life = np.array([[a.waypoints.t_s[0], a.waypoints.t_s[-1]] for a in agents]).reshape(len(at), 2, 1)
-        outside_s = t_s - np.clip(t_s, life[:, 0], life[:, 1])
-        return cls(
-            present=np.array([s.valid for s in at], dtype=bool).reshape(len(at), len(t_s)),
-            center_m=np.stack([x, y, z], axis=-1) + np.insert(velocity, 2, 0.0, axis=2) * outside_s[..., None],
-            velocity_mps=velocity,
-            yaw_rad=yaw,
-            size_m=np.array([agent.size_m for agent in agents], dtype=np.float64).reshape(len(at), 3),
-        )
-
-    @classmethod
-    def in_turn(cls, agents: Sequence[Agent], t_s: Array) -> Iterator[tuple[NDArray[np.intp], int, BoxTable]]:
-        """Evaluate agents at times (T,), rising, some at a time: the agents that are there, the first time, and their boxes."""
-        life = np.array([[a.waypoints.t_s[0], a.waypoints.t_s[-1]] for a in agents]).reshape(-1, 2)
-        for first in range(0, len(t_s), TICKS_AT_A_TIME):
-            some = t_s[first : first + TICKS_AT_A_TIME]
-            rows = np.flatnonzero((life[:, 0] <= some[-1] + SAME_S) & (life[:, 1] >= some[0] - SAME_S))
-            table = cls.of([agents[k] for k in rows.tolist()], some, margin_s=SAME_S)
-            there = np.flatnonzero(table.present.any(axis=1))
-            yield rows[there], first, table.take(there)
-
-    def take(self, rows: NDArray[np.intp]) -> BoxTable:
-        """Return the boxes of some of the agents."""
-        return BoxTable(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +72,7 @@ BORDER_SHARE = 0.05
 MAX_BASELINE_M = 3.0
 
 
-def shown_in_images(boxes: BoxTable, recording: Recording) -> NDArray[np.bool_]:
+def shown_in_images(boxes: AgentTable, recording: Recording) -> NDArray[np.bool_]:
     """Mark (A, T) where a searched camera next to the LiDAR has an agent well inside its image, large enough to be detected."""
     shown = np.zeros(boxes.present.shape, dtype=bool)
     log, schedule = recording.log, recording.schedule
@@ -228,7 +169,7 @@ def count_rays(
     if agents:
         stamps = [timeline.t_ns[k] if cloud is None else cloud.stamp_ns for k, cloud in enumerate(clouds)]
         t_s = (np.array(stamps, dtype=np.int64) - timeline.t0_ns) / NS_PER_S
-        boxes = BoxTable.of(agents, t_s, margin_s=MAX_LAG_S)
+        boxes = AgentTable.of(agents, t_s, margin_s=MAX_LAG_S)
         for tick in np.flatnonzero(boxes.present.any(axis=0)).tolist():
             cloud = clouds[tick]
             if cloud is not None and cloud.free is not None and len(cloud.free):
@@ -236,10 +177,14 @@ def count_rays(
     return RayCounts(*counts[0]), RayCounts(*counts[1])
 
 
-def count_at(boxes: BoxTable, tick: int, origin: Array, rays: Rays) -> NDArray[np.int64]:
+def count_at(boxes: AgentTable, tick: int, origin: Array, rays: Rays) -> NDArray[np.int64]:
     """Count the rays of one tick toward the solid part and the whole by their ending (2, 3, A)."""
     agent = np.flatnonzero(boxes.present[:, tick])
-    center, velocity, size = boxes.center_m[agent, tick] - origin, boxes.velocity_mps[agent, tick], boxes.size_m[agent]
+    center, velocity, size = (
+        boxes.center_m[agent, tick] - origin,
+        boxes.heading_velocity_mps[agent, tick],
+        boxes.size_m[agent],
+    )
     counts = np.zeros((2, 3, len(boxes.present)), dtype=np.int64)
     start = rays.start
     to = rays.end - start
@@ -404,7 +349,7 @@ def structure_shares(
     if len(ticks) == 0 or not rows:
         return shares[0], shares[1]
     stamps = np.array(list(stamp_of.values()), dtype=np.int64)
-    boxes = BoxTable.of([agents[i] for i in rows], (stamps - timeline.t0_ns) / NS_PER_S, margin_s=MAX_LAG_S)
+    boxes = AgentTable.of([agents[i] for i in rows], (stamps - timeline.t0_ns) / NS_PER_S, margin_s=MAX_LAG_S)
     for row, i in enumerate(rows):
         alive = np.flatnonzero(boxes.present[row])
         searched = alive[np.unique(np.linspace(0, len(alive) - 1, min(len(alive), SEARCHED_TICKS)).astype(np.intp))]
@@ -416,7 +361,7 @@ def structure_shares(
     return shares[0], shares[1]
 
 
-def _surface_at(boxes: BoxTable, row: int, column: int, cloud: Obstacles | None, reach_m: float) -> Surface | None:
+def _surface_at(boxes: AgentTable, row: int, column: int, cloud: Obstacles | None, reach_m: float) -> Surface | None:
     """Follow the surface of one agent in one cloud up to `reach_m` from its center."""
     if cloud is None:
         return None
@@ -518,7 +463,9 @@ def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) 
     in_structure, beside = structure_shares(agents, clouds, timeline)
     met = whole.inside + whole.through
     shown = (
-        shown_in_images(BoxTable.of(agents, recording.t_s), recording) & (met >= whole.before) & (met >= MIN_TICK_RAYS)
+        shown_in_images(AgentTable.of(agents, recording.t_s), recording)
+        & (met >= whole.before)
+        & (met >= MIN_TICK_RAYS)
     )
     weighed = []
     for k, candidate in enumerate(candidates):

@@ -11,7 +11,7 @@ from log2sim.agents.candidate import AgentCandidate, Support, confirm, name_agen
 from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
 from log2sim.agents.evidence import Recording, doubt_size, weigh
 from log2sim.agents.size import independent
-from log2sim.datatypes import GROUP_OF, Agent, Doubt
+from log2sim.datatypes import GROUP_OF, Agent, AgentTable, Doubt
 from log2sim.geometry import Array, overlap_of_smaller
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
@@ -73,30 +73,14 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
     first, last = max(a.waypoints.t_s[0], b.waypoints.t_s[0]), min(a.waypoints.t_s[-1], b.waypoints.t_s[-1])
     t = np.linspace(first, last, SAMPLES)
     groups = {GROUP_OF[a.category], GROUP_OF[b.category]}
+    boxes = AgentTable.of((a, b), t)
+    apart_m = np.hypot(*(boxes.xy_m[0] - boxes.xy_m[1]).T)
     if groups == {"pedestrian"}:
-        p, q = a.at(t), b.at(t)
-        return bool(np.median(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m)) < SAME_PERSON_M)
-    if not _touch_long_enough(a, b, t):
-        return False
+        return bool(np.median(apart_m) < SAME_PERSON_M)
+    if np.sum(apart_m <= np.hypot(*boxes.size_m[:, :2].T).sum() / 2) < SAMPLES // 2:
+        return False  # too far for their boxes to touch at half of the times
     least = SHARED_AREA_OF_PERSON if groups == {"pedestrian", "vehicle"} else SHARED_AREA
-    return bool(np.median(_shared_areas(a, b, t)) > least)
-
-
-def _touch_long_enough(a: Agent, b: Agent, t_s: Array) -> bool:
-    """Return whether two agents are near enough for their boxes to touch at half of the times (T,); else they share 0 on the median."""
-    p, q = a.at(t_s), b.at(t_s)
-    reach_m = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
-    return bool(np.sum(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) <= reach_m) >= len(t_s) // 2)
-
-
-def _shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
-    """Return the overlap (T,) of two agents' boxes at times (T,) as a share of the smaller box; 0 where one is absent."""
-    rectangles = []
-    for agent in (a, b):
-        s = agent.at(t_s)
-        length, width = (np.full(len(t_s), v) for v in agent.size_m[:2])
-        rectangles.append(np.column_stack([s.x_m, s.y_m, length, width, s.yaw_rad]))
-    return overlap_of_smaller(*rectangles)
+    return bool(np.median(overlap_of_smaller(*(boxes.rectangles(k, slice(None)) for k in range(2)))) > least)
 
 
 # Share of the rays that pass through the solid part of labeled boxes in real logs and of exact ones in synthetic ones: below

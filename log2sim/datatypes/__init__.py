@@ -5,6 +5,7 @@ from __future__ import annotations
 from log2sim.datatypes.agent import (
     COLOR_NAMES,
     FLAGS,
+    MARGIN_S,
     MIN_TRUSTED_CONFIDENCE,
     STANDSTILL_DRIFT_M,
     STANDSTILL_MPS,
@@ -16,6 +17,7 @@ from log2sim.datatypes.agent import (
     say_confidence,
     why_doubtful,
 )
+from log2sim.datatypes.agent_table import AgentTable
 from log2sim.datatypes.categories import (
     CATEGORIES,
     CATEGORY,
@@ -86,6 +88,7 @@ __all__ = [
     "GROUP_OF",
     "LANE_LINE_KINDS",
     "LANE_ORIGINS",
+    "MARGIN_S",
     "MARKING_KINDS",
     "MAX_SIZE_M",
     "MAX_SPEED_MPS",
@@ -100,6 +103,7 @@ __all__ = [
     "VEHICLE",
     "VERSION",
     "Agent",
+    "AgentTable",
     "BoxEvidence",
     "Boxes3D",
     "Deferred",

@@ -102,6 +102,9 @@ STANDSTILL_MPS = 0.15
 STANDSTILL_DRIFT_M = 2.0 * STANDSTILL_MPS
 """How far a standing agent may seem to move: 2 s at that speed, after which a smoothed drift is seen as motion."""
 
+MARGIN_S = 1e-6
+"""Times this far outside a trajectory are at its ends: stamps of ticks and waypoints are the same up to rounding."""
+
 MIN_DISCONTINUITY_M = 2.0
 """A waypoint is discontinuous when it is farther than this from where the speeds lead, and"""
 
@@ -411,7 +414,7 @@ class Agent:
         """The spline through the waypoints."""
         return Trajectory.through(self.waypoints, self.rear_axle_offset_m)
 
-    def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = 1e-6) -> AgentStates:
+    def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = MARGIN_S) -> AgentStates:
         """Evaluate the trajectory at times: positions by cubics with the logged velocities, yaw along the shorter arc.
 
         Parameters

@@ -19,17 +19,10 @@ MEMORY_BYTES = 64 * 2**20
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StoredArray:
-    """An array in the file of an `ArrayFile`.
-
-    Attributes
-    ----------
-    offset : int
-        Of its first byte.
-    dtype : dtype
-    """
+    """An array in the file of an `ArrayFile`."""
 
     file: ArrayFile
-    offset: int
+    offset: int  # of its first byte
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
@@ -44,10 +37,7 @@ class ArrayFile:
     The file has no name, and the system removes it when the process ends in whatever way. It lies in the folder of temporary
     files, which the environment variable TMPDIR names.
 
-    Attributes
-    ----------
-    memory_bytes : int
-        Of the arrays that stay in memory.
+    `memory_bytes`: of the arrays that stay in memory.
     """
 
     def __init__(self, memory_bytes: int | None = None) -> None:
@@ -64,10 +54,7 @@ class ArrayFile:
     def keep(self, array: NDArray[Any]) -> NDArray[Any] | StoredArray:
         """Return the array itself while there is room for it in memory, else what reads it from the file.
 
-        Raises
-        ------
-        OSError
-            Where the folder of temporary files has no room.
+        Raises `OSError` where the folder of temporary files has no room.
         """
         with self._lock:
             if self._kept + array.nbytes <= self.memory_bytes or not array.nbytes:
@@ -97,12 +84,7 @@ class ArrayFile:
 
 
 class ArrayList(Sequence[NDArray[Any]]):
-    """Arrays of which some are in a file; each is read when it is asked for, and not kept.
-
-    Parameters
-    ----------
-    items : sequence of arrays and `StoredArray`
-    """
+    """Arrays of which some are in a file; each is read when it is asked for, and not kept."""
 
     __slots__ = ("items",)
 

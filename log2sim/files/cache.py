@@ -33,10 +33,7 @@ def cache_folder() -> Path:
     system has for such files: `~/.cache/log2sim`, on macOS `~/Library/Caches/log2sim`, on Windows
     `%LOCALAPPDATA%\log2sim\Cache`.
 
-    Raises
-    ------
-    ConfigError
-        When the user has no home folder.
+    Raises `ConfigError` when the user has no home folder.
     """
     chosen, home = os.environ.get(VARIABLE, ""), os.environ.get("XDG_CACHE_HOME", "")
     if chosen:
@@ -81,34 +78,17 @@ _SETTINGS, _LAST_RUN = "settings.json", "last_run.json"
 
 @dataclass(frozen=True)
 class Usage:
-    """What a cache holds.
+    """What a cache holds."""
 
-    Attributes
-    ----------
-    entries : mapping of str to int
-        By group, the part of their names before the key.
-    bytes : mapping of str to int
-        The same of their sizes.
-    """
-
-    entries: Mapping[str, int]
-    bytes: Mapping[str, int]
+    entries: Mapping[str, int]  # by group, the part of their names before the key
+    bytes: Mapping[str, int]  # the same of their sizes
 
 
 class DiskCache:
     """A cache folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Made when the first entry is kept, for this user alone.
-    max_bytes : int, optional
-        Size of all entries; without it that of the folder's settings.
-
-    Attributes
-    ----------
-    problem : str or None
-        Why nothing more is written: what went wrong first.
+    `folder`: made when the first entry is kept, for this user alone. `max_bytes`: size of all entries; without it that
+    of the folder's settings. `problem`: why nothing more is written: what went wrong first.
     """
 
     def __init__(self, folder: Path, max_bytes: int | None = None) -> None:
@@ -169,10 +149,7 @@ class DiskCache:
     def set_limit(self, max_mb: int) -> None:
         """Set the limit for this and all later runs, and drop what is beyond it.
 
-        Raises
-        ------
-        ConfigError
-            When it cannot be written.
+        Raises `ConfigError` when it cannot be written.
         """
         self.max_bytes = max_mb * 1024**2
         self._write_json(_SETTINGS, {"max_mb": max_mb})

@@ -36,10 +36,7 @@ def is_plain(text: str) -> bool:
 def parse_float(text: str) -> float:
     """Parse a number; it may be infinite or NaN.
 
-    Raises
-    ------
-    ValueError
-        For any other text.
+    Raises `ValueError` for any other text.
     """
     if not is_plain(text):
         raise ValueError(f"could not convert string to float: {text[:40]!a}")
@@ -49,10 +46,7 @@ def parse_float(text: str) -> float:
 def parse_int(text: str) -> int:
     """Parse a whole number.
 
-    Raises
-    ------
-    ValueError
-        For any other text.
+    Raises `ValueError` for any other text.
     """
     if not is_plain(text):
         raise ValueError(f"invalid whole number: {text[:40]!a}")
@@ -86,17 +80,8 @@ class RepeatedKeysError(ValueError):
 def parse_unique(text: str, **hooks: Any) -> Any:
     """Parse a JSON text in which no key occurs twice in one object.
 
-    Parameters
-    ----------
-    **hooks
-        Parsers of numbers, as `json.loads` takes them.
-
-    Raises
-    ------
-    RepeatedKeysError
-        For keys that do; all others are found first.
-    ValueError
-        For what is no JSON.
+    `**hooks`: parsers of numbers, as `json.loads` takes them. Raises `RepeatedKeysError` for keys that do; all others
+    are found first; `ValueError` for what is no JSON.
     """
     repeated: list[str] = []
     value = json.loads(text, object_pairs_hook=partial(_unique, repeated), **hooks)
@@ -135,18 +120,9 @@ SHOWN_CHARACTERS = 80
 def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     """Describe the first error of a document, unknown keys before all others.
 
-    Parameters
-    ----------
-    error : ValidationError
-        What `model.model_validate` raised.
-    model : type
-        The model; its JSON Schema tells which keys and values are possible.
-
-    Returns
-    -------
-    str
-        Such as "unknown key 'agent[0].colour'; did you mean 'agent[0].color'?" or "'rate_hz' is 0, expected a number
-        from 0.1 to 200".
+    `error`: what `model.model_validate` raised. `model`: the model; its JSON Schema tells which keys and values are
+    possible. Returns such as "unknown key 'agent[0].colour'; did you mean 'agent[0].color'?" or "'rate_hz' is 0,
+    expected a number from 0.1 to 200".
     """
     problems = error.errors(include_url=False)
     problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
@@ -231,10 +207,7 @@ def replaced(path: Path | str) -> Iterator[Path]:
 
     Within `log2sim.files.outputs.together` it is renamed at the end of that.
 
-    Raises
-    ------
-    ConfigError
-        For a path that cannot be written.
+    Raises `ConfigError` for a path that cannot be written.
     """
     target = Path(path)
     if target.is_dir():
@@ -272,11 +245,8 @@ def refuse_below_file(path: Path | str) -> None:
 def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
     """Refuse output files that could not be written, before any work is done for them; None is skipped.
 
-    Raises
-    ------
-    ConfigError
-        For a file that exists and may not be replaced, a folder, a parent that is a file or may not be written in, or one name for two
-        files.
+    Raises `ConfigError` for a file that exists and may not be replaced, a folder, a parent that is a file or may not be
+    written in, or one name for two files.
     """
     targets = [Path(p) for p in paths if p is not None]
     for k, target in enumerate(targets):
@@ -297,10 +267,8 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
 def check_folder(folder: Path, *, overwrite: bool) -> None:
     """Refuse an output folder that cannot be written, or that another run is writing, before any work is done for it.
 
-    Raises
-    ------
-    ConfigError
-        For a file, a parent that is a file or may not be written in, or a folder that another run is about to write.
+    Raises `ConfigError` for a file, a parent that is a file or may not be written in, or a folder that another run is
+    about to write.
     """
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; give the name of a folder")
@@ -317,11 +285,8 @@ def write_json(path: Path | str, value: Any) -> None:
 def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     """Read a JSON file.
 
-    Raises
-    ------
-    error
-        For a file that is missing, too large, not valid JSON, or has a number that is not finite; with its position. For keys that
-        occur twice in one object, too: which of the two values is meant, no program can tell.
+    Raises `error` for a file that is missing, too large, not valid JSON, or has a number that is not finite; with its
+    position. For keys that occur twice in one object, too: which of the two values is meant, no program can tell.
     """
     path = Path(path)
     if path.is_dir():
@@ -408,10 +373,7 @@ def load_schema(name: str) -> dict[str, Any]:
 def check(document: Any, name: str, error: type[Log2SimError]) -> None:
     """Validate a document against a schema.
 
-    Raises
-    ------
-    error
-        Naming the first field that violates the schema and what was expected there.
+    Raises `error` naming the first field that violates the schema and what was expected there.
     """
     problem = next(_validator()(load_schema(name)).iter_errors(document), None)
     if problem is None:

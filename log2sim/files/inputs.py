@@ -31,20 +31,8 @@ class TooLargeError(OSError):
 def open_regular(path: Path | str, *, buffering: int = -1) -> BinaryIO:
     """Open a regular file to read its bytes.
 
-    Parameters
-    ----------
-    buffering : int
-        As for `open`.
-
-    Returns
-    -------
-    file object
-
-    Raises
-    ------
-    OSError
-        For a file that is missing or may not be read, and for whatever is no regular file. A pipe would wait for somebody who
-        writes, a device may never end, and both have a size of 0.
+    `buffering`: as for `open`. Raises `OSError` for a file that is missing or may not be read, and for whatever is no
+    regular file. A pipe would wait for somebody who writes, a device may never end, and both have a size of 0.
     """
     _require_regular(os.stat(path).st_mode, path)  # before it is opened: opening a device may already do something
     # Without waiting, should it have become a pipe by now.
@@ -60,12 +48,8 @@ def open_regular(path: Path | str, *, buffering: int = -1) -> BinaryIO:
 def read_bytes(path: Path | str, limit_bytes: int) -> bytes:
     """Read a whole regular file.
 
-    Raises
-    ------
-    TooLargeError
-        For more than `limit_bytes`, also in a file that grows while it is read; no more than that is read.
-    OSError
-        As `open_regular` does.
+    Raises `TooLargeError` for more than `limit_bytes`, also in a file that grows while it is read; no more than that is
+    read; `OSError` as `open_regular` does.
     """
     with open_regular(path, buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
@@ -91,14 +75,8 @@ def read_file(
 ) -> bytes:
     """Read a whole regular file as `read_bytes` does; whatever is wrong with it is an `error` of one line.
 
-    Parameters
-    ----------
-    error : type
-        Of the exception that is raised.
-    where : str, optional
-        What its message begins with; by default the path.
-    missing : str
-        What it says of a file that is not there.
+    `error`: of the exception that is raised. `where`: what its message begins with; by default the path. `missing`:
+    what it says of a file that is not there.
     """
     try:
         return read_bytes(path, limit_bytes)
@@ -115,12 +93,8 @@ def read_file(
 def require_readable(path: Path | str, limit_bytes: int, error: type[Exception], what: str) -> None:
     """Check a file that another library is going to open by its name.
 
-    Parameters
-    ----------
-    error : type
-        Of the exception that is raised for a file that is missing, empty, too large or no regular file.
-    what : str
-        What it should be, for the message.
+    `error`: of the exception that is raised for a file that is missing, empty, too large or no regular file. `what`:
+    what it should be, for the message.
     """
     try:
         with open_regular(path, buffering=0) as file:
@@ -179,10 +153,7 @@ def follows_links() -> bool:
 def inside(root: Path, relative: str, what: str) -> Path:
     """Resolve a path that a log names.
 
-    Raises
-    ------
-    LogError
-        For a path outside the log's folder, also through a symbolic link unless links are followed.
+    Raises `LogError` for a path outside the log's folder, also through a symbolic link unless links are followed.
     """
     try:
         resolved = (root / relative).resolve()
@@ -205,19 +176,9 @@ def require_links_inside(folder: Path, *roots: Path, files: Iterable[Path] = ())
     name, or of the same number ("000007.bin" and "0000000007.bin"). This is for layouts that fix the names of their files; where
     a log states them, `inside` allows no link that leaves.
 
-    Parameters
-    ----------
-    folder : Path
-        All that is in it is looked at; it may lie behind links itself.
-    *roots : Path
-        Other folders that belong to the log, such as the one that was named.
-    files : iterable of Path
-        Files of the log elsewhere; each must lie in one of the folders.
-
-    Raises
-    ------
-    LogError
-        Naming the first link that leads out, and where to.
+    `folder`: all that is in it is looked at; it may lie behind links itself. `*roots`: other folders that belong to the
+    log, such as the one that was named. `files`: files of the log elsewhere; each must lie in one of the folders.
+    Raises `LogError` naming the first link that leads out, and where to.
     """
     if _followed.get():
         return
@@ -229,10 +190,7 @@ def require_links_inside(folder: Path, *roots: Path, files: Iterable[Path] = ())
 def require_link_inside(file: Path, *roots: Path) -> None:
     """Refuse one file of a log that is a link out of its folders, as `require_links_inside` does.
 
-    Raises
-    ------
-    LogError
-        Naming the link and where it leads to.
+    Raises `LogError` naming the link and where it leads to.
     """
     if not _followed.get():
         _require_inside(file, [root.resolve() for root in roots])

@@ -40,18 +40,8 @@ def holding_claims() -> Iterator[None]:
 def claim(target: Path, *, overwrite: bool) -> None:
     """Within `holding_claims`: refuse a file or folder that another living run is about to write, or that cannot be written.
 
-    Parameters
-    ----------
-    overwrite : bool
-        Whether another run does not matter.
+    `overwrite`: whether another run does not matter. Raises `ConfigError` before anything was done.
 
-    Raises
-    ------
-    ConfigError
-        Before anything was done.
-
-    Notes
-    -----
     A locked file next to the target shows it to others. The system unlocks it when the process ends in any way, so that no claim of a
     dead run stays. Folders that are missing above the target are made, and removed again where nothing came into them.
     """
@@ -138,8 +128,6 @@ _expected_new: ContextVar[set[Path] | None] = ContextVar("expected_new", default
 def temporary_beside(target: Path) -> Path:
     """Return a free name for a file or folder that becomes `target`; what runs that died left under such names is removed.
 
-    Notes
-    -----
     The name holds the machine since its last start and the process, so that of another living run nothing is removed.
     """
     for left in target.parent.glob(f".{glob.escape(target.stem)}.*"):
@@ -171,12 +159,8 @@ def remove(path: Path) -> None:
 def put(temporary: Path, target: Path) -> bool:
     """Rename a finished file to its target, or keep it for the end of `together`; return whether it waits for that.
 
-    Raises
-    ------
-    ConfigError
-        When another run wrote the target meanwhile and this one may not replace it.
-    OSError
-        When it cannot be renamed.
+    Raises `ConfigError` when another run wrote the target meanwhile and this one may not replace it; `OSError` when it
+    cannot be renamed.
     """
     waiting = _waiting.get()
     if waiting is not None:
@@ -217,10 +201,7 @@ def _rename_to_new(temporary: Path, target: Path) -> None:
 def together() -> Iterator[None]:
     """Within the block files are written under temporary names; at its end all of them appear, after an error none.
 
-    Raises
-    ------
-    ConfigError
-        When one of them cannot be renamed; those that are new are removed again.
+    Raises `ConfigError` when one of them cannot be renamed; those that are new are removed again.
     """
     files: list[tuple[Path, Path]] = []
     token = _waiting.set(files)
@@ -238,10 +219,7 @@ def together() -> Iterator[None]:
 def place_all(files: Sequence[tuple[Path, Path]]) -> None:
     """Rename finished files to their targets, all of them or none.
 
-    Raises
-    ------
-    ConfigError
-        When one of them cannot be renamed; those that are new are removed again.
+    Raises `ConfigError` when one of them cannot be renamed; those that are new are removed again.
     """
     placed: list[Path] = []
     try:
@@ -308,18 +286,9 @@ _WORKING_FOLDER, _EXCHANGE = -100, 2
 def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
     """Yield a temporary folder beside `target` that takes its place when the block succeeds.
 
-    Parameters
-    ----------
-    overwrite : bool
-        Whether a folder may be replaced; without it only an empty one is.
+    `overwrite`: whether a folder may be replaced; without it only an empty one is. Raises `ConfigError` when it cannot
+    be written, naming the file in it, or when another run wrote the target meanwhile.
 
-    Raises
-    ------
-    ConfigError
-        When it cannot be written, naming the file in it, or when another run wrote the target meanwhile.
-
-    Notes
-    -----
     On Linux the new folder and the one that it replaces exchange their names at once, so that a run that is killed leaves either. On
     other systems there is a moment at which the target has no name; what was there is beside it then, as `.NAME.XXXXXXXX.old`.
     """
@@ -359,10 +328,7 @@ def exchange_names(one: Path, other: Path) -> bool:
 def unfinished_folder(temporary: Path, target: Path) -> Iterator[Path]:
     """Make a folder for files that are to be moved to `target`, and remove what is left of it after the block.
 
-    Raises
-    ------
-    ConfigError
-        When one of its files cannot be written, naming what it would have become.
+    Raises `ConfigError` when one of its files cannot be written, naming what it would have become.
     """
     try:
         temporary.mkdir(parents=True)

@@ -23,18 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Call:
-    """A call that log2sim makes.
+    """A call that log2sim makes."""
 
-    Attributes
-    ----------
-    shown : str
-        As it is declared, for messages.
-    positional : int
-        Number of positional arguments.
-    """
-
-    shown: str
-    positional: int
+    shown: str  # as it is declared, for messages
+    positional: int  # number of positional arguments
     keywords: tuple[str, ...] = ()
 
 
@@ -82,10 +74,7 @@ def find_defect(kind: str, found: Any) -> str | None:
 def require_members(found: Any, members: tuple[str, ...], call: Call, source: str) -> None:
     """Require that an object has its members and that its method `detect` can be called.
 
-    Raises
-    ------
-    PluginError
-        In one line that begins with `source`.
+    Raises `PluginError` in one line that begins with `source`.
     """
     defect = _find_member_defect(found, members, call)
     if defect is not None:
@@ -183,12 +172,8 @@ def installed(kind: str) -> EntryPoints:
 def load(kind: str, name: str) -> Any:
     """Import the plug-in `name` of a kind.
 
-    Raises
-    ------
-    ConfigError
-        When no plug-in has that name; the message lists the known ones and the nearest.
-    PluginError
-        When one of another package cannot be imported, or is not what the kind asks for; the message names the package.
+    Raises `ConfigError` when no plug-in has that name; the message lists the known ones and the nearest; `PluginError`
+    when one of another package cannot be imported, or is not what the kind asks for; the message names the package.
     """
     if name in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][name].partition(":")

@@ -16,14 +16,8 @@ class StageClock:
 
     Not for use from several threads: what a worker does in the background is not a stage's time but its waiting is.
 
-    Attributes
-    ----------
-    seconds : dict of str to float
-        By stage, on the wall.
-    cpu_seconds : dict of str to float
-        By stage, of the processor; what workers spend meanwhile counts.
-    peak_mib : dict of str to float
-        Largest resident memory of the process up to the end of each stage, MiB.
+    `seconds`: by stage, on the wall. `cpu_seconds`: by stage, of the processor; what workers spend meanwhile counts.
+    `peak_mib`: largest resident memory of the process up to the end of each stage, MiB.
     """
 
     def __init__(self) -> None:

@@ -45,18 +45,10 @@ CITY_IN_NAME = re.compile(r"____([A-Z]{3})(_city_|\.|$)")
 
 @dataclass(frozen=True)
 class City:
-    """A city frame: UTM coordinates from an origin, heights from an unknown zero.
+    """A city frame: UTM coordinates from an origin, heights from an unknown zero."""
 
-    Attributes
-    ----------
-    utm_zone : int
-        North of the equator.
-    east_m, north_m : float, m
-        Of the origin, in UTM on WGS 84.
-    """
-
-    utm_zone: int
-    east_m: float
+    utm_zone: int  # north of the equator
+    east_m: float  # of the origin, in UTM on WGS 84
     north_m: float
 
 
@@ -104,12 +96,8 @@ OFFSET_STEP_M = 1000.0
 def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:
     """Read `city_SE3_egovehicle.feather`.
 
-    Returns
-    -------
-    track : PoseTrack
-        Every row of the file, in a map whose origin is whole kilometers away from that of the city.
-    offset_m : (3,) tuple of float, m
-        From the city's frame to the map: city = map + `offset_m`.
+    Returns `track`: every row of the file, in a map whose origin is whole kilometers away from that of the city;
+    `offset_m` (3,) tuple of float, m: from the city's frame to the map: city = map + `offset_m`.
     """
     columns = read_columns(path, {"timestamp_ns": "int", **TRANSFORM})
     city_T_ego = transforms_of(columns, path)
@@ -132,10 +120,8 @@ def read_mounts(path: Path) -> dict[str, Array]:
 def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
     """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,).
 
-    Raises
-    ------
-    LogError
-        When one is not finite or absurdly far away, or its quaternion no unit quaternion; names file and row.
+    Raises `LogError` when one is not finite or absurdly far away, or its quaternion no unit quaternion; names file and
+    row.
     """
     q = np.stack([columns[k].astype(np.float64) for k in QUATERNION], axis=1)
     position = np.stack([columns[k].astype(np.float64) for k in TRANSLATION], axis=1)
@@ -170,14 +156,8 @@ MAX_OFFSET_NS = 1_000_000_000
 def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_lidar: Array) -> Stream:
     """Stream of one LiDAR.
 
-    Parameters
-    ----------
-    lidar : {"up_lidar", "down_lidar"}
-    t_ns : (F,) int64
-        Reference stamps of the files.
-    files : list of Path
-        F files, each with the points of both LiDARs.
-    ego_T_lidar : (4, 4) float64
+    `lidar` {"up_lidar", "down_lidar"}. `t_ns` (F,) int64: reference stamps of the files. `files`: F files, each with
+    the points of both LiDARs. `ego_T_lidar` (4, 4) float64.
     """
     lidar_T_ego = inverse(ego_T_lidar)
 
@@ -261,17 +241,9 @@ def read_labels(
 ) -> Labels:
     """Read `annotations.feather`.
 
-    Parameters
-    ----------
-    upper_lidar_xy : (2,) float64, m
-        Position of the upper LiDAR, ego frame.
-    swept_ns : (F,) int64
-        Stamps of the sweeps that are there.
-    notes : list of str
-        Takes what was left out.
+    `upper_lidar_xy` (2,) float64, m: position of the upper LiDAR, ego frame. `swept_ns` (F,) int64: stamps of the
+    sweeps that are there. `notes`: takes what was left out.
 
-    Notes
-    -----
     A box is in the ego frame of its sweep's stamp, the start of the sweep, as the points are. It is drawn around the points
     of both LiDARs, which scan an object half a turn apart and each where it was at that time; ego motion alone is compensated.
     Hence the time of a box is the mean of both passages (`scan_time_ns`), not the stamp. In the two sweeps of the sample log,
@@ -311,10 +283,7 @@ def read_labels(
 def scan_time_ns(xy_lidar: Array) -> NDArray[np.int64]:
     """Compute when both LiDARs scan objects: the mean (N,), ns, after the stamp of the sweep.
 
-    Parameters
-    ----------
-    xy_lidar : (N, 2) float64, m
-        Positions of the objects from the LiDARs, axes of the ego.
+    `xy_lidar` (N, 2) float64, m: positions of the objects from the LiDARs, axes of the ego.
     """
     upper_ns = np.round(compute_turn_share(xy_lidar, START_AZIMUTH_RAD) * PERIOD_NS).astype(np.int64)
     return np.asarray((upper_ns + (upper_ns + HALF_TURN_NS) % PERIOD_NS) // 2)

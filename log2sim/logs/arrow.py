@@ -43,10 +43,7 @@ DICTIONARY_BATCH, RECORD_BATCH = 2, 3
 def declared_size(data: bytes) -> tuple[int, int]:
     """Return the rows and the unpacked bytes of all record batches of an Arrow file.
 
-    Raises
-    ------
-    ValueError
-        When it is truncated or its structure is damaged.
+    Raises `ValueError` when it is truncated or its structure is damaged.
     """
     if len(data) < 24 or data[-6:] != ARROW_MAGIC:
         raise ValueError("the Arrow file is truncated: it does not end with ARROW1")
@@ -145,10 +142,7 @@ Kind = Literal["float", "int", "bool", "text", "bytes", "floats", "ints"]
 def values_of(column: Any, kind: Kind) -> NDArray[Any]:
     """Convert a validated pyarrow array of N values; `log2sim.logs.arrow.read_columns` describes the kinds.
 
-    Raises
-    ------
-    ValueError
-        When the column holds something else; says what was expected.
+    Raises `ValueError` when the column holds something else; says what was expected.
     """
     if kind not in get_args(Kind):
         raise TypeError(f"unknown kind '{kind}', expected one of {', '.join(get_args(Kind))}")
@@ -241,19 +235,11 @@ ROWS_AT_A_TIME = 16_384
 
 @dataclass(frozen=True)
 class TableLimits:
-    """What a table may have at most.
-
-    Attributes
-    ----------
-    file_bytes : int
-        Of a feather file, which is read as a whole. Parquet files are read in parts.
-    unpacked_bytes : int
-        Of all that is decompressed at a time.
-    """
+    """What a table may have at most."""
 
     rows: int = 20_000_000
-    file_bytes: int = 1024**3
-    unpacked_bytes: int = 2 * 1024**3
+    file_bytes: int = 1024**3  # of a feather file, which is read as a whole. Parquet files are read in parts.
+    unpacked_bytes: int = 2 * 1024**3  # of all that is decompressed at a time
 
 
 LIMITS = TableLimits()
@@ -269,30 +255,15 @@ def read_columns(
 ) -> dict[str, NDArray[Any]]:
     """Read columns of a feather or parquet file; its content decides which of the two it is, not its name.
 
-    Parameters
-    ----------
-    wanted : mapping of str to str
-        What each column must hold. "float": numbers, as (N,) float32 if they are float16 or float32, else float64, NaN where
-        one is missing. "int": whole numbers, (N,) int64. "bool": (N,) bool. "text": (N,) object of str, also of whole numbers
-        ("3"). "bytes": (N,) object of bytes. "floats" and "ints": a list of numbers a row, (N, K) where the type says that
-        all have the length K, else (N,) object of arrays. Columns encoded by a dictionary are decoded. Missing text, bytes
-        and lists are None.
-    optional : collection of str
-        Names out of `wanted` that may be absent; they are absent in the result then.
-    error : type
-        What is raised: `LogError` for an index or calibration, `RecordError` for one record.
-
-    Returns
-    -------
-    dict of str to (N, ...) array
-        In the order of `wanted`.
-
-    Raises
-    ------
-    LogError or `error`
-        When the file is missing, too large, damaged, or has no such column; names file, column and what was expected.
-    MissingExtra
-        When pyarrow is not installed.
+    `wanted`: what each column must hold. "float": numbers, as (N,) float32 if they are float16 or float32, else
+    float64, NaN where one is missing. "int": whole numbers, (N,) int64. "bool": (N,) bool. "text": (N,) object of str,
+    also of whole numbers ("3"). "bytes": (N,) object of bytes. "floats" and "ints": a list of numbers a row, (N, K)
+    where the type says that all have the length K, else (N,) object of arrays. Columns encoded by a dictionary are
+    decoded. Missing text, bytes and lists are None. `optional`: names out of `wanted` that may be absent; they are
+    absent in the result then. `error`: what is raised: `LogError` for an index or calibration, `RecordError` for one
+    record. Returns dict of str to (N, ...) array: in the order of `wanted`. Raises `LogError` or `error` when the file
+    is missing, too large, damaged, or has no such column; names file, column and what was expected; `MissingExtra` when
+    pyarrow is not installed.
     """
     with translate_errors(path, error):
         table = _read_table(path, wanted, optional, limits)
@@ -328,10 +299,8 @@ def translate_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
 def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection[str] = ()) -> list[str]:
     """Return the names out of `wanted` that a pyarrow schema has.
 
-    Raises
-    ------
-    ValueError
-        When a column is missing or there twice, or when its type is an extension: those run code of whoever registered them.
+    Raises `ValueError` when a column is missing or there twice, or when its type is an extension: those run code of
+    whoever registered them.
     """
     pyarrow = import_pyarrow()
     names = list(schema.names)
@@ -425,17 +394,9 @@ Row = dict[str, Any]
 class ParquetRows:
     """Rows of a parquet file, read on request, also from several threads.
 
-    Parameters
-    ----------
-    path : Path
-    wanted : mapping of str to str
-        The columns of a row and what they hold, as for `log2sim.logs.arrow.read_columns`.
-    optional : collection of str
-        Names out of `wanted` that may be absent.
-    limits : TableLimits
+    `wanted`: the columns of a row and what they hold, as for `log2sim.logs.arrow.read_columns`. `optional`: names out
+    of `wanted` that may be absent.
 
-    Notes
-    -----
     To read a row of a parquet file, the rows before it in its row group have to be decoded. Reading therefore continues after
     the last row that was read, and decoded rows are kept up to `MAX_KEPT_BYTES`: reading in the order of the file decodes it
     once, reading an earlier row that is not kept starts its row group again. Many writers use one row group for the whole file.
@@ -469,10 +430,7 @@ class ParquetRows:
     def read(self, index: int) -> Row:
         """Read row `index`: a number, str, bytes or array for each column, None where it is missing.
 
-        Raises
-        ------
-        RecordError
-            When the file is damaged there or lacks a wanted column; names file, row and column.
+        Raises `RecordError` when the file is damaged there or lacks a wanted column; names file, row and column.
         """
         with self._lock, translate_errors(f"{self._path}, row {index}", RecordError):
             self._open()

@@ -70,18 +70,10 @@ GRID = 32
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """A value of a calibration that no sensor, or hardly one, can have.
+    """A value of a calibration that no sensor, or hardly one, can have."""
 
-    Attributes
-    ----------
-    message : str
-        Names the sensor, where its calibration is, the field and its value.
-    is_impossible : bool
-        Whether nothing that is measured with it can be right; else it is only doubtful.
-    """
-
-    message: str
-    is_impossible: bool
+    message: str  # names the sensor, where its calibration is, the field and its value
+    is_impossible: bool  # whether nothing that is measured with it can be right; else it is only doubtful
 
 
 def list_calibration_problems(log: Log) -> list[str]:
@@ -188,15 +180,9 @@ UNITS = {10**3: "units that differ by 1000, such as ms and us", 10**6: "ms again
 
 @dataclass(frozen=True)
 class Span:
-    """First and last stamp of something.
+    """First and last stamp of something."""
 
-    Attributes
-    ----------
-    words : str
-        What it is, such as "ego poses".
-    """
-
-    words: str
+    words: str  # what it is, such as "ego poses"
     first_ns: int
     last_ns: int
 

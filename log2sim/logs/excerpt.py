@@ -40,18 +40,10 @@ class _Span:
 def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = None, stop_s: float | None = None) -> Log:
     """Restrict a log to some cameras and to a time.
 
-    Parameters
-    ----------
-    cameras : sequence of str
-        All where it is empty. LiDARs are always kept.
-    start_s, stop_s : float, optional
-        Ticks, the frames of the reference camera or else the sweeps of a LiDAR, are kept from `start_s` to `stop_s`, s after
-        the first one. Other records reach up to `RECORD_MARGIN_NS` beyond them, poses and labels to the next one.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown camera, and where no tick is left.
+    `cameras`: all where it is empty. LiDARs are always kept. `start_s`, `stop_s`: ticks, the frames of the reference
+    camera or else the sweeps of a LiDAR, are kept from `start_s` to `stop_s`, s after the first one. Other records
+    reach up to `RECORD_MARGIN_NS` beyond them, poses and labels to the next one. Raises `ConfigError` for an unknown
+    camera, and where no tick is left.
     """
     for name in cameras:
         if name not in log.cameras:

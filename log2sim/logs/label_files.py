@@ -43,10 +43,8 @@ CATEGORY_OF: Mapping[str, str] = {
 def with_label_file(log: Log, path: Path) -> Log:
     """Return a log with the boxes of a file as its labels, in place of its own.
 
-    Raises
-    ------
-    LogError
-        When the file cannot be read, is of none of the formats, or has no box at a time at which the log has a pose.
+    Raises `LogError` when the file cannot be read, is of none of the formats, or has no box at a time at which the log
+    has a pose.
     """
     first = read_file(path, JSON_LIMIT_BYTES, LogError)[:4096].decode("utf-8-sig", errors="replace").lstrip()
     notes: list[str] = []

@@ -44,12 +44,7 @@ MAX_DIGITS = 19
 def list_numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Return the files of a folder by the number that is their name (of a frame, or a stamp), in the order of the numbers; others are left out.
 
-    Parameters
-    ----------
-    folder : Path
-        May be absent: there are no files then.
-    suffixes : tuple of str
-        In lower case, such as ".jpg" or ".pkl.gz".
+    `folder`: may be absent: there are no files then. `suffixes`: in lower case, such as ".jpg" or ".pkl.gz".
     """
     found = {}
     for path in list_files(folder, suffixes):
@@ -101,17 +96,8 @@ def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]
 def guard_log(log: Log, where: str) -> Log:
     """Return the log with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
 
-    Parameters
-    ----------
-    log : Log
-        As a reader returns it.
-    where : str
-        Its path, for errors.
-
-    Raises
-    ------
-    LogError
-        For poses of the ego that are not finite, or farther from the origin of the map than any place on Earth.
+    `log`: as a reader returns it. `where`: its path, for errors. Raises `LogError` for poses of the ego that are not
+    finite, or farther from the origin of the map than any place on Earth.
     """
     _require_possible_poses(log, where)
     return log.changed(
@@ -173,17 +159,8 @@ def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[
 def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """Decode a JPEG or PNG file as (H, W, 3) uint8 BGR.
 
-    Parameters
-    ----------
-    where : str
-        Names file and stamp in errors.
-    size_px : (int, int)
-        Width and height that the calibration is for.
-
-    Raises
-    ------
-    RecordError
-        When it is truncated, no JPEG or PNG, or of another size.
+    `where`: names file and stamp in errors. `size_px` (int, int): width and height that the calibration is for. Raises
+    `RecordError` when it is truncated, no JPEG or PNG, or of another size.
     """
     jpeg = data[:2] == b"\xff\xd8"
     width, height = image_size(data, where)
@@ -203,15 +180,8 @@ def image_size(data: bytes, where: str) -> tuple[int, int]:
 def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px: tuple[int, int]) -> Stream:
     """Stream of image files.
 
-    Parameters
-    ----------
-    name : str
-        Of the camera.
-    t_ns : (F,) int64
-    files : list of Path
-        F image files.
-    size_px : (int, int)
-        Width and height that the calibration is for.
+    `name`: of the camera. `t_ns` (F,) int64. `files`: F image files. `size_px` (int, int): width and height that the
+    calibration is for.
     """
 
     def read(i: int) -> NDArray[np.uint8]:
@@ -302,10 +272,7 @@ def parse_pcd(
     A time field is `t_offset_ns`, `offset` or `t` (relative to the stamp) or `timestamp` (absolute); whole numbers are
     nanoseconds, floating-point numbers seconds.
 
-    Raises
-    ------
-    ValueError
-        When the header or the data do not follow the format.
+    Raises `ValueError` when the header or the data do not follow the format.
     """
     header, body = _read_header(data)
     layout = _layout(header)
@@ -438,10 +405,8 @@ Intensity = NDArray[Any] | None
 def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
     """Read a sweep; rows that are not finite are dropped.
 
-    Raises
-    ------
-    RecordError
-        When it is missing, truncated, too large or not of the layout that its suffix promises; names file and stamp.
+    Raises `RecordError` when it is missing, truncated, too large or not of the layout that its suffix promises; names
+    file and stamp.
     """
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     try:
@@ -463,10 +428,7 @@ def sweep_of(
 
     Intensities (N,) of any type of numbers become float32; those that cannot be, NaN.
 
-    Raises
-    ------
-    ValueError
-        For times of points farther from the stamp than `checked_offset_ns` allows.
+    Raises `ValueError` for times of points farther from the stamp than `checked_offset_ns` allows.
     """
     # False for NaN. Mostly all points are possible, which their least and greatest coordinate tell in a tenth of the time.
     if len(xyz_m) and not (xyz_m.min() >= -MAX_POSITION_M and xyz_m.max() <= MAX_POSITION_M):

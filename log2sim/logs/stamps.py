@@ -23,14 +23,8 @@ def count_words(words: Iterable[str]) -> str:
 def note_left_out(kinds: Iterable[str], no_road_users: Collection[str], notes: list[str]) -> None:
     """Note the labels that get no category.
 
-    Parameters
-    ----------
-    kinds : iterable of str
-        What the data set calls the object of each label that is left out.
-    no_road_users : collection of str
-        Kinds that are left out on purpose; others are not known.
-    notes : list of str
-        Takes a note for either of the two, where there are such labels.
+    `kinds`: what the data set calls the object of each label that is left out. `no_road_users`: kinds that are left out
+    on purpose; others are not known. `notes`: takes a note for either of the two, where there are such labels.
     """
     kinds = list(kinds)
     for reason, known in (("they are no road users", True), ("their kind is not known", False)):
@@ -42,19 +36,8 @@ def note_left_out(kinds: Iterable[str], no_road_users: Collection[str], notes: l
 def note_damaged_rows(damaged: Sequence[str], total: int, notes: list[str]) -> None:
     """Note the rows of a text that are left out because they cannot be read.
 
-    Parameters
-    ----------
-    damaged : sequence of str
-        Where each of them is and what is wrong with it.
-    total : int
-        Of all rows.
-    notes : list of str
-        Takes a note where there are such rows.
-
-    Raises
-    ------
-    LogError
-        When no row can be read.
+    `damaged`: where each of them is and what is wrong with it. `total`: of all rows. `notes`: takes a note where there
+    are such rows. Raises `LogError` when no row can be read.
     """
     if damaged and len(damaged) == total:
         raise LogError(damaged[0])
@@ -85,21 +68,8 @@ MAX_POINT_OFFSET_NS = NS_PER_S
 def checked_offset_ns(t_ns: NDArray[np.number], stamp_ns: int = 0) -> NDArray[np.int64]:
     """Compute the times of points relative to the stamp of their sweep.
 
-    Parameters
-    ----------
-    t_ns : (N,) whole or floating-point numbers
-        Finite.
-    stamp_ns : int
-        What they count from; 0 for times that are relative to the stamp already.
-
-    Returns
-    -------
-    (N,) int64
-
-    Raises
-    ------
-    ValueError
-        For any beyond `MAX_POINT_OFFSET_NS`.
+    `t_ns` (N,) whole or floating-point numbers: finite. `stamp_ns`: what they count from; 0 for times that are relative
+    to the stamp already. Returns (N,) int64. Raises `ValueError` for any beyond `MAX_POINT_OFFSET_NS`.
     """
     # As integers of Python, which do not overflow.
     ends = [int(t) - stamp_ns for t in (t_ns.min(), t_ns.max())] if len(t_ns) else []
@@ -115,19 +85,9 @@ def checked_offset_ns(t_ns: NDArray[np.number], stamp_ns: int = 0) -> NDArray[np
 def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:
     """Select and sort rows so that their stamps strictly increase.
 
-    Parameters
-    ----------
-    t_ns : (N,) int64
-    what : str
-        Names the records in notes.
-
-    Returns
-    -------
-    rows : (M,) int
-        Sorted by stamp; of several rows with one stamp the first. Rows are left out whose stamps are farther than `MAX_DISTANCE_NS`
-        from the middle one: a single stamp of 0 would make a log of decades.
-    notes : list of str
-        Remarks on wrong, unsorted and repeated stamps.
+    `t_ns` (N,) int64. `what`: names the records in notes. Returns `rows` (M,) int: sorted by stamp; of several rows
+    with one stamp the first. Rows are left out whose stamps are farther than `MAX_DISTANCE_NS` from the middle one: a
+    single stamp of 0 would make a log of decades; `notes`: remarks on wrong, unsorted and repeated stamps.
     """
     order = np.argsort(t_ns, kind="stable")
     notes = []
@@ -154,17 +114,9 @@ def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.
 def compute_turn_share(xy_lidar: Array, start_azimuth_rad: float = np.pi) -> Array:
     """Compute the share of a clockwise turn after which a LiDAR scans directions.
 
-    Parameters
-    ----------
-    xy_lidar : (N, >= 2) float64, m
-        Points, from the LiDAR.
-    start_azimuth_rad : float, rad
-        Direction in which the turn starts and ends, counter-clockwise from x, in (-pi, pi].
-
-    Returns
-    -------
-    (N,) float64
-        0 to 1; 1 only for directions that end the turn.
+    `xy_lidar` (N, >= 2) float64, m: points, from the LiDAR. `start_azimuth_rad` rad: direction in which the turn starts
+    and ends, counter-clockwise from x, in (-pi, pi]. Returns (N,) float64: 0 to 1; 1 only for directions that end the
+    turn.
     """
     turned = (start_azimuth_rad - np.arctan2(xy_lidar[:, 1], xy_lidar[:, 0])) / (2 * np.pi)
     return np.asarray(turned + (turned < 0))
@@ -173,12 +125,8 @@ def compute_turn_share(xy_lidar: Array, start_azimuth_rad: float = np.pi) -> Arr
 def compute_scan_offset_ns(xy_lidar: Array, turn_ns: int) -> NDArray[np.int64]:
     """Compute the time (N,) at which a LiDAR scans directions, relative to the end of its turn.
 
-    Parameters
-    ----------
-    xy_lidar : (N, >= 2) float64, m
-        Points, from the LiDAR, which turns clockwise and starts and ends in the direction of -x.
-    turn_ns : int
-        Duration of the turn.
+    `xy_lidar` (N, >= 2) float64, m: points, from the LiDAR, which turns clockwise and starts and ends in the direction
+    of -x. `turn_ns`: duration of the turn.
     """
     return np.round((compute_turn_share(xy_lidar) - 1) * turn_ns).astype(np.int64)
 
@@ -189,13 +137,8 @@ def select_spaced(t_ns: NDArray[np.int64], track_id: NDArray[np.str_], min_step_
     An object that crosses the direction in which the turns start is scanned at the end of one turn and at the start of the
     next: the later one is dropped.
 
-    Parameters
-    ----------
-    t_ns : (N,) int64
-        Those of each track in the order of the turns.
-    track_id : (N,) str
-    min_step_ns : int
-        Rows sooner after the last one that was kept of their track are dropped.
+    `t_ns` (N,) int64: those of each track in the order of the turns. `track_id` (N,) str. `min_step_ns`: rows sooner
+    after the last one that was kept of their track are dropped.
     """
     last: dict[str, int] = {}
     keep = []
@@ -228,19 +171,9 @@ def poses_from_geodetic(map_frame: MapFrame, position: Array, attitude_rad: Arra
 
     Yaw is counter-clockwise from true east and is turned to the grid's east by the meridian convergence.
 
-    Parameters
-    ----------
-    position : (N, 3) float64
-        Latitude and longitude in deg, altitude in m.
-    attitude_rad : (N, 3) float64, rad
-        Roll, pitch, yaw.
-    where : str
-        Names the projection in messages.
-
-    Raises
-    ------
-    LogError
-        When the projection is not one that PROJ knows or does not reach the points; begins with `where`.
+    `position` (N, 3) float64: latitude and longitude in deg, altitude in m. `attitude_rad` (N, 3) float64, rad: roll,
+    pitch, yaw. `where`: names the projection in messages. Raises `LogError` when the projection is not one that PROJ
+    knows or does not reach the points; begins with `where`.
     """
     forward = _projection(map_frame, where)
     latitude_deg, longitude_deg, altitude_m = (np.ascontiguousarray(c) for c in position.T)

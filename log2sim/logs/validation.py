@@ -25,17 +25,8 @@ def validate_log(
 ) -> list[str]:
     """List the problems of a log, one line each.
 
-    Parameters
-    ----------
-    path, format, sequence
-        As for `open_log`; or an open log.
-    progress : callable, optional
-        Called as `progress(done, total)` after each record.
-
-    Raises
-    ------
-    LogError
-        When the log cannot be opened at all.
+    `path`, `format`, `sequence`: as for `open_log`; or an open log. `progress`: called as `progress(done, total)` after
+    each record. Raises `LogError` when the log cannot be opened at all.
     """
     log = path if isinstance(path, Log) else open_log(path, format=format, sequence=sequence)
     # Notes on other formats say what the format lacks; those on native logs say what is wrong with the stamps.

@@ -11,7 +11,7 @@ import numpy as np
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
-from log2sim.perception.first_pass import Observations, base_pose
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
     STREAM_METHODS,
@@ -23,6 +23,7 @@ from log2sim.perception.homography.estimate import (
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.observe_tick import base_pose
 from log2sim.plan import HomographyScope, Plan
 
 # A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.

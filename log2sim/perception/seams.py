@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, distort, inverse
-from log2sim.perception.first_pass import Observations, base_pose
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography.rig import Rig, RigRows, cam_of_ground, heights_of, rotation_of
 from log2sim.perception.homography.rig_fit import MOUNT_SIGMA_RAD, RigFit
 from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.records import shrink
 from log2sim.perception.sync import Schedule
 

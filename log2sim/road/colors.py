@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import COLOR_NAMES, Agent, Log, Scenario
+from log2sim.datatypes import COLOR_NAMES, AgentTable, Log, Scenario
 from log2sim.datatypes.color_names import name_probabilities, to_rgb
 from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera, inverse, line_time_s, project, undistort
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
@@ -259,42 +259,6 @@ MAX_VIEWS = 8  # of an agent; more do not change a median
 MIN_HEIGHT_PX = 20.0  # doors are a third of the height: six lines of pixels
 
 
-@dataclass(frozen=True, eq=False)
-class Boxes:
-    """Boxes of agents at several times.
-
-    Attributes
-    ----------
-    center : (A, F, 3) float64, m, map frame
-        NaN while an agent is not there.
-    yaw : (A, F) float64
-    size : (A, 3) float64, m
-    """
-
-    agents: Sequence[Agent]
-    center: Array
-    yaw: Array
-    size: Array
-
-    def at(self, k: int) -> Boxes:
-        """Return the boxes at one of the times."""
-        return Boxes(self.agents, self.center[:, k : k + 1], self.yaw[:, k : k + 1], self.size)
-
-
-def boxes_at(agents: Sequence[Agent], t_s: Array) -> Boxes:
-    """Return the boxes of agents at times (F,), s, of the scenario."""
-    center, yaw = np.full((len(agents), len(t_s), 3), np.nan), np.full((len(agents), len(t_s)), np.nan)
-    for k, agent in enumerate(agents):
-        w = agent.waypoints
-        if agent.is_permanent:
-            center[k], yaw[k] = [w.x_m[0], w.y_m[0], w.z_m[0]], w.yaw_rad[0]
-        else:
-            states = agent.at(t_s)
-            center[k] = np.stack([states.x_m, states.y_m, states.z_m], axis=-1)
-            yaw[k] = states.yaw_rad
-    return Boxes(agents, center, yaw, np.array([a.size_m for a in agents], float).reshape(-1, 3))
-
-
 def choose_views(log: Log, scenario: Scenario, wanted: Sequence[str]) -> dict[str, dict[int, list[str]]]:
     """Choose frames in which to look at agents.
 
@@ -315,9 +279,9 @@ def choose_views(log: Log, scenario: Scenario, wanted: Sequence[str]) -> dict[st
         frames = _spaced(log.streams[name].t_ns) if name in log.streams else np.zeros(0, np.int64)
         t_ns = log.streams[name].t_ns[frames] if len(frames) else frames
         poses, known = log.map_T_sensor(name, t_ns) if len(frames) else (np.zeros((0, 4, 4)), np.zeros(0, bool))
-        boxes = boxes_at(agents, (t_ns - scenario.t0_ns) / NS_PER_S)
+        boxes = AgentTable.of(agents, (t_ns - scenario.t0_ns) / NS_PER_S, permanent=True)
         for k in np.flatnonzero(known):
-            score = _clear_heights(camera, inverse(poses[k]), boxes.center[:, k], boxes.size)
+            score = _clear_heights(camera, inverse(poses[k]), boxes.center_m[:, k], boxes.size_m)
             scores.append((name, int(frames[k]), score))
     return _best_views(scores, [(row, agents[row].id) for row in rows])
 
@@ -398,7 +362,7 @@ class ColorSampler:
         self._log, self._scenario = log, scenario
         self._vehicles = [a.id for a in scenario.others if a.category in SHAPES]
         self._views = choose_views(log, scenario, self._vehicles)
-        self._boxes: dict[str, dict[int, Boxes]] = {}
+        self._boxes: dict[str, AgentTable] = {}
         self._looks: dict[str, list[Look]] = {}
         self.gray: set[str] = set()
 
@@ -421,21 +385,21 @@ class ColorSampler:
         agents = self._views.get(camera, {}).get(index, ())
         if not agents:
             return
-        boxes = self._boxes_in(camera)[index]
-        scene = _Scene(view, boxes, image_bgr, *halves)
+        boxes = self._boxes_in(camera)
+        place = int(np.searchsorted(self.frames()[camera], index))
+        scene = _Scene(view, boxes, place, image_bgr, *halves)
         for agent in agents:
             row = next(k for k, other in enumerate(boxes.agents) if other.id == agent)
             look = scene.look_at(row)
             if look is not None:
                 self._looks.setdefault(agent, []).append(look)
 
-    def _boxes_in(self, camera: str) -> dict[int, Boxes]:
+    def _boxes_in(self, camera: str) -> AgentTable:
         """Return the boxes of all agents in the frames that it wants of a camera, made for all of them at once."""
         if camera not in self._boxes:
-            frames = self.frames()[camera]
-            t_s = (self._log.streams[camera].t_ns[frames] - self._scenario.t0_ns) / NS_PER_S
-            boxes = boxes_at(self._scenario.others, t_s)
-            self._boxes[camera] = {index: boxes.at(k) for k, index in enumerate(frames.tolist())}
+            t_ns = self._log.streams[camera].t_ns[self.frames()[camera]]
+            t_s = (t_ns - self._scenario.t0_ns) / NS_PER_S
+            self._boxes[camera] = AgentTable.of(self._scenario.others, t_s, permanent=True)
         return self._boxes[camera]
 
     def colors(self) -> dict[str, dict[str, Any]]:
@@ -455,13 +419,18 @@ class ColorSampler:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """A picture with the boxes of all agents at its time."""
+    """A picture with the boxes of all agents at the times of several, of which it is the one at `place`."""
 
     view: View
-    boxes: Boxes
+    boxes: AgentTable
+    place: int
     image: Image
     above: Image
     below: Image
+
+    @property
+    def _center_m(self) -> Array:
+        return self.boxes.center_m[:, self.place]
 
     @cached_property
     def _linear_above(self) -> Array:
@@ -473,7 +442,7 @@ class _Scene:
 
     def look_at(self, row: int) -> Look | None:
         """Look at an agent; None where too little of its paint is seen."""
-        center, yaw, size = self.boxes.center[row, 0], self.boxes.yaw[row, 0], self.boxes.size[row]
+        center, yaw, size = self._center_m[row], self.boxes.yaw_rad[row, self.place], self.boxes.size_m[row]
         if not np.isfinite(center).all():
             return None
         found = project_boxes_in_view(self.view, center[None], size[None], yaw[None])
@@ -522,8 +491,8 @@ class _Scene:
         nearest = np.full(len(rays), np.inf)
         for k in self._near(origin, rays, within):
             if k != but:
-                half = self.boxes.size[k] / 2
-                start, turned = _to_box(origin, rays, self.boxes.center[k, 0], self.boxes.yaw[k, 0])
+                half = self.boxes.size_m[k] / 2
+                start, turned = _to_box(origin, rays, self._center_m[k], self.boxes.yaw_rad[k, self.place])
                 np.minimum(nearest, hit_block(-half, half, start, turned)[0], out=nearest)
         return nearest
 
@@ -536,9 +505,9 @@ class _Scene:
         axis = directions.mean(axis=0)
         axis /= np.linalg.norm(axis)
         cone = np.arccos(np.clip((directions @ axis).min(), -1, 1))
-        toward = self.boxes.center[:, 0] - origin
+        toward = self._center_m - origin
         away = np.linalg.norm(toward, axis=1)
-        reach = np.linalg.norm(self.boxes.size, axis=1) / 2
+        reach = np.linalg.norm(self.boxes.size_m, axis=1) / 2
         with np.errstate(invalid="ignore", divide="ignore"):
             angle = np.arccos(np.clip(toward @ axis / away, -1, 1))
             sphere = np.where(away > reach, np.arcsin(np.clip(reach / away, -1, 1)), np.pi)
@@ -547,7 +516,7 @@ class _Scene:
 
     def _road(self, row: int, map_T_cam: Array) -> Array:
         """Return pixels (G, 3), linear RGB, of the road around an agent, where no agent hides it."""
-        center, yaw, size = self.boxes.center[row, 0], self.boxes.yaw[row, 0], self.boxes.size[row]
+        center, yaw, size = self._center_m[row], self.boxes.yaw_rad[row, self.place], self.boxes.size_m[row]
         points = center + _turned(_ring(size), yaw)
         cam_T_map = inverse(map_T_cam)
         uv, inside = project(self.view.camera, points @ cam_T_map[:3, :3].T + cam_T_map[:3, 3])

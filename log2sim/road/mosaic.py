@@ -19,9 +19,9 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
 from log2sim.geometry import Array, inverse
-from log2sim.perception.first_pass import base_pose
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.seams import roads_at
 from log2sim.perception.sync import Schedule
 from log2sim.road.ground_map import Raster

@@ -336,9 +336,9 @@ def _observed_table(table: MotionTable, known: Known, rows: Index) -> MotionTabl
     there = known.observed[rows] & table.present[rows]
     blank = np.where(there, 1.0, np.nan)
     return MotionTable(
-        tuple(table.agents[k] for k in rows.tolist()), table.t_s, table.tick_s,
-        np.where(there, table.position_m[rows], np.nan), np.where(there, table.velocity_mps[rows], np.nan),
-        blank * table.yaw_rad[rows], blank * table.sigma_m[rows], there,
+        tuple(table.agents[k] for k in rows.tolist()), table.t_s,
+        blank[..., None] * table.center_m[rows], blank * table.yaw_rad[rows], blank * table.speed_mps[rows],
+        table.tick_s, np.where(there, table.velocity_mps[rows], np.nan), blank * table.sigma_m[rows], there,
         np.where(there, _numbered(table.piece[rows], known.piece[rows]), -1),
     )  # fmt: skip
 

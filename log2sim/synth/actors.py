@@ -19,23 +19,12 @@ EGO_COLOR = (198, 200, 204)  # as sensors at the roadside see it
 
 @dataclass(frozen=True, eq=False)
 class ActorStates:
-    """States of an actor at some times.
+    """States of an actor at some times."""
 
-    Attributes
-    ----------
-    center_m : (T, 3) float64, m
-        Box centers.
-    yaw_rad : (T,) float64, rad
-    speed_mps : (T,) float64, m/s
-        Along the heading.
-    distance_m : (T,) float64, m
-        Distance covered.
-    """
-
-    center_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    distance_m: Array
+    center_m: Array  # (T, 3), m: box centers
+    yaw_rad: Array  # (T,), rad
+    speed_mps: Array  # (T,), m/s: along the heading
+    distance_m: Array  # (T,), m: distance covered
 
     def map_T_agent(self) -> Array:
         """Poses (T, 4, 4) of the box center."""
@@ -44,23 +33,14 @@ class ActorStates:
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """One road user of a scene.
-
-    Attributes
-    ----------
-    path : TimedPath or None
-        None for a parked one.
-    parked : (float, float, float) or None
-        x, y in m and heading in rad of a parked one.
-    offset_m : float
-        Distance from the guided point forward to the box center.
-    """
+    """One road user of a scene."""
 
     spec: AgentSpec
     appearance: Appearance
-    path: TimedPath | None
+    path: TimedPath | None  # None for a parked one
+    # x, y in m and heading in rad of a parked one
     parked: tuple[float, float, float] | None = None
-    offset_m: float = field(default=0.0)
+    offset_m: float = field(default=0.0)  # distance from the guided point forward to the box center
 
     def at(self, t_s: ArrayLike) -> ActorStates:
         """States at times (T,) in s since the start of the log."""
@@ -153,20 +133,12 @@ def _ego_body(ego: Ego, motion: EgoMotion) -> Actor:
 
 @dataclass(frozen=True, eq=False)
 class MovingScene:
-    """A scene with the motion of everything in it.
-
-    Attributes
-    ----------
-    actors : tuple of Actor
-        Without the ego.
-    ego_body : Actor or None
-        The ego as others see it.
-    """
+    """A scene with the motion of everything in it."""
 
     scene: Scene
     ego: EgoMotion | None
-    actors: tuple[Actor, ...]
-    ego_body: Actor | None
+    actors: tuple[Actor, ...]  # without the ego
+    ego_body: Actor | None  # the ego as others see it
 
     @classmethod
     def of(cls, scene: Scene) -> MovingScene:

@@ -117,29 +117,15 @@ GRAIN = 0.5  # of plaster relative to asphalt
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """One side of a building.
+    """One side of a building."""
 
-    Attributes
-    ----------
-    foot_m : (2,) float64, m
-        One end of its foot.
-    along : (2,) float64
-        Unit direction from there along the foot.
-    outward : (2,) float64
-        Unit normal.
-    color : (int, int, int)
-        RGB.
-    seed : tuple of int
-        Of its windows and stains.
-    """
-
-    foot_m: Array
-    along: Array
-    outward: Array
+    foot_m: Array  # (2,), m: one end of its foot
+    along: Array  # (2,): unit direction from there along the foot
+    outward: Array  # (2,): unit normal
     length_m: float
     height_m: float
-    color: tuple[int, int, int]
-    seed: tuple[int, ...]
+    color: tuple[int, int, int]  # RGB
+    seed: tuple[int, ...]  # of its windows and stains
 
     @cached_property
     def texture(self) -> tuple[NDArray[np.uint8], ...]:
@@ -223,23 +209,13 @@ SUBPIXEL_BITS = 4  # of the coordinates of polygons
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A wall that looks at the camera, in the image.
-
-    Attributes
-    ----------
-    gap_m : float
-        Distance of the camera from its plane.
-    polygon : (P, 2) int32
-        In 1 / 2**SUBPIXEL_BITS px.
-    rows, columns : slice
-        The rectangle around it.
-    """
+    """A wall that looks at the camera, in the image."""
 
     wall: Wall
-    gap_m: float
-    polygon: NDArray[np.int32]
-    rows: slice
-    columns: slice
+    gap_m: float  # distance of the camera from its plane
+    polygon: NDArray[np.int32]  # (P, 2): in 1 / 2**SUBPIXEL_BITS px
+    rows: slice  # the rectangle around it
+    columns: slice  # the rectangle around it
 
     @property
     def region(self) -> tuple[slice, slice]:

@@ -29,12 +29,8 @@ PATCHES = ((8, 0.8), (32, 1.3), (256, 1.7))  # sizes in pixels and their strengt
 def grain(seed: int, level: int, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
     """Factors of brightness around 1 for a part of an endless surface.
 
-    Parameters
-    ----------
-    level
-        Pixels are 2**level times as large as the finest.
-    first, shape
-        Row and column of the first pixel at this level, and the number of rows and columns.
+    `level`: pixels are 2**level times as large as the finest. `first`, `shape`: row and column of the first pixel at
+    this level, and the number of rows and columns.
     """
     noise = _noise(seed, level)
     rows, columns = ((f + np.arange(n)) % len(noise) for f, n in zip(first, shape))
@@ -65,14 +61,8 @@ def paint_left(
 ) -> NDArray[np.float32]:
     """Share of paint that is left in each pixel of a part of an endless surface, from 0 to 1.
 
-    Parameters
-    ----------
-    level
-        Pixels are 2**level times as large as the finest.
-    first, shape
-        Row and column of the first pixel at this level, and the number of rows and columns.
-    worn
-        Share of the surface on which paint is missing.
+    `level`: pixels are 2**level times as large as the finest. `first`, `shape`: row and column of the first pixel at
+    this level, and the number of rows and columns. `worn`: share of the surface on which paint is missing.
     """
     left = _left(seed, level, worn)
     rows, columns = ((f + np.arange(n)) % len(left) for f, n in zip(first, shape))
@@ -114,19 +104,13 @@ BEND_AT, BEND_REACH, BEND_HEAD = 0.55, 0.2, 0.3
 
 @dataclass(frozen=True)
 class GroundPlan:
-    """What is painted on a meadow.
-
-    Attributes
-    ----------
-    keeps_right : bool
-        Whether vehicles drive on the right.
-    """
+    """What is painted on a meadow."""
 
     roads: Sequence[Road] = ()
     zebras: Sequence[Zebra] = ()
     stop_lines: Sequence[StopLine] = ()
     arrows: Sequence[Arrow] = ()
-    keeps_right: bool = True
+    keeps_right: bool = True  # whether vehicles drive on the right
 
     @classmethod
     def of(cls, scene: Scene) -> GroundPlan:
@@ -144,14 +128,9 @@ class GroundPlan:
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """A line with a width.
+    """A line with a width."""
 
-    Attributes
-    ----------
-    line : (P, 2) float64, m
-    """
-
-    line: Array
+    line: Array  # (P, 2), m
     width_m: float
 
     def wider(self, by_m: float) -> Stroke:
@@ -161,25 +140,15 @@ class Stroke:
 
 @dataclass(frozen=True, eq=False)
 class RoadLine:
-    """A line that is painted along a road, before anything interrupts it.
-
-    Attributes
-    ----------
-    kind : "solid" or "dashed"
-    line : (P, 2) float64, m
-        Its middle.
-    color : "white" or "yellow"
-    dashes : tuple of (Q, 2) float64, m
-        What is painted of it.
-    boundary : int
-        Boundary of lanes that it marks: 0 at the right of the road as its line runs, up to its number of lanes at the left.
-    """
+    """A line that is painted along a road, before anything interrupts it."""
 
     kind: Literal["solid", "dashed"]
-    line: Array
+    line: Array  # (P, 2), m: its middle
     width_m: float
     color: PaintColor
-    dashes: tuple[Array, ...]
+    dashes: tuple[Array, ...]  # tuple of (Q, 2) float64, m: what is painted of it
+    # Boundary of lanes that it marks: 0 at the right of the road as its line runs, up to its number of lanes at the
+    # left
     boundary: int
 
     @property
@@ -323,12 +292,7 @@ SUBPIXELS = 2  # masks are drawn so much finer than tiles
 class Ground:
     """The ground of a scene, painted when and where it is looked at.
 
-    Parameters
-    ----------
-    plan
-        What is painted on a meadow.
-    seed
-        Of grain, stains and wear.
+    `plan`: what is painted on a meadow. `seed`: of grain, stains and wear.
     """
 
     def __init__(self, plan: GroundPlan, seed: int) -> None:
@@ -394,28 +358,15 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """Paint of one color that is worn alike.
-
-    Attributes
-    ----------
-    color : str
-    worn : float
-        Share that is missing.
-    strength : float
-        From 0 for what cannot be seen to 1 for fresh paint.
-    free : _Strokes
-        What nothing interrupts.
-    along : tuple of (_Strokes, _Strokes)
-        Lines along roads, and what interrupts them.
-    outlines : tuple of (P, 2) float64, m
-    """
+    """Paint of one color that is worn alike."""
 
     color: PaintColor
-    worn: float
-    strength: float
-    free: _Strokes
+    worn: float  # share that is missing
+    strength: float  # from 0 for what cannot be seen to 1 for fresh paint
+    free: _Strokes  # what nothing interrupts
+    # Tuple of (_Strokes, _Strokes): lines along roads, and what interrupts them
     along: tuple[tuple[_Strokes, _Strokes], ...]
-    outlines: tuple[Array, ...]
+    outlines: tuple[Array, ...]  # tuple of (P, 2) float64, m
 
     def drawn(self, canvas: _Canvas) -> Mask | None:
         """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that was once painted; None where nothing was."""

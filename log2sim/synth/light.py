@@ -27,40 +27,22 @@ WET_ALBEDO = 0.62  # of a wet road relative to a dry one
 class Light:
     """Light on a scene and what the air does to it; colors are linear BGR at the exposure of the camera.
 
-    Attributes
-    ----------
-    sun : (float, float, float)
-        Unit direction towards the sun.
-    sun_color, sky_color : (float, float, float)
-        Light on a white surface that faces the sun, and on one that sees the whole sky.
-    horizon, zenith : (float, float, float)
-        The sky at the horizon and overhead.
-    extinction_per_m : float
-        Share of light that the air takes on a meter.
-    lamps : float
-        Brightness of headlights, rear lights and street lights, relative to what surfaces emit by day.
-    wetness : float
-        From 0 for a dry road to 1 for a wet one.
-    noise : float
-        Of the camera, relative to daylight.
-    exposure : float
-        Relative to that of a night, at which lamps light the road well.
-    glare : bool
-        Whether wet ground mirrors the sun and lamps.
+    `sun_color`, `sky_color` (float, float, float): light on a white surface that faces the sun, and on one that sees
+    the whole sky.
     """
 
-    sun: Color
+    sun: Color  # unit direction towards the sun
     sun_color: Color
     sky_color: Color
-    horizon: Color
-    zenith: Color
-    extinction_per_m: float = 1 / 500
-    lamps: float = 0.0
-    wetness: float = 0.0
+    horizon: Color  # the sky at the horizon and overhead
+    zenith: Color  # the sky at the horizon and overhead
+    extinction_per_m: float = 1 / 500  # share of light that the air takes on a meter
+    lamps: float = 0.0  # brightness of headlights, rear lights and street lights, relative to what surfaces emit by day
+    wetness: float = 0.0  # from 0 for a dry road to 1 for a wet one
     rain_mm_h: float = 0.0
-    noise: float = 1.0
-    exposure: float = 0.01
-    glare: bool = False
+    noise: float = 1.0  # of the camera, relative to daylight
+    exposure: float = 0.01  # relative to that of a night, at which lamps light the road well
+    glare: bool = False  # whether wet ground mirrors the sun and lamps
 
     def on_ground(self) -> NDArray[np.float32]:
         """Light (3,) that level ground under the open sky gives back relative to its dry color."""
@@ -166,12 +148,7 @@ def reflected(
 ) -> NDArray[np.float32]:
     """Light (P, 3) from surfaces with unit normals (P, 3) towards a camera.
 
-    Parameters
-    ----------
-    height : (P,) float32, m
-        Above the road.
-    lamplight : (P, 3) float32, optional
-        Light of lamps on the surfaces.
+    `height` (P,) float32, m: above the road. `lamplight` (P, 3) float32: light of lamps on the surfaces.
     """
     # Channel by channel, because NumPy is slow where the last axis is short.
     sun_x, sun_y, sun_z = (np.float32(x) for x in light.sun)
@@ -219,18 +196,12 @@ CAMERA_NEAR_M = 0.2  # of the near plane
 
 @dataclass(frozen=True, eq=False)
 class RenderCamera:
-    """A camera at one time.
+    """A camera at one time."""
 
-    Attributes
-    ----------
-    K : (3, 3) float64, px
-    map_T_cam : (4, 4) float64
-    """
-
-    K: Array
+    K: Array  # (3, 3), px
     width_px: int
     height_px: int
-    map_T_cam: Array
+    map_T_cam: Array  # (4, 4)
 
     @classmethod
     def of(cls, camera: Camera, map_T_cam: Array) -> RenderCamera:
@@ -407,16 +378,10 @@ GROUND_BAND_M = 0.2  # what is lower counts as ground, which lamps light at a gr
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A lamp at one time.
+    """A lamp at one time."""
 
-    Attributes
-    ----------
-    position_m : (3,) float64, m
-    forward : (2,) float64 or None
-        Direction of a headlight; None for a street light, which shines downwards.
-    """
-
-    position_m: Array
+    position_m: Array  # (3,), m
+    # (2,) float64 or None: direction of a headlight; None for a street light, which shines downwards
     forward: Array | None = None
 
 

@@ -19,28 +19,17 @@ FIRST_LEG_S = -1e4  # begin of the leg before the first waypoint
 
 @dataclass(frozen=True, eq=False)
 class PathStates:
-    """States of the guided point at asked times.
+    """States of the guided point at asked times."""
 
-    Attributes
-    ----------
-    xy_m : (T, 2) float64, m
-    yaw_rad : (T,) float64, rad
-    speed_mps : (T,) float64, m/s
-    distance_m : (T,) float64, m
-        Arc length from the first waypoint.
-    """
-
-    xy_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    distance_m: Array
+    xy_m: Array  # (T, 2), m
+    yaw_rad: Array  # (T,), rad
+    speed_mps: Array  # (T,), m/s
+    distance_m: Array  # (T,), m: arc length from the first waypoint
 
 
 class RoundedPath:
     """A smooth curve along waypoints (W, 2), parametrized by arc length and straight beyond its ends.
 
-    Notes
-    -----
     The polyline is averaged twice over a window of `rounding_m`: corners become curves whose curvature grows and falls
     linearly, like a pair of clothoids, straight parts stay straight, and nothing overshoots. A turn by 90 degrees peaks at
     a curvature of about 5.7 / rounding_m.
@@ -91,16 +80,9 @@ def _extended(s: Array, at: Array, values: Array) -> Array:
 class TimedPath:
     """A path with a timetable; between waypoints the speed is a smoothstep, so the acceleration is continuous.
 
-    Parameters
-    ----------
-    waypoints : (W, 3)
-        x, y in m and the speed there in m/s.
-    wait_s
-        How long to stand at a waypoint, by its index; its speed must be 0.
-    start_s
-        Time at the first waypoint; before that the agent stands (speed 0) or comes straight.
-    where
-        Names the agent in messages.
+    `waypoints` (W, 3): x, y in m and the speed there in m/s. `wait_s`: how long to stand at a waypoint, by its index;
+    its speed must be 0. `start_s`: time at the first waypoint; before that the agent stands (speed 0) or comes
+    straight. `where`: names the agent in messages.
     """
 
     def __init__(

@@ -27,48 +27,25 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Appearance:
-    """Appearance of an actor; colors are sRGB from 0 to 255.
-
-    Attributes
-    ----------
-    size_m : (float, float, float)
-        Length, width, height.
-    color : (int, int, int)
-    kind : str
-        Body of a car.
-    second_color : (int, int, int)
-    skin : (int, int, int)
-    hair : (int, int, int)
-    seed : int
-        Varies the folds of clothes.
-    """
+    """Appearance of an actor; colors are sRGB from 0 to 255."""
 
     category: str
-    size_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]  # length, width, height
     color: tuple[int, int, int]
-    kind: str = ""
+    kind: str = ""  # body of a car
     second_color: tuple[int, int, int] = (45, 50, 66)
     skin: tuple[int, int, int] = (196, 150, 122)
     hair: tuple[int, int, int] = (52, 38, 28)
-    seed: int = 0
+    seed: int = 0  # varies the folds of clothes
 
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Optical properties of P surface points, colors in linear BGR.
+    """Optical properties of P surface points, colors in linear BGR."""
 
-    Attributes
-    ----------
-    albedo : (P, 3) float32
-    gloss : (P,) float32
-        Share of the surroundings that is mirrored.
-    glow : (P, 3) float32
-        Emitted light.
-    """
-
-    albedo: NDArray[np.float32]
-    gloss: NDArray[np.float32]
-    glow: NDArray[np.float32]
+    albedo: NDArray[np.float32]  # (P, 3)
+    gloss: NDArray[np.float32]  # (P,): share of the surroundings that is mirrored
+    glow: NDArray[np.float32]  # (P, 3): emitted light
 
 
 def linear_bgr(rgb: tuple[int, int, int]) -> NDArray[np.float32]:
@@ -78,28 +55,14 @@ def linear_bgr(rgb: tuple[int, int, int]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Points of one material on an actor, to be painted.
-
-    Attributes
-    ----------
-    out : Paint
-        Of all points of the actor.
-    rows : (Q,) int64
-        Rows of this patch in `out`.
-    p : (Q, 3) float64, m
-        Points in the agent frame.
-    z : (Q,) float64, m
-        Heights above the ground.
-    n : (Q, 3) float64
-        Normals.
-    """
+    """Points of one material on an actor, to be painted."""
 
     appearance: Appearance
-    out: Paint
-    rows: Index
-    p: Array
-    z: Array
-    n: Array
+    out: Paint  # of all points of the actor
+    rows: Index  # (Q,) int64: rows of this patch in `out`
+    p: Array  # (Q, 3), m: points in the agent frame
+    z: Array  # (Q,), m: heights above the ground
+    n: Array  # (Q, 3): normals
     part: Material
 
     def set(self, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
@@ -352,11 +315,7 @@ MAX_LEVEL = 4
 class GroundReflectance:
     """Reflectance of the painted ground where beams meet it.
 
-    Parameters
-    ----------
-    ground : Ground
-    wetness : float
-        From 0 for dry to 1 for wet ground.
+    `wetness`: from 0 for dry to 1 for wet ground.
     """
 
     def __init__(self, ground: Ground, wetness: float = 0.0) -> None:

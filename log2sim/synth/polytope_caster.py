@@ -30,70 +30,36 @@ MIN_DRIFT_MPS = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """An object for the caster.
-
-    Attributes
-    ----------
-    position_m : (3,) float64, m
-        Middle of its floor at time 0.
-    velocity_mps : (2,) float64, m/s
-    glass_passes : float
-        Share of rays that its windows let through.
-    """
+    """An object for the caster."""
 
     parts: tuple[Polytope, ...]
-    position_m: Array
+    position_m: Array  # (3,), m: middle of its floor at time 0
     yaw_rad: float
-    velocity_mps: Array
-    glass_passes: float = 0.6
+    velocity_mps: Array  # (2,), m/s
+    glass_passes: float = 0.6  # share of rays that its windows let through
 
 
 @dataclass(frozen=True, eq=False)
 class SensorState:
-    """Where a LiDAR is during a sweep.
+    """Where a LiDAR is during a sweep."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) float64
-        From the sensor to the level frame.
-    position_m : (3,) float64, m
-        At time 0, the middle of the sweep.
-    velocity_mps : (2,) float64, m/s
-    """
-
-    rotation: Array
-    position_m: Array
-    velocity_mps: Array
+    rotation: Array  # (3, 3): from the sensor to the level frame
+    position_m: Array  # (3,), m: at time 0, the middle of the sweep
+    velocity_mps: Array  # (2,), m/s
 
 
 @dataclass(eq=False)
 class Rays:
-    """The rays of a sweep, L lines by A firings, and what each meets first.
+    """The rays of a sweep, L lines by A firings, and what each meets first."""
 
-    Attributes
-    ----------
-    azimuth, elevation : (A,), (L,) float64
-        In the sensor's frame, rad.
-    direction : (L, A, 3) float32
-        Level frame.
-    column_s : (A,) float32
-        Times of the firings relative to the middle of the sweep.
-    range_m : (L, A) float32
-        Infinite without a hit.
-    hit : (L, A) int32
-    material : (L, A) int8
-    incidence : (L, A) float32
-        Cosine between ray and normal.
-    """
-
-    azimuth: Array
-    elevation: Array
-    direction: NDArray[np.float32]
-    column_s: NDArray[np.float32]
-    range_m: NDArray[np.float32]
-    hit: NDArray[np.int32]
-    material: NDArray[np.int8]
-    incidence: NDArray[np.float32]
+    azimuth: Array  # (A,), (L,) float64: in the sensor's frame, rad
+    elevation: Array  # (A,), (L,) float64: in the sensor's frame, rad
+    direction: NDArray[np.float32]  # (L, A, 3): level frame
+    column_s: NDArray[np.float32]  # (A,): times of the firings relative to the middle of the sweep
+    range_m: NDArray[np.float32]  # (L, A): infinite without a hit
+    hit: NDArray[np.int32]  # (L, A)
+    material: NDArray[np.int8]  # (L, A)
+    incidence: NDArray[np.float32]  # (L, A): cosine between ray and normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,26 +170,14 @@ def _approach(rays: Rays, solid: Solid, index: int, windows: Windows, sensor: Se
 
 @dataclass(frozen=True, eq=False)
 class _Crossings:
-    """Where n rays cross the half-spaces of P parts with K faces in all.
+    """Where n rays cross the half-spaces of P parts with K faces in all."""
 
-    Attributes
-    ----------
-    enter, leave : (P, n) float32, m
-        Infinite where a ray misses the part.
-    latest : (K, n) float32, m
-        Of the faces that a ray enters by, -inf of the others.
-    slope : (K, n) float32
-        Normals times directions.
-    start, count : (P,) int64
-        Of each part's faces.
-    """
-
-    enter: NDArray[np.float32]
-    leave: NDArray[np.float32]
-    latest: NDArray[np.float32]
-    slope: NDArray[np.float32]
-    start: NDArray[np.int64]
-    count: NDArray[np.int64]
+    enter: NDArray[np.float32]  # (P, n), m: infinite where a ray misses the part
+    leave: NDArray[np.float32]  # (P, n), m: infinite where a ray misses the part
+    latest: NDArray[np.float32]  # (K, n), m: of the faces that a ray enters by, -inf of the others
+    slope: NDArray[np.float32]  # (K, n): normals times directions
+    start: NDArray[np.int64]  # (P,): of each part's faces
+    count: NDArray[np.int64]  # (P,): of each part's faces
 
     @classmethod
     def of(cls, near: _Approach, parts: Sequence[Polytope], column_s: NDArray[np.float32]) -> _Crossings:
@@ -302,27 +256,13 @@ class Terrain(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """Points of a sweep, motion compensated.
+    """Points of a sweep, motion compensated."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float32, m
-        Level frame.
-    intensity : (N,) float32
-        In [0, 1].
-    t_s : (N,) float32
-        Relative to the middle of the sweep.
-    hit : (N,) int32
-        Index of the object, or GROUND.
-    line : (N,) int32
-        Line of the sensor.
-    """
-
-    xyz_m: NDArray[np.float32]
-    intensity: NDArray[np.float32]
-    t_s: NDArray[np.float32]
-    hit: NDArray[np.int32]
-    line: NDArray[np.int32]
+    xyz_m: NDArray[np.float32]  # (N, 3), m: level frame
+    intensity: NDArray[np.float32]  # (N,): in [0, 1]
+    t_s: NDArray[np.float32]  # (N,): relative to the middle of the sweep
+    hit: NDArray[np.int32]  # (N,): index of the object, or GROUND
+    line: NDArray[np.int32]  # (N,): line of the sensor
 
 
 def cast_polytopes(
@@ -335,12 +275,7 @@ def cast_polytopes(
 ) -> Returns:
     """Cast a sweep.
 
-    Parameters
-    ----------
-    rng : Generator
-        Draws reflectances, losses and noise.
-    returns : ReturnModel, optional
-        By default the noise of the model and no more.
+    `rng`: draws reflectances, losses and noise. `returns`: by default the noise of the model and no more.
     """
     rays = _cast_ground(model, sensor, terrain)
     windows = windows_of(solids, sensor)

@@ -35,21 +35,12 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Polytope:
-    """Points p with normals @ p <= offsets, in the frame of an object (x forward, y left, z up from the middle of its floor).
+    """Points p with normals @ p <= offsets, in the frame of an object (x forward, y left, z up from the middle of its floor)."""
 
-    Attributes
-    ----------
-    normals : (K, 3) float32
-        Outward unit normals.
-    offsets : (K,) float32, m
-    low, high : (3,) float64, m
-        Bounds.
-    """
-
-    normals: NDArray[np.float32]
-    offsets: NDArray[np.float32]
-    low: Array
-    high: Array
+    normals: NDArray[np.float32]  # (K, 3): outward unit normals
+    offsets: NDArray[np.float32]  # (K,), m
+    low: Array  # (3,), m: bounds
+    high: Array  # (3,), m: bounds
     material: Material
 
     def vertices(self) -> Array:
@@ -80,14 +71,8 @@ def _made(normals: Array, offsets: Array, low: Sequence[float], high: Sequence[f
 def prism(profile: Sequence[tuple[float, float]], width: float, material: Material, *, taper: float = 0.0) -> Polytope:
     """Extrude a convex side profile over the width.
 
-    Parameters
-    ----------
-    profile : sequence of (x, z), m
-        Counter-clockwise.
-    width : float, m
-        At the lowest point of the profile.
-    taper : float
-        Lean of the sides inward, m per m of height.
+    `profile` sequence of (x, z), m: counter-clockwise. `width` m: at the lowest point of the profile. `taper`: lean of
+    the sides inward, m per m of height.
     """
     points = np.asarray(profile, np.float64)
     edges = points[np.r_[1 : len(points), 0]] - points
@@ -190,20 +175,9 @@ MIN_VOLUME = 1e-5  # of three unit normals that meet in a point
 def meshes_of(objects: Sequence[Sequence[Polytope]], center_z_m: Sequence[float]) -> list[Mesh]:
     """Make the meshes of objects, flat-shaded.
 
-    Parameters
-    ----------
-    objects
-        Parts of each, in its frame, which has its origin on the floor.
-    center_z_m
-        Height of each mesh's origin in that frame.
+    `objects`: parts of each, in its frame, which has its origin on the floor. `center_z_m`: height of each mesh's
+    origin in that frame. Returns `part` holds the index of the part of each face.
 
-    Returns
-    -------
-    list of Mesh
-        `part` holds the index of the part of each face.
-
-    Notes
-    -----
     Corners are where triples of planes meet inside all others; around each face they are ordered by angle. Polytopes with
     equally many faces are worked on together.
     """

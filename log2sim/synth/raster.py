@@ -19,8 +19,6 @@ SPHERE_MARGIN_M = 1e-5
 def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
     """Distance (N,) along rays (N, 3) to the nearest of triangles (F, 3 vertices, 3), inf where there is none.
 
-    Notes
-    -----
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997); both sides of a triangle count. Triangles that
     lie together share a sphere around them, and only rays that meet the sphere are tested against them, in batches of
     bounded size.
@@ -69,24 +67,12 @@ def _spheres_around(triangles: Array, ends: NDArray[np.int64]) -> tuple[Array, A
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """Triangles as what products with rays need.
+    """Triangles as what products with rays need."""
 
-    Attributes
-    ----------
-    normal : (F, 3) float64
-        Product of the edges, not of unit length.
-    offset : (F,) float64
-        Of the planes along their normals.
-    edges : (2, F, 3) float64
-        Second and first edge, for both coordinates within a triangle.
-    moments : (2, F, 3) float64
-        Products of these edges with the first vertex.
-    """
-
-    normal: Array
-    offset: Array
-    edges: Array
-    moments: Array
+    normal: Array  # (F, 3): product of the edges, not of unit length
+    offset: Array  # (F,): of the planes along their normals
+    edges: Array  # (2, F, 3): second and first edge, for both coordinates within a triangle
+    moments: Array  # (2, F, 3): products of these edges with the first vertex
 
     @classmethod
     def of(cls, triangles: Array) -> _Planes:
@@ -124,24 +110,14 @@ Index = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """The nearest surface of a mesh at each pixel that it covers, by ascending row and column.
+    """The nearest surface of a mesh at each pixel that it covers, by ascending row and column."""
 
-    Attributes
-    ----------
-    u, v : (P,) int32
-        Column and row.
-    depth_m : (P,) float32, m
-        Along the optical axis.
-    face : (P,) int32
-    planes : (F, 3 vertices, 3) float64
-        For each face and each of its vertices the coefficients of u, v and 1 of a linear function of the image: the
-        barycentric weight of the vertex divided by the depth.
-    """
-
-    u: Index
-    v: Index
-    depth_m: NDArray[np.float32]
-    face: Index
+    u: Index  # (P,) int32: column and row
+    v: Index  # (P,) int32: column and row
+    depth_m: NDArray[np.float32]  # (P,), m: along the optical axis
+    face: Index  # (P,) int32
+    # (F, 3 vertices, 3) float64: for each face and each of its vertices the coefficients of u, v and 1 of a linear
+    # function of the image: the barycentric weight of the vertex divided by the depth
     planes: Array
 
     def pixel(self, width_px: int) -> Index:
@@ -164,28 +140,14 @@ class Fragments:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """All pixels that the faces of a mesh cover, row by row of each face.
+    """All pixels that the faces of a mesh cover, row by row of each face."""
 
-    Attributes
-    ----------
-    pixel : (P,) int32
-        Row-major index into the image.
-    nearness : (P,) float32, 1/m
-        Inverse depth.
-    row : (P,) int32
-        Which row of which face.
-    row_face, row_v : (R,) int32
-        Face and row of the image of each row.
-    planes : (F, 3 vertices, 3) float64
-        As in `Fragments`.
-    """
-
-    pixel: Index
-    nearness: NDArray[np.float32]
-    row: Index
-    row_face: Index
-    row_v: Index
-    planes: Array
+    pixel: Index  # (P,) int32: row-major index into the image
+    nearness: NDArray[np.float32]  # (P,), 1/m: inverse depth
+    row: Index  # (P,) int32: which row of which face
+    row_face: Index  # (R,) int32: face and row of the image of each row
+    row_v: Index  # (R,) int32: face and row of the image of each row
+    planes: Array  # (F, 3 vertices, 3): as in `Fragments`
     width_px: int
 
     @classmethod
@@ -226,10 +188,7 @@ class Samples:
 class ZBuffer:
     """The nearest of all samples that were added, and which one it is.
 
-    Parameters
-    ----------
-    nearness : (N,) float32, 1/m
-        Inverse depth of the background of each pixel; changed in place.
+    `nearness` (N,) float32, 1/m: inverse depth of the background of each pixel; changed in place.
     """
 
     def __init__(self, nearness: NDArray[np.float32]) -> None:
@@ -253,16 +212,10 @@ class ZBuffer:
 def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int) -> Fragments:
     """Rasterize a mesh for a pinhole camera.
 
-    Parameters
-    ----------
-    vertices_cam : (V, 3) float64, m, cam frame
-    faces : (F, 3) int
-        Counter-clockwise from outside; faces that look away are left out, and so is what is nearer than `NEAR_M`.
-    K : (3, 3) float64, px
-        Pixel centers are whole numbers, as in OpenCV.
+    `vertices_cam` (V, 3) float64, m, cam frame. `faces` (F, 3) int: counter-clockwise from outside; faces that look
+    away are left out, and so is what is nearer than `NEAR_M`. `K` (3, 3) float64, px: pixel centers are whole numbers,
+    as in OpenCV.
 
-    Notes
-    -----
     Edge functions in homogeneous coordinates, so that faces which reach behind the camera need no clipping: Olano & Greer,
     Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).
     """

@@ -27,16 +27,10 @@ MIN_GRAZING_SINE = 0.02  # of the angle to the ground below which no return come
 
 @dataclass(frozen=True, eq=False)
 class LabeledSweep:
-    """A sweep and what each of its points lies on.
-
-    Attributes
-    ----------
-    hit : (N,) int64
-        Index of the actor, GROUND, BUILDING, EGO or AIR.
-    """
+    """A sweep and what each of its points lies on."""
 
     sweep: Sweep
-    hit: NDArray[np.int64]
+    hit: NDArray[np.int64]  # (N,): index of the actor, GROUND, BUILDING, EGO or AIR
 
 
 def mount_T_lidar(spec: LidarSpec) -> Array:
@@ -124,20 +118,12 @@ def cast_sweep(
 
 @dataclass(frozen=True, eq=False)
 class _Returns:
-    """Rays that came back, map frame.
+    """Rays that came back, map frame."""
 
-    Attributes
-    ----------
-    origin, ray : (N, 3) float64
-    distance_m : (N,) float64, m
-    hit : (N,) int64
-        As in `LabeledSweep`.
-    """
-
-    origin: Array
-    ray: Array
-    distance_m: Array
-    hit: NDArray[np.int64]
+    origin: Array  # (N, 3)
+    ray: Array  # (N, 3)
+    distance_m: Array  # (N,), m
+    hit: NDArray[np.int64]  # (N,): as in `LabeledSweep`
 
 
 def _intensity(met: _Returns, scene: Scene, ground: GroundReflectance, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -180,8 +166,6 @@ def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool
 
     Rays that start inside miss it too, unless `from_inside`: then the distance is negative.
 
-    Notes
-    -----
     Slab method of Kay & Kajiya, "Ray Tracing Complex Scenes" (SIGGRAPH 1986).
     """
     parallel = ray == 0

@@ -60,23 +60,13 @@ Painter = Callable[[NDArray[np.int64], Values, Values], Paint]  # of materials, 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A solid body at one time.
+    """A solid body at one time."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        In its own frame, which has its origin at the middle of the box.
-    map_T_body : (4, 4) float64
-    size_m : (float, float, float)
-        Of the box.
-    passes : (K,) float32 or None
-        Share of samples through which one sees what is behind, by material; None for a solid body.
-    """
-
-    mesh: Mesh
-    map_T_body: Array
-    size_m: tuple[float, float, float]
+    mesh: Mesh  # in its own frame, which has its origin at the middle of the box
+    map_T_body: Array  # (4, 4)
+    size_m: tuple[float, float, float]  # of the box
     painter: Painter
+    # (K,) float32 or None: share of samples through which one sees what is behind, by material; None for a solid body
     passes: NDArray[np.float32] | None = None
 
     @classmethod
@@ -194,10 +184,7 @@ def draw_shadows(
 ) -> None:
     """Darken the ground (H, W) in the shadow of bodies and, right below them, further.
 
-    Parameters
-    ----------
-    standing
-        Convex outlines (P, 2), m, of further shadows on level ground.
+    `standing`: convex outlines (P, 2), m, of further shadows on level ground.
     """
     sun = np.zeros(ground.shape, np.uint8)
     sky = np.zeros(ground.shape, np.uint8)
@@ -378,8 +365,6 @@ WET_COARSENESS = 2  # of the grid on which it is computed
 def mirror_lights(view: RenderCamera, lit: Lighting, color: Image, depth: Image, ground: NDArray[np.bool_]) -> None:
     """Let wet ground (H, W) mirror the sun and lamps towards the camera; in place, nothing without glare.
 
-    Notes
-    -----
     Facets with Gaussian slopes (Beckmann & Spizzichino, 1963), the reflectance of water after Schlick (1994).
     """
     light = lit.light
@@ -443,24 +428,12 @@ GRAIN = 0.8  # standard deviation of the sensor's noise, of 255
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """Visible part of a body in an image.
+    """Visible part of a body in an image."""
 
-    Attributes
-    ----------
-    visible_px : int
-        Pixels that show it.
-    silhouette_px : int
-        Pixels of its whole silhouette in the image.
-    box_px : (4,) float64, px
-        Box of the visible part, edges of pixels counted from the image's corner.
-    silhouette_box_px : (4,) float64, px
-        Box of the whole silhouette in the image.
-    """
-
-    visible_px: int
-    silhouette_px: int
-    box_px: Array
-    silhouette_box_px: Array
+    visible_px: int  # pixels that show it
+    silhouette_px: int  # pixels of its whole silhouette in the image
+    box_px: Array  # (4,), px: box of the visible part, edges of pixels counted from the image's corner
+    silhouette_box_px: Array  # (4,), px: box of the whole silhouette in the image
 
 
 class Scenery(Protocol):
@@ -489,18 +462,12 @@ class Scenery(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SceneInstant:
-    """Everything in a scene at one time.
-
-    Attributes
-    ----------
-    lamps : sequence of Lamp
-        Headlights and street lights that are on.
-    """
+    """Everything in a scene at one time."""
 
     backdrop: Scenery
     bodies: Sequence[Body]
     light: Light = NOON
-    lamps: Sequence[Lamp] = ()
+    lamps: Sequence[Lamp] = ()  # headlights and street lights that are on
 
 
 def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -33,42 +33,23 @@ Angle = Annotated[float, Field(ge=-90, le=90)]
 
 
 class LidarModel(BaseModel):
-    """A LiDAR whose rays form a grid of lines by azimuths; it turns clockwise from the left end of its field of view.
-
-    Attributes
-    ----------
-    elevation_deg : tuple of float
-        Of each line, deg.
-    azimuth_deg : (float, float)
-        Right and left end of the field of view, deg.
-    azimuth_step_deg : float
-        Angle between two firings, deg.
-    range_m : float
-        Largest measured distance, m.
-    noise_m : float
-        Standard deviation of a distance, m.
-    rate_hz : float
-        Sweeps per second, 1/s.
-    height_m : float
-        Usual height above the ground, m.
-    pitch_deg : float
-        Usual pitch, positive downward, deg.
-    """
+    """A LiDAR whose rays form a grid of lines by azimuths; it turns clockwise from the left end of its field of view."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str = "custom"
-    elevation_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=512)]
+    elevation_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=512)]  # of each line, deg
+    # right and left end of the field of view, deg
     azimuth_deg: tuple[Annotated[float, Field(ge=-180, le=180)], Annotated[float, Field(ge=-180, le=180)]] = (
         -180.0,
         180.0,
     )
-    azimuth_step_deg: Annotated[float, Field(ge=0.02, le=10)] = 0.2
-    range_m: Annotated[float, Field(ge=1, le=500)] = 100.0
-    noise_m: Annotated[float, Field(ge=0, le=1)] = 0.02
-    rate_hz: Annotated[float, Field(ge=0.1, le=100)] = 10.0
-    height_m: Annotated[float, Field(ge=0.1, le=50)] = 1.8
-    pitch_deg: Angle = 0.0
+    azimuth_step_deg: Annotated[float, Field(ge=0.02, le=10)] = 0.2  # angle between two firings, deg
+    range_m: Annotated[float, Field(ge=1, le=500)] = 100.0  # largest measured distance, m
+    noise_m: Annotated[float, Field(ge=0, le=1)] = 0.02  # standard deviation of a distance, m
+    rate_hz: Annotated[float, Field(ge=0.1, le=100)] = 10.0  # sweeps per second, 1/s
+    height_m: Annotated[float, Field(ge=0.1, le=50)] = 1.8  # usual height above the ground, m
+    pitch_deg: Angle = 0.0  # usual pitch, positive downward, deg
 
     def azimuths_rad(self) -> Array:
         """Azimuths (A,) of the firings in their order, from the left (high) to the right (low), rad."""
@@ -131,10 +112,7 @@ LIDAR_MODELS = {
 def lidar_model(name_or_path: str) -> LidarModel:
     """Return a LiDAR of the table, or read one from a TOML file with the attributes of `LidarModel` as keys.
 
-    Raises
-    ------
-    ConfigError
-        For an unknown name, an unreadable file, an unknown key or an impossible value.
+    Raises `ConfigError` for an unknown name, an unreadable file, an unknown key or an impossible value.
     """
     if name_or_path in LIDAR_MODELS:
         return LIDAR_MODELS[name_or_path]
@@ -185,21 +163,11 @@ Kind = Literal["clear", "rain", "fog"]
 
 @dataclass(frozen=True)
 class Weather:
-    """Weather as a LiDAR feels it.
+    """Weather as a LiDAR feels it."""
 
-    Attributes
-    ----------
-    kind : str
-        clear, rain or fog.
-    visibility_m : float
-        Meteorological visibility in fog, m.
-    rain_mm_h : float
-        Rate of rain, mm/h.
-    """
-
-    kind: Kind = "clear"
-    visibility_m: float = 200.0
-    rain_mm_h: float = 10.0
+    kind: Kind = "clear"  # clear, rain or fog
+    visibility_m: float = 200.0  # meteorological visibility in fog, m
+    rain_mm_h: float = 10.0  # rate of rain, mm/h
 
     @property
     def extinction_per_m(self) -> float:
@@ -213,21 +181,11 @@ class Weather:
 
 @dataclass(frozen=True)
 class ReturnModel:
-    """How a sensor loses and disturbs returns.
+    """How a sensor loses and disturbs returns."""
 
-    Attributes
-    ----------
-    noise_m : float
-        Standard deviation of a distance, m.
-    dropout : float
-        Share of returns that are lost whatever they hit.
-    mixed : float
-        Share of returns that lie between two surfaces.
-    """
-
-    noise_m: float = 0.02
-    dropout: float = 0.03
-    mixed: float = 0.002
+    noise_m: float = 0.02  # standard deviation of a distance, m
+    dropout: float = 0.03  # share of returns that are lost whatever they hit
+    mixed: float = 0.002  # share of returns that lie between two surfaces
     weather: Weather = Weather()
 
 
@@ -236,12 +194,8 @@ def reflected(
 ) -> NDArray[np.float32]:
     """Signal (N,) of returns relative to a target of reflectance 1 at `REFERENCE_RANGE_M` in clear air.
 
-    Parameters
-    ----------
-    range_m : (N,) float32, m
-    reflectance : (N,) float32
-    incidence : (N,) float32
-        Cosine of the angle between ray and normal.
+    `range_m` (N,) float32, m. `reflectance` (N,) float32. `incidence` (N,) float32: cosine of the angle between ray and
+    normal.
     """
     lost = np.exp(np.float32(-2 * weather.extinction_per_m) * range_m)
     nearness = np.maximum(range_m / np.float32(REFERENCE_RANGE_M), np.float32(0.05))
@@ -257,10 +211,7 @@ def detected(signal: NDArray[np.float32], model: ReturnModel, rng: np.random.Gen
 def backscattered(range_m: NDArray[np.float32], weather: Weather, rng: np.random.Generator) -> Array:
     """Distances (N,) at which rays come back from fog or rain before they reach a surface; inf where they do not.
 
-    Parameters
-    ----------
-    range_m : (N,) float32, m
-        Distances to the surfaces, inf without one.
+    `range_m` (N,) float32, m: distances to the surfaces, inf without one.
     """
     out = np.full(len(range_m), np.inf)
     if weather.extinction_per_m == 0:

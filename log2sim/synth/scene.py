@@ -347,10 +347,7 @@ def load_scene(path: Path | str) -> Scene:
 def scene_from_table(table: dict[str, Any]) -> Scene:
     """Check a TOML document and make it a scene.
 
-    Raises
-    ------
-    ConfigError
-        For the first unknown key or impossible value.
+    Raises `ConfigError` for the first unknown key or impossible value.
     """
     try:
         return Scene.model_validate(table)

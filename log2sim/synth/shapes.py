@@ -18,23 +18,12 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    Attributes
-    ----------
-    vertices_m : (V, 3) float64, m
-    normals : (V, 3) float64
-        Outward unit normals of the vertices.
-    faces : (F, 3) int64
-        Indices of vertices, counter-clockwise from outside.
-    part : (F,) int64
-        Material of each face.
-    """
-
-    vertices_m: Array
-    normals: Array
-    faces: NDArray[np.int64]
-    part: NDArray[np.int64]
+    vertices_m: Array  # (V, 3), m
+    normals: Array  # (V, 3): outward unit normals of the vertices
+    faces: NDArray[np.int64]  # (F, 3): indices of vertices, counter-clockwise from outside
+    part: NDArray[np.int64]  # (F,): material of each face
 
     def fitted(self, size_m: ArrayLike, low: Array | None = None, high: Array | None = None) -> Mesh:
         """Scale and shift each axis so that the extents `low`..`high` (default: its own) become a centered box."""

@@ -25,25 +25,13 @@ Mount = Literal["vehicle", "roadside"]
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A road of constant curvature with its reference line in the middle.
+    """A road of constant curvature with its reference line in the middle."""
 
-    Attributes
-    ----------
-    origin_m : (2,) float64, m
-        Point of the line at s = 0.
-    yaw_rad : float
-        Direction of the line there.
-    half_width_m : float
-        Half of the carriageway, m.
-    lanes : int
-        In all.
-    """
-
-    origin_m: Array
-    yaw_rad: float
+    origin_m: Array  # (2,), m: point of the line at s = 0
+    yaw_rad: float  # direction of the line there
     curvature_per_m: float
-    half_width_m: float
-    lanes: int
+    half_width_m: float  # half of the carriageway, m
+    lanes: int  # in all
     keeps_right: bool = True
     one_way: bool = False
 
@@ -71,22 +59,12 @@ class Road:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Ground: a tilted and bent plane with waves, and kerbs beside the roads.
+    """Ground: a tilted and bent plane with waves, and kerbs beside the roads."""
 
-    Attributes
-    ----------
-    coefficients : (5,) float64
-        Of x, y, x^2, x y, y^2.
-    waves : (K, 4) float64
-        Amplitude in m, wave numbers along x and y in rad/m, phase.
-    kerb_m : float
-        Height of the ground beside the roads.
-    """
-
-    coefficients: Array
-    waves: Array
+    coefficients: Array  # (5,): of x, y, x^2, x y, y^2
+    waves: Array  # (K, 4): amplitude in m, wave numbers along x and y in rad/m, phase
     roads: tuple[Road, ...]
-    kerb_m: float
+    kerb_m: float  # height of the ground beside the roads
 
     def height(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return heights (N,) without kerbs, m."""
@@ -116,32 +94,16 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class TrafficObject:
-    """A road user or a thing at time 0, the middle of the sweep.
+    """A road user or a thing at time 0, the middle of the sweep."""
 
-    Attributes
-    ----------
-    category : str
-        One of the road users' categories, "" for clutter.
-    position_m : (3,) float64, m
-        Middle of its floor, level frame under the sensor.
-    size_m : (float, float, float)
-        Length, width, height, m.
-    speed_mps : float
-        Along the heading.
-    turn_radps : float
-        Rate of the heading.
-    kind : str
-        What clutter is: tree, pole, building ...
-    """
-
-    category: str
-    position_m: Array
+    category: str  # one of the road users' categories, "" for clutter
+    position_m: Array  # (3,), m: middle of its floor, level frame under the sensor
     yaw_rad: float
-    size_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]  # length, width, height, m
     parts: tuple[Polytope, ...]
-    speed_mps: float = 0.0
-    turn_radps: float = 0.0
-    kind: str = ""
+    speed_mps: float = 0.0  # along the heading
+    turn_radps: float = 0.0  # rate of the heading
+    kind: str = ""  # what clutter is: tree, pole, building
 
     def pose_at(self, t_s: float) -> tuple[Array, float]:
         """Position (3,) of the middle of its floor and heading, on an arc, at a time relative to the middle of the sweep."""
@@ -154,23 +116,16 @@ class TrafficObject:
 
 @dataclass(frozen=True, eq=False)
 class TrafficScene:
-    """Everything around a LiDAR; level frame: z up, origin on the ground below the sensor, x forward.
+    """Everything around a LiDAR; level frame: z up, origin on the ground below the sensor, x forward."""
 
-    Attributes
-    ----------
-    mount : str
-        vehicle or roadside.
-    second : (LidarModel, SensorState) or None
-        Another LiDAR that sees the scene too.
-    """
-
-    mount: Mount
+    mount: Mount  # vehicle or roadside
     roads: tuple[Road, ...]
     surface: Surface
     objects: tuple[TrafficObject, ...]
     lidar: LidarModel
     sensor: SensorState
     returns: ReturnModel
+    # (LidarModel, SensorState) or None: another LiDAR that sees the scene too
     second: tuple[LidarModel, SensorState] | None = None
 
     def at(self, t_s: float) -> TrafficScene:
@@ -204,27 +159,15 @@ class TrafficScene:
 
 @dataclass(frozen=True, eq=False)
 class LabeledCloud:
-    """A cloud and the road users in it, as a network is trained on.
+    """A cloud and the road users in it, as a network is trained on."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float32, m
-        Level frame.
-    hit : (N,) int32
-        Index of the object, -1 for the ground.
-    category : (M,) str
-        Of the road users.
-    boxes : (M, 7) float64
-        x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's points.
-    points : (M,) int64
-        Number of points on each.
-    """
-
-    xyz_m: NDArray[np.float32]
-    hit: NDArray[np.int32]
-    category: NDArray[np.str_]
+    xyz_m: NDArray[np.float32]  # (N, 3), m: level frame
+    hit: NDArray[np.int32]  # (N,): index of the object, -1 for the ground
+    category: NDArray[np.str_]  # (M,): of the road users
+    # (M, 7) float64: x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's
+    # points
     boxes: Array
-    points: NDArray[np.int64]
+    points: NDArray[np.int64]  # (M,): number of points on each
     scene: TrafficScene = field(repr=False)
 
 
@@ -473,15 +416,9 @@ def draw_scene(
 ) -> TrafficScene:
     """Draw a random scene.
 
-    Parameters
-    ----------
-    mount : str
-        "vehicle": the LiDAR is on a car's roof on the road; "roadside": on a pole beside it, tilted down to the road.
-    rng : Generator
-    lidar : LidarModel, optional
-        By default one of the common sensors, with elevations and density that vary as between units.
-    weather : Weather, optional
-        By default clear, in one scene of ten rain or fog.
+    `mount`: "vehicle": the LiDAR is on a car's roof on the road; "roadside": on a pole beside it, tilted down to the
+    road. `lidar`: by default one of the common sensors, with elevations and density that vary as between units.
+    `weather`: by default clear, in one scene of ten rain or fog.
     """
     roads, sensor_forward = _draw_roads(mount, rng)
     surface = _draw_surface(roads, rng)
@@ -620,23 +557,15 @@ FORWARD_R_CAM = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Camera and LiDAR at one time.
-
-    Attributes
-    ----------
-    map_T_cam : (4, 4) float64
-    map_T_lidar : (4, 4) float64
-    map_T_level : (4, 4) float64
-        A frame at the camera with x right, y down along gravity and z forward: the camera's own where it looks level.
-    lidar_height_m : float
-        Above the ground below it.
-    """
+    """Camera and LiDAR at one time."""
 
     camera: Camera
-    map_T_cam: Array
-    map_T_lidar: Array
+    map_T_cam: Array  # (4, 4)
+    map_T_lidar: Array  # (4, 4)
+    # (4, 4) float64: a frame at the camera with x right, y down along gravity and z forward: the camera's own where it
+    # looks level
     map_T_level: Array
-    lidar_height_m: float
+    lidar_height_m: float  # above the ground below it
 
 
 def camera_for(mount: Mount) -> tuple[int, int, Array]:
@@ -673,10 +602,7 @@ def mount_T_cam_of(mount: Mount, rig: Rig) -> Array:
 def sensor_named(name: str | None, mount: Mount) -> LidarModel | None:
     """Return the LiDAR of a name or TOML file; by default the usual one of the mount, for "random" None.
 
-    Raises
-    ------
-    ConfigError
-        For a name that is not known or a file that cannot be read.
+    Raises `ConfigError` for a name that is not known or a file that cannot be read.
     """
     if name == "random":
         return None

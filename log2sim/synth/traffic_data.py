@@ -57,22 +57,12 @@ LIDAR_FROM_IMU_M, IMU_HEIGHT_M = (0.81, -0.32), 0.93
 
 @dataclass(frozen=True, eq=False)
 class KittiFrame:
-    """One frame.
+    """One frame."""
 
-    Attributes
-    ----------
-    image : (H, W, 3) uint8
-        BGR.
-    points : (N, 4) float32
-        x, y, z in m in the LiDAR's frame and intensity in [0, 1].
-    calibration, labels : str
-        Contents of the text files.
-    """
-
-    image: NDArray[np.uint8]
-    points: NDArray[np.float32]
-    calibration: str
-    labels: str
+    image: NDArray[np.uint8]  # (H, W, 3): BGR
+    points: NDArray[np.float32]  # (N, 4): x, y, z in m in the LiDAR's frame and intensity in [0, 1]
+    calibration: str  # contents of the text files
+    labels: str  # contents of the text files
 
     def write(self, folder: Path, index: int) -> None:
         """Write the four files of a frame below a folder such as `training`."""
@@ -106,8 +96,6 @@ def _lidar_T_imu(rig: Rig) -> Array:
 def label_text(objects: Sequence[TrafficObject], seen: Sequence[Visibility | None], rig: Rig) -> str:
     """Write a label file: road users, and as regions to be ignored those that are too small or hidden.
 
-    Notes
-    -----
     Truncation is the share of the box outside the picture. Occlusion is 0 where 80 % or more of the silhouette are visible,
     1 where 40 %, 2 below. The 2D box surrounds the whole silhouette in the picture, hidden parts too, as KITTI's do.
     """
@@ -173,20 +161,11 @@ CAR_AHEAD_M = 0.3  # of the car's middle before its LiDAR
 
 @dataclass(frozen=True, eq=False)
 class TrafficRun:
-    """A random scene over time.
+    """A random scene over time."""
 
-    Attributes
-    ----------
-    scene : TrafficScene
-        At time 0.
-    ego : TrafficObject or None
-        The sensor's car; None at the roadside.
-    distance_m : (S, M) float64, m
-        Way that each object, and as the last the sensor's car, has gone after each `STEP_S`.
-    """
-
-    scene: TrafficScene
-    ego: TrafficObject | None
+    scene: TrafficScene  # at time 0
+    ego: TrafficObject | None  # the sensor's car; None at the roadside
+    # (S, M) float64, m: way that each object, and as the last the sensor's car, has gone after each `STEP_S`
     distance_m: Array
 
     def at(self, t_s: float) -> TrafficScene:
@@ -422,33 +401,17 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class TrafficSettings:
-    """What to write.
+    """What to write."""
 
-    Attributes
-    ----------
-    mount : str
-        "vehicle" or "roadside".
-    sensor : str or None
-        Name or TOML file of a LiDAR, "random", or None for the usual one of the mount.
-    layout : str
-        "kitti" or "log2sim".
-    duration_s : float
-        Of each log; a scene in KITTI's layout is one frame.
-    light, weather : str or None
-        As in scene files; None draws them for each scene.
-    pictures : bool
-        Whether logs have a camera.
-    """
-
-    mount: Mount
+    mount: Mount  # "vehicle" or "roadside"
     scenes: int = 10
     seed: int = 0
-    sensor: str | None = None
-    layout: Layout = "kitti"
-    duration_s: float = 5.0
-    light: str | None = None
-    weather: str | None = None
-    pictures: bool = True
+    sensor: str | None = None  # name or TOML file of a LiDAR, "random", or None for the usual one of the mount
+    layout: Layout = "kitti"  # "kitti" or "log2sim"
+    duration_s: float = 5.0  # of each log; a scene in KITTI's layout is one frame
+    light: str | None = None  # as in scene files; None draws them for each scene
+    weather: str | None = None  # as in scene files; None draws them for each scene
+    pictures: bool = True  # whether logs have a camera
 
 
 def write_traffic(
@@ -456,10 +419,8 @@ def write_traffic(
 ) -> None:
     """Write random scenes below a folder, whole or not at all; the same settings write the same bytes.
 
-    Raises
-    ------
-    ConfigError
-        For an unknown sensor, KITTI's layout without pictures, or when the folder may not be replaced or cannot be written.
+    Raises `ConfigError` for an unknown sensor, KITTI's layout without pictures, or when the folder may not be replaced
+    or cannot be written.
     """
     if settings.layout == "kitti" and not settings.pictures:
         raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")

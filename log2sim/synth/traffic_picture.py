@@ -60,26 +60,17 @@ PEOPLE = ("pedestrian", "cyclist", "motorcycle")
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """Appearance of an object, by part.
-
-    Attributes
-    ----------
-    size_m : (float, float, float)
-    material : (K,) int64
-    color : (K, 3) float32
-    gloss : (K,) float32
-    trousers, skin, hair : (3,) float32
-    """
+    """Appearance of an object, by part."""
 
     category: str
     kind: str
     size_m: tuple[float, float, float]
-    material: NDArray[np.int64]
-    color: NDArray[np.float32]
-    gloss: NDArray[np.float32]
-    trousers: NDArray[np.float32]
-    skin: NDArray[np.float32]
-    hair: NDArray[np.float32]
+    material: NDArray[np.int64]  # (K,)
+    color: NDArray[np.float32]  # (K, 3)
+    gloss: NDArray[np.float32]  # (K,)
+    trousers: NDArray[np.float32]  # (3,)
+    skin: NDArray[np.float32]  # (3,)
+    hair: NDArray[np.float32]  # (3,)
 
     def painter(self) -> Painter:
         """Return the function that colors points of it."""
@@ -192,28 +183,18 @@ GRAIN_SEED = 0  # one grain for all scenes, because it takes long to make
 
 @dataclass(frozen=True, eq=False)
 class TrafficBackdrop:
-    """The ground of a random scene.
-
-    Attributes
-    ----------
-    buildings, shadows : tuple
-        None; houses are bodies.
-    """
+    """The ground of a random scene."""
 
     ground: Ground
     terrain: Terrain | None
-    buildings: tuple[tuple[Wall, ...], ...] = ()
-    shadows: tuple[Array, ...] = ()
+    buildings: tuple[tuple[Wall, ...], ...] = ()  # none; houses are bodies
+    shadows: tuple[Array, ...] = ()  # none; houses are bodies
 
 
 class TrafficPainter:
     """Makes the pictures' content of one random scene; shapes and colors are made once.
 
-    Parameters
-    ----------
-    scene : TrafficScene
-    seed : int
-        Of colors.
+    `seed`: of colors.
     """
 
     def __init__(self, scene: TrafficScene, seed: int) -> None:

@@ -127,8 +127,6 @@ Interval = tuple[float, float]
 def map_features_of(scene: Scene) -> MapFeatures:
     """Say what is painted on the ground of a scene, where its roads end, and which lanes they have.
 
-    Notes
-    -----
     A line is cut where another road, a crosswalk or a stretch without markings interrupts it; a piece goes from where its
     paint begins to where it ends. Worn lines are whole, removed ones are left out. A lane lies between the lines that are
     painted, else between the ends of its road; it is cut where another road crosses it.
@@ -225,23 +223,14 @@ def _crosswalk(zebra: Zebra, k: int) -> Marking:
 
 @dataclass(frozen=True, eq=False)
 class _Lanes:
-    """The lanes of a road from its right to its left, as its line runs.
-
-    Attributes
-    ----------
-    first_forward, last_forward : int
-        Which lanes lead along the line.
-    at_m : (L + 1,) float64
-        How far to the left of the road's line their boundaries lie.
-    sides : tuple of lists
-        Markings, or borders, of each boundary for the lane at its right and the one at its left.
-    """
+    """The lanes of a road from its right to its left, as its line runs."""
 
     road: Road
     number: int
-    first_forward: int
-    last_forward: int
-    at_m: Array
+    first_forward: int  # which lanes lead along the line
+    last_forward: int  # which lanes lead along the line
+    at_m: Array  # (L + 1,): how far to the left of the road's line their boundaries lie
+    # Markings, or borders, of each boundary for the lane at its right and the one at its left
     sides: tuple[tuple[list[Marking] | list[RoadBorder], list[Marking] | list[RoadBorder]], ...]
 
     @classmethod
@@ -362,22 +351,12 @@ MIN_LABEL_PX = 8.0  # a smaller box is no label
 
 @dataclass(frozen=True, eq=False)
 class FrameVisibility:
-    """Visibility of the actors in one camera frame.
-
-    Attributes
-    ----------
-    unoccluded : (A,) float64
-        Share of the silhouette that is visible.
-    inside : (A,) float64
-        Share of the projected box inside the image.
-    box_px : (A, 4) float64, px
-        Box of the visible part; NaN without one.
-    """
+    """Visibility of the actors in one camera frame."""
 
     t_ns: int
-    unoccluded: Array
-    inside: Array
-    box_px: Array
+    unoccluded: Array  # (A,): share of the silhouette that is visible
+    inside: Array  # (A,): share of the projected box inside the image
+    box_px: Array  # (A, 4), px: box of the visible part; NaN without one
 
 
 def visibility_by_camera(
@@ -416,18 +395,10 @@ def _box_inside(camera: Camera, cam_T_map: Array, actor: Actor, t_s: float) -> f
 
 @dataclass(frozen=True, eq=False)
 class LidarVisibility:
-    """Points of one LiDAR on the actors.
+    """Points of one LiDAR on the actors."""
 
-    Attributes
-    ----------
-    t_ns : (F,) int64
-        Middles of the sweeps.
-    points : (F, A) int
-        Points on each actor.
-    """
-
-    t_ns: NDArray[np.int64]
-    points: NDArray[np.intp]
+    t_ns: NDArray[np.int64]  # (F,): middles of the sweeps
+    points: NDArray[np.intp]  # (F, A): points on each actor
 
 
 def visible_at(

@@ -15,10 +15,11 @@ from log2sim.evaluation.bench.settings import ErrorSums, error_of
 from log2sim.evaluation.metrics.comparison import StateTable, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
-from log2sim.perception.first_pass import Observations, base_pose
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.homography.estimate import MAX_RANGE_M
 from log2sim.perception.homography_stage import CameraHomography, place_by_homography
+from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import Schedule
 
 CUTOFF_M = 2.0
@@ -228,7 +229,7 @@ def true_positions(
         for k in np.flatnonzero(known):
             m = observations.measurements[ticks[k]]
             rows = np.flatnonzero(m.camera == camera)
-            if len(rows) and len(table.ids):
+            if len(rows) and len(table.agents):
                 boxes = _boxes_in_image(log, camera, table, int(k), inverse(map_T_cam[k]))
                 pairs = _matched_agents(m.take(rows), table, boxes)
                 later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
@@ -247,10 +248,11 @@ def lidar_positions(observations: Observations, tick_s: float) -> list[KnownPosi
 
 def _boxes_in_image(log: Log, camera: str, table: StateTable, k: int, cam_T_map: Array) -> Array:
     """Project the truth agents that count at a frame: boxes (A, 4), px, NaN for the others."""
-    boxes = np.full((len(table.ids), 4), np.nan)
+    boxes = np.full((len(table.agents), 4), np.nan)
     rows = np.flatnonzero(table.present[:, k] & table.visible[:, k])
-    center = np.column_stack([table.xy_m[rows, k], table.z_m[rows, k]])
-    projected = project_boxes(center, table.size_m[rows], table.yaw_rad[rows, k], log.cameras[camera], cam_T_map)
+    projected = project_boxes(
+        table.center_m[rows, k], table.size_m[rows], table.yaw_rad[rows, k], log.cameras[camera], cam_T_map
+    )
     boxes[rows] = projected.box_px
     return boxes
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, Agent, IgnoreRegions, LabelView, Scenario
+from log2sim.datatypes import Agent, AgentTable, IgnoreRegions, LabelView, Scenario
 from log2sim.evaluation.metrics.truth import MIN_POINTS, image_samples
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index
 
@@ -228,18 +228,11 @@ TRUTH_MARGIN_S = 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class StateTable:
-    """States of A agents at T ticks; NaN where an agent is absent.
+class StateTable(AgentTable):
+    """Agents at T ticks with what makes them count.
 
     Attributes
     ----------
-    category, group : (A,) str
-    size_m : (A, 3) float64, m
-    xy_m : (A, T, 2) float64, m
-        Box centers, the scenario's map frame.
-    z_m : (A, T) float64, m
-    yaw_rad : (A, T) float64
-    speed_mps : (A, T) float64, m/s
     range_m : (A, T) float64, m
         From the ego's center; infinite without an ego.
     visible : (A, T) bool
@@ -250,23 +243,10 @@ class StateTable:
         LiDAR points in the truth's box; NaN where they were not counted.
     """
 
-    ids: tuple[str, ...]
-    category: NDArray[np.str_]
-    group: NDArray[np.str_]
-    size_m: Array
-    xy_m: Array
-    z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
     range_m: Array
     visible: Mask
     labeled: Mask
     lidar_points: Array
-
-    @property
-    def present(self) -> Mask:
-        """Mark (A, T) the ticks at which each agent is present."""
-        return np.isfinite(self.xy_m[..., 0])
 
 
 def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
@@ -316,15 +296,8 @@ def _thinned(t_s: Array, wanted_s: Array) -> Array:
 
 def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:
     """Sample reconstructed agents at the ticks (T,); `ego_xy` (T, 2), m, or None."""
-    sampled = [a.at(ticks_s) for a in agents]
-    xy = _stack([np.stack([s.x_m, s.y_m], -1) for s in sampled], (len(ticks_s), 2))
-    yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
-    speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
-    z = _stack([s.z_m for s in sampled], (len(ticks_s),))
-    there, unknown = np.isfinite(yaw), np.full(yaw.shape, np.nan)
-    return _table(
-        agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=there, labeled=there, lidar_points=unknown
-    )
+    table = AgentTable.of(agents, ticks_s)
+    return _with_range(table, ego_xy, table.present, table.present, np.full(table.yaw_rad.shape, np.nan))
 
 
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
@@ -335,15 +308,22 @@ def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_
     `visible` is that of the nearest waypoint. In gaps longer than 0.25 s and outside the trajectory it is False: there an
     interpolated or extrapolated box only prevents a reconstructed agent from counting as false.
     """
-    columns = [_sample_truth(a, ticks_s) for a in agents]
-    xy = _stack([c[0] for c in columns], (len(ticks_s), 2)) + shift_m[:2]
-    z = _stack([c[1] for c in columns], (len(ticks_s),)) + shift_m[2]
-    yaw = _stack([c[2] for c in columns], (len(ticks_s),))
-    speed = _stack([c[3] for c in columns], (len(ticks_s),))
-    visible, labeled = (_stack([c[k].astype(np.float64) for c in columns], (len(ticks_s),)) > 0 for k in (4, 5))
-    points = _stack([c[6] for c in columns], (len(ticks_s),))
-    seen = {"visible": visible & labeled, "labeled": labeled, "lidar_points": points}
-    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, **seen)
+    table = AgentTable.of(agents, ticks_s, margin_s=TRUTH_MARGIN_S)
+    visible, labeled = np.ones(table.present.shape, dtype=bool), np.zeros(table.present.shape, dtype=bool)
+    points = np.full(table.present.shape, np.nan)
+    for k, agent in enumerate(agents):
+        w, nearest = agent.waypoints, nearest_index(agent.waypoints.t_s, ticks_s)
+        if w.visible is not None:
+            visible[k] = w.visible[nearest]
+        if w.lidar_points is not None:
+            near = (np.abs(w.t_s[nearest] - ticks_s) <= MAX_TRUTH_GAP_S) & table.present[k]
+            points[k] = np.where(near, w.lidar_points[nearest], np.nan)
+        # Simplified, a static agent has its first and last waypoint only, and one in straight motion a few.
+        simplified = bool(agent.quality.get("waypoints_left_out"))
+        max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
+        labeled[k] = agent.at(ticks_s, max_gap_s=float(max_gap_s)).valid
+    moved = replace(table, center_m=table.center_m + shift_m)
+    return _with_range(moved, ego_xy, visible & labeled, labeled, points)
 
 
 def ego_states(
@@ -356,48 +336,19 @@ def ego_states(
     true = truth_states((truth.ego,), truth_ticks_s, shift_m, None)
     if ours is None:
         return true
-    xy_m = np.where(true.present[..., None], true.xy_m, ours.xy_m)
-    return replace(true, xy_m=xy_m, yaw_rad=np.where(true.present, true.yaw_rad, ours.yaw_rad))
+    center_m = np.where(true.present[..., None], true.center_m, ours.center_m)
+    return replace(true, center_m=center_m, yaw_rad=np.where(true.present, true.yaw_rad, ours.yaw_rad))
 
 
-def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask, Mask, Array]:
-    w = agent.waypoints
-    s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
-    outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
-    step = s.speed_mps * outside
-    xy = np.stack([s.x_m + step * np.cos(s.yaw_rad), s.y_m + step * np.sin(s.yaw_rad)], -1)
-    present = np.abs(outside) <= TRUTH_MARGIN_S
-    nearest = nearest_index(w.t_s, t)
-    visible = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest]
-    points = np.full(len(t), np.nan) if w.lidar_points is None else w.lidar_points[nearest]
-    points = np.where(np.abs(w.t_s[nearest] - t) <= MAX_TRUTH_GAP_S, points, np.nan)
-    # Simplified, a static agent has its first and last waypoint only, and one in straight motion a few.
-    simplified = bool(agent.quality.get("waypoints_left_out"))
-    max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
-    labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
-    nan = np.where(present, 0.0, np.nan)
-    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible, labeled, points + nan
-
-
-def _table(agents: tuple[Agent, ...], ego_xy: Array | None, **columns: Any) -> StateTable:
-    """Complete the sampled columns with what is constant for each agent, and with the distance from the ego."""
-    category = np.array([a.category for a in agents], dtype="<U16")
-    if ego_xy is None:
-        range_m = np.where(np.isfinite(columns["yaw_rad"]), np.inf, np.nan)
-    else:
-        range_m = np.hypot(*np.moveaxis(columns["xy_m"] - ego_xy, -1, 0))
-    return StateTable(
-        ids=tuple(a.id for a in agents),
-        category=category,
-        group=np.array([GROUP_OF.get(c, "other") for c in category], dtype="<U16"),
-        size_m=np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3),
-        range_m=range_m,
-        **columns,
+def _with_range(
+    table: AgentTable, ego_xy: Array | None, visible: Mask, labeled: Mask, lidar_points: Array
+) -> StateTable:
+    away_m = (
+        np.full(table.present.shape, np.inf) if ego_xy is None else np.hypot(*np.moveaxis(table.xy_m - ego_xy, -1, 0))
     )
-
-
-def _stack(rows: list[Array], shape: tuple[int, ...]) -> Array:
-    return np.stack(rows) if rows else np.zeros((0, *shape))
+    range_m = np.where(table.present, away_m, np.nan)
+    columns = table.agents, table.t_s, table.center_m, table.yaw_rad, table.speed_mps
+    return StateTable(*columns, range_m, visible, labeled, lidar_points)
 
 
 MIN_REGION_SHARE = 0.5
@@ -422,14 +373,13 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
     A camera shows a box in an ignore region when at least half of the visible outline lies in the union of the regions of
     the nearest frame. One camera that shows it in a labeled part suffices to keep it.
     """
-    center_m = np.concatenate([agents.xy_m, agents.z_m[..., None]], axis=-1)
     labeled, hidden = np.zeros_like(candidates), np.zeros_like(candidates)
     for view in ignore_regions.views:
         frame, near, map_T_cam = _frames_at(view, t_s)
         for k in np.flatnonzero(candidates.any(0) & near):
             rows = np.flatnonzero(candidates[:, k])
             regions = view.region_px[view.region_frame == frame[k]]
-            boxes = center_m[rows, k], agents.size_m[rows], agents.yaw_rad[rows, k]
+            boxes = agents.center_m[rows, k], agents.size_m[rows], agents.yaw_rad[rows, k]
             for row, uv in zip(rows, image_samples(view.camera, inverse(map_T_cam[k]), *boxes)):
                 if len(uv):
                     share = _inside_any(uv, regions).mean()
@@ -560,7 +510,7 @@ def compare(
     """
     same_group = truth.group[:, None] == other.group[None]
     pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
-    found = associate(pairs, len(truth.ids), len(other.ids), truth.range_m.shape[1])
+    found = associate(pairs, len(truth.agents), len(other.agents), truth.range_m.shape[1])
     in_sight = counted = selection.covers(truth) & truth.visible
     # Half a tick of tolerance, since stamps jitter.
     enough = counted.sum(1) * tick_s >= MIN_COUNTED_S - tick_s / 2 if tick_s else np.zeros(len(counted), dtype=bool)
@@ -616,7 +566,7 @@ def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s:
     """
     if regions is None:
         return c
-    in_truth_map = replace(c.other, xy_m=c.other.xy_m - shift_m[:2], z_m=c.other.z_m - shift_m[2])
+    in_truth_map = replace(c.other, center_m=c.other.center_m - shift_m)
     never = c.false & np.isin(c.other.category, regions.categories)[:, None]
     ignored = never | ignored_ticks(regions, truth_ticks_s, in_truth_map, c.false & ~never)
     return replace(c, false=c.false & ~ignored, ignored=ignored)

@@ -287,12 +287,12 @@ def _agent_rows(j: JudgedAgents, truth: StateTable) -> list[dict[str, Any]]:
         there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
         rows.append(
             {
-                "id": j.states.ids[k],
+                "id": j.states.agents[k].id,
                 "category": str(j.states.category[k]),
                 "ticks": int(ticks.sum()),
                 "wrong_ticks": int((j.wrong[k] & ticks).sum()),
                 **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
-                "taken_for": {truth.ids[i] if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
+                "taken_for": {truth.agents[i].id if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
                 "confidence": float(j.confidence[k]),
                 "doubted": bool(j.reasons[k]),
                 "doubts": list(j.reasons[k]),

@@ -144,7 +144,7 @@ def agent_rows(c: Comparison) -> list[dict[str, Any]]:
     """Make one row per counted truth agent: its matches and errors; size errors are signed."""
     truth, other, counted, switched = c.truth, c.other, c.counted, c.switched
     errors = state_errors(truth, other, c.match, counted)
-    rows, rows_of = [], np.broadcast_to(np.arange(len(truth.ids))[:, None], counted.shape)
+    rows, rows_of = [], np.broadcast_to(np.arange(len(truth.agents))[:, None], counted.shape)
     for i in np.flatnonzero(counted.any(1)):
         mine, covered = errors.take(errors.truth == i), coverage(c, rows_of == i)
         ids, ticks = np.unique(mine.other, return_counts=True)
@@ -152,12 +152,12 @@ def agent_rows(c: Comparison) -> list[dict[str, Any]]:
         headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
         rows.append(
             {
-                "id": truth.ids[i],
+                "id": truth.agents[i].id,
                 "category": str(truth.category[i]),
                 "ticks": int(counted[i].sum()),
                 "matched": len(mine.other),
                 **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
-                "matched_ids": {other.ids[j]: int(n) for j, n in zip(ids, ticks)},
+                "matched_ids": {other.agents[j].id: int(n) for j, n in zip(ids, ticks)},
                 "id_switches": int(switched[i].sum()),
                 "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
                 "position_rmse_m": root_mean_square(mine.position_m),
@@ -175,7 +175,7 @@ def false_rows(other: StateTable, false: Mask, hit: Mask) -> list[dict[str, Any]
     """Make one row per reconstructed agent that is false at some tick."""
     return [
         {
-            "id": other.ids[j],
+            "id": other.agents[j].id,
             "category": str(other.category[j]),
             "false_ticks": int(false[j].sum()),
             "matched_ticks": int(hit[j].sum()),
@@ -190,7 +190,7 @@ def ignored_rows(other: StateTable, ignored: Mask) -> list[dict[str, Any]]:
     """Make one row per reconstructed agent that is ignored at some tick."""
     return [
         {
-            "id": other.ids[j],
+            "id": other.agents[j].id,
             "category": str(other.category[j]),
             "ignored_ticks": int(ignored[j].sum()),
             "ticks": int(other.present[j].sum()),
@@ -487,10 +487,10 @@ def _matched(c: Comparison, scenario: Scenario) -> dict[str, Agent]:
     """Return the agent that each truth agent is matched with most often, by its id."""
     agents = {agent.id: agent for agent in scenario.others}
     out = {}
-    for row, name in enumerate(c.truth.ids):
+    for row, agent in enumerate(c.truth.agents):
         hits = c.match[row][c.counted[row] & (c.match[row] >= 0)]
         if len(hits):
-            out[name] = agents[c.other.ids[int(np.bincount(hits).argmax())]]
+            out[agent.id] = agents[c.other.agents[int(np.bincount(hits).argmax())].id]
     return out
 
 

@@ -46,20 +46,11 @@ EGO_VEHICLE = EgoVehicle(size_m=(4.77, 1.82, 1.52), rear_axle_offset_m=1.25)
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Calibration of one drive.
+    """Calibration of one drive."""
 
-    Attributes
-    ----------
-    ego_T_velo : (4, 4) float64
-    ego_T_rect : (4, 4) float64
-        Pose of the rectified camera 0.
-    projections : mapping of int to (3, 4) float64
-        P by number of camera.
-    """
-
-    ego_T_velo: Array
-    ego_T_rect: Array
-    projections: Mapping[int, Array]
+    ego_T_velo: Array  # (4, 4)
+    ego_T_rect: Array  # (4, 4): pose of the rectified camera 0
+    projections: Mapping[int, Array]  # mapping of int to (3, 4) float64: P by number of camera
 
     def camera(self, number: int, width_px: int, height_px: int) -> Camera:
         """Camera `number` of the rectified images, called "image_0N"."""
@@ -90,10 +81,7 @@ def read_text(path: Path) -> str:
 def read_calibration(path: Path) -> dict[str, Array]:
     """Numbers by key of a KITTI calibration file; none for lines that hold words.
 
-    Raises
-    ------
-    LogError
-        For a key that occurs twice, and for one that nothing follows, as where a file is cut.
+    Raises `LogError` for a key that occurs twice, and for one that nothing follows, as where a file is cut.
     """
     values: dict[str, Array] = {}
     for line in filter(None, map(str.strip, read_text(path).splitlines())):
@@ -145,8 +133,6 @@ def checked_projection(P: Array, where: str) -> Array:
 def poses_from_oxts(rows: Array) -> tuple[Array, MapFrame]:
     """Ego poses (N, 4, 4) and the map frame of oxts records (N, >= 6): lat, lon, alt, roll, pitch, yaw.
 
-    Notes
-    -----
     Mercator on a sphere of 6378137 m scaled by the cosine of the first latitude, as in the KITTI development kit (Geiger et
     al., 2013), so that lengths near the first record are true. The origin is the first fix, put on the road.
     """
@@ -199,8 +185,6 @@ def sweep_stream(
 def spin_offset_ns(xyz_m: NDArray[np.floating], begin_ns: int, end_ns: int) -> NDArray[np.int64]:
     """Time (N,) ns of points (N, 3) in the velo frame, relative to the moment at which the scanner faces forward.
 
-    Notes
-    -----
     The scanner turns clockwise seen from above. On drive 2011_09_26_0005, aligned sweeps 0.6 and 1.5 s apart agree to 5.1 cm
     (point to plane, RMS) with this, to 5.7 cm without stamps, to 6.0 cm with the other sense.
     """
@@ -234,41 +218,22 @@ CAMERA = "image_02"
 
 @dataclass(frozen=True, eq=False)
 class DriveLabels:
-    """Contents of a label file; empty without one.
-
-    Attributes
-    ----------
-    boxes_2d : mapping of str to ImageLabels
-        By camera.
-    ignored : mapping of str to ImageRegions
-        By camera.
-    text : str
-        The file, for the log's digest.
-    """
+    """Contents of a label file; empty without one."""
 
     boxes_3d: Labels | None = None
-    boxes_2d: Mapping[str, ImageLabels] = field(default_factory=dict)
-    ignored: Mapping[str, ImageRegions] = field(default_factory=dict)
-    text: str = ""
+    boxes_2d: Mapping[str, ImageLabels] = field(default_factory=dict)  # by camera
+    ignored: Mapping[str, ImageRegions] = field(default_factory=dict)  # by camera
+    text: str = ""  # the file, for the log's digest
 
 
 @dataclass(frozen=True, eq=False)
 class LabelRows:
-    """Lines of a label file.
+    """Lines of a label file."""
 
-    Attributes
-    ----------
-    frame : (L,) int64
-    track_id : (L,) str
-    type : (L,) str
-    values : (L, 14) float64
-        The numbers from truncation on.
-    """
-
-    frame: NDArray[np.int64]
-    track_id: NDArray[np.str_]
-    type: NDArray[np.str_]
-    values: Array
+    frame: NDArray[np.int64]  # (L,)
+    track_id: NDArray[np.str_]  # (L,)
+    type: NDArray[np.str_]  # (L,)
+    values: Array  # (L, 14): the numbers from truncation on
 
     def take(self, index: NDArray[np.bool_]) -> LabelRows:
         """Select the rows of a mask."""
@@ -284,8 +249,6 @@ def read_labels(
 ) -> DriveLabels:
     """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,), `notes` takes what was left out.
 
-    Notes
-    -----
     Only objects in view of camera 2 have labels. Regions of its images with objects too far, too occluded or too crowded to
     be labeled are marked by boxes of the type DontCare.
     """
@@ -305,16 +268,8 @@ def labels_of_rows(
 ) -> DriveLabels:
     """Place the rows of label files in the map; those of unlabeled regions become regions of the image.
 
-    Parameters
-    ----------
-    ego_T_rect : (4, 4) float64
-        Pose of the rectified camera 0.
-    track : PoseTrack
-        Poses of the ego.
-    stamp_of : callable
-        Gives the stamps (L,) of frame numbers (L,).
-    text : str
-        The files, for the log's digest.
+    `ego_T_rect` (4, 4) float64: pose of the rectified camera 0. `track`: poses of the ego. `stamp_of`: gives the stamps
+    (L,) of frame numbers (L,). `text`: the files, for the log's digest.
     """
     is_ignored = rows.type == NOT_LABELED
     ignored = rows.take(is_ignored)
@@ -346,17 +301,8 @@ def labels_of_rows(
 def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> LabelRows:
     """Parse the lines of a label file.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    damaged : list of str, optional
-        Takes a message for each line that is wrong, which is left out.
-
-    Raises
-    ------
-    LogError
-        Naming the first line that is wrong, without `damaged`.
+    `path`: for messages. `damaged`: takes a message for each line that is wrong, which is left out. Raises `LogError`
+    naming the first line that is wrong, without `damaged`.
     """
     frames, ids, types, values = [], [], [], []
     for k, line in enumerate(text.splitlines(), start=1):
@@ -400,12 +346,8 @@ def _parse_words(words: list[str]) -> tuple[int, list[float]]:
 def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
     """Box centers (L, 3), sizes (L, 3) and yaws (L,) in the map.
 
-    Parameters
-    ----------
-    map_T_rect : (L, 4, 4)
-        Pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
-    values : (L, 7)
-        Height, width, length, x, y, z of the bottom's center, rotation about the camera's y axis.
+    `map_T_rect` (L, 4, 4): pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
+    `values` (L, 7): height, width, length, x, y, z of the bottom's center, rotation about the camera's y axis.
     """
     height, width, length = values[:, 0], values[:, 1], values[:, 2]
     center = values[:, 3:6] - np.stack([np.zeros_like(height), height / 2, np.zeros_like(height)], axis=1)

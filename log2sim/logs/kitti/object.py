@@ -68,26 +68,13 @@ READER = KittiObjectReader()
 
 @dataclass(frozen=True, eq=False)
 class _Calibration:
-    """Calibration of one frame.
+    """Calibration of one frame."""
 
-    Attributes
-    ----------
-    ego_T_rect : (4, 4) float64
-        For an ego on the ground below the LiDAR of this frame.
-    rect_T_velo : (4, 4) float64
-    P : (3, 4) float64
-        From the rectified camera 0 to the image; may hold a rotation.
-    knows_ground : bool
-        Whether the height of the LiDAR is known from that of the IMU.
-    names_imu : bool
-        Whether the file has an entry for the IMU.
-    """
-
-    ego_T_rect: Array
-    rect_T_velo: Array
-    P: Array
-    knows_ground: bool
-    names_imu: bool
+    ego_T_rect: Array  # (4, 4): for an ego on the ground below the LiDAR of this frame
+    rect_T_velo: Array  # (4, 4)
+    P: Array  # (3, 4): from the rectified camera 0 to the image; may hold a rotation
+    knows_ground: bool  # whether the height of the LiDAR is known from that of the IMU
+    names_imu: bool  # whether the file has an entry for the IMU
 
     @classmethod
     def read(cls, path: Path) -> _Calibration:
@@ -124,8 +111,6 @@ class _Calibration:
 def intrinsics_and_rotation(M: Array) -> tuple[Array, Array]:
     """Split the left part (3, 3) of a projection, of positive determinant, into intrinsics and a rotation.
 
-    Notes
-    -----
     RQ decomposition (Hartley and Zisserman, "Multiple View Geometry", A4.1.1), by QR of the reversed rows.
     """
     q, r = np.linalg.qr(M[::-1].T)

@@ -57,21 +57,12 @@ _EXPECTED = {
 
 @dataclass(frozen=True, eq=False)
 class CsvTable:
-    """A CSV file with typed columns.
-
-    Attributes
-    ----------
-    columns : mapping of str to (N,) array
-    line : (N,) int64
-        Line of the file of each row, for messages.
-    sha256 : str
-        Of the file.
-    """
+    """A CSV file with typed columns."""
 
     path: Path
-    columns: Mapping[str, NDArray[Any]]
-    line: NDArray[np.int64]
-    sha256: str
+    columns: Mapping[str, NDArray[Any]]  # mapping of str to (N,) array
+    line: NDArray[np.int64]  # (N,): line of the file of each row, for messages
+    sha256: str  # of the file
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -99,17 +90,9 @@ def read_csv_table(
 ) -> CsvTable:
     """Read a CSV file with a header.
 
-    Parameters
-    ----------
-    columns, optional : mapping of name to "int", "float", "bool" or "str"
-        Columns that must and that may be there, in any order. An unknown one is an error.
-    damaged : list of str, optional
-        Takes a message for each row with fewer or more fields than the header, which is left out; else it is an error.
-
-    Raises
-    ------
-    LogError
-        Naming file, line and field.
+    `columns`, `optional`: columns that must and that may be there, in any order. An unknown one is an error. `damaged`:
+    takes a message for each row with fewer or more fields than the header, which is left out; else it is an error.
+    Raises `LogError` naming file, line and field.
     """
     kinds = {**columns, **(optional or {})}
     data = read_file(path, MAX_TABLE_BYTES, LogError)
@@ -298,24 +281,13 @@ def shifted_labels(labels: Labels, offset: Array) -> Labels:
 
 @dataclass(frozen=True, eq=False)
 class SweepFiles:
-    """Sweeps of one LiDAR.
-
-    Attributes
-    ----------
-    t_ns : (F,) int64
-        Absolute stamps.
-    frame : {"lidar", "map"}
-        Of the points.
-    offset : (3,) float64, m
-        What is taken off coordinates of the map.
-    compensated_ns : (F,) int64 or None
-        Stamps of compensation, as `log2sim.datatypes.Sweep` has them.
-    """
+    """Sweeps of one LiDAR."""
 
     files: list[Path]
-    t_ns: NDArray[np.int64]
-    frame: Literal["lidar", "map"]
-    offset: Array
+    t_ns: NDArray[np.int64]  # (F,): absolute stamps
+    frame: Literal["lidar", "map"]  # {"lidar", "map"}: of the points
+    offset: Array  # (3,), m: what is taken off coordinates of the map
+    # (F,) int64 or None: stamps of compensation, as `log2sim.datatypes.Sweep` has them
     compensated_ns: NDArray[np.int64] | None
 
     def read(self, i: int) -> Sweep:

@@ -44,14 +44,8 @@ Poses = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
 def sweep_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], poses: Poses) -> Stream:
     """Stream of .pcd.bin files.
 
-    Parameters
-    ----------
-    t_ns : (F,) int64
-        Ends of the turns.
-    files : list of Path
-        F files.
-    poses : callable
-        Returns the poses (N, 4, 4) of the LiDAR in the map at stamps (N,), and whether each is known.
+    `t_ns` (F,) int64: ends of the turns. `files`: F files. `poses`: returns the poses (N, 4, 4) of the LiDAR in the map
+    at stamps (N,), and whether each is known.
     """
 
     def read(i: int) -> Sweep:
@@ -63,10 +57,7 @@ def sweep_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], poses: P
 def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
     """Read a sweep in the frame of the sensor at `t_ns`; points nearer than 1 m, which are no returns, are left out.
 
-    Raises
-    ------
-    RecordError
-        When the file is missing or its size is not that of whole points.
+    Raises `RecordError` when the file is missing or its size is not that of whole points.
     """
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     points = len(data) // BYTES_PER_POINT
@@ -113,28 +104,14 @@ CHANNEL = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One sensor of a scene.
+    """One sensor of a scene."""
 
-    Attributes
-    ----------
-    name : str
-        Such as CAM_FRONT.
-    modality : str
-        "camera", "lidar" or "radar".
-    calibration : Record
-        Of calibrated_sensor.
-    ego_T_sensor : (4, 4) float64
-    records : list of Record
-        Of sample_data, key frames and sweeps, by their stamps, with files or without.
-    t_ns : (F,) int64
-    """
-
-    name: str
-    modality: str
-    calibration: Record
-    ego_T_sensor: Array
-    records: list[Record]
-    t_ns: NDArray[np.int64]
+    name: str  # such as CAM_FRONT
+    modality: str  # "camera", "lidar" or "radar"
+    calibration: Record  # of calibrated_sensor
+    ego_T_sensor: Array  # (4, 4)
+    records: list[Record]  # of sample_data, key frames and sweeps, by their stamps, with files or without
+    t_ns: NDArray[np.int64]  # (F,)
 
     def present(self, root: Path, where: Path) -> tuple[list[Record], NDArray[np.int64], list[Path]]:
         """Select the records whose files are there: records, stamps (F,) and files."""
@@ -145,19 +122,11 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The records of one scene.
-
-    Attributes
-    ----------
-    record : Record
-        Of scene.
-    notes : list of str
-        Takes what is wrong with the stamps.
-    """
+    """The records of one scene."""
 
     tables: Tables
-    record: Record
-    notes: list[str] = field(default_factory=list)
+    record: Record  # of scene
+    notes: list[str] = field(default_factory=list)  # takes what is wrong with the stamps
 
     @cached_property
     def samples(self) -> list[Record]:
@@ -312,22 +281,9 @@ class _Rows:
 def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: list[str]) -> Labels | None:
     """Read the annotations of a scene.
 
-    Parameters
-    ----------
-    lidar : Channel or None
-        In whose sweeps objects were labeled.
-    offset_m : (3,) float64
-        Taken off positions.
-    notes : list of str
-        Takes what was left out.
+    `lidar`: in whose sweeps objects were labeled. `offset_m` (3,) float64: taken off positions. `notes`: takes what was
+    left out. Returns None for a scene without annotations, as those of the test split are.
 
-    Returns
-    -------
-    Labels or None
-        None for a scene without annotations, as those of the test split are.
-
-    Notes
-    -----
     A box fits the points where they were measured, and the LiDAR scans different directions at different times of its
     turn. Of the one fast car with points at hand, the box ends 2 cm from points of 16 ms before the stamp, in which it
     drove 15 cm.

@@ -41,10 +41,7 @@ class Tables:
     def path(self, table: str) -> Path:
         """Return the file of a table.
 
-        Raises
-        ------
-        LogError
-            When it is a link that leaves the folders of the log.
+        Raises `LogError` when it is a link that leaves the folders of the log.
         """
         path = self.folder / f"{table}.json"
         require_link_inside(path, self.folder.parent)
@@ -85,10 +82,8 @@ def scan_records(path: Path, key: str, values: Collection[str], chunk_bytes: int
 
     Only these records are parsed. Memory is bounded by the chunk; line breaks and spaces are as they like.
 
-    Raises
-    ------
-    LogError
-        For a table that is missing or does not begin and end as a list, or a wanted record that is not valid JSON.
+    Raises `LogError` for a table that is missing or does not begin and end as a list, or a wanted record that is not
+    valid JSON.
     """
     wanted = frozenset(values)
     plain = frozenset(value.encode(errors="replace") for value in wanted)

@@ -223,18 +223,9 @@ def read_labels(
 ) -> Labels:
     """Labels of the cuboid files by number of sweep.
 
-    Parameters
-    ----------
-    files : mapping of the sweep's number to its cuboids
-    t_ns, gt_t_ns : (N,) int64
-        Stamps of the sweeps of the Pandar64 and of the PandarGT.
-    map_T_lidar : (N, 4, 4)
-        Poses of the Pandar64 at `t_ns`.
-    notes : list of str
-        Takes what was left out.
+    `t_ns`, `gt_t_ns` (N,) int64: stamps of the sweeps of the Pandar64 and of the PandarGT. `map_T_lidar` (N, 4, 4):
+    poses of the Pandar64 at `t_ns`. `notes`: takes what was left out.
 
-    Notes
-    -----
     A cuboid fits the points where they were measured, and the Pandar64 scans different directions at different times; on
     moving cars of sequence 002 the time by `compute_scan_offset_ns` is off that of the points inside the box by 0.5 +- 0.4 ms:
     the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object
@@ -559,8 +550,6 @@ def _intrinsics(folder: Path) -> Array:
 def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: Path, notes: list[str]) -> Array:
     """Mount `ego_T_cam` (4, 4) of a camera from its poses in the world: medians over its frames.
 
-    Notes
-    -----
     With the ego interpolated at the camera's own stamps, single frames of sequence 002 differ from it by 1 to 5 mm and
     0.006 to 0.027 degrees (RMS by camera); with the pose of the sweep of the same number it would be up to 96 mm.
     """

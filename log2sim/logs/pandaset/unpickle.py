@@ -30,26 +30,11 @@ MAX_TEXTS = 10_000_000
 def decode_text(kind: str, length: int, start: int, buffers: Sequence[bytes | bytearray | None]) -> NDArray[Any]:
     """Decode an array of text.
 
-    Parameters
-    ----------
-    kind : {"string", "large_string"}
-    length, start : int
-        Number of texts, and how many texts of the buffers come before them.
-    buffers : sequence of bytes or None
-        One bit a text that says whether it is there (None: all are), offsets, UTF-8 bytes.
+    `kind` {"string", "large_string"}. `length`, `start`: number of texts, and how many texts of the buffers come before
+    them. `buffers`: one bit a text that says whether it is there (None: all are), offsets, UTF-8 bytes. Returns (N,)
+    object: texts; NaN where there is none, as in the text columns of pandas. Raises `ValueError` when the buffers do
+    not hold what they should.
 
-    Returns
-    -------
-    (N,) object
-        Texts; NaN where there is none, as in the text columns of pandas.
-
-    Raises
-    ------
-    ValueError
-        When the buffers do not hold what they should.
-
-    Notes
-    -----
     Arrow columnar format, "variable-size binary layout"; bits are numbered from the least significant one.
     """
     if kind not in OFFSETS:
@@ -98,10 +83,8 @@ Columns = dict[str, NDArray[Any]]
 def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_bytes: int = MAX_TABLE_BYTES) -> Columns:
     """Read the columns (N,) of a DataFrame from a .pkl or .pkl.gz file.
 
-    Raises
-    ------
-    RecordError or `error`
-        When the file is missing, larger than `limit_bytes` once unpacked, no table, or names a class that tables do not need.
+    Raises `RecordError` or `error` when the file is missing, larger than `limit_bytes` once unpacked, no table, or
+    names a class that tables do not need.
     """
     packed = read_file(path, limit_bytes, error, missing="cannot be read: No such file or directory")
     try:

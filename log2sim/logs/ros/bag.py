@@ -29,29 +29,17 @@ _SPLIT = re.compile(r"^(?P<name>.*?)(?:_?\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)?_(?P<pa
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording, found by names alone.
-
-    Attributes
-    ----------
-    place : Path
-        Its file or folder.
-    files : tuple of Path
-        In the order of the parts.
-    settings : tuple of Path
-        Where a TOML file for it may lie; the first that exists counts.
-    """
+    """One recording, found by names alone."""
 
     name: str
-    place: Path
-    files: tuple[Path, ...]
-    settings: tuple[Path, ...]
+    place: Path  # its file or folder
+    files: tuple[Path, ...]  # in the order of the parts
+    settings: tuple[Path, ...]  # where a TOML file for it may lie; the first that exists counts
 
 
 def find_recordings(path: Path) -> dict[str, Recording]:
     """Find the recordings at a file or folder by name; none where there are none.
 
-    Notes
-    -----
     A folder with metadata.yaml is one recording. Bags of one name that are numbered from 0 are parts of one recording; other
     bags of a folder are recordings of their own.
     """
@@ -174,27 +162,15 @@ NAME_BYTES = 272
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """Messages of one topic; M is their number, i counts them in the order of recording.
+    """Messages of one topic; M is their number, i counts them in the order of recording."""
 
-    Attributes
-    ----------
-    name, msgtype, encoding, definition : str
-        As in `containers.Channel`.
-    file : (M,) int
-        Index of the file of each message.
-    entry : (M,) int
-        Its number there.
-    recorded_ns : (M,) int64
-        When the recorder received it.
-    """
-
-    name: str
-    msgtype: str
-    encoding: str
-    definition: str
-    file: NDArray[np.intp]
-    entry: NDArray[np.intp]
-    recorded_ns: NDArray[np.int64]
+    name: str  # as in `containers.Channel`
+    msgtype: str  # as in `containers.Channel`
+    encoding: str  # as in `containers.Channel`
+    definition: str  # as in `containers.Channel`
+    file: NDArray[np.intp]  # (M,): index of the file of each message
+    entry: NDArray[np.intp]  # (M,): its number there
+    recorded_ns: NDArray[np.int64]  # (M,): when the recorder received it
 
     def __len__(self) -> int:
         """Return the number of messages."""
@@ -204,15 +180,8 @@ class Topic:
 class Bag:
     """The files of a recording.
 
-    Attributes
-    ----------
-    place : Path
-        File or folder of the recording, for errors.
-    topics : dict of str to Topic
-        Sorted by name.
-    notes : list of str
-    digest : str
-        SHA-256 over names, sizes and indexes of the files.
+    `place`: file or folder of the recording, for errors. `topics`: sorted by name. `digest`: SHA-256 over names, sizes
+    and indexes of the files.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -249,15 +218,8 @@ class Bag:
     def collect(self, wanted: Mapping[str, int | None]) -> dict[str, list[bytes | None]]:
         """Read all messages of some topics, or their first bytes, in one pass through the files.
 
-        Parameters
-        ----------
-        wanted : mapping of str to int or None
-            Topics with the number of bytes; None for whole messages of up to `MAX_INDEX_BYTES`.
-
-        Returns
-        -------
-        dict of str to list of bytes or None
-            By topic, in the order of recording; None for a damaged message, and for those beyond `MAX_COLLECTED_BYTES`.
+        `wanted`: topics with the number of bytes; None for whole messages of up to `MAX_INDEX_BYTES`. Returns by topic,
+        in the order of recording; None for a damaged message, and for those beyond `MAX_COLLECTED_BYTES`.
         """
         topics = [self.topics[name] for name in wanted]
         found: dict[str, list[bytes | None]] = {t.name: [None] * len(t) for t in topics}

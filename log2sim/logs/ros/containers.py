@@ -29,47 +29,23 @@ MAX_MESSAGES = 20_000_000
 
 @dataclass(frozen=True)
 class Channel:
-    """Messages of one topic and type in one file.
-
-    Attributes
-    ----------
-    msgtype : str
-        Such as "sensor_msgs/msg/Image".
-    encoding : str
-        "ros1", "cdr", or another that is not decoded.
-    definition : str
-        Text of the message definition; empty where the file holds none.
-    compression : str
-        Of each message by itself: "" or "zstd".
-    """
+    """Messages of one topic and type in one file."""
 
     topic: str
-    msgtype: str
-    encoding: str
-    definition: str = ""
-    compression: str = ""
+    msgtype: str  # such as "sensor_msgs/msg/Image"
+    encoding: str  # "ros1", "cdr", or another that is not decoded
+    definition: str = ""  # text of the message definition; empty where the file holds none
+    compression: str = ""  # of each message by itself: "" or "zstd"
 
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """Index of the messages of a file, in the order in which they lie there; M is their number.
+    """Index of the messages of a file, in the order in which they lie there; M is their number."""
 
-    Attributes
-    ----------
-    channel : (M,) int32
-        Index into the channels.
-    t_ns : (M,) int64
-        When the recorder received the message.
-    chunk : (M,) int32
-        Index into the chunks; -1 for a message outside of chunks.
-    place : (M,) int64
-        Where it begins: a byte of its chunk or file, or a row of a database.
-    """
-
-    channel: NDArray[np.int32]
-    t_ns: NDArray[np.int64]
-    chunk: NDArray[np.int32]
-    place: NDArray[np.int64]
+    channel: NDArray[np.int32]  # (M,): index into the channels
+    t_ns: NDArray[np.int64]  # (M,): when the recorder received the message
+    chunk: NDArray[np.int32]  # (M,): index into the chunks; -1 for a message outside of chunks
+    place: NDArray[np.int64]  # (M,): where it begins: a byte of its chunk or file, or a row of a database
 
 
 class Container(Protocol):
@@ -287,12 +263,8 @@ class _PartialChunk:
 def decompress(data: bytes, method: str, size_bytes: int) -> bytes:
     """Decompress data that unpack to `size_bytes`, without allocating more.
 
-    Raises
-    ------
-    ValueError, OSError, RuntimeError, EOFError
-        For damaged data, and for data that unpack to another size.
-    MissingExtra
-        Where the library of the method is not installed.
+    Raises `ValueError`, `OSError`, `RuntimeError` or `EOFError` for damaged data, and for data that unpack to
+    another size; `MissingExtra` where the library of the method is not installed.
     """
     checked = min(size_bytes, MAX_CHUNK_BYTES)
     unpacked = data if method in ("", "none") else decompress_head(data, method, checked + 1)

@@ -43,10 +43,7 @@ class Edge:
 class FrameTree:
     """Frames by name; each has at most one parent, which is checked where a frame is used.
 
-    Parameters
-    ----------
-    where : str
-        Names the recording in errors.
+    `where`: names the recording in errors.
     """
 
     def __init__(self, where: str) -> None:
@@ -103,10 +100,7 @@ class FrameTree:
     def mount(self, dst: str, src: str) -> Array | None:
         """Compute dst_T_src (4, 4) of frames that do not move against each other; None when they do or are not connected.
 
-        Raises
-        ------
-        LogError
-            For a frame on the way that has two parents, and for a cycle.
+        Raises `LogError` for a frame on the way that has two parents, and for a cycle.
         """
         if dst == src:
             return np.eye(4)
@@ -214,20 +208,11 @@ MIN_ROAD_POINTS = 200
 
 @dataclass(frozen=True, eq=False)
 class EgoFrame:
-    """The vehicle's frame.
+    """The vehicle's frame."""
 
-    Attributes
-    ----------
-    base : str or None
-        Its name; None for a recording of roadside sensors.
-    base_T_ego : (4, 4) float64
-    ground_z_m : float or None
-        Height of the road in the ego frame; None where it has to be measured.
-    """
-
-    base: str | None
-    base_T_ego: Array
-    ground_z_m: float | None
+    base: str | None  # its name; None for a recording of roadside sensors
+    base_T_ego: Array  # (4, 4)
+    ground_z_m: float | None  # height of the road in the ego frame; None where it has to be measured
     vehicle: EgoVehicle
     notes: tuple[str, ...]
 
@@ -237,16 +222,8 @@ def choose_base(
 ) -> tuple[str | None, str]:
     """Choose the vehicle's frame, and say why.
 
-    Parameters
-    ----------
-    sensor_frames : list of str
-        Frames of the LiDARs, then of the cameras.
-    pose_frames : iterable of str
-        Frames whose poses odometry gives.
-    fixed_frames : tuple of str
-        Names of frames that do not move.
-    given : str
-        That of the settings; "" without one.
+    `sensor_frames`: frames of the LiDARs, then of the cameras. `pose_frames`: frames whose poses odometry gives.
+    `fixed_frames`: names of frames that do not move. `given`: that of the settings; "" without one.
     """
     if given:
         return given, "the settings name it"
@@ -304,10 +281,7 @@ def _known_ground_m(base: str, base_T_ego: Array, tree: FrameTree, given: set[st
 def measure_ground_m(sweep: Sweep, ego_T_lidar: Array) -> float:
     """Measure the height of the road in the ego frame: the most frequent one of points around and below the sensor.
 
-    Raises
-    ------
-    RecordError
-        When there are too few points there.
+    Raises `RecordError` when there are too few points there.
     """
     points = apply(ego_T_lidar, sweep.xyz_m)
     radius = np.hypot(points[:, 0] - ego_T_lidar[0, 3], points[:, 1] - ego_T_lidar[1, 3])

@@ -178,10 +178,7 @@ class TopicSettings(Section):
 def read_settings(places: Iterable[Path]) -> tuple[TopicSettings, Path | None]:
     """Read the first settings file that exists, and say which; defaults where there is none.
 
-    Raises
-    ------
-    ConfigError
-        For a file that is no TOML, an unknown key or a value out of its range; names file and key.
+    Raises `ConfigError` for a file that is no TOML, an unknown key or a value out of its range; names file and key.
     """
     path = next((p for p in places if is_present(p)), None)
     if path is None:
@@ -204,28 +201,16 @@ MIN_COVERED_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Stamped:
-    """Messages of a topic in the order of their stamps; F is their number.
+    """Messages of a topic in the order of their stamps; F is their number."""
 
-    Attributes
-    ----------
-    t_ns : (F,) int64
-        Strictly increasing.
-    row : (F,) int
-        Which message of the topic each is.
-    delay_s : float or None
-        Median from the header's stamp to the recorder's; None where the recorder's are used.
-    """
-
-    t_ns: NDArray[np.int64]
-    row: NDArray[np.intp]
-    delay_s: float | None
+    t_ns: NDArray[np.int64]  # (F,): strictly increasing
+    row: NDArray[np.intp]  # (F,): which message of the topic each is
+    delay_s: float | None  # median from the header's stamp to the recorder's; None where the recorder's are used
 
 
 def stamp_messages(topic: Topic, heads: Sequence[bytes | None], notes: list[str], *, recorded: bool = False) -> Stamped:
     """Take the stamps from the first bytes of the messages of a topic; None of them where a message is damaged.
 
-    Notes
-    -----
     A damaged message keeps its place: it gets the recorder's stamp less the usual delay, so that reading it is what fails.
     """
     t_ns, known = np.zeros(len(topic), dtype=np.int64), np.zeros(len(topic), dtype=bool)
@@ -289,8 +274,6 @@ ENCAPSULATION_BYTES = 4
 def sweep_from_livox(raw: bytes, encoding: str, t_ns: int, settings: LidarTopic, where: str) -> Sweep:
     """Build a sweep from the bytes of a CustomMsg; `RecordError`, beginning with `where`, when they are damaged.
 
-    Notes
-    -----
     The points are viewed as an array: decoded one by one, 20,000 of them would take longer than a sweep lasts.
     """
     order = "<" if encoding == "ros1" or raw[1:2] == b"\1" else ">"

@@ -48,30 +48,17 @@ class FoundPoses:
 
 @dataclass(frozen=True, eq=False)
 class PoseSources:
-    """What poses may come from.
-
-    Attributes
-    ----------
-    topics : mapping of str to list of str
-        Topics by kind.
-    messages : mapping of str to sequence of bytes or None
-        Their messages.
-    base : str
-        The vehicle's frame.
-    span_ns : (int, int)
-        First and last stamp of the sensors.
-    damaged : dict of str to int
-        Messages by topic that could not be read, of the topics that were tried.
-    """
+    """What poses may come from."""
 
     bag: Bag
-    topics: Mapping[str, Sequence[str]]
-    messages: Mapping[str, Sequence[bytes | None]]
+    topics: Mapping[str, Sequence[str]]  # topics by kind
+    messages: Mapping[str, Sequence[bytes | None]]  # their messages
     tree: FrameTree
-    base: str
+    base: str  # the vehicle's frame
     settings: PoseSettings
     map: MapSettings
-    span_ns: tuple[int, int]
+    span_ns: tuple[int, int]  # first and last stamp of the sensors
+    # Messages by topic that could not be read, of the topics that were tried
     damaged: dict[str, int] = field(default_factory=dict)
 
     def find(self) -> tuple[FoundPoses | None, list[dict[str, Any]]]:

@@ -44,19 +44,14 @@ MAX_SENSOR_TOPICS = 1000
 class Roles:
     """What topics are used for.
 
-    Attributes
-    ----------
-    cameras, lidars : dict of str to CameraTopic, LidarTopic
-        By the name of the sensor, with all topics filled in.
-    topics : dict of str to list of str
-        Topics by kind: "camera info", "odometry", "pose", "gnss", "imu", "tf".
-    reasons : dict of str to (str, str)
-        Role and reason by topic.
+    `cameras`, `lidars`: by the name of the sensor, with all topics filled in.
     """
 
     cameras: dict[str, CameraTopic] = field(default_factory=dict)
     lidars: dict[str, LidarTopic] = field(default_factory=dict)
+    # Topics by kind: "camera info", "odometry", "pose", "gnss", "imu", "tf"
     topics: dict[str, list[str]] = field(default_factory=dict)
+    # role and reason by topic
     reasons: dict[str, tuple[str, str]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -74,12 +69,8 @@ class Roles:
 def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
     """Decide what each topic is used for.
 
-    Raises
-    ------
-    ConfigError
-        When the settings name a topic that the recording does not have, or that is of another type.
-    LogError
-        For more than `MAX_SENSOR_TOPICS` that no settings choose from.
+    Raises `ConfigError` when the settings name a topic that the recording does not have, or that is of another type;
+    `LogError` for more than `MAX_SENSOR_TOPICS` that no settings choose from.
     """
     roles = Roles()
     usable: dict[str, list[Topic]] = {}

@@ -45,21 +45,11 @@ def camera_from_info(
 ) -> Camera:
     """Build a camera from a CameraInfo.
 
-    Parameters
-    ----------
-    info : sensor_msgs/CameraInfo
-    pose : (mount, (4, 4) float64)
-        Where the frame of the images is: mount_T_cam.
-    rectified : bool
-        Whether the images are rectified: then P is theirs, their axes are turned by R, and there is no distortion.
-    stereo : bool
-        Whether another camera has the same frame, as the second of a stereo pair has in ROS: then the last column of P holds
-        its position in it.
-
-    Raises
-    ------
-    CalibrationProblem
-        When the camera is not calibrated, or its lens model is none of those that `Camera` has.
+    `pose` (mount, (4, 4) float64): where the frame of the images is: mount_T_cam. `rectified`: whether the images are
+    rectified: then P is theirs, their axes are turned by R, and there is no distortion. `stereo`: whether another
+    camera has the same frame, as the second of a stereo pair has in ROS: then the last column of P holds its position
+    in it. Raises `CalibrationProblem` when the camera is not calibrated, or its lens model is none of those that
+    `Camera` has.
     """
     mount, mount_T_cam = pose
     model, distortion = "none", tuple[float, ...]()
@@ -153,10 +143,8 @@ ENCODINGS: dict[str, tuple[int, int, str]] = {
 def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """Convert a decoded Image to (H, W, 3) uint8 BGR; of 16 bits the upper 8 are kept.
 
-    Raises
-    ------
-    RecordError
-        For an unknown encoding, fewer bytes than width, height and step promise, or a size that is not that of the calibration.
+    Raises `RecordError` for an unknown encoding, fewer bytes than width, height and step promise, or a size that is not
+    that of the calibration.
     """
     import cv2
 
@@ -224,20 +212,8 @@ def find_time_field(names: list[str], chosen: str = "") -> str | None:
 def sweep_from(message: Any, t_ns: int, period_ns: float, settings: LidarTopic, where: str) -> Sweep:
     """Build a sweep from a decoded PointCloud2.
 
-    Parameters
-    ----------
-    message : sensor_msgs/PointCloud2
-    t_ns : int
-        Its stamp.
-    period_ns : float
-        Time between two sweeps, by which the unit of the times is recognized.
-    where : str
-        Names the message in errors.
-
-    Raises
-    ------
-    RecordError
-        When fields, sizes and data contradict each other.
+    `t_ns`: its stamp. `period_ns`: time between two sweeps, by which the unit of the times is recognized. `where`:
+    names the message in errors. Raises `RecordError` when fields, sizes and data contradict each other.
     """
     points = point_table(message, where)
     missing = [name for name in "xyz" if name not in (points.dtype.names or ())]
@@ -306,8 +282,6 @@ def _dtype(message: Any, step: int, where: str) -> np.dtype[Any]:
 def offsets_ns(values: NDArray[Any], t_ns: int, period_ns: float, settings: LidarTopic) -> NDArray[np.int64] | None:
     """Compute times (N,) ns of points relative to the stamp of their message; None where no unit makes sense of them.
 
-    Notes
-    -----
     Drivers give seconds, milliseconds, microseconds or nanoseconds under the same names, from the stamp or of a clock. The unit
     is the one in which the values span about the time between two sweeps. Values far from zero are of a clock: the stamps' own
     where it is near to them; otherwise the first of them is put at the stamp.

@@ -56,23 +56,13 @@ class Memory:
 
 
 class Field(NamedTuple):
-    """A field of a message.
-
-    Attributes
-    ----------
-    kind : int
-        VARINT, FIXED64, BYTES or FIXED32.
-    value : int
-        Of a varint, or the bits of a fixed one; 0 for bytes.
-    begin, end : int
-        Offsets of the value.
-    """
+    """A field of a message."""
 
     number: int
-    kind: int
-    value: int
-    begin: int
-    end: int
+    kind: int  # VARINT, FIXED64, BYTES or FIXED32
+    value: int  # of a varint, or the bits of a fixed one; 0 for bytes
+    begin: int  # offsets of the value
+    end: int  # offsets of the value
 
     def real(self) -> float:
         """Return the value of a field of 8 or 4 bytes as a floating-point number."""
@@ -86,10 +76,7 @@ class Field(NamedTuple):
 def fields(source: Source, begin: int, end: int) -> Iterator[Field]:
     """Walk the fields of the message in a span; values of type BYTES are skipped.
 
-    Raises
-    ------
-    WireError
-        When a field leaves the span or is of an unknown wire type, or there are more than `MAX_FIELDS`.
+    Raises `WireError` when a field leaves the span or is of an unknown wire type, or there are more than `MAX_FIELDS`.
     """
     count = 0
     while begin < end:
@@ -126,8 +113,6 @@ def fields_of(data: bytes) -> Iterator[Field]:
 def doubles_by_number(data: bytes) -> list[tuple[int, float]]:
     """Return number and value of each floating-point field of a message, in their order.
 
-    Notes
-    -----
     A message of nothing but doubles with numbers below 16, as boxes and transforms are, has a key of one byte every 9 bytes.
     Labels are nearly all such messages, and this reads them in a tenth of the time.
     """
@@ -190,21 +175,14 @@ Span = tuple[int, int]
 
 @dataclass(eq=False)
 class FrameIndex:
-    """Offsets and small fields of one Frame; offsets count from the start of the record's data.
-
-    Attributes
-    ----------
-    pose : (4, 4) float64 or None
-    images : dict of camera number to (ImageTimes, Span of the JPEG)
-    lasers : dict of LiDAR number to Span of its message
-        Only those with a range image.
-    """
+    """Offsets and small fields of one Frame; offsets count from the start of the record's data."""
 
     context: Span = (0, 0)
     stamp_us: int | None = None
-    pose: Array | None = None
+    pose: Array | None = None  # (4, 4) float64 or None
+    # Dict of camera number to (ImageTimes, Span of the JPEG)
     images: dict[int, tuple[ImageTimes, Span]] = field(default_factory=dict)
-    lasers: dict[int, Span] = field(default_factory=dict)
+    lasers: dict[int, Span] = field(default_factory=dict)  # only those with a range image
     labels: list[Span] = field(default_factory=list)
     camera_labels: list[Span] = field(default_factory=list)
     projected_labels: list[Span] = field(default_factory=list)
@@ -214,10 +192,7 @@ class FrameIndex:
 def read_index(window: RecordWindow) -> FrameIndex:
     """Read offsets and small fields of a Frame; neither images nor range images.
 
-    Raises
-    ------
-    WireError
-        When the record is no Frame.
+    Raises `WireError` when the record is no Frame.
     """
     index = FrameIndex()
     for f in fields(window, 0, window.size):
@@ -285,10 +260,7 @@ def read_calibration(
 ) -> tuple[dict[int, CameraCalibration], dict[int, LaserCalibration], dict[str, str]]:
     """Read cameras, LiDARs and statistics (time of day, location, weather) of a Context.
 
-    Raises
-    ------
-    WireError
-        For a calibration that is incomplete; names it.
+    Raises `WireError` for a calibration that is incomplete; names it.
     """
     cameras, lasers, stats = {}, {}, {}
     for f in fields_of(context):
@@ -336,10 +308,7 @@ def _laser(data: bytes) -> tuple[int, LaserCalibration]:
 def read_box(data: bytes, dimensions: int) -> tuple[str, int, list[float]] | None:
     """Read id, type and box (center, size as length, width[, height], heading) of a Label; None when it has no box.
 
-    Parameters
-    ----------
-    dimensions : int
-        3, or 2 for a box in an image.
+    `dimensions`: 3, or 2 for a box in an image.
     """
     found = _by_number(data)
     box = _submessage(data, found, 1)

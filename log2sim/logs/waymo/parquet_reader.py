@@ -75,10 +75,7 @@ def component_file(root: Path, component: str, segment: str) -> Path:
 def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
     """Read stamps in us and poses (4, 4) of the frames, and remarks on those that are none.
 
-    Raises
-    ------
-    LogError
-        When no row has both.
+    Raises `LogError` when no row has both.
     """
     columns = read_columns(path, {STAMP: "int", POSE: "floats"})
     found = [(int(t), matrix(cell)) for t, cell in zip(columns[STAMP], columns[POSE])]
@@ -193,41 +190,18 @@ def matrix(cell: Any) -> Any:
 
 @dataclass(frozen=True)
 class RecordColumns:
-    """Columns that are large and read row by row.
+    """Columns that are large and read row by row."""
 
-    Attributes
-    ----------
-    kinds : mapping of str to str
-        What each column holds, as for `log2sim.logs.arrow.read_columns`.
-    optional : collection of str
-        Names that may be absent.
-    """
-
-    kinds: Mapping[str, Kind]
-    optional: Collection[str] = ()
+    kinds: Mapping[str, Kind]  # what each column holds, as for `log2sim.logs.arrow.read_columns`
+    optional: Collection[str] = ()  # names that may be absent
 
 
 @dataclass(eq=False)
 class SensorRows:
     """A component with one row for each frame and sensor; without any where its file is absent.
 
-    Parameters
-    ----------
-    index : mapping of str to str
-        Columns to read at once, with the stamp and the sensor.
-    names : mapping of int to str
-        Sensors by number.
-    frame_of : mapping of int to int
-        Index of the frame of a stamp in us.
-
-    Attributes
-    ----------
-    rows : dict of (int, int) to int
-        Row of a frame by index and sensor by number.
-    columns : mapping of str to array
-        The columns of `index`.
-    note : str
-        What was left out; empty where nothing was.
+    `index`: columns to read at once, with the stamp and the sensor. `names`: sensors by number. `frame_of`: index of
+    the frame of a stamp in us.
     """
 
     path: Path
@@ -235,9 +209,10 @@ class SensorRows:
     names: Mapping[int, str]
     frame_of: Mapping[int, int]
     records: RecordColumns
+    # row of a frame by index and sensor by number
     rows: dict[tuple[int, int], int] = field(default_factory=dict)
-    columns: Columns = field(default_factory=dict)
-    note: str = ""
+    columns: Columns = field(default_factory=dict)  # the columns of `index`
+    note: str = ""  # what was left out; empty where nothing was
 
     def __post_init__(self) -> None:
         """Read the index."""

@@ -30,10 +30,7 @@ MAX_MATRIX_BYTES = 64 * 1024 * 1024
 def read_range_images(laser: bytes) -> RangeImages:
     """Decompress the range images of a Laser message of version 1.
 
-    Raises
-    ------
-    WireError
-        When they are damaged, too large or not of the layout (H, W, C).
+    Raises `WireError` when they are damaged, too large or not of the layout (H, W, C).
     """
     returns, poses = [], None
     for number, ranges, pixel_poses in sorted(range_image_parts(laser)):
@@ -90,20 +87,10 @@ def points_of(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Turn the range images of one LiDAR into points.
 
-    Parameters
-    ----------
-    world_T_vehicle : (4, 4) float64
-        Pose that defines the vehicle's frame.
+    `world_T_vehicle` (4, 4) float64: pose that defines the vehicle's frame. Returns `xyz_m` (N, 3) float32, m, lidar
+    frame: of all returns, in the lidar's frame as it was at `world_T_vehicle`; `turn` (N,) float64: share of the turn,
+    in [0, 1), at which the middle of each point's column was measured.
 
-    Returns
-    -------
-    xyz_m : (N, 3) float32, m, lidar frame
-        Of all returns, in the lidar's frame as it was at `world_T_vehicle`.
-    turn : (N,) float64
-        Share of the turn, in [0, 1), at which the middle of each point's column was measured.
-
-    Notes
-    -----
     After comments of RangeImage in dataset.proto: each pixel is taken to the world by the pose of the vehicle at its own time
     and back by `world_T_vehicle`. Range images without such poses are made of points in the vehicle's frame already.
     """
@@ -139,10 +126,7 @@ def _pixels_with_return(image: NDArray[np.float32]) -> tuple[NDArray[np.intp], N
 def row_inclinations(laser: LaserCalibration, height: int) -> Array:
     """Inclination (H,) rad of each row.
 
-    Raises
-    ------
-    WireError
-        When the number of beams is another than that of rows.
+    Raises `WireError` when the number of beams is another than that of rows.
     """
     beams = laser.inclinations_rad
     if not len(beams):
@@ -204,19 +188,9 @@ def labels_of(
 ) -> Labels:
     """Turn 3D boxes in the vehicle's frames into labels in the map.
 
-    Parameters
-    ----------
-    table : BoxTable
-        `frame` counts the frames in order.
-    map_T_vehicle : (F, 4, 4) float64
-        Poses that define the vehicle's frames.
-    top : LaserCalibration or None
-        None puts every label at the stamp of its frame's pose.
-    notes : list of str
-        Takes what was left out.
+    `table`: `frame` counts the frames in order. `map_T_vehicle` (F, 4, 4) float64: poses that define the vehicle's
+    frames. `top`: none puts every label at the stamp of its frame's pose. `notes`: takes what was left out.
 
-    Notes
-    -----
     A box fits the points where they were measured, and the TOP LiDAR scans different directions at different times: the box
     has the time of its direction. The data set states no times of boxes; where it derives boxes from them (`camera_synced_box`) it calls them boxes at the
     start of the frame. On its sample the camera's label of a cyclist at 8.5 m/s is 13 px from the box at this time, 24 px
@@ -260,14 +234,8 @@ def _road_users(table: BoxTable, notes: list[str]) -> tuple[BoxTable, NDArray[np
 def image_labels_of(table: BoxTable, stamps_ns: NDArray[np.int64], size_px: tuple[int, int]) -> ImageLabels:
     """Turn boxes of one camera's images into labels, cut at the border of the image.
 
-    Parameters
-    ----------
-    table : BoxTable
-        `frame` counts the frames in order.
-    stamps_ns : (F,) int64
-        Of the camera's image in each frame; negative where there is none.
-    size_px : (int, int)
-        Width and height.
+    `table`: `frame` counts the frames in order. `stamps_ns` (F,) int64: of the camera's image in each frame; negative
+    where there is none. `size_px` (int, int): width and height.
     """
     kind = np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
     box = np.concatenate([table.center - table.size / 2, table.center + table.size / 2], axis=1)
@@ -281,16 +249,10 @@ def image_labels_of(table: BoxTable, stamps_ns: NDArray[np.int64], size_px: tupl
 
 @dataclass(frozen=True, eq=False)
 class LabelsOnRequest(Mapping[str, ImageLabels]):
-    """Image labels by camera that are read when one camera's are first used.
-
-    Attributes
-    ----------
-    read : callable
-        Reads the labels of a camera.
-    """
+    """Image labels by camera that are read when one camera's are first used."""
 
     cameras: tuple[str, ...]
-    read: Callable[[str], ImageLabels]
+    read: Callable[[str], ImageLabels]  # reads the labels of a camera
     _found: dict[str, ImageLabels] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 

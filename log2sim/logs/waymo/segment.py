@@ -32,56 +32,31 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Calibration of a camera as the data set has it.
+    """Calibration of a camera as the data set has it."""
 
-    Attributes
-    ----------
-    intrinsic : (9,) float64
-        f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3.
-    vehicle_T_camera : (4, 4) float64
-        The camera's frame has x forward, y left, z up.
-    direction : int
-        RollingShutterReadOutDirection.
-    """
-
-    intrinsic: Array
-    vehicle_T_camera: Array
+    intrinsic: Array  # (9,): f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3
+    vehicle_T_camera: Array  # (4, 4): the camera's frame has x forward, y left, z up
     width_px: int
     height_px: int
-    direction: int
+    direction: int  # RollingShutterReadOutDirection
 
 
 @dataclass(frozen=True, eq=False)
 class LaserCalibration:
-    """Calibration of a LiDAR.
+    """Calibration of a LiDAR."""
 
-    Attributes
-    ----------
-    vehicle_T_lidar : (4, 4) float64
-    inclinations_rad : (n,) float64
-        Of the beams from the lowest to the highest; empty where they are spread evenly between the limits.
-    limits_rad : (2,) tuple of float
-        Lowest and highest inclination.
-    """
-
-    vehicle_T_lidar: Array
+    vehicle_T_lidar: Array  # (4, 4)
+    # (n,) float64: of the beams from the lowest to the highest; empty where they are spread evenly between the limits
     inclinations_rad: Array
-    limits_rad: tuple[float, float]
+    limits_rad: tuple[float, float]  # (2,) tuple of float: lowest and highest inclination
 
 
 @dataclass(frozen=True, eq=False)
 class ImageTimes:
-    """When an image was taken, and from where.
+    """When an image was taken, and from where."""
 
-    Attributes
-    ----------
-    world_T_vehicle : (4, 4) float64 or None
-        Pose of the vehicle at `pose_s`.
-    pose_s, shutter_s, trigger_s, readout_done_s : float, s
-        Unix times, and the duration of the exposure of one line; 0 where the data set has none.
-    """
-
-    world_T_vehicle: Array | None
+    world_T_vehicle: Array | None  # (4, 4) float64 or None: pose of the vehicle at `pose_s`
+    # Unix times, and the duration of the exposure of one line; 0 where the data set has none
     pose_s: float
     shutter_s: float
     trigger_s: float
@@ -95,8 +70,6 @@ class ImageTimes:
     def middle_ns(self) -> int | None:
         """Return the middle of the exposure of the middle line; None where the data set does not state it.
 
-        Notes
-        -----
         The first line is exposed from the trigger on, the last one until its readout at the end (comments of CameraImage in
         dataset.proto): half a shutter after the trigger and half a shutter before the end lie the middles of both.
         """
@@ -116,68 +89,36 @@ class ImageTimes:
 
 @dataclass(frozen=True, eq=False)
 class FrameRow:
-    """One frame: a turn of the TOP LiDAR with the images taken during it.
+    """One frame: a turn of the TOP LiDAR with the images taken during it."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Of the first column of the TOP LiDAR's turn.
-    world_T_vehicle : (4, 4) float64
-        Pose that defines the frame of points and labels, about the middle of the turn.
-    images : mapping of camera number to ImageTimes
-    lasers : tuple of int
-        Numbers of the LiDARs with points.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  # of the first column of the TOP LiDAR's turn
+    # (4, 4) float64: pose that defines the frame of points and labels, about the middle of the turn
     world_T_vehicle: Array
     images: Mapping[int, ImageTimes]
-    lasers: tuple[int, ...]
+    lasers: tuple[int, ...]  # numbers of the LiDARs with points
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImages:
-    """Range images of one LiDAR in one frame.
+    """Range images of one LiDAR in one frame."""
 
-    Attributes
-    ----------
-    returns : tuple of (H, W, C) float32
-        First channel: range in m, not positive where nothing returned.
-    poses : (H, W, 6) float32 or None
-        Roll, pitch, yaw, x, y, z of the vehicle in the world at the time of each pixel.
-    """
-
+    # Tuple of (H, W, C) float32: first channel: range in m, not positive where nothing returned
     returns: tuple[NDArray[np.float32], ...]
+    # (H, W, 6) float32 or None: roll, pitch, yaw, x, y, z of the vehicle in the world at the time of each pixel
     poses: NDArray[np.float32] | None
 
 
 @dataclass(frozen=True, eq=False)
 class BoxTable:
-    """Labeled boxes, in 3D in the vehicle's frame or upright in an image.
+    """Labeled boxes, in 3D in the vehicle's frame or upright in an image."""
 
-    Attributes
-    ----------
-    frame : (B,) int64
-        Index of the frame.
-    track_id : (B,) str
-    kind : (B,) int64
-        Type by its number in label.proto.
-    center : (B, 3) or (B, 2) float64
-        m, or px.
-    size : (B, 3) or (B, 2) float64
-        Length, width, height in m, or length (along u) and width (along v) in px.
-    heading_rad : (B,) float64
-    lost : int
-        Further boxes, which cannot be read or are of no frame.
-    """
-
-    frame: NDArray[np.int64]
-    track_id: NDArray[np.str_]
-    kind: NDArray[np.int64]
-    center: Array
-    size: Array
-    heading_rad: Array
-    lost: int = 0
+    frame: NDArray[np.int64]  # (B,): index of the frame
+    track_id: NDArray[np.str_]  # (B,)
+    kind: NDArray[np.int64]  # (B,): type by its number in label.proto
+    center: Array  # (B, 3) or (B, 2) float64: m, or px
+    size: Array  # (B, 3) or (B, 2) float64: length, width, height in m, or length (along u) and width (along v) in px
+    heading_rad: Array  # (B,)
+    lost: int = 0  # further boxes, which cannot be read or are of no frame
 
     @classmethod
     def of(cls, rows: list[tuple[int, str, int, Any]], dimensions: int, lost: int) -> BoxTable:
@@ -208,47 +149,26 @@ class BoxTable:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """One segment of either version, with functions that read its records.
-
-    Attributes
-    ----------
-    path : Path
-        Its file or folder, for errors.
-    cameras : mapping of number to CameraCalibration
-    lasers : mapping of number to LaserCalibration
-    frames : list of FrameRow
-        At least one; not yet in order.
-    image : callable
-        Returns the JPEG of a frame by index and camera by number; raises `RecordError`.
-    ranges : callable
-        Returns the range images of a frame by index and LiDAR by number; raises `RecordError`.
-    boxes : callable or None
-        Reads the 3D labels; None for a segment without any.
-    image_boxes : callable or None
-        Reads the 2D labels of a camera by number; None for a segment without any.
-    image_boxes_are_projected : bool
-        Whether `image_boxes` are the 3D labels projected into the images, not drawn in them.
-    pixel_poses_are_missing : bool
-        Whether range images of the TOP LiDAR come without the poses that belong to them.
-    where : callable
-        Names a frame by index in errors.
-    details : mapping
-        For `log2sim inspect`.
-    """
+    """One segment of either version, with functions that read its records."""
 
     name: str
-    path: Path
+    path: Path  # its file or folder, for errors
     cameras: Mapping[int, CameraCalibration]
     lasers: Mapping[int, LaserCalibration]
-    frames: list[FrameRow]
+    frames: list[FrameRow]  # at least one; not yet in order
+    # Returns the JPEG of a frame by index and camera by number; raises `RecordError`
     image: Callable[[int, int], bytes]
+    # Returns the range images of a frame by index and LiDAR by number; raises `RecordError`
     ranges: Callable[[int, int], RangeImages]
-    boxes: Callable[[], BoxTable] | None
+    boxes: Callable[[], BoxTable] | None  # reads the 3D labels; None for a segment without any
+    # Reads the 2D labels of a camera by number; None for a segment without any
     image_boxes: Callable[[int], BoxTable] | None
+    # Whether `image_boxes` are the 3D labels projected into the images, not drawn in them
     image_boxes_are_projected: bool
-    where: Callable[[int], str]
+    where: Callable[[int], str]  # names a frame by index in errors
+    # Whether range images of the TOP LiDAR come without the poses that belong to them
     pixel_poses_are_missing: bool = False
-    details: Mapping[str, Any] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)  # for `log2sim inspect`
     notes: list[str] = field(default_factory=list)
 
 
@@ -282,21 +202,11 @@ MAX_LAG_NS = 1_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class FrameTimes:
-    """Stamps of F frames in order.
+    """Stamps of F frames in order."""
 
-    Attributes
-    ----------
-    start_ns : (F,) int64
-        Of the first column of the TOP LiDAR's turn.
-    period_ns : (F,) int64
-        Duration of the turn, to the start of the next one.
-    pose_ns : (F,) int64
-        Of the pose that defines the vehicle's frame, to which points are compensated.
-    """
-
-    start_ns: Stamps
-    period_ns: Stamps
-    pose_ns: Stamps
+    start_ns: Stamps  # (F,) int64: of the first column of the TOP LiDAR's turn
+    period_ns: Stamps  # (F,) int64: duration of the turn, to the start of the next one
+    pose_ns: Stamps  # (F,) int64: of the pose that defines the vehicle's frame, to which points are compensated
 
     @classmethod
     def of(cls, frames: list[FrameRow], notes: list[str]) -> FrameTimes:

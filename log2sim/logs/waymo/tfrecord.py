@@ -136,13 +136,7 @@ def starts_like_tfrecord(path: Path) -> bool:
 class RecordFile:
     """The records of a TFRecord file.
 
-    Attributes
-    ----------
-    path : Path
-    spans : list of (int, int)
-        Offset and size of the data of each record.
-    notes : list of str
-        What was left out.
+    `spans` list of (int, int): offset and size of the data of each record. `notes`: what was left out.
     """
 
     def __init__(self, path: Path) -> None:
@@ -154,15 +148,8 @@ class RecordFile:
     def read(self, k: int, what: str) -> bytes:
         """Return the data of record `k`, checked.
 
-        Parameters
-        ----------
-        what : str
-            Names the record in errors.
-
-        Raises
-        ------
-        RecordError
-            When the file became shorter or the CRC is not that of the data.
+        `what`: names the record in errors. Raises `RecordError` when the file became shorter or the CRC is not that of
+        the data.
         """
         with self._lock:
             if k in self._kept:

@@ -20,39 +20,22 @@ LETTERBOX_GRAY = 114
 
 @dataclass(frozen=True)
 class InputSpec:
-    """Image input of a model.
-
-    Attributes
-    ----------
-    height_px, width_px : int or None
-        None where the model takes any size.
-    channels_last : bool
-        (1, H, W, 3) instead of (1, 3, H, W).
-    dtype : numpy.dtype
-    """
+    """Image input of a model."""
 
     name: str
-    height_px: int | None
-    width_px: int | None
-    channels_last: bool
+    height_px: int | None  # None where the model takes any size
+    width_px: int | None  # None where the model takes any size
+    channels_last: bool  # (1, H, W, 3) instead of (1, 3, H, W)
     dtype: np.dtype[Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Placement of the image in the input: `uv_input = uv_image * scale + shift_px`.
+    """Placement of the image in the input: `uv_input = uv_image * scale + shift_px`."""
 
-    Attributes
-    ----------
-    scale : (2,) float64
-    shift_px : (2,) float64
-    input_px : (int, int)
-        Width and height of the input.
-    """
-
-    scale: Array
-    shift_px: Array
-    input_px: tuple[int, int]
+    scale: Array  # (2,)
+    shift_px: Array  # (2,)
+    input_px: tuple[int, int]  # width and height of the input
 
     def to_image(self, box_input: Array) -> Array:
         """Convert boxes (M, 4) from px of the input to px of the image."""
@@ -61,25 +44,14 @@ class Placement:
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Preprocessing of a family of models.
+    """Preprocessing of a family of models."""
 
-    Attributes
-    ----------
-    fit : str
-        "corner" and "center" keep the aspect ratio and fill the rest with gray (letterbox), "stretch" does not, "tf1"
-        stretches with the sampling of TensorFlow 1.
-    rgb : bool
-        Channel order RGB instead of BGR.
-    unit : bool
-        Values 0-1 instead of 0-255; never for integer inputs.
-    default_px : int or None
-        Side of the input of a model that takes any size, None for the image's own.
-    """
-
+    # "corner" and "center" keep the aspect ratio and fill the rest with gray (letterbox), "stretch" does not, "tf1"
+    # stretches with the sampling of TensorFlow 1
     fit: Literal["corner", "center", "stretch", "tf1"]
-    rgb: bool
-    unit: bool
-    default_px: int | None = 640
+    rgb: bool  # channel order RGB instead of BGR
+    unit: bool  # values 0-1 instead of 0-255; never for integer inputs
+    default_px: int | None = 640  # side of the input of a model that takes any size, None for the image's own
 
     def __call__(self, image_bgr: NDArray[np.uint8], spec: InputSpec) -> tuple[NDArray[Any], Placement]:
         """Convert an image (H, W, 3) uint8 BGR to the input (1, 3, h, w) or (1, h, w, 3), with its placement there."""
@@ -136,8 +108,6 @@ def resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]
 def resize_as_tf1(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize to (width, height) px as TensorFlow 1 did: output pixel i samples the input at i * in / out.
 
-    Notes
-    -----
     Pixel centers at the corner instead of the middle, border repeated. SSD models of that time were trained so: other
     sampling moves their scores by up to 0.27.
     """
@@ -175,17 +145,8 @@ class Classes:
     def best(self, class_scores: Array, min_score: float) -> tuple[NDArray[np.intp], Array, NDArray[np.str_]]:
         """Choose categories from scores (N, C): at most one a row and group, so that a rider does not hide the bicycle.
 
-        Parameters
-        ----------
-        class_scores : (N, C) float
-        min_score : float
-            Rows whose best score of a group is lower are left out.
-
-        Returns
-        -------
-        row : (M,) int
-        score : (M,) float64
-        category : (M,) str
+        `class_scores` (N, C) float. `min_score`: rows whose best score of a group is lower are left out. Returns `row`
+        (M,) int; `score` (M,) float64; `category` (M,) str.
         """
         rows, scores, categories = [], [], []
         # Few rows of thousands reach the score.
@@ -221,14 +182,9 @@ BY_COUNT: Mapping[int, Classes] = {80: COCO_80, 90: COCO_90, 91: COCO_91}
 def choose_classes(names: str | None, count: int | None, default: Classes, where: str) -> Classes:
     """Find out the classes of a model: by the names in its metadata, else by their number.
 
-    Parameters
-    ----------
-    names
-        The entry `names` of the ONNX metadata: a Python literal, list or dict by index, as Ultralytics writes it.
-    count
-        Number of classes in the output, None where the output holds class ids; then `default` holds.
-    where
-        The file, for messages.
+    `names`: the entry `names` of the ONNX metadata: a Python literal, list or dict by index, as Ultralytics writes it.
+    `count`: number of classes in the output, None where the output holds class ids; then `default` holds. `where`: the
+    file, for messages.
     """
     if names is not None:
         return classes_from_names(names, where)
@@ -269,19 +225,11 @@ Outputs = Mapping[str, NDArray[Any]]
 
 
 class Candidates(NamedTuple):
-    """Decoded boxes before suppression.
+    """Decoded boxes before suppression."""
 
-    Attributes
-    ----------
-    box_input : (M, 4) float64
-        u0, v0, u1, v1 in px of the model's input.
-    score : (M,) float64
-    category : (M,) str
-    """
-
-    box_input: Array
-    score: Array
-    category: NDArray[np.str_]
+    box_input: Array  # (M, 4): u0, v0, u1, v1 in px of the model's input
+    score: Array  # (M,)
+    category: NDArray[np.str_]  # (M,)
 
 
 class Layout(Protocol):

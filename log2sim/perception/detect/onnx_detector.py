@@ -48,23 +48,13 @@ DTYPES: Mapping[str, type] = {
 
 @dataclass(frozen=True, eq=False)
 class OnnxModel:
-    """Loaded model; `run` may be called from several threads.
-
-    Attributes
-    ----------
-    metadata : mapping of str to str
-        Custom metadata of the file, such as class names.
-    session : onnxruntime.InferenceSession
-        Runs in the thread that calls it.
-    threads : int
-        That may run it side by side.
-    """
+    """Loaded model; `run` may be called from several threads."""
 
     path: Path
     spec: InputSpec
-    metadata: Mapping[str, str]
-    session: Any
-    threads: int
+    metadata: Mapping[str, str]  # custom metadata of the file, such as class names
+    session: Any  # runs in the thread that calls it
+    threads: int  # that may run it side by side
 
     def digest(self) -> str | None:
         """Return the SHA-256 of the file; None for one whose weights are in other files."""
@@ -83,15 +73,8 @@ class OnnxModel:
 def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     """Load an ONNX file.
 
-    Parameters
-    ----------
-    threads
-        That may run it side by side, None for as many as `log2sim.files.stages.usable_threads` says.
-
-    Raises
-    ------
-    ConfigError
-        A missing, oversized or broken file, or a model whose inputs are not one image.
+    `threads`: that may run it side by side, None for as many as `log2sim.files.stages.usable_threads` says. Raises
+    `ConfigError`: a missing, oversized or broken file, or a model whose inputs are not one image.
     """
     import onnxruntime
 
@@ -148,8 +131,6 @@ def strongest_first(detections: Detections) -> Detections:
 def suppress(detections: Detections, max_overlap: float) -> Detections:
     """Keep the strongest of boxes that overlap by more than `max_overlap` (IoU) within one group of categories.
 
-    Notes
-    -----
     Greedy suppression across the classes of a group: a van that a model detects as car and truck becomes one box, while
     a person in front of a car is kept. O(M^2) time.
     """
@@ -194,15 +175,9 @@ class Tile:
 def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:
     """Plan the whole image and one row of tiles from left to right, vertically centered, no higher than wide.
 
-    Parameters
-    ----------
-    tiles
-        1: only the whole image; N: also N tiles; "auto": see `auto_tile_count`.
-    input_px
-        Width of the model's input, None where it takes any size.
+    `tiles`: 1: only the whole image; N: also N tiles; "auto": see `auto_tile_count`. `input_px`: width of the model's
+    input, None where it takes any size.
 
-    Notes
-    -----
     The sky and the road right in front of the car are seen in the whole image only: no far objects are there.
     """
     whole = Tile(0, 0, width_px, height_px)
@@ -238,8 +213,6 @@ def is_cut_by_tile(box_px: Array, tile: Tile, width_px: int, height_px: int) -> 
 def merge(found: list[tuple[Tile, Detections]], width_px: int, height_px: int, max_overlap: float) -> Detections:
     """Merge the boxes of all tiles, in px of the whole image, into one set.
 
-    Notes
-    -----
     A box cut by an inner border is dropped: tiles overlap, and objects larger than the overlap are detected in the whole
     image. A half box would give a wrong object, a missing box only a missing observation of a track.
     """
@@ -268,13 +241,9 @@ RIDDEN = {"bicycle": "cyclist", "motorcycle": "motorcycle", "cyclist": "cyclist"
 def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detections:
     """Replace each two-wheeler and the person on it by one box around both; a bicycle without a person stays one.
 
-    Parameters
-    ----------
-    sure_score : float
-        A two-wheeler of a lower score that lies inside the person's box is a bag or clothes, and nothing is joined.
+    `sure_score`: a two-wheeler of a lower score that lies inside the person's box is a bag or clothes, and nothing is
+    joined.
 
-    Notes
-    -----
     A person rides if its box ends near the two-wheeler's lower edge, rises above it, and shares most of the narrower
     width of both. A person who pushes a bicycle is often joined too: one image does not tell the two cases apart, and
     both move as one. Pairs are chosen greedily, each box in one pair. Boxes inside a pair are dropped, since models often
@@ -341,33 +310,20 @@ PROBE_PX = 320
 
 @dataclass(frozen=True, eq=False)
 class OnnxDetector:
-    """Detector from a model, its output layout and settings.
-
-    Attributes
-    ----------
-    min_score : float
-        Lowest score of a box.
-    min_weak_score : float
-        The same of people, two-wheelers and traffic lights: weaker boxes continue their tracks, and a weak bicycle under a person tells a rider.
-    max_overlap : float
-        IoU above which two boxes of one group are duplicates.
-    tiles : int or "auto"
-    default_min_score : float
-        Lowest score where none is set.
-    together : int
-        Tiles in one run of a model of one size that takes any number of inputs; 1 for all others.
-    """
+    """Detector from a model, its output layout and settings."""
 
     name: str
     model: OnnxModel
     layout: Layout
     classes: Classes
-    min_score: float
+    min_score: float  # lowest score of a box
+    # The same of people, two-wheelers and traffic lights: weaker boxes continue their tracks, and a weak bicycle under
+    # a person tells a rider
     min_weak_score: float
-    max_overlap: float
+    max_overlap: float  # IoU above which two boxes of one group are duplicates
     tiles: Literal["auto"] | int
-    default_min_score: float
-    together: int = 1
+    default_min_score: float  # lowest score where none is set
+    together: int = 1  # tiles in one run of a model of one size that takes any number of inputs; 1 for all others
 
     @property
     def cache_key(self) -> str | None:
@@ -476,8 +432,6 @@ def open_onnx(
 def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]:
     """Recognize the layout of a model by its outputs for a gray image; returns both.
 
-    Notes
-    -----
     The declared shapes are not enough: many exports leave them open, and decoded boxes look like undecoded ones.
     """
     tried: dict[tuple[int, ...], Outputs] = {}

@@ -43,20 +43,12 @@ TENSOR_DTYPES: dict[int, type] = {1: np.float32, 2: np.float64, 3: np.int32, 4: 
 
 @dataclass(frozen=True)
 class Node:
-    """One operation of a graph.
-
-    Attributes
-    ----------
-    inputs : tuple of str
-        Names of nodes, without output numbers.
-    attributes : dict of str to bytes
-        Undecoded AttrValue messages.
-    """
+    """One operation of a graph."""
 
     name: str
     op: str
-    inputs: tuple[str, ...]
-    attributes: dict[str, bytes]
+    inputs: tuple[str, ...]  # names of nodes, without output numbers
+    attributes: dict[str, bytes]  # undecoded AttrValue messages
 
     def integers(self, key: str) -> list[int]:
         """Read a list of integers, such as strides; empty when the attribute is absent."""
@@ -77,10 +69,7 @@ class Node:
 def read_graph(data: bytes) -> dict[str, Node]:
     """Read all nodes of a GraphDef by name.
 
-    Raises
-    ------
-    ValueError
-        When the bytes are no such message.
+    Raises `ValueError` when the bytes are no such message.
     """
     nodes = [read_node(value) for number, wire, value in fields(data) if number == 1 and wire == BYTES]
     return {node.name: node for node in nodes}
@@ -314,10 +303,7 @@ class Converter:
 def convert(graph: bytes) -> onnx.ModelProto:
     """Convert the frozen graph: `images` (N, 300, 300, 3) uint8 RGB to `boxes` (N, 1917, 4) and `scores` (N, 1917, 7).
 
-    Raises
-    ------
-    ValueError
-        When the bytes are not that model's graph.
+    Raises `ValueError` when the bytes are not that model's graph.
     """
     import onnx
     from onnx import TensorProto, helper
@@ -384,8 +370,6 @@ def decode_boxes(converter: Converter, encoded: str, anchors: NDArray[np.float32
 def anchor_boxes() -> NDArray[np.float32]:
     """Build the anchors (1917, 4) center v, u, height, width in 0-1: by layer, cell row by row, then shape.
 
-    Notes
-    -----
     SSD (Liu et al., 2016) with the object detection API's reduced lowest layer: three shapes there, six elsewhere.
     """
     scales = [*np.linspace(MIN_SCALE, MAX_SCALE, len(FEATURE_CELLS)), 1.0]
@@ -430,24 +414,13 @@ PICTURE_STEPS = ("picture/float", "picture/scaled", "picture/shifted")
 
 @dataclass(frozen=True, eq=False)
 class Convolution:
-    """A convolution with what follows it folded into its weights and bias.
-
-    Attributes
-    ----------
-    node : onnx.NodeProto
-    weights : (M, C, kH, kW) float32
-    bias : (M,) float32
-    output : str
-        Name of the last value that is folded in.
-    clipped : bool
-        Whether a ReLU6 is among what is folded in.
-    """
+    """A convolution with what follows it folded into its weights and bias."""
 
     node: Any
-    weights: NDArray[np.float32]
-    bias: NDArray[np.float32]
-    output: str
-    clipped: bool
+    weights: NDArray[np.float32]  # (M, C, kH, kW)
+    bias: NDArray[np.float32]  # (M,)
+    output: str  # name of the last value that is folded in
+    clipped: bool  # whether a ReLU6 is among what is folded in
 
 
 def known_ranges() -> dict[str, tuple[float, float]]:
@@ -462,17 +435,9 @@ def known_ranges() -> dict[str, tuple[float, float]]:
 def quantize(model: onnx.ModelProto, ranges: Mapping[str, tuple[float, float]]) -> onnx.ModelProto:
     """Return the model with quantized convolutions and sums; `boxes` and `scores` stay floats.
 
-    Parameters
-    ----------
-    model : onnx.ModelProto
-        Of `log2sim.perception.detect.ssd_mobilenet.convert`.
-    ranges : mapping of str to (float, float)
-        Least and greatest value of what no ReLU6 bounds, see `known_ranges`.
-
-    Raises
-    ------
-    ValueError
-        For a convolution or sum without a known range.
+    `model`: of `log2sim.perception.detect.ssd_mobilenet.convert`. `ranges` mapping of str to (float, float): least and
+    greatest value of what no ReLU6 bounds, see `known_ranges`. Raises `ValueError` for a convolution or sum without a
+    known range.
     """
     import onnx
 
@@ -523,10 +488,7 @@ def fold_convolutions(model: onnx.ModelProto) -> dict[str, Convolution]:
 class Quantizer:
     """Translation of a graph of floats node by node.
 
-    Attributes
-    ----------
-    nodes, initializers : list
-        Of the quantized graph.
+    `nodes`, `initializers`: of the quantized graph.
     """
 
     def __init__(self, model: onnx.ModelProto, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -685,12 +647,8 @@ def create(
 ) -> OnnxDetector:
     """Make the detector `ssd-mobilenet-v2`.
 
-    Raises
-    ------
-    MissingExtra
-        When the package with the weights, or `onnx` for the first conversion, is not installed.
-    ConfigError
-        When the weights are others than the ones known, or the cache cannot be written.
+    Raises `MissingExtra` when the package with the weights, or `onnx` for the first conversion, is not installed;
+    `ConfigError` when the weights are others than the ones known, or the cache cannot be written.
     """
     detector = open_onnx(converted_model(), min_score=min_score, max_overlap=max_overlap, tiles=tiles, name=NAME)
     return replace(detector, together=TOGETHER)
