@@ -6,10 +6,14 @@ import pytest
 from extremes import CASES, Case, outcome_of
 
 
+# By default every fourth.
+BY_DEFAULT = [c for c in CASES if c.run_by == "tests"][::4]
+
+
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(c, id=c.name, marks=[pytest.mark.slow] if c.run_by == "slow tests" else [])
+        pytest.param(c, id=c.name, marks=[] if c in BY_DEFAULT else [pytest.mark.slow])
         for c in CASES
         if c.run_by != "tool"
     ],

@@ -8,22 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-import train_lidar
-from lidar_training import fitting, real_logs, two_stream
-from lidar_training import two_stream_boxes as boxes_of
-from lidar_training import two_stream_inputs as inputs
-from lidar_training.pairs import Pair, pair_of
-from lidar_training.samples import CATEGORIES, Sample, write_shard
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.geometry import Camera, project_boxes, rotation_from_rpy, transform
 from log2sim.perception.detect3d.network import load_network
 from log2sim.perception.lidar.cloud import Cloud
 
+torch = pytest.importorskip("torch", reason="needs the extra 'train'")
 pytest.importorskip("onnx", reason="needs the extra 'train'")
-pytest.importorskip("torch", reason="training needs the extra 'train'")
-pytest.importorskip("onnx")
+
+import train_lidar  # noqa: E402
+from lidar_training import fitting, real_logs, two_stream  # noqa: E402
+from lidar_training import two_stream_boxes as boxes_of  # noqa: E402
+from lidar_training import two_stream_inputs as inputs  # noqa: E402
+from lidar_training.pairs import Pair, pair_of  # noqa: E402
+from lidar_training.samples import CATEGORIES, Sample, write_shard  # noqa: E402
+
 # Threads that wait for a busy core are slower than one.
 torch.set_num_threads(1)
 
