@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from extremes import CASES, Case, outcome_of
 
-
-# By default every fourth.
+# The default suite runs every fourth.
 BY_DEFAULT = [c for c in CASES if c.run_by == "tests"][::4]
 
 
