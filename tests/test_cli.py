@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import json
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+import tifffile
 from command_line import names, run
+from localization_worlds import BEND, HOUSES, LIDAR, drive
+from test_detection_cache import TICKS, Seeing, entries, folder, made
 from typer.testing import CliRunner
 from worlds import tiny_toml
 
 import log2sim
-from log2sim import Scenario
+from log2sim import Scenario, errors
 from log2sim.cli import entry
-from log2sim.errors import LogError, install_command
+from log2sim.errors import LogError, MissingExtra, install_command
 from log2sim.files.documents import check
 from log2sim.files.plugins import BUILT_IN
+from log2sim.logs.native.writer import write_log
 
 COMMANDS = (
     "reconstruct",
@@ -33,6 +40,8 @@ COMMANDS = (
     "cache",
     "config",
 )
+
+
 PNG, GIF = b"\x89PNG", b"GIF8"
 
 
@@ -336,3 +345,153 @@ def test_every_command_names_the_files_it_wrote(
         new = set(names(tmp_path)) - set(before)
         assert new
         assert [name for name in new if name not in ran.out] == [], command
+
+
+__all__ = ["folder", "made"]  # fixtures
+
+
+QUICK = ["map.lanes=false", "appearance.colors=false", "calibration.check=false", "stop_s=0.55"]
+
+
+def reconstruct(log: Path, out: Path, *options: str) -> tuple[str, dict[str, int | None]]:
+    """What a run prints, and what its report says of the cache."""
+    changes = [part for change in QUICK for part in ("--set", change)]
+    report = out.with_suffix(".report.json")
+    ran = run("reconstruct", log, "--out", out, "--report", report, "--detector", "seeing", *changes, *options)
+    assert ran.code == 0, ran.err
+    return ran.out, json.loads(report.read_text())["detection_cache"]
+
+
+def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
+    tiny_folder: Path, folder: Path, made: list[Seeing], tmp_path: Path
+) -> None:
+    assert run("cache").code == 0  # nothing is there yet
+    out, cached = reconstruct(tiny_folder, tmp_path / "a.json", "--no-cache")
+    assert cached is None
+    assert not folder.exists()
+    out, cached = reconstruct(tiny_folder, tmp_path / "b.json")
+    assert "earlier runs" not in out
+    assert cached == {"found": 0, "kept": TICKS, "problem": None}
+    out, cached = reconstruct(tiny_folder, tmp_path / "c.json")
+    assert f"{TICKS} pictures known from earlier runs" in out
+    assert (tmp_path / "c.json").read_bytes() == (tmp_path / "a.json").read_bytes()
+    shown = json.loads(run("cache", "--json").out)
+    size = sum(path.stat().st_size for path in entries(folder))
+    assert shown == {
+        "folder": str(folder),
+        "max_mb": 2048,
+        "bytes": size,
+        "pictures": TICKS,
+        "detectors": [{"name": "seeing", "pictures": TICKS, "bytes": size}],
+        "last_run": {"found": TICKS, "kept": 0},
+    }
+    assert f"{TICKS} by seeing" in run("cache").out
+    assert run("cache", "--clear").out == f"{folder}: {TICKS} pictures removed\n"
+    assert entries(folder) == []
+
+
+def test_a_png_comes_with_its_place_and_says_what_is_left_out(tiny_folder: Path, tmp_path: Path) -> None:
+    ran = run("map", tiny_folder, "--out", tmp_path / "m.png", "--cell", "0.1")
+    assert ran.code == 0, ran.err
+    assert names(tmp_path) == ["m.pgw", "m.png"]
+    picture = cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED)
+    assert picture[picture[..., 3] > 0][:, :3].std() > 5
+    assert "without --scenario only agents with labels are left out" in ran.out
+    assert "m.png: " in ran.out
+
+
+def test_heights_as_geotiff_with_a_scenario(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
+    out = tmp_path / "h.tif"
+    ran = run("map", tiny_folder, "--scenario", tiny_scenario, "--out", out, "--layer", "height", "--cell", "0.2")
+    assert ran.code == 0, ran.err
+    assert names(tmp_path) == ["h.tif"]
+    heights = tifffile.imread(out)
+    assert abs(float(np.nanmedian(heights))) < 0.05
+    assert "without --scenario" not in ran.out
+
+
+SPARSE = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive whose GNSS is off by 0.4 m, with labels."""
+    log, _ = drive(HOUSES, BEND, duration_s=1.2, sigma_m=0.4, angle_deg=0.3, seed=3, lidars=[SPARSE], observe=True)
+    folder = tmp_path_factory.mktemp("noisy") / "drive"
+    write_log(log, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def by_lidar(noisy: Path) -> Path:
+    out = noisy.parent / "lidar.json"
+    ran = run(
+        "reconstruct", noisy, "--detector", "lidar:labels", "--poses", "lidar", "--out", out, "--report",
+        noisy.parent / "report.json",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    assert "poses: lidar (as requested)\n" in ran.out
+    return out
+
+
+def test_the_report_says_where_the_poses_come_from(noisy: Path, by_lidar: Path) -> None:
+    report = json.loads((noisy.parent / "report.json").read_text())
+    check(report, "report-1", LogError)
+    assert report["poses"]["source"] == "lidar"
+    assert report["poses"]["estimate"]["lidar"] == "top"
+    assert report["poses"]["estimate"]["poses"] == 12
+    assert Scenario.load(by_lidar).ego.quality["source"] == "LiDAR odometry"
+
+
+def test_evaluate_places_the_labels_by_the_poses_of_the_scenario(noisy: Path, by_lidar: Path) -> None:
+    out = noisy.parent / "metrics.json"
+    assert run("evaluate", by_lidar, "--truth", noisy, "--out", out, "--overwrite").code == 0
+    same = json.loads(out.read_text())
+    assert run("evaluate", by_lidar, "--truth", noisy, "--poses", "given", "--out", out, "--overwrite").code == 0
+    other = json.loads(out.read_text())
+    assert same["ego"]["position_rmse_m"] < 0.1 < other["ego"]["position_rmse_m"]
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Installed:
+    """An installed distribution of which pip noted this origin."""
+
+    def __init__(self, origin: dict[str, object] | None) -> None:
+        self.origin = origin
+
+    def read_text(self, name: str) -> str | None:
+        return json.dumps(self.origin) if name == "direct_url.json" and self.origin is not None else None
+
+
+def installed_from(origin: dict[str, object] | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "site-packages/log2sim/errors.py"))
+    monkeypatch.setattr(metadata, "distribution", lambda name: Installed(origin))
+
+
+def test_in_a_checkout_the_advice_names_the_checkout() -> None:
+    assert install_command("osi") == f"pip install --editable '{ROOT}[osi]'"
+    assert str(MissingExtra("export to OSI", "osi")).endswith(f": {install_command('osi')}")
+
+
+@pytest.mark.parametrize(
+    ("origin", "command"),
+    [
+        (None, "pip install 'log2sim[osi]'"),
+        ({"url": "file:///a%20b/log2sim", "dir_info": {}}, "pip install '/a b/log2sim[osi]'"),
+        (
+            {"url": "https://x.org/log2sim.git", "vcs_info": {"vcs": "git", "commit_id": "1"}},
+            "pip install 'log2sim[osi] @ git+https://x.org/log2sim.git'",
+        ),
+        (
+            {"url": "file:///w/log2sim-1.whl", "archive_info": {}},
+            "pip install 'log2sim[osi] @ file:///w/log2sim-1.whl'",
+        ),
+    ],
+)
+def test_elsewhere_the_advice_names_the_origin_of_the_installation(
+    origin: dict[str, object] | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    installed_from(origin, monkeypatch, tmp_path)
+    assert install_command("osi") == command

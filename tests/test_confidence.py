@@ -30,9 +30,14 @@ from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
 from log2sim.datatypes import Doubt, Track
+from log2sim.datatypes.log_odds import log_odds_of, probability_of
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
+
+
 DARK = [None] * len(TIMELINE.t_ns)
+
+
 NAMES = [f.name for f in fields(Evidence)]
 
 
@@ -114,3 +119,9 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     found = evidence_of(replace(candidate, track=replace(candidate.track, measurements=bare)), TIMELINE)
     assert np.isfinite(list(asdict(found).values())).all()
     assert (found.hidden, found.blind) == (1.0, 1.0)
+
+
+@given(st.floats(1e-6, 1 - 1e-6))
+def test_one_undoes_the_other_and_a_complement_has_the_opposite_sign(p: float) -> None:
+    assert probability_of(log_odds_of(p)) == pytest.approx(p, rel=1e-9)
+    assert log_odds_of(1 - p) == pytest.approx(-log_odds_of(p), abs=1e-9)

@@ -2,33 +2,50 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from worlds import camera_ahead, outline_px, scan, standing
 
 from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
-from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import observe
+from log2sim.perception.frames import AHEAD, KeepingReader, RecordReader, look_again, work_ahead
 from log2sim.perception.fusion import fuse
-from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, sample_rays
 from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan, select_sensors
 
 T0_NS = 1_700_000_000_000_000_000
+
+
 STEP_NS = 100_000_000
+
+
 TICKS = 4
+
+
 SPEED_MPS = 5.0
+
+
 SOLIDS = (standing(16.0, 3.0, 30.0), standing(12.0, -4.0, 0.0, (0.7, 0.7, 1.75)))
+
+
 CATEGORIES = ("car", "pedestrian")
+
+
 EGO_T_LIDAR = transform(np.eye(3), np.array([0.0, 0.0, 1.9]))
+
+
 STAMPS = T0_NS + np.arange(TICKS) * STEP_NS
 
 
@@ -248,3 +265,167 @@ def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
     out, _ = run(log, detector)
     assert out.unseen == ({} if finds else {"front": [0, 1, 2, 3]})
     assert [f.kind for f in out.faults] == ([] if finds else ["black_images"])
+
+
+SIZE = (64, 48)
+
+
+K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1.0]])
+
+
+class Wants:
+    """Takes note of what comes."""
+
+    def __init__(self, **frames: list[int]) -> None:
+        self.wanted = {name: np.array(index, dtype=np.int64) for name, index in frames.items()}
+        self.got: list[tuple[str, int, int]] = []
+
+    def frames(self) -> dict[str, NDArray[np.int64]]:
+        return self.wanted
+
+    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
+        self.got.append((camera, index, int(image_bgr[0, 0, 0])))
+
+
+def log_of(reads: list[tuple[str, int]], *, black: int = -1, broken: int = -1) -> Log:
+    """Two cameras with 5 frames each, the second 50 ms later; the first pixel of a frame is its index."""
+
+    def read(name: str, i: int) -> NDArray[np.uint8]:
+        reads.append((name, i))
+        if i == broken:
+            raise RecordError("broken")
+        blocks = np.random.default_rng([i, len(name)]).integers(0, 255, (6, 8, 3)).astype(np.uint8)
+        image = blocks.repeat(8, axis=0).repeat(8, axis=1)
+        image[0, 0] = i
+        return np.zeros_like(image) if i == black else image
+
+    cameras = {n: Camera(n, *SIZE, K, "map", np.eye(4)) for n in ("left", "right2")}
+    streams = {
+        name: Stream(name, np.arange(5, dtype=np.int64) * 10**8 + k * 5 * 10**7, lambda i, n=name: read(n, i))
+        for k, name in enumerate(cameras)
+    }
+    return Log("l", "synthetic", cameras, {}, streams)
+
+
+def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
+    reads: list[tuple[str, int]] = []
+    log = log_of(reads)
+    first, second = Wants(left=[3, 1, 1], right2=[1]), Wants(left=[3, 4])
+    steps: list[tuple[int, int]] = []
+    assert look_again(log, RecordReader(log), [first, second], lambda *step: steps.append(step)) == 4
+    assert first.got == [("left", 1, 1), ("right2", 1, 1), ("left", 3, 3)]
+    assert second.got == [("left", 3, 3), ("left", 4, 4)]
+    assert sorted(reads) == [("left", 1), ("left", 3), ("left", 4), ("right2", 1)]
+    assert steps == [(k + 1, 4) for k in range(4)]
+
+
+def test_kept_sweeps_are_read_once_and_stay_as_they_are() -> None:
+    reads: list[int] = []
+
+    def read(i: int) -> Sweep:
+        reads.append(i)
+        return Sweep(
+            i, np.full((4, 3), i, np.float32), t_ns=np.arange(4) + i, intensity=None if i else np.ones(4, np.float32)
+        )
+
+    lidar = Lidar("top", "map", np.eye(4))
+    log = Log("l", "synthetic", {}, {"top": lidar}, {"top": Stream("top", np.arange(5, dtype=np.int64), read)})
+    reader = KeepingReader(log, 2)
+    for _ in range(2):
+        for i in (0, 1, 2):
+            sweep = reader.get("top", i)
+            assert (sweep.stamp_ns, sweep.xyz_m.tolist(), sweep.t_ns.tolist()) == (
+                i,
+                [[i] * 3] * 4,
+                [i, i + 1, i + 2, i + 3],
+            )
+            assert (sweep.intensity is None) == (i > 0)
+    assert reads == [0, 1, 2, 2]
+    reader.forget()
+    reader.get("top", 0)
+    assert reads[-1] == 0
+
+
+PATIENCE_S = 20.0
+
+
+def test_no_more_is_made_ahead_than_asked_for() -> None:
+    begun: list[int] = []
+    results = work_ahead(begun.append, range(100), ahead=3)
+    next(results)
+    assert len(begun) <= 5
+    results.close()
+
+
+def test_an_error_comes_with_the_item_that_caused_it() -> None:
+    results = work_ahead(lambda n: 6 // n, [3, 2, 0, 1])
+    assert [next(results), next(results)] == [2, 3]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_closing_an_iterator_does_not_wait_for_its_work() -> None:
+    """The garbage collector may close it under a lock that the working threads need to end."""
+    started, held, closed = threading.Event(), threading.Event(), threading.Event()
+
+    def work(n: int) -> int:
+        if n:
+            started.set()
+            held.wait(PATIENCE_S)
+        return n
+
+    results = work_ahead(work, range(2 * AHEAD), ahead=1)
+    assert next(results) == 0
+    assert started.wait(PATIENCE_S)
+
+    def close() -> None:
+        results.close()
+        closed.set()
+
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
+    in_time = closed.wait(PATIENCE_S / 4)
+    held.set()
+    closing.join()
+    assert in_time
+
+
+def cloud_of(xyz, *, height=None, sensors=(), t_s=None):
+    n = len(xyz)
+    height = xyz[:, 2] if height is None else height
+    t_s = np.zeros(n) if t_s is None else t_s
+    return Cloud(
+        10**18, np.array([1e5, 2e6, 3.0]), xyz.astype(np.float32), t_s.astype(np.float32),
+        np.array([0, 0, 2.0], np.float32), np.abs(height) < 0.1, height.astype(np.float32), tuple(sensors),
+    )  # fmt: skip
+
+
+def directions(rays):
+    to = rays.end - rays.start
+    return np.arctan2(to[:, 1], to[:, 0]), to[:, 2] / np.hypot(to[:, 0], to[:, 1])
+
+
+def test_near_and_far_points_keep_their_share() -> None:
+    # A wall at 5 m on one half and one at 40 m on the other, both with a ray every 0.1 degrees.
+    azimuth, slope = (
+        a.ravel() for a in np.meshgrid(np.deg2rad(np.arange(-80, 80, 0.1)), np.deg2rad(np.arange(-2, 2, 0.1)))
+    )
+    reach = np.where(azimuth < 0, 5.0, 40.0)
+    rays = sample_rays(cloud_of(np.column_stack([reach * np.cos(azimuth), reach * np.sin(azimuth), 2 + reach * slope])))
+    near = np.hypot(rays.end[:, 0], rays.end[:, 1]) < 6
+    assert near.sum() == pytest.approx((~near).sum(), rel=0.02)
+    assert len(rays) == pytest.approx(160 / 0.5 * 4 / 0.5, rel=0.15)
+    found_azimuth, found_slope = directions(rays)
+    assert np.ptp(found_azimuth) == pytest.approx(np.deg2rad(160), abs=2 * CELL_RAD)
+    assert np.ptp(found_slope) == pytest.approx(np.deg2rad(4), abs=2 * CELL_RAD)
+
+
+def test_each_ray_starts_where_its_sensor_was() -> None:
+    sensors = [
+        CloudSensor(2, np.array([1.0, 0, 2]), np.array([10.0, 0, 0])),
+        CloudSensor(1, np.array([-1.0, 3, 1]), np.zeros(3)),
+    ]
+    xyz = np.array([[20.0, 0, 1], [0, 20, 1], [-20, 0, 1]])
+    rays = sample_rays(cloud_of(xyz, sensors=sensors, t_s=np.array([0.0, -0.1, 0.05])))
+    start_of = {tuple(e): s for e, s in zip(rays.end.round(3).tolist(), rays.start.round(3).tolist())}
+    assert start_of == {(20, 0, 1): [1, 0, 2], (0, 20, 1): [0, 0, 2], (-20, 0, 1): [-1, 3, 1]}

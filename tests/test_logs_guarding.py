@@ -21,7 +21,10 @@ from test_logs_contract import ENCODERS
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError, RecordError
 from log2sim.logs.opening import open_log
-from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, read_sweep
+from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, list_numbered_files, read_sweep
+from log2sim.logs.stamps import (
+    compute_turn_share,
+)
 
 RAISED = [
     ValueError("odd"), TypeError("odd"), OverflowError("too large"), KeyError("x"), IndexError(), AttributeError("odd"),
@@ -29,6 +32,8 @@ RAISED = [
     NotImplementedError("compression type 99"), RuntimeError("encrypted"), RecursionError("deep"), AssertionError(), OSError(5, "I/O"),
     ZeroDivisionError("by zero"), np.linalg.LinAlgError("singular"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"),
 ]  # fmt: skip
+
+
 STAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -151,7 +156,11 @@ def broken_member(method: int) -> bytes:
 
 
 WIDE = "{'descr': '|V400000000', 'fortran_order': False, 'shape': (3, 3), }"
+
+
 BOMB = header("{'descr': '<f8', 'fortran_order': False, 'shape': (20000000, 64), }") + bytes(1000)
+
+
 BROKEN_SWEEPS: dict[str, tuple[str, bytes, str]] = {
     "unbalanced header": (".npy", header("{'descr': '<f8', 'shape': (4, 3"), "not a readable sweep"),
     "header with a bad token": (".npy", header("{'descr': '<f8', 'shape': (4, 3)?, \\\n"), "not a readable sweep"),
@@ -181,3 +190,44 @@ def test_broken_sweep_files_are_record_errors_without_much_memory(tmp_path: Path
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak_bytes < 20_000_000
+
+
+@pytest.mark.parametrize("start_deg", [180.0, 144.0, 0.0, -179.0])
+def test_the_share_of_a_turn_grows_clockwise_from_its_start(start_deg: float) -> None:
+    share = np.linspace(0.001, 0.999, 50)
+    azimuth = np.radians(start_deg) - 2 * np.pi * share
+    xy = 7.0 * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    np.testing.assert_allclose(compute_turn_share(xy, np.radians(start_deg)), share, atol=1e-12)
+
+
+def test_files_are_ordered_by_number_and_other_names_are_left_out(tmp_path: Path) -> None:
+    largest = np.iinfo(np.int64).max
+    names = [
+        "10.pkl.gz",
+        "9.pkl.gz",
+        "x9.pkl.gz",
+        "8.gz",
+        "7.PNG",
+        f"{largest}.png",
+        f"{largest + 1}.png",
+        f"{'9' * 99}.png",
+    ]
+    for name in names:
+        (tmp_path / name).touch()
+    assert list(list_numbered_files(tmp_path, (".pkl.gz", ".png"))) == [7, 9, 10, largest]
+    assert list_numbered_files(tmp_path / "none", (".png",)) == {}
+
+
+XYZ = np.array([[1.0, 2, 3], [np.nan, 0, 0], [4, 5, 6]], np.float32)
+
+
+def test_files_with_four_columns_and_with_named_columns(tmp_path: Path) -> None:
+    rows = np.column_stack([XYZ, [0.1, 0.2, 0.3]]).astype("<f4")
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+    (tmp_path / "b.bin").write_bytes((rows * [1, 1, 1, 0]).astype("<f4").tobytes())
+    np.savez(tmp_path / "a.npz", xyz_m=XYZ, intensity=np.array([1, 2, 3], np.uint8))
+    np.savez(tmp_path / "b.npz", xyz_m=XYZ)
+    np.testing.assert_allclose(read_sweep(tmp_path / "a.bin", 0).intensity, [0.1, 0.3], rtol=1e-6)
+    np.testing.assert_array_equal(read_sweep(tmp_path / "a.npz", 0).intensity, [1, 3])
+    assert read_sweep(tmp_path / "b.bin", 0).intensity is None
+    assert read_sweep(tmp_path / "b.npz", 0).intensity is None

@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lidar_networks import NAMES, empty_maps, encode, info
+from lidar_training.clouds import draw_example
+from numpy.typing import NDArray
 
+from log2sim.config import LidarConfig
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.protocols import Criterion, match
 from log2sim.geometry import box_corners_bev, overlap_area, wrap_angle
 from log2sim.perception.detect3d.boxes import (
     MIN_HEAT,
+    LevelBoxes,
     Rectangles,
     decode_centers,
+    decode_votes,
     headings,
+    mean_shift,
     peaks,
     shared_area,
+    sigmoid,
     suppress,
 )
+from log2sim.perception.detect3d.detectors import open_shipped
 
 LOW = np.array([-20.0, -12.0])
+
+
 SIZES = {
     "car": (4.4, 1.8, 1.5), "truck": (8.0, 2.5, 3.2), "bus": (12.0, 2.6, 3.1), "motorcycle": (2.1, 0.8, 1.5),
     "cyclist": (1.8, 0.6, 1.7), "pedestrian": (0.6, 0.7, 1.75),
@@ -127,3 +141,119 @@ def test_the_order_of_boxes_does_not_matter() -> None:
     order = rng.permutation(60)
     assert order[suppress(boxes.take(order), score[order], group[order])].tolist() == kept.tolist()
     assert 5 < len(kept) < 60
+
+
+LOW_VOTES = np.array([-10.0, -10.0])
+
+
+CAR = (4.4, 1.8, 1.5)
+
+
+def grid_of(maps: NDArray[np.float32], top_m: float = 1.5) -> NDArray[np.float32]:
+    """The grid, two cells a cell of the maps, of a cloud with points of one height everywhere."""
+    grid = np.zeros((12, 2 * maps.shape[1], 2 * maps.shape[2]), np.float32)
+    grid[0] = top_m / 2
+    return grid
+
+
+def decode(maps: NDArray[np.float32], top_m: float = 1.5) -> LevelBoxes:
+    return decode_votes(maps, grid_of(maps, top_m), info(), LOW_VOTES)
+
+
+def test_two_objects_become_two_boxes_as_encoded() -> None:
+    maps = empty_maps(40, 40)
+    boxes = [(-4.2, -3.1, 0.8, *CAR, 0.7), (5.3, 4.4, 0.9, 0.6, 0.7, 1.75, -2.0)]
+    encode(maps, boxes[0], "car", low=LOW_VOTES, cells=3)
+    encode(maps, boxes[1], "pedestrian", low=LOW_VOTES, cells=1)
+    found = decode(maps)
+    order = np.argsort(found.group)
+    found = found.take(order)
+    assert found.category.tolist() == ["car", "pedestrian"]
+    np.testing.assert_allclose(np.column_stack([found.center_m, found.size_m, found.yaw_rad]), boxes, atol=1e-4)
+    np.testing.assert_allclose(found.heading_score, 1.0, atol=1e-5)
+    assert np.all(sigmoid(found.heat) > 0.999)
+
+
+def test_the_majority_decides_and_the_score_is_its_mean_probability() -> None:
+    maps = empty_maps(40, 40)
+    encode(maps, (0.2, 0.2, 0.8, *CAR, 0.0), "car", low=LOW_VOTES, cells=1)
+    maps[19:23, 19:22, 19:22] = 0
+    maps[20, 19:22, 19:22] = np.log(6.0)
+    maps[19:23, 19, 19:21] = np.array([0, 0, np.log(6.0), 0])[:, None]
+    found = decode(maps)
+    assert found.category.tolist() == ["car"]
+    # Six ninths of the cells give the class 6 / 9, one third of the remaining ones 1 / 9.
+    assert sigmoid(found.heat)[0] == pytest.approx((7 * 6 / 9 + 2 * 1 / 9) / 9)
+
+
+def exact_mode(vote: NDArray[np.float64], start: NDArray[np.float64], h: float) -> NDArray[np.float64]:
+    """Mean shift by its definition."""
+    x = start
+    for _ in range(200):
+        weight = np.exp(-np.sum((vote - x) ** 2, axis=1) / (2 * h * h))
+        x = weight @ vote / weight.sum()
+    return x
+
+
+def test_mean_shift_finds_the_modes_of_the_definition() -> None:
+    rng = np.random.default_rng(6)
+    centers = np.array([[0.0, 0.0], [4.0, 1.0], [-3.0, 5.0]])
+    vote = np.concatenate([c + rng.normal(0, 0.3, (30, 2)) for c in centers]) + 1000.0
+    mode, index = mean_shift(vote, 0.9)
+    for k in range(3):
+        own = index[30 * k : 30 * (k + 1)]
+        expected = exact_mode(vote, vote[30 * k], 0.9)
+        assert np.linalg.norm(mode[own] - expected, axis=1).max() < 0.25
+
+
+VEHICLES = ("car", "truck", "bus")
+
+
+def vehicles(boxes: SceneBoxes) -> SceneBoxes:
+    return boxes.take(np.isin(boxes.category, VEHICLES))
+
+
+def found_in(example, detector) -> SceneBoxes:
+    found = detector.detect(example.cloud)
+    rows = np.column_stack([found.center_m, found.size_m, found.yaw_rad])
+    return SceneBoxes.of(rows, found.category, found.score, points=found.points)
+
+
+@pytest.fixture(scope="module", params=["vehicle", "roadside"])
+def scenes(request):
+    detector = open_shipped(request.param, LidarConfig())
+    examples = [draw_example(request.param, (31, k)) for k in range(10)]
+    return detector, examples, [found_in(e, detector) for e in examples]
+
+
+def test_most_vehicles_with_many_points_are_found_and_few_are_invented(scenes) -> None:
+    _, examples, found = scenes
+    sure = SceneBoxes.join([vehicles(f).take(vehicles(f).score >= 0.5) for f in found])
+    truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
+    near = truth.ignoring((truth.points < 50) | (truth.range_m > 25))
+    matches = match(sure, near, Criterion("iou_bev", 0.5))
+    assert matches.truths > 40
+    assert matches.right.sum() / matches.truths > 0.8
+    assert matches.right.sum() / (matches.right | matches.false).sum() > 0.8
+
+
+def test_most_headings_point_forward(scenes) -> None:
+    _, examples, found = scenes
+    sure = SceneBoxes.join([vehicles(f).take(vehicles(f).score >= 0.5) for f in found])
+    truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
+    matches = match(sure, truth, Criterion("iou_bev", 0.5))
+    off = wrap_angle(sure.box[matches.right, 6] - truth.box[matches.truth[matches.right], 6])
+    assert np.mean(np.abs(off) < np.pi / 2) > 0.75
+
+
+def test_a_turned_scene_gives_turned_boxes(scenes) -> None:
+    """By a quarter turn, which maps cells onto cells."""
+    detector, examples, found = scenes
+    cloud = examples[0].cloud
+    xyz = np.column_stack([-cloud.xyz[:, 1], cloud.xyz[:, 0], cloud.xyz[:, 2]])
+    sensor = np.array([-cloud.sensor[1], cloud.sensor[0], cloud.sensor[2]], np.float32)
+    turned = detector.detect(replace(cloud, xyz=xyz, sensor=sensor))
+    sure = found[0].take(found[0].score > 0.6)
+    away = np.hypot(turned.center_m[:, 0] + sure.box[:, None, 1], turned.center_m[:, 1] - sure.box[:, None, 0])
+    assert len(sure) > 3
+    assert np.mean(away.min(axis=1) < 1.0) > 0.8
