@@ -47,6 +47,18 @@ MUTANTS = (
     ("anti-windup", "simulation/follower.py", "(given == asked) | (error * wanted <= 0)", "(given == given)"),
     ("feed-forward of curvature", "simulation/follower.py", "wanted = row[4:6] + pull", "wanted = 0.5 * row[4:6] + pull"),
     ("gate of matches", "evaluation/metrics/comparison.py", "distance <= gates_m[a, None]", "distance <= 2 * gates_m[a, None]"),
+    ("what is ahead is braked for late", "simulation/reactive.py", "(pace_mps - leader_mps) / (2 *", "(pace_mps - leader_mps) / (8 *"),
+    ("sides of a reversed lane", "road/strips.py", "left=self.right, right=self.left", "left=self.left, right=self.right"),
+    ("sweeps of odometry are not compensated", "localization/odometry.py", "share_of_motion(motion, share), np", "share_of_motion(motion, 0 * share), np"),
+    ("switches of identity", "evaluation/metrics/comparison.py", "& (now != last)", "& (now > last)"),
+    ("association of HOTA", "evaluation/metrics/evaluator.py", "np.divide(potential, union", "np.divide(potential, potential + union"),
+    ("normals face the sensor", "localization/roadside_fit.py", "np.where(facing < 0, -1.0, 1.0)", "np.where(facing < 0, 1.0, 1.0)"),
+    ("sigmas of predictions do not grow", "prediction/prediction.py", "** 2 + variance)", "** 2 + 0 * variance)"),
+    ("centers of exported boxes", "export/openscenario/write.py", "x=number(agent.rear_axle_offset_m), y", "x=number(-agent.rear_axle_offset_m), y"),
+    ("shifts to the side", "edit/motion.py", "y_m=w.y_m + offset * np.cos(yaw)", "y_m=w.y_m - offset * np.cos(yaw)"),
+    ("hypotheses are not counted", "agents/hypotheses.py", "- np.log(count))", ")"),
+    ("lit lamps", "road/signals.py", "log += 0.0 if", "log += 0.0 if True or"),
+    ("pairs beyond a gap of time", "evaluation/metrics/comparison.py", "<= MAX_TRUTH_GAP_S) & table", "<= 9 * MAX_TRUTH_GAP_S) & table"),
 )  # fmt: skip
 
 
