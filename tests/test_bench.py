@@ -14,7 +14,8 @@ from worlds import tiny_log
 
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Detections, Frame, Log, Scenario, Waypoints
-from log2sim.evaluation.bench.benchmark import Benchmark, bench
+from log2sim.errors import LogError
+from log2sim.evaluation.bench.benchmark import Benchmark, bench, document, format_table
 from log2sim.evaluation.bench.runs import BenchContext, detect_once, make_context
 from log2sim.evaluation.bench.runs import timed_first_pass as run_first_pass
 from log2sim.evaluation.bench.scores import (
@@ -31,7 +32,10 @@ from log2sim.evaluation.bench.settings import (
     pareto_front,
     recommend,
 )
+from log2sim.files.documents import check
 from log2sim.geometry import Array, apply_homography
+from log2sim.perception.detect.layouts import COCO_80, LAYOUTS, InputSpec
+from log2sim.perception.detect.onnx_detector import OnnxDetector, OnnxModel
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
 from log2sim.perception.sync import schedule_of
@@ -266,3 +270,84 @@ def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: 
     quiet = run("bench", *options, "--overwrite", "--quiet", "--stop", "0.2")
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
     assert json.loads((tmp_path / "b/bench.json").read_text())["ticks"] == 3
+
+
+def test_tiles_and_input_sizes_are_those_that_change_something(
+    tiny: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_size(log: Log, config: Config) -> OnnxDetector:
+        side = None if config.detect.name == "any.onnx" else 300
+        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None, 1)
+        return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.4, 0.5, "auto", 0.4)
+
+    monkeypatch.setattr("log2sim.evaluation.bench.settings.create_image_detector", open_size)
+    grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
+    found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
+    # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.
+    assert found == {
+        "any auto tiles": (0, 0),
+        "any 2 tiles": (2, 0),
+        "any 3 tiles": (3, 0),
+        "any 5 tiles": (5, 0),
+        "any input 320 px": (0, 320),
+        "any input 640 px": (0, 640),
+        "any input 960 px": (0, 960),
+        "fixed auto tiles": (0, 0),
+        "fixed 2 tiles": (2, 0),
+        "fixed 3 tiles": (3, 0),
+        "fixed 5 tiles": (5, 0),
+    }
+    assert [s.present for s in grid.detect] == [True] + [False] * 10
+    assert grid.detect[-1].config.detect.name == "models/fixed.onnx"
+    alike = make_grid(tiny[0], Config.load(detect={"name": "a/m.onnx"}), ["b/m.onnx"]).detect
+    assert len({s.name for s in alike}) == len(alike) == 8
+
+
+def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> None:
+    out = json.loads(json.dumps(document(result), allow_nan=False))
+    check(out, "bench-1", LogError)
+    assert out["truth"] == "tiny"
+    assert out["ticks"] == 10
+    for panel, entry in zip(result.panels, out["panels"], strict=True):
+        front = {p.setting for p, f in zip(panel.points, panel.on_front, strict=True) if f}
+        assert {p["setting"] for p in entry["points"] if p["on_front"]} == front
+        assert entry["supports"]["setting"] == panel.recommendation.supported
+        assert all(p["error"] == p["figures"][entry["error"]["figure"]] for p in entry["points"])
+
+
+def test_the_dataframe_has_a_row_for_each_setting_with_its_figures(result: Benchmark) -> None:
+    pytest.importorskip("pandas")
+    table = result.to_dataframe()
+    points = [(panel.stage, point) for panel in result.panels for point in panel.points]
+    assert list(zip(table.stage, table.setting)) == [(stage, point.setting) for stage, point in points]
+    assert table.present.sum() == sum(point.present for _, point in points)
+    for row, (_, point) in zip(table.to_dict("records"), points, strict=True):
+        assert row["ms_per_tick"] == point.ms_per_tick
+        known = {name: value for name, value in point.figures.items() if value is not None}
+        assert {k: row[k] for k in known} == known
+
+
+def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) -> None:
+    lines = format_table(result).split("\n")
+    for panel in result.panels:
+        rows = lines[lines.index(f"{panel.stage}: {panel.label}") + 2 :][: len(panel.points)]
+        for p in panel.points:
+            [row] = [r for r in rows if f" {p.setting}  " in r]
+            assert ("*" in row) == p.present
+        order = [next(p.ms_per_tick for p in panel.points if f" {p.setting}  " in r) for r in rows]
+        assert order == sorted(order)
+    assert "What the figures support:" in lines
+
+
+def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_path: Path) -> None:
+    wrong = {
+        3: (tmp_path / "none", "--out", tmp_path / "b"),
+        2: (tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--detector", "lables"),
+    }
+    for code, arguments in wrong.items():
+        ran = run("bench", *arguments)
+        assert ran.code == code
+        assert ran.line
+    (tmp_path / "file").write_text("")
+    assert "is a file and not a folder" in run("bench", tiny_folder, "--out", tmp_path / "file").line
+    assert names(tmp_path) == ["file"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from cooperation_worlds.hidden_traffic import figures as traffic_figures
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast
 
 from log2sim.datatypes import Boxes3D
+from log2sim.synth.scene import load_scene
+from log2sim.synth.synthesis import synthesize
 from log2sim.synth.traffic_data import START_NS
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
@@ -72,3 +75,19 @@ def true_boxes(traffic: HiddenTraffic, t_ns: int) -> Boxes3D:
     some, yaw = np.ones(len(users)), np.array([o.yaw_rad for o in users])
     category = np.array([o.category for o in users], dtype="<U16")
     return Boxes3D(np.full(len(users), t_ns), center, size, yaw, some, category, some, some.astype(np.int64))
+
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize("name", list(DRAW))
+def test_scene_files_have_a_lidar_at_each_end_with_the_ranges_of_the_paper(name: str) -> None:
+    scene = load_scene(ROOT / "samples" / "cooperation" / f"{name}.toml")
+    log, truth = synthesize(scene, observe=False)
+    by_mount = {spec.mount: spec for spec in scene.lidar}
+    assert by_mount["ego"].position_m[2] == 2.0
+    assert by_mount["ego"].range_m == 20.0
+    assert by_mount["map"].position_m[2] == 3.0
+    assert by_mount["map"].range_m == 40.0
+    assert set(log.lidars) == {VEHICLE_LIDAR, ROAD_LIDAR}
+    assert len(truth.agents) == len(scene.agent) + 1

@@ -213,3 +213,31 @@ def test_unusable_models_are_refused_with_file_and_reason(case: str, tmp_path: P
     with pytest.raises(ConfigError, match=message) as caught:
         create_detector(str(path), LOG)
     assert "bad.onnx" in str(caught.value)
+
+
+def picky_model(path: Path, output: NDArray[np.float32], side: int) -> Path:
+    """A model that says it takes any size and fails for all but one."""
+    helper, array = onnx.helper, onnx.numpy_helper.from_array
+    constants = {"c": output, "same": np.zeros((1, 3, side, side), np.float32), "zero": np.zeros(1, np.float32)}
+    nodes = [helper.make_node("Constant", [], [name], value=array(value)) for name, value in constants.items()]
+    nodes += [
+        helper.make_node("Add", ["images", "same"], ["sum"]),
+        helper.make_node("ReduceMean", ["sum"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["c", "nothing"], ["output"]),
+    ]
+    infos = [
+        helper.make_tensor_value_info(n, 1, v) for n, v in (("images", (1, 3, None, None)), ("output", output.shape))
+    ]
+    graph = helper.make_graph(nodes, "picky", infos[:1], infos[1:])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return path
+
+
+def test_a_model_that_refuses_the_sizes_of_other_families_is_recognized(tmp_path: Path) -> None:
+    path = picky_model(tmp_path / "m.onnx", zeros(3549, 85), 416)
+    assert create_detector(str(path), LOG).layout.name == "yolox"  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"m\.onnx: the model fails on an image \(1, 3, 320, 320\)"):
+        create_detector(str(path), LOG, input_px=320)
+    with pytest.raises(ConfigError, match=r"n\.onnx: the model fails on an image"):
+        create_detector(str(picky_model(tmp_path / "n.onnx", zeros(5, 7), 77)), LOG)

@@ -17,7 +17,7 @@ from worlds import tiny_log
 
 from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, ImageRegions, Labels, Log
-from log2sim.errors import LogError
+from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
@@ -260,3 +260,28 @@ def test_detect_and_evaluate_as_commands(tiny_folder: Path, tmp_path: Path) -> N
     assert names(tmp_path) == ["boxes.json", "metrics.json", "scores.png"]
     assert run("evaluate", boxes, "--truth", tiny_folder, "--quiet").out == ""
     assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes).code == 2
+
+
+def test_a_log_of_another_time_and_one_without_labels_are_refused(tiny: Log) -> None:
+    found = detect_log(tiny, LABELS).found
+    later = replace(found, t_ns=found.t_ns + 3600 * NS)
+    with pytest.raises(LogError, match="are both of one log"):
+        evaluate_boxes(later, tiny, Options("center"))
+    with pytest.raises(LogError, match="no labeled 3D boxes"):
+        evaluate_boxes(found, replace(tiny, labels=None), Options("center"))
+    with pytest.raises(LogError, match="of no sweep"):
+        evaluate_boxes(replace(found, t_ns=found.t_ns[:0], boxes=()), tiny, Options("center"))
+    with pytest.raises(ConfigError, match="need a camera"):
+        evaluate_boxes(found, replace(tiny, cameras={}), Options("kitti"))
+
+
+def test_options_name_what_is_wrong() -> None:
+    with pytest.raises(ConfigError, match=r"'kiti' \(did you mean 'kitti'"):
+        Options("kiti")
+    with pytest.raises(ConfigError, match="--score"):
+        Options("kitti", min_score=1.5)
+    with pytest.raises(ConfigError, match="--range: 0 m"):
+        Options("kitti", max_range_m=0.0)
+    with pytest.raises(ConfigError, match="has no 'truck'"):
+        Options("kitti", classes=["truck"]).chosen()
+    assert [c.name for c in Options("center", classes=["two_wheeler", "bus"]).chosen()] == ["two_wheeler", "bus"]

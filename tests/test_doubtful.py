@@ -32,6 +32,7 @@ from log2sim.errors import ConfigError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.export.exporters import Options, export, formats, with_doubtful
 from log2sim.export.openscenario.read import load
+from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
 THROUGH = Doubt("passes_through", "passes through parked at 1.2 s", 1.0, 1.5)
@@ -225,3 +226,18 @@ def test_a_long_side_across_the_way_slides(length_m, turned_deg):
     doubts = sideways_doubts(m, t, np.full(10, 0.4), np.full(10, 3.6))
     assert [doubt.flag for doubt in doubts] == (["sideways"] if length_m == 6.0 and turned_deg == 90.0 else [])
     assert sideways_doubts(m, t, np.full(10, 0.4), np.full(10, 0.5)) == ()
+
+
+def test_the_command_replays_without_them(tmp_path: Path) -> None:
+    doubted().save(tmp_path / "s.json")
+    arguments = ("replay", tmp_path / "s.json", "--dt", "0.1", "--mode", "exact")
+    ran = run(*arguments, "--confidence", "0.5", "--out", tmp_path / "r.json")
+    assert ran.code == 0
+    assert "1 of 3 agents left out: unsure (confidence 0.49)" in ran.out
+    loaded = Replay.load(tmp_path / "r.json")
+    assert [a.id for a in loaded.agents] == ["ego", "sure", "phantom"]
+    assert loaded.left_out == {"unsure": "confidence 0.49"}
+    both = run(*arguments, "--confidence", "0.5", "--drop-doubtful")
+    assert "2 of 3 agents left out: unsure (confidence 0.49), phantom (passes through parked at 1.2 s" in both.out
+    assert "left out" not in run(*arguments).out
+    assert run(*arguments, "--confidence", "2").code == 2

@@ -305,3 +305,15 @@ def test_agents_are_as_uncertain_as_the_poses_that_place_them() -> None:
     standing = with_pose_errors(Agent("b", "car", size, near, static=True), log, timeline).waypoints
     np.testing.assert_allclose(standing.sigma_xy_m, 0.1, atol=1e-3)
     assert with_pose_errors(Agent("a", "car", size, near), log_of(true), timeline).waypoints is near
+
+
+@pytest.mark.parametrize(("step", "bound_m"), [(5, 0.1), (25, 0.1), (50, 0.3)])
+def test_poses_of_a_slower_source_that_repeat_are_not_used(step: int, bound_m: float) -> None:
+    true = drive(10, 50, turn=0.2)
+    rows = np.arange(len(true.t_ns)) // step * step
+    track = replace(true, map_T_ego=true.map_T_ego[rows])
+    found = check_poses(track)
+    assert errors(found, true)[0] < bound_m
+    told = [f for f in list_faults(log_of(track), found.stretches, None) if f.kind == "frozen_poses"]
+    assert len(told) == 1
+    assert "repeat the one before" in told[0].message

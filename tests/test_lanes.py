@@ -19,6 +19,7 @@ from log2sim.geometry import Array
 from log2sim.road.lane_graph import find_covered, find_side_of_traffic, infer_lanes
 from log2sim.road.lane_keeping import find_lane_changes, locate_in_lanes, summarize_lane_keeping
 from log2sim.road.polyline import Polyline, collect_paths
+from log2sim.road.strips import find_strips
 from log2sim.road.strokes import fit_curve
 
 
@@ -290,3 +291,14 @@ def test_inspect_describes_a_scenario(tmp_path: Path) -> None:
     assert document["lanes"] == {"count": 4, "junctions": 0, "inferred_from": {"markings": 4}, "in_file": True}
     assert document["ego_in_lane"]["aside_m"]["mean"] == pytest.approx(0.25, abs=1e-3)
     assert document["notes"] == ["night"]
+
+
+def test_worn_lines_are_bridged_and_long_gaps_are_not() -> None:
+    lines = [
+        paint("right", 0.0),
+        paint("a", 3.5, "dashed", span=(0, 40)),
+        paint("b", 3.5, "dashed", span=(52, 100), turn=True),
+    ]
+    assert [round(s.line.length_m) for s in find_strips(lines, [])] == [100]
+    lines[2] = paint("b", 3.5, "dashed", span=(60, 100))
+    assert sorted(round(s.line.length_m) for s in find_strips(lines, [])) == [40, 40]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plain_settings import AGENTS_ALONE
 from test_pipeline import assert_same_agents
-from worlds import tiny_log
+from worlds import scan, standing, tiny_log
 
 import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
@@ -19,10 +19,10 @@ import log2sim.pipeline
 import log2sim.plan
 from log2sim import Config, Scenario, reconstruct, replay
 from log2sim.agents.estimate import simplify_waypoints
-from log2sim.datatypes import Detections, Frame, Log, Measurements, Waypoints
+from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
 from log2sim.errors import LogError, RecordError
 from log2sim.files.documents import check
-from log2sim.geometry import PoseTrack
+from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.fusion import fuse_tick
 from log2sim.perception.lidar.cloud import assemble_cloud
@@ -280,3 +280,31 @@ def test_a_waypoint_that_departs_in_any_column_stays(column: str) -> None:
 
 
 # --- the report
+
+
+def with_roadside_lidar(log: Log, distance_m: float, reads: Counter[int]) -> Log:
+    """The log with a LiDAR that stands in the map at a distance and sees posts around itself."""
+    points, _ = scan([standing(8.0, 0.0)])
+
+    def read(i: int) -> Sweep:
+        reads[i] += 1
+        return Sweep(int(log.streams["top"].t_ns[i]), points, "lidar", None)
+
+    post = Lidar("post", "map", transform(np.eye(3), np.array([distance_m, 0.0, 1.9])))
+    streams = {**log.streams, "post": Stream("post", log.streams["top"].t_ns, read)}
+    return replace(log, lidars={**log.lidars, "post": post}, streams=streams)
+
+
+def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: Counter[int] = Counter()
+    log = with_roadside_lidar(tiny, 2000.0, reads)
+    without = run(log)
+    step = entry(without, "use of every LiDAR")
+    assert not step["kept"]
+    assert "post" in step["reason"]
+    assert not reads
+    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
+    full = run(log)
+    assert entry(full, "use of every LiDAR")["kept"]
+    assert sum(reads.values()) > 5
+    assert_same_agents(without.scenario, full.scenario, within=0.0)  # its points are beyond the range that is measured

@@ -12,11 +12,11 @@ from worlds import tiny_log
 
 from log2sim import Config, reconstruct
 from log2sim.datatypes import ImageLabels, Log, Stream, Sweep
-from log2sim.errors import LogError
+from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform, yaw_of
 from log2sim.localization.camera_motion import follow_camera
 from log2sim.localization.choice import localize
-from log2sim.localization.odometry import Odometry, run_odometry
+from log2sim.localization.odometry import Odometry, densest_lidar, run_odometry
 from log2sim.localization.replaced import replace_poses
 from log2sim.localization.verdict import fit_to_given
 from log2sim.perception.lidar.cloud import sweep_to_map
@@ -227,3 +227,38 @@ def test_a_scenario_of_a_camera_alone_holds_the_ego() -> None:
     assert result.scenario.ego.quality["source"] == "camera motion"
     assert result.scenario.provenance["poses"] == {"source": "camera"}
     assert isinstance(result.log.ego, PoseTrack)
+
+
+def without_poses(log: Log) -> Log:
+    return replace(log, ego=None)
+
+
+def test_unreadable_sweeps_are_counted_and_bridged() -> None:
+    log, true = bend()
+
+    def change(sweep: Sweep, i: int) -> Sweep:
+        if 8 <= i < 11:
+            raise RecordError("gone")
+        return sweep if i != 15 else replace(sweep, xyz_m=sweep.xyz_m[:10], t_ns=sweep.t_ns[:10])
+
+    found = run_odometry(with_sweeps(log, change), "top")
+    assert found.problems == {"unreadable or without a pose": 3, "too few points": 1}
+    assert len(found.t_ns) == found.sweeps - 3
+    assert found.predicted.sum() == 1
+    assert relative_errors(track_of(found), true)[0][~found.predicted].max() < 0.1
+
+
+def test_the_densest_lidar_on_the_ego_is_taken() -> None:
+    sparse = {"name": "side", "position_m": [0.0, 0.0, 1.0], "channels": 4, "range_m": 20.0}
+    dense = {"name": "top", "position_m": [1.2, 0.0, 1.9], "channels": 24}
+    fixed = {"name": "pole", "position_m": [9.0, 9.0, 5.0], "channels": 24, "mount": "map"}
+    log, _ = drive(HOUSES, STRAIGHT, duration_s=0.3, lidars=[sparse, fixed, dense])
+    assert densest_lidar(log) == "top"
+
+
+def test_an_empty_plain_keeps_the_given_poses() -> None:
+    log, _ = drive([], STRAIGHT, duration_s=1.0, sigma_m=0.3)
+    choice = localize(log, Config.load(poses=AUTO))[1]
+    assert choice.source == "given"
+    with pytest.raises(LogError, match="cannot tell how the ego moves"):
+        localize(without_poses(log), Config())

@@ -20,6 +20,9 @@ from log2sim.datatypes import ImageRegions, Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Camera, PoseTrack
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
+from log2sim.logs.excerpt import cut_log
+from log2sim.logs.native.writer import write_log
+from log2sim.logs.opening import open_log
 from log2sim.plan import select_sensors
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
@@ -163,3 +166,37 @@ def test_reconstruct_inspect_and_validate_tell_the_same(log_folder: Path, tmp_pa
     ran = run("validate", log_folder)
     assert ran.code == 3
     assert all(line in ran.err for line in told)
+
+
+def test_of_a_part_of_a_log_no_label_is_kept_that_is_far_from_it() -> None:
+    log = sound()
+    once = log.labels.t_ns[log.labels.track_id == log.labels.track_id[0]][0]
+    rows = np.flatnonzero((log.labels.track_id != log.labels.track_id[0]) | (log.labels.t_ns == once))
+    columns = {
+        k: v[rows] for k, v in vars(log.labels).items() if isinstance(v, np.ndarray) and len(v) == len(log.labels.t_ns)
+    }
+    part = cut_log(log.changed(labels=replace(log.labels, **columns)), start_s=2.5, stop_s=3.0)
+    assert log.labels.track_id[0] not in part.labels.track_id
+    assert list_time_problems(part) == []
+
+
+def test_no_pose_at_the_ticks_of_a_run_is_told_by_its_reason(tiny_folder: Path, tmp_path: Path) -> None:
+    """The first half of the poses is lost, and the run takes the first ticks."""
+    log = open_log(tiny_folder)
+    later = log.ego.t_ns > log.streams["front"].t_ns[0] + NS_PER_S // 2
+    part = log.changed(ego=PoseTrack(log.ego.t_ns[later], log.ego.map_T_ego[later]))
+    write_log(part, tmp_path / "log")
+    ran = run(
+        "reconstruct",
+        tmp_path / "log",
+        "--out",
+        tmp_path / "s.json",
+        "--detector",
+        "labels",
+        "--stop",
+        "0.1",
+        "--quiet",
+    )
+    assert ran.code == 4
+    assert "the ego poses are from 17" in ran.line
+    assert "no ego poses" not in ran.line

@@ -256,3 +256,23 @@ def test_moving_cars_are_in_their_boxes_at_the_times_of_the_labels(sample: Log) 
     assert total > 2000
     assert inside[0] / total > 0.98
     assert inside[1] / total < 0.92
+
+
+@pytest.mark.parametrize(
+    ("gone", "streams", "words"),
+    [
+        ("sensors/cameras", {"up_lidar", "down_lidar"}, "no images: sensors/cameras/ holds none"),
+        (INTRINSICS, {"up_lidar", "down_lidar"}, f"images of 1 cameras left out: {INTRINSICS} is missing"),
+        ("sensors/lidar", {"ring_front_center"}, "no sweeps: sensors/lidar/ holds none"),
+        (ANNOTATIONS, {"ring_front_center", "up_lidar", "down_lidar"}, f"no labels: {ANNOTATIONS} is missing"),
+    ],
+)
+def test_parts_may_be_missing(folder: Path, gone: str, streams: set[str], words: str) -> None:
+    if (folder / gone).is_dir():
+        shutil.rmtree(folder / gone)
+    else:
+        (folder / gone).unlink()
+    log = open_log(folder)
+    assert set(log.streams) == streams
+    assert any(note.startswith(words) for note in log.notes), log.notes
+    assert (log.labels is None) == (gone == ANNOTATIONS)

@@ -231,3 +231,39 @@ def test_files_with_four_columns_and_with_named_columns(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_sweep(tmp_path / "a.npz", 0).intensity, [1, 3])
     assert read_sweep(tmp_path / "b.bin", 0).intensity is None
     assert read_sweep(tmp_path / "b.npz", 0).intensity is None
+
+
+def pcd(fields: str, types: str, sizes: str, counts: str, points: str, rows: np.ndarray) -> bytes:
+    lines = (f"FIELDS {fields}", f"SIZE {sizes}", f"TYPE {types}", f"COUNT {counts}", f"POINTS {points}", "DATA binary")
+    return "\n".join(lines).encode() + b"\n" + rows.tobytes()
+
+
+XYZT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+
+
+def timed(kind: str, t: float) -> np.ndarray:
+    rows = np.zeros(2, dtype=[*XYZT, ("t", kind)])
+    rows["t"] = t
+    return rows
+
+
+ODD_PCD = {
+    "axis of no column": pcd("x y z", "F F F", "4 4 4", "0 1 1", "2", np.zeros(2, XYZT)),
+    "axis of two columns": pcd("x y z", "F F F", "4 4 4", "2 1 1", "2", np.zeros(4, XYZT)),
+    "time of two columns": pcd("x y z t", "F F F F", "4 4 4 4", "1 1 1 2", "2", np.zeros(9, XYZT)),
+    "points overflow": pcd("x y z", "F F F", "4 4 4", "1 1 1", "9" * 400, np.zeros(2, XYZT)),
+    "points of 5000 digits": pcd("x y z", "F F F", "4 4 4", "1 1 1", "9" * 5000, np.zeros(2, XYZT)),
+    "absolute time at the end of uint64": pcd(
+        "x y z timestamp", "F F F U", "4 4 4 8", "1 1 1 1", "2", timed("<u8", 2**64 - 1)
+    ),
+    "seconds without end": pcd("x y z t", "F F F F", "4 4 4 8", "1 1 1 1", "2", timed("<f8", 1e300)),
+    "width without height": b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nDATA binary\n" + bytes(24),
+    "much text": b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 20000000\nDATA ascii\n" + b"1 " * 100,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ODD_PCD)
+def test_odd_headers_of_pcd_files_are_record_errors(tmp_path: Path, name: str) -> None:
+    (tmp_path / "s.pcd").write_bytes(ODD_PCD[name])
+    with pytest.raises(RecordError, match="not a readable sweep"):
+        read_sweep(tmp_path / "s.pcd", STAMP_NS)

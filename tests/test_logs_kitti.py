@@ -195,3 +195,23 @@ def test_the_recorded_drive_opens_with_its_real_stamps(real_data: Path) -> None:
     near = np.linalg.norm(sweep.xyz_m[:, :2], axis=1) < 12
     heights = apply(log.lidars["velodyne"].mount_T_lidar, sweep.xyz_m[near])[:, 2]
     assert abs(np.median(heights[heights < 0.4])) < 0.1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "3 7 Spaceship 0 0",
+        "3 7 Car 0 0 0 1 2 30 20 1.5",
+        "3 7 Car 0 0 x 1 2 30 20 1 1 1 1 1 1 1",
+        "2" * 30 + " 7 Car" + " 1" * 14,
+        "3 7 Car" + " 1" * 17,
+    ],
+)
+def test_a_damaged_label_line_is_left_out_and_counted(tracking: Path, line: str) -> None:
+    file = tracking / "training" / "label_02" / "0007.txt"
+    before = open_log(tracking)
+    file.write_text(file.read_text() + line + "\n")
+    log = open_log(tracking)
+    assert log.labels.track_id.tolist() == before.labels.track_id.tolist()
+    (note,) = set(log.notes) - set(before.notes)
+    assert note.startswith(f"1 of 4 rows of labels are damaged and left out, first: {file}, line 4: ")

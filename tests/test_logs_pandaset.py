@@ -15,9 +15,9 @@ from log_encoders.pandaset import encode
 from log_encoders.world import world_log
 
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import apply, inverse, wrap_angle
+from log2sim.geometry import apply, inverse, rotation_from_rpy, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.pandaset.reader import PERIOD_NS, read_labels
+from log2sim.logs.pandaset.reader import PERIOD_NS, georeference, read_labels
 from log2sim.logs.stamps import compute_scan_offset_ns
 
 
@@ -217,3 +217,32 @@ def test_impossible_numbers_are_refused_by_the_file_that_holds_them(
 ) -> None:
     with pytest.raises(LogError, match=words):
         _ = open_log(changed(world, tmp_path, name, change)).labels
+
+
+def track(turn_rad: float, length_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Fixes and map positions of a drive to the north-east; the map is turned by `turn_rad` against east and north."""
+    from pyproj import Geod
+
+    s = np.linspace(0, length_m, 30)
+    lon, lat, _ = Geod(ellps="WGS84").fwd(np.full(30, -122.4), np.full(30, 37.7), np.full(30, 30.0), s)
+    east_north = np.stack([s * np.sin(np.radians(30)), s * np.cos(np.radians(30)), np.zeros(30)], axis=1)
+    return np.stack([lat, lon, np.full(30, 5.0)], axis=1), east_north @ rotation_from_rpy(0, 0, turn_rad).T + [
+        3.0,
+        -2.0,
+        1.0,
+    ]
+
+
+def test_the_map_is_tied_to_earth_only_where_gnss_shows_its_north() -> None:
+    from pyproj import Proj
+
+    geodetic, xyz = track(0.0, 80.0)
+    frame, reason = georeference(geodetic, xyz, "gps")
+    assert reason == ""
+    x, y = Proj(frame.projection)(geodetic[:, 1], geodetic[:, 0])
+    np.testing.assert_allclose(np.stack([x, y], 1), xyz[:, :2], atol=0.01)
+    assert frame.altitude_m == pytest.approx(4.0, abs=1e-3)
+    for turn, length, words in ((0.1, 80.0, "differ by"), (0.0, 5.0, "moves less than")):
+        frame, reason = georeference(*track(turn, length), "gps")
+        assert words in reason
+        assert frame.projection is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from log_encoders.world import world_log
 
 from log2sim import open_log
 from log2sim.datatypes import Log, Stream
-from log2sim.errors import LogError, RecordError
-from log2sim.geometry import NS_PER_S
+from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.geometry import NS_PER_S, transform
+from log2sim.logs.ros import bag
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.containers import ChunkedFile
 
@@ -224,3 +226,80 @@ def test_recorded_bags_without_sensors_list_their_topics(name: str, topic: str, 
     with pytest.raises(LogError, match=topic) as caught:
         open_log(source)
     assert "\n" not in str(caught.value)
+
+
+def test_header_stamps_that_are_zero_or_of_another_clock_are_noted(tmp_path: Path) -> None:
+    def spoiled(message: Message) -> Message:
+        header = getattr(message[4], "header", None)
+        if message[2].startswith("/front/image"):
+            header.stamp = replace(header.stamp, sec=0, nanosec=0)
+        if message[2] == "/top/points":
+            header.stamp = replace(header.stamp, sec=header.stamp.sec - 1000)
+        return message
+
+    path = bag_of(tmp_path, Style("mcap", poses="odometry"), spoiled)
+    log = open_log(path)
+    assert any("/front/image_raw/compressed: its header stamps are all 0" in note for note in log.notes)
+    assert any("/top/points: its header stamps are" in note and "not synchronized" in note for note in log.notes)
+    np.testing.assert_array_equal(log.streams["front"].t_ns, world_log().streams["front"].t_ns + ros.IMAGE_DELAY_NS)
+    settings = '[lidars.top]\ntopic = "/top/points"\nstamps = "recorded"\n'
+    told = open_log(with_settings(path, settings))
+    np.testing.assert_array_equal(told.streams["top"].t_ns, world_log().streams["top"].t_ns + ros.OTHER_DELAY_NS)
+
+
+def test_no_more_than_a_limit_is_kept_of_what_is_read_at_opening(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_of(tmp_path, Style())
+    monkeypatch.setattr(bag, "MAX_COLLECTED_BYTES", 5000)
+    log = open_log(path)
+    assert any("have more than 5000 bytes; the rest is not read" in note for note in log.notes)
+    monkeypatch.setattr(bag, "MAX_INDEX_BYTES", 40)
+    damaged = open_log(path)
+    assert any("/tf_static: 1 of 1 messages are damaged" in note for note in damaged.notes)
+
+
+def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None:
+    def turned(message: Message) -> Message:
+        if message[2] == "/gnss/imu":
+            q = message[4].orientation
+            q.w, q.x, q.y, q.z = (0.7071067811865476 * v for v in (q.w - q.z, q.x - q.y, q.y + q.x, q.z + q.w))
+        return message
+
+    placed = replace(
+        world_log().map, latitude_deg=48.0, longitude_deg=11.0, altitude_m=0.0, projection="+proj=utm +zone=32"
+    )
+    world = replace(world_log(), map=placed)
+    style = Style("bag", poses="gnss", ego_T_base=transform(np.eye(3), [0.3, 0.0, 0.9]))
+    for turn, expected in ((lambda m: m, False), (turned, True)):
+        folder = tmp_path / str(expected)
+        path = ros.write((turn(m) for m in Maker(world, style)), folder, "world", style)
+        log = open_log(path)
+        assert any("degrees off the direction of travel" in note for note in log.notes) == expected
+
+
+WRONG_SETTINGS = {
+    '[cameras.front]\ntopic = "/front/image"': "'cameras.front.topic' is '/front/image', but .*did you mean '/front/image_raw/compressed'",
+    '[lidars.top]\ntopic = "/front/camera_info"': "holds sensor_msgs/msg/CameraInfo, expected .*sensor_msgs/msg/PointCloud2",
+    '[lidars.top]\ntopik = "/top/points"': "unknown key 'lidars.top.topik'; did you mean 'lidars.top.topic'",
+    '[lidars.top]\ntopic = "/top/points"\ntime_unit = "minutes"': "'lidars.top.time_unit' is 'minutes', expected one of",
+    '[poses]\nsource = "gnss"': "asks for source 'gnss', which gives none",
+    "[ego]\norigin_m = [1.0, 2.0]": "'ego.origin_m' has 2 values",
+    'reference_camera = "rear"': "'reference_camera' is 'rear'; there are: front",
+    "[ego\n": "not valid TOML",
+    '[[static_transforms]]\nparent = "a"\nchild = "b"\nrotation_wxyz = [1.0, 1.0, 0.0, 0.0]': "has norm 1.41421",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bag_of(tmp_path_factory.mktemp("plain"), Style("bag"))
+
+
+@pytest.mark.parametrize("text", WRONG_SETTINGS)
+def test_wrong_settings_are_named(text: str, plain: Path) -> None:
+    with pytest.raises(ConfigError, match=WRONG_SETTINGS[text]) as caught:
+        open_log(with_settings(plain, text))
+    assert "\n" not in str(caught.value)
+    assert "world.topics.toml" in str(caught.value)
+    plain.with_name("world.topics.toml").unlink()

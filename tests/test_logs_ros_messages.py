@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_encoders import ros
+from rosbags.typesys import get_types_from_msg
 
 from log2sim.errors import RecordError
-from log2sim.geometry import apply, inverse, project, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, apply, inverse, project, rotation_from_rpy, transform
 from log2sim.logs.ros.frames import FrameTree
-from log2sim.logs.ros.messages import LidarTopic
+from log2sim.logs.ros.messages import LidarTopic, sweep_from_livox
 from log2sim.logs.ros.sensors import (
     ENCODINGS,
     camera_from_info,
@@ -245,3 +247,37 @@ def test_a_frame_that_moves_has_no_mount_but_a_track() -> None:
     # The slower edge is held before its first and after its last stamp.
     np.testing.assert_allclose(track.map_T_ego[[0, 3, 10], :3, 3], [[0, 5, 2], [3, 6, 2], [10, 7, 2]])
     assert tree.track("world", "lidar") is None
+
+
+LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+
+
+LIVOX = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+)
+
+
+@pytest.mark.parametrize("frame", ["livox_frame", "l", "of7char"])
+@pytest.mark.parametrize("ros1", [True, False])
+def test_clouds_of_the_livox_driver_are_those_that_another_library_writes(ros1: bool, frame: str) -> None:
+    name = "livox_ros_driver2/msg/CustomMsg"
+    store = ros.typestore(ros1)
+    store.register({**get_types_from_msg(LIVOX_POINT, name.replace("Msg", "Point")), **get_types_from_msg(LIVOX, name)})
+    make = {kind.rpartition("/")[2]: store.types[kind] for kind in store.types if kind != "std_msgs/msg/Time"}
+    stamp = make["Time"](sec=STAMP_NS // NS_PER_S, nanosec=STAMP_NS % NS_PER_S)
+    header = make["Header"](stamp=stamp, frame_id=frame, **({"seq": 5} if ros1 else {}))
+    points = [
+        make["CustomPoint"](offset_time=int(t), x=x, y=y, z=z, reflectivity=9, tag=16, line=3)
+        for t, (x, y, z) in zip(AFTER_NS, XYZ.tolist())
+    ]
+    message = make["CustomMsg"](
+        header=header, timebase=STAMP_NS, point_num=len(points), lidar_id=1, rsvd=np.zeros(3, np.uint8), points=points
+    )
+    raw = bytes(store.serialize_ros1(message, name) if ros1 else store.serialize_cdr(message, name))
+    encoding = "ros1" if ros1 else "cdr"
+    sweep = sweep_from_livox(raw, encoding, STAMP_NS, PLAIN, "cloud")
+    np.testing.assert_array_equal(sweep.xyz_m, XYZ)
+    np.testing.assert_array_equal(sweep.t_ns, STAMP_NS + AFTER_NS)
+    for cut in (0, 10, 30, 60, len(raw) - 2):
+        with pytest.raises(RecordError, match=r"^cloud: \d+ bytes"):
+            sweep_from_livox(raw[:cut], encoding, STAMP_NS, PLAIN, "cloud")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyproj
 import pytest
@@ -13,7 +14,7 @@ import tifffile
 from log2sim.datatypes import MapFrame
 from log2sim.errors import LogError
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.map_files import read_png_map, world_file_of, write_map, write_world_file
+from log2sim.road.map_files import geokeys_of, lowest_m, read_png_map, world_file_of, write_map, write_world_file
 
 PROJECTIONS = {
     "kitti": "+proj=merc +R=6378137 +lon_0=8.4228 +k_0=0.6559113 +x_0=0 +y_0=-4117000.68 +units=m +no_defs",
@@ -114,3 +115,25 @@ def test_a_map_without_a_usable_world_file_is_refused(world: str | None, reason:
         (tmp_path / "m.pgw").write_text(world)
     with pytest.raises(LogError, match=reason):
         read_png_map(tmp_path / "m.png", MapFrame())
+
+
+@pytest.mark.parametrize(
+    ("projection", "reason"),
+    [(None, "does not tell"), ("+proj=nothing", "no known projection"), ("+proj=moll +lon_0=0", "no key")],
+)
+def test_without_a_place_on_earth_the_keys_say_so(projection: str | None, reason: str, tmp_path: Path) -> None:
+    keys = geokeys_of(MapFrame(projection=projection))
+    assert keys.problem is not None
+    assert reason in keys.problem
+    write_map(small_map(), tmp_path / "m.tif", "height", MapFrame(projection=projection))
+    with tifffile.TiffFile(tmp_path / "m.tif") as file:
+        assert decoded(file.pages[0])[1024] == 32767
+
+
+def test_a_png_of_heights_has_steps_of_a_centimeter(tmp_path: Path) -> None:
+    ground = small_map()
+    write_map(ground, tmp_path / "h.png", "height")
+    steps = cv2.imread(str(tmp_path / "h.png"), cv2.IMREAD_UNCHANGED)
+    known = np.isfinite(ground.height_m)
+    assert not steps[~known].any()
+    np.testing.assert_allclose(lowest_m(ground) + 0.01 * (steps[known] - 1.0), ground.height_m[known], atol=0.0051)

@@ -223,3 +223,27 @@ def test_a_truth_in_another_projection_is_reprojected():
             assert result["yaw_median_deg"] < 0.02
         assert result["placement"]["ego_apart_m"] is None
         assert evaluate(ours, truth)["ego"]["position_rmse_m"] < 1e-5
+
+
+def test_without_a_georeference_the_truth_goes_where_the_egos_fit():
+    """Rotated by 40 degrees and 1 km away; a standing ego has a heading, too."""
+    turn = np.radians(40)
+    for ego in (world().ego, agent("ego", 3.0, 1.0, yaw=0.3, static=True)):
+        ours = scenario(ego, *world().others)
+        far = []
+        for a in ours.agents:
+            w = a.waypoints
+            x, y = np.cos(turn) * w.x_m - np.sin(turn) * w.y_m, np.sin(turn) * w.x_m + np.cos(turn) * w.y_m
+            far.append(
+                replace(a, waypoints=replace(w, x_m=x + 1000, y_m=y - 500, z_m=w.z_m + 7, yaw_rad=w.yaw_rad + turn))
+            )
+        result = evaluate(ours, replace(ours, agents=tuple(far), map=MapFrame(projection="+proj=utm +zone=33")))
+        assert result["placement"]["method"] == "ego_path"
+        assert result["placement"]["ego_apart_m"] < 1e-6
+        assert result["position_rmse_m"] < 1e-6
+        assert result["yaw_median_deg"] < 1e-6
+    # Maps of one projection stay: a wrong pose is an error.
+    assert evaluate(shifted(world(), 5.0), world())["placement"] == {"method": "ego_path", "ego_apart_m": 0.0}
+    utm = MapFrame(projection="+proj=utm +zone=33")
+    same = evaluate(replace(shifted(world(), 5.0), map=utm), replace(world(), map=utm))
+    assert same["placement"] == {"method": "same_map", "ego_apart_m": 5.0}

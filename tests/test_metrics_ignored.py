@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import tiny_log
 
-from log2sim.datatypes import Agent, IgnoreRegions, LabelView, Scenario, Waypoints
-from log2sim.errors import ScenarioError
+from log2sim.datatypes import Agent, IgnoreRegions, ImageRegions, LabelView, Scenario, Waypoints
+from log2sim.errors import LogError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check
 from log2sim.geometry import Camera
+from log2sim.logs.native.writer import write_log
+from log2sim.logs.opening import open_log
 
 T_S = np.arange(21) / 10
 CAR = (4.0, 2.0, 1.5)
@@ -148,3 +151,36 @@ def test_a_truth_file_keeps_its_views(tmp_path):
     np.testing.assert_array_equal(again.ignore_regions.views[0].map_T_cam, seen.map_T_cam)
     TRUTH.save(tmp_path / "plain.json")
     assert "unlabeled" not in json.loads((tmp_path / "plain.json").read_text())
+
+
+def labeled_by_camera(log, t_ns, boxes, cameras=("front",)):
+    return replace(
+        log,
+        labels=replace(log.labels, cameras=cameras),
+        ignored_regions={"front": ImageRegions(np.asarray(t_ns, dtype=np.int64), np.asarray(boxes, dtype=float))},
+    )
+
+
+def test_a_native_log_keeps_its_regions_and_names_what_is_wrong(tmp_path):
+    log, _ = tiny_log(duration_s=0.2)
+    log = labeled_by_camera(log, log.streams["front"].t_ns[[0, 1]], [[0.5, 1, 20, 30], [4, 5, 60, 70]])
+    write_log(log, tmp_path / "log")
+    again = open_log(tmp_path / "log")
+    assert again.labels.cameras == ("front",)
+    for column in ("t_ns", "box_px"):
+        expected = getattr(log.ignored_regions["front"], column)
+        np.testing.assert_array_equal(getattr(again.ignored_regions["front"], column), expected)
+    table, manifest = tmp_path / "log/labels/ignored_2d.csv", tmp_path / "log/log.json"
+    text = table.read_text()
+    table.write_text(text.replace("60.0,70.0", "60.0,5.0"))
+    with pytest.raises(LogError, match=r"ignored_2d.csv, line 3, field 'u1_px,v1_px'.*empty"):
+        open_log(tmp_path / "log")
+    table.write_text(text.replace(",front,", ",back,"))
+    with pytest.raises(LogError, match=r"ignored_2d.csv, line 2, field 'camera': no camera 'back'"):
+        open_log(tmp_path / "log")
+    table.write_text(text)
+    document = json.loads(manifest.read_text())
+    document["labels"]["cameras"] = ["rear"]
+    manifest.write_text(json.dumps(document))
+    with pytest.raises(LogError, match=r"field 'labels.cameras': no camera 'rear'"):
+        open_log(tmp_path / "log")

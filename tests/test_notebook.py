@@ -7,15 +7,19 @@ import re
 from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 from worlds import tiny_log
 
+from log2sim import plot
 from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.datatypes.scenario import COLUMNS
+from log2sim.errors import ConfigError, ScenarioError
 from log2sim.perception.sync import synchronize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
@@ -166,3 +170,65 @@ def test_agents_are_drawn_where_their_labels_are(log: Log, scenario: Scenario) -
         k = int(np.argmin(np.linalg.norm(known.center_m - at, axis=1)))
         assert at == pytest.approx(known.center_m[k], abs=0.02)
         assert size == pytest.approx(known.size_m[k])
+
+
+def test_what_holds_columns_shows_them_by_their_shapes(log: Log, scenario: Scenario) -> None:
+    agent = scenario.agents[0]
+    values = (agent, agent.waypoints, log.labels, log.ego, log.cameras["front"], log.streams["front"], log.lidars)
+    shown = [repr(value) for value in values]
+    assert max(map(len, shown)) < 500
+    assert not any("array(" in text or "\n" in text for text in shown)
+    assert repr(agent).startswith(f"<Agent {agent.id!r}: {agent.category}")
+    assert f"t_s=<({len(agent.waypoints)},) float64>" in shown[1]
+
+
+def test_a_log_without_cameras_shows_a_sweep(log: Log) -> None:
+    blind = log.changed(cameras={})
+    assert "top, from above" in Tags(blind._repr_html_() or "").text
+
+
+def test_a_failed_parquet_file_leaves_the_old_one(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pq = pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "agents.parquet"
+    path.write_text("old")
+
+    def full(table: Any, target: Path) -> None:
+        target.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(ConfigError, match=r"agents\.parquet: cannot be written: No space left"):
+        scenario.to_parquet(path)
+    assert [f.name for f in tmp_path.iterdir()] == ["agents.parquet"]
+    assert path.read_text() == "old"
+
+
+def test_a_log_shows_a_moment(log: Log, scenario: Scenario, tmp_path: Path) -> None:
+    picture = log.show(log.ticks()[5], camera="front", scenario=scenario)
+    shown = cv2.imdecode(np.frombuffer(picture._repr_png_(), np.uint8), cv2.IMREAD_COLOR)
+    assert shown.std() > 20
+    assert "agent: vehicle" in [t.get_text() for legend in picture.figure.legends for t in legend.get_texts()]
+    assert "0.500 s" in repr(picture)
+    picture.save(tmp_path / "tick.png")
+    with pytest.raises(ConfigError, match="exists already"):
+        picture.save(tmp_path / "tick.png")
+    with pytest.raises(ConfigError, match="no camera 'back'"):
+        log.show(0.5, camera="back")
+    with pytest.raises(ConfigError, match=r"ticks from 0 to 0\.900 s"):
+        log.show(7.0)
+
+
+def test_plot_makes_a_figure_of_its_own(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib.pyplot as plt
+
+    monkeypatch.setattr(matplotlib, "rcParams", matplotlib.rcParams.copy())
+    plt.switch_backend("agg")
+    ax = plot(scenario, truth=scenario)
+    assert ax.figure.number in plt.get_fignums()
+    plt.close(ax.figure)
+    other = replace(scenario, map=replace(scenario.map, projection="+proj=utm +zone=33"))
+    with pytest.raises(ScenarioError, match=r"map\.projection"):
+        plot(scenario, truth=other)
+    assert plt.get_fignums() == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import os
 import signal
 import subprocess
@@ -17,6 +18,8 @@ from log2sim.errors import ConfigError
 from log2sim.files import outputs as output_folders
 from log2sim.files.documents import check_targets, replaced, write_json
 from log2sim.files.outputs import (
+    claim,
+    holding_claims,
     refusing_to_replace,
     replaced_folder,
     temporary_beside,
@@ -142,4 +145,37 @@ def test_a_folder_that_is_replaced_is_there_at_every_moment(tmp_path: Path, monk
         (folder / "new").write_text("x")
     assert seen == [(["new"], ["old"]), (["old"], ["new"])]
     assert names(target) == ["new"]
+    assert names(tmp_path) == ["log"]
+
+
+def test_with_overwrite_another_run_does_not_matter(tmp_path: Path) -> None:
+    contexts = [contextvars.copy_context() for _ in range(3)]
+    holders = [holding_claims() for _ in contexts]
+    for context, holder in zip(contexts, holders):
+        context.run(holder.__enter__)
+    contexts[0].run(claim, tmp_path / "a", overwrite=False)
+    contexts[1].run(claim, tmp_path / "a", overwrite=True)
+    with pytest.raises(ConfigError, match="another run is about to write it"):
+        contexts[2].run(claim, tmp_path / "a", overwrite=False)
+    for context, holder in zip(contexts, holders):
+        context.run(holder.__exit__, None, None, None)
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_placed_leaves_the_earlier_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "log"
+    target.mkdir()
+    (target / "a").write_text("x")
+    sound = Path.rename
+
+    def fails(self: Path, new: Path) -> Path:
+        if new == target and ".old" not in self.name:
+            raise OSError(28, "No space left on device", str(self))
+        return sound(self, new)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    monkeypatch.setattr(output_folders, "exchange_names", lambda one, other: False)  # as on other systems
+    with pytest.raises(ConfigError, match="log: cannot be written: No space"), replaced_folder(target, overwrite=True):
+        pass
+    assert names(target) == ["a"]
     assert names(tmp_path) == ["log"]

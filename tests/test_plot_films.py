@@ -16,16 +16,20 @@ from export_worlds import straight, world
 from matplotlib.colors import to_rgb
 
 from log2sim.datatypes import Scenario
+from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import encoding
+from log2sim.visualization.plot.layers import Overlays
 from log2sim.visualization.plot.selection import (
     PlotOptions,
     TimeRange,
     cut_replay,
     cut_scenario,
+    select_shown,
 )
 from log2sim.visualization.plot.style import INK
-from log2sim.visualization.plot.tracks import plot_tracks
+from log2sim.visualization.plot.tracks import plot_tracks, still
+from log2sim.visualization.plot.viewport import assign_roles
 
 
 def scene() -> Scenario:
@@ -159,3 +163,35 @@ def test_a_film_plays_in_a_browser(tmp_path: Path, name: str, kind: str) -> None
             c.width = v.videoWidth; c.height = v.videoHeight; const g = c.getContext('2d'); g.drawImage(v, 0, 0);
             return [...g.getImageData(2, 2, 1, 1).data].slice(0, 3)"""
         assert min(browser.run(pixel)) > 245  # the paper is white
+
+
+def test_without_pyav_an_mp4_becomes_a_webm_which_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(encoding, "_import_av", lambda: None)
+    scene().save(tmp_path / "s.json")
+    options = ("--size", "480x320", "--stop", 0.3, "--fps", 10)
+    ran = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
+    assert ran.code == 0, ran.err
+    (note,) = [line for line in ran.out.splitlines() if line.startswith("note:")]
+    assert "'video'" in note
+    assert note.endswith("written as film.webm")
+    assert names(tmp_path) == ["film.webm", "s.json"]
+    again = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
+    assert (again.code, "film.webm: exists already" in again.line) == (2, True)
+    first = (tmp_path / "film.webm").read_bytes()
+    assert run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options, "--overwrite").code == 0
+    assert (tmp_path / "film.webm").read_bytes() == first
+    found, frames = read_film(tmp_path / "film.webm")
+    assert (found["name"], found["width"], len(frames)) == ("vp9", 480, 4)
+
+
+def test_a_picture_shows_the_agents_and_the_part_of_the_map_that_it_is_asked_for() -> None:
+    scenario = scene()
+    options = PlotOptions(extent_m=(12.0, 9.0, -3.0, -4.0), agents=("car-1",))
+    shown, result = select_shown(scenario, replay(scenario, dt_s=0.05), options)
+    assert [a.id for a in shown.agents] == [a.id for a in result.agents] == ["car-1"]
+    layout = still(shown, assign_roles(shown), Overlays(options=options))
+    x0, x1, y0, y1 = *layout.ax.get_xlim(), *layout.ax.get_ylim()
+    assert (x0 + x1, y0 + y1) == pytest.approx((9.0, 5.0))
+    assert min(x1 - x0 - 15.0, y1 - y0 - 13.0) == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(ConfigError, match=r"agents: 'car1' is no agent.*'car-1'"):
+        select_shown(scenario, None, PlotOptions(agents=("car1",)))

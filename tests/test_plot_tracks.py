@@ -269,3 +269,33 @@ def test_boxes_are_hatched_where_they_are_doubtful() -> None:
     assert (
         striped(drawn(replace(clean, agents=tuple(replace(a, doubts=(), confidence=1.0) for a in clean.agents)))) == []
     )
+
+
+def texts(sheet: FigureLayout) -> list[str]:
+    return [t.get_text() for legend in sheet.figure.legends for t in legend.get_texts()]
+
+
+def meeting() -> Scenario:
+    """Eighteen that end a meter apart, so that their labels want the same places."""
+    ways = [(np.cos(a), np.sin(a)) for a in np.linspace(0, 2 * np.pi, 18, endpoint=False)]
+    return make_scenario(*(make_agent(str(k), (22 * c, 22 * s), (-10 * c, -10 * s)) for k, (c, s) in enumerate(ways)))
+
+
+@pytest.mark.parametrize("scenario", [many(40), meeting()], ids=["spread", "meeting"])
+def test_labels_do_not_overlap(scenario: Scenario) -> None:
+    sheet = draw(scenario)
+    sheet.canvas.draw()
+    labels = [t for t in sheet.ax.texts if t.get_fontweight() == "bold"]
+    assert len(labels) > 6
+    boxes = [t.get_window_extent() for t in labels]
+    for i, a in enumerate(boxes):
+        # Letters of the box's edge may touch; a shared area of more than a pixel or two is an overlap.
+        assert not any(
+            min(a.x1, b.x1) - max(a.x0, b.x0) > 2 and min(a.y1, b.y1) - max(a.y0, b.y0) > 2 for b in boxes[:i]
+        )
+
+
+def test_overlays_get_a_line_in_the_legend() -> None:
+    scenario = crossing()
+    assert not {"truth", "replay"} & set(texts(draw(scenario)))
+    assert {"truth", "replay"} <= set(texts(draw(scenario, truth=scenario, replay=replay(scenario))))

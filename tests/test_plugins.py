@@ -13,7 +13,7 @@ from plugin_packages import SECTION, install, install_readme
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.datatypes import Log
-from log2sim.errors import PluginError
+from log2sim.errors import LogError, PluginError
 from log2sim.export.exporters import export
 from log2sim.files import plugins
 from log2sim.perception.detect3d.detectors import create_lidar_detector
@@ -166,3 +166,47 @@ def test_what_is_no_plug_in_is_one_line_that_names_the_package(
     with pytest.raises(PluginError, match=rf"'mine' of {PACKAGE} \(broken:THING\): {message}") as raised:
         plugins.load(kind, "mine")
     assert "\n" not in str(raised.value)
+
+
+READER = """
+class Reader:
+    name, looks_for, suffixes = "mine", "nothing", ()
+    def matches(self, path): return {matches}
+    def sequences(self, path): return {sequences}
+    def open(self, path, sequence): return {log}
+THING = Reader()
+"""
+
+
+GOOD = {"matches": "True", "sequences": "['a']", "log": "None"}
+
+
+@pytest.mark.parametrize("code", ["import no_such_module", READER.format(**{**GOOD, "matches": "path.nothing"})])
+def test_a_broken_reader_keeps_no_other_log_from_being_opened(
+    packages: Path, tiny_folder: Path, tmp_path: Path, code: str
+) -> None:
+    broken(packages, "log", code)
+    log = open_log(tiny_folder)
+    assert log.format == "log2sim"
+    told = [note for note in log.notes if "'broken 2.1'" in note]
+    assert len(told) == code.startswith("import")
+    with pytest.raises((LogError, PluginError), match=PACKAGE):
+        open_log(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("def THING(seen): return 1", r"policy at 0 s: answered int, expected log2sim\.simulation\.policy\.Controls"),
+        (
+            "class THING:\n    def __init__(self, x): pass",
+            r"cannot be made: TypeError: .*missing 1 required positional argument: 'x'",
+        ),
+        ("THING = 3", r"is a int, expected a callable policy\(observation\) -> Controls"),
+        ("def THING(seen): return seen.nothing", r"policy at 0 s: raised AttributeError"),
+    ],
+)
+def test_a_policy_that_fails_is_one_line(packages: Path, tiny_folder: Path, code: str, message: str) -> None:
+    broken(packages, "policy", code)
+    with pytest.raises(PluginError, match=rf"^policy 'mine' of {PACKAGE} \(broken:THING\): {message}"):
+        replay(Scenario.load(tiny_folder / "truth.json"), ego=load_policy("mine"))

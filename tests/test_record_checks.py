@@ -8,17 +8,19 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
-from worlds import scan, standing, tiny_log
+from worlds import camera_ahead, scan, standing, tiny_log
 
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.records import (
     CameraWatch,
     LidarWatch,
+    RecordWatch,
     shows_nothing,
     shrink,
     sketch_sweep,
 )
+from log2sim.perception.sync import synchronize
 
 STEP_NS = 100_000_000
 COUNT = 10
@@ -148,3 +150,25 @@ def test_flat_ground_alone_looks_the_same_from_everywhere_and_is_no_copy():
     log = lidar_log(0.5)
     ground, _ = scan([], sensor=(0.0, 0.0, 1.9))
     assert not any(repeated(log, [Sweep(int(t), ground - [0.0, 0.0, 1.9]) for t in STAMPS]))
+
+
+def streams_log(**stamps):
+    cameras = {name: camera_ahead(name) for name in stamps if name != "top"}
+    lidars = {"top": Lidar("top", "map", np.eye(4))} if "top" in stamps else {}
+    nothing = lambda i: Sweep(0, np.zeros((1, 3)))  # noqa: E731
+    return Log("log", "test", cameras, lidars, {n: Stream(n, t, nothing) for n, t in stamps.items()})
+
+
+def missing(log):
+    schedule = synchronize(log, tuple(log.cameras))
+    return [(f.kind, f.sensor, f.message) for f in RecordWatch(log).faults(schedule)]
+
+
+def test_missing_records_are_told_with_start_and_length():
+    t = 1_700_000_000_000_000_000 + np.arange(50) * STEP_NS
+    assert missing(streams_log(front=t, left=t, top=t)) == []
+    found = missing(streams_log(front=t, left=np.delete(t, slice(30, 50)), top=np.delete(t, slice(11, 20))))
+    assert found == [
+        ("missing_images", "left", "no pictures in the last 2.00 s, after 2.90 s"),
+        ("missing_sweeps", "top", "no sweeps for 1.00 s, from 1.00 to 2.00 s"),
+    ]

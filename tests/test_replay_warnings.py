@@ -150,3 +150,16 @@ def test_the_file_holds_the_warnings(tmp_path: Path) -> None:
     loaded = Replay.load(files[1])
     assert loaded.warnings == warn(scene, loaded)
     assert "warnings" not in json.loads((SAMPLE.parent / "truth.json").read_text(encoding="utf-8"))
+
+
+def test_a_vehicle_that_the_end_does_not_know_cannot_be_warned() -> None:
+    car, p = replace(town_ego(), id="car"), crossing_walker(8.0)
+    known = scenario_of(seen(car, road=(0.0, 14.0)), seen(p, road=(0.0, 14.0)))
+    assert [e.driver for e in warn(known, ends="road").events] == ["car"]
+    assert warn(scenario_of(seen(car, vehicle=(0.0, 14.0)), seen(p, road=(0.0, 14.0))), ends="road").events == ()
+    two = [
+        line(name, x, speed=10.0, duration_s=12.0, yaw=yaw) for name, x, yaw in (("a", 0.0, 0.0), ("b", 180.0, np.pi))
+    ]
+    unknown = scenario_of(*(seen(a, vehicle=(0.0, 12.0)) for a in two))
+    (missed,) = warn(unknown, replay(unknown, dt_s=0.05), ends="road").events
+    assert missed.warned is None

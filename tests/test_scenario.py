@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from log2sim.datatypes import Agent, MapFrame, Scenario, Waypoints
 
@@ -124,3 +125,16 @@ def test_the_file_states_its_frame_and_an_older_one_still_loads() -> None:
     older = {**document, "plan": document["stages"], "map": {**document["map"]}}
     del older["stages"], older["map"]["frame"], older["map"]["position"]
     assert Scenario.from_dict(older).to_dict() == document
+
+
+def test_arrays_along_agents_and_times_hold_the_rows_of_the_table() -> None:
+    pytest.importorskip("xarray")
+    scenario = make_scenario()
+    arrays, table = scenario.to_xarray(), scenario.to_dataframe()
+    for row in table.itertuples():
+        cell = arrays.sel(agent=row.agent, t_s=row.t_s)
+        for name in ("x_m", "yaw_rad", "sigma_xy_m", "observed", "category", "length_m", "confidence"):
+            np.testing.assert_equal(cell[name].item(), getattr(row, name))
+    assert int(np.isfinite(arrays.x_m).sum()) == len(table)
+    assert arrays.x_m.attrs["units"] == "m"
+    assert Scenario("nothing", 0, 0.0, ()).to_xarray().sizes == {"agent": 0, "t_s": 0}

@@ -18,6 +18,7 @@ from log2sim.logs.opening import open_log
 from log2sim.synth import shapes
 from log2sim.synth.actors import MovingScene
 from log2sim.synth.motion import TimedPath
+from log2sim.synth.paint import Appearance, paint
 from log2sim.synth.raycast import EGO, GROUND, cast_sweep
 from log2sim.synth.scene import load_scene, scene_from_table
 from log2sim.synth.shapes import Mesh
@@ -323,3 +324,17 @@ def test_a_walker_touches_its_box_over_a_stride_and_always_the_ground() -> None:
     poses = [shapes.pedestrian(size, k, False).vertices_m for k in range(shapes.PHASES)]
     assert np.allclose(np.max([p.max(0) for p in poses], axis=0), np.array(size) / 2, atol=1e-9)
     assert np.allclose([p[:, 2].min() for p in poses], -size[2] / 2, atol=1e-9)
+
+
+@pytest.mark.parametrize("category", SIZES)
+def test_every_part_has_a_color(category: str) -> None:
+    mesh = shape(category)
+    look = Appearance(category, SIZES[category], (200, 30, 30), "sedan")
+    rng = np.random.default_rng(0)
+    face = rng.integers(len(mesh.faces), size=20000)
+    weight = rng.dirichlet([1, 1, 1], size=len(face))[:, :, None]
+    points, normals = ((x[mesh.faces[face]] * weight).sum(1) for x in (mesh.vertices_m, mesh.normals))
+    colors = paint(look, mesh.part[face], points, normals)
+    assert colors.albedo.shape == (len(face), 3)
+    assert np.all((colors.albedo >= 0) & (colors.albedo <= 1.3))
+    assert len(np.unique(colors.albedo.round(2), axis=0)) > 3

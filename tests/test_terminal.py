@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
 import subprocess
 import sys
+import time
 
 import pytest
 from command_line import run
@@ -14,10 +16,13 @@ from replay_maneuvers import scenario_of
 from replay_scenes import LENGTH_M, line, parked
 from test_layers import ROOT
 
+from log2sim.cli import doctor
 from log2sim.cli import doctor as installation
+from log2sim.cli.progress import Bars
 from log2sim.simulation.metrics.all_metrics import summarize
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.runner import replay
+from log2sim.visualization.progress import REDRAWN_EVERY_S, WORDS, show_progress
 
 
 def test_the_readme_and_the_help_name_the_same_exit_codes() -> None:
@@ -79,3 +84,52 @@ def test_doctor_lists_extras_that_are_missing_with_the_line_that_adds_them(monke
     missing = {extra["name"]: extra["missing"] for extra in document["extras"]}
     assert missing["odometry"] == ["small-gicp"]
     assert document["broken"] == []
+
+
+@pytest.mark.parametrize("broken", ["missing", "outdated", "unimportable"])
+def test_doctor_exits_with_5_when_something_needed_is_broken(broken: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = installation.version_of
+    if broken != "outdated":
+        monkeypatch.setitem(sys.modules, "simplejpeg", None)
+    if broken != "unimportable":
+        version = None if broken == "missing" else "0.1"
+        monkeypatch.setattr(installation, "version_of", lambda name: version if name == "simplejpeg" else known(name))
+    ran = run("doctor")
+    assert ran.code == doctor.BROKEN_CODE == 5
+    assert "log2sim: simplejpeg: " in ran.err
+    word = {
+        "missing": "is missing: pip install 'simplejpeg>=",
+        "outdated": "is too old",
+        "unimportable": "cannot be imported",
+    }
+    assert word[broken] in ran.err
+
+
+def test_a_stage_of_unknown_length_ends_with_the_next_one() -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    display = Progress(console=Console(file=io.StringIO()))
+    bars = Bars(display)
+    bars("load", 0, 0)
+    assert [task.description for task in display.tasks] == [WORDS["load"]]
+    bars("detect and measure", 1, 2)
+    bars("track", 0, 0)
+    assert [task.description for task in display.tasks] == [WORDS["detect and measure"], WORDS["track"]]
+
+
+def test_progress_of_functions_is_one_line_a_stage_that_is_written_anew(capsys: pytest.CaptureFixture[str]) -> None:
+    show_progress("track", 0, 0)
+    time.sleep(REDRAWN_EVERY_S)
+    for done in range(1, 1001):
+        show_progress("draw", done, 1000)
+    show_progress(3, 3)  # of functions with a single stage
+    lines = capsys.readouterr().out.split("\n")
+    assert [line.rpartition("\r")[2].rstrip() for line in lines] == [
+        "tracking",
+        "drawing: 1000 of 1000",
+        "done: 3 of 3",
+        "",
+    ]
+    assert 1 < lines[1].count("\r") < 1000
+    assert len({len(line) for line in "\r".join(lines[:3]).split("\r")[1:]} - {0}) == 1

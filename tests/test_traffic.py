@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import tiny_log, tiny_scene
 
+from log2sim.errors import ConfigError
 from log2sim.geometry import apply, inverse, rotation_from_rpy
 from log2sim.synth.actors import MovingScene
 from log2sim.synth.backdrop import draw_terrain
@@ -26,6 +27,7 @@ from log2sim.synth.returns import (
     LidarModel,
     ReturnModel,
     Weather,
+    lidar_model,
     reflected,
 )
 from log2sim.synth.traffic import Surface, TrafficScene, draw_scene, labeled_cloud, rig_of
@@ -340,3 +342,17 @@ def test_a_body_behind_another_is_hidden_and_a_net_is_seen_through() -> None:
     assert alone[1] is not None
     assert alone[1].visible_px == pytest.approx(0.65 * alone[1].silhouette_px, rel=0.1)
     assert hidden[1] is None or hidden[1].visible_px < 0.1 * hidden[1].silhouette_px
+
+
+def test_sensors_of_ones_own(tmp_path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("elevation_deg = [-10, -5, 0]\nazimuth_deg = [-30, 30]\nrange_m = 40\n")
+    model = lidar_model(str(path))
+    assert model.name == "mine"
+    assert len(model.azimuths_rad()) == 300
+    for text, word in (("elevation = [1]", "elevation"), ("elevation_deg = [100]", "elevation_deg"), ("x = [", "TOML")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=word):
+            lidar_model(str(path))
+    with pytest.raises(ConfigError, match="vlp16"):
+        lidar_model("vpl16")
