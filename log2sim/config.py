@@ -67,7 +67,9 @@ class PosesConfig(Section):
         "camera where it has neither, else given.",
     )
     check: bool = setting(
-        True, "Whether the log's own poses are checked for jumps, standstills of the data and gaps, and repaired."
+        True,
+        "Whether the log's own poses are checked for jumps, standstills of the data and gaps, and for drift by the sweeps of a "
+        "LiDAR on the ego, and repaired.",
     )
 
 

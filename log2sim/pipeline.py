@@ -28,6 +28,7 @@ from log2sim.agents.judge import judge
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Measurements, Scenario
 from log2sim.errors import NothingToReconstruct
+from log2sim.files.processes import default_jobs
 from log2sim.files.stages import StageClock
 from log2sim.geometry import NS_PER_S
 from log2sim.localization.choice import GIVEN, PoseChoice, localize
@@ -69,7 +70,8 @@ class Run:
     """What the stages of one run share: the sensors in one map and on one clock, the ticks, and the plan.
 
     `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
-    `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`.
+    `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
+    of processes that share the ticks.
     """
 
     log: Log
@@ -79,6 +81,7 @@ class Run:
     detectors: Detectors
     clock: StageClock
     progress: Progress
+    jobs: int = 1
     poses: PoseChoice = GIVEN
     faults: tuple[Fault, ...] = ()
     registration: Sequence[dict[str, Any]] = ()
@@ -91,6 +94,7 @@ def reconstruct(
     detector: GivenDetector | list[GivenDetector] | tuple[GivenDetector, ...] | None = None,
     progress: Progress | None = None,
     cache: bool = True,
+    jobs: int | None = None,
 ) -> Result:
     """Reconstruct the scenario of a log.
 
@@ -109,6 +113,9 @@ def reconstruct(
         Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
     cache : bool
         Whether what the detector finds in pictures is taken from the user's cache, and kept there.
+    jobs : int, optional
+        Processes that share the ticks; the result is the same for any number. None for as many as there are usable cores, and one
+        with a detector of another package or program, which need not work in a forked process.
 
     Raises
     ------
@@ -119,12 +126,18 @@ def reconstruct(
     NothingToReconstruct
         When neither an ego nor any agent was found.
     """
-    run = start(log, config or Config(), detector=detector, progress=progress, cache=cache)
+    run = start(log, config or Config(), detector=detector, progress=progress, cache=cache, jobs=jobs)
     return infer_scenario(run, observe_log(run))
 
 
 def start(
-    log: Log, config: Config, *, detector: Any = None, progress: Progress | None = None, cache: bool = True
+    log: Log,
+    config: Config,
+    *,
+    detector: Any = None,
+    progress: Progress | None = None,
+    cache: bool = True,
+    jobs: int | None = None,
 ) -> Run:
     """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
@@ -146,7 +159,8 @@ def start(
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
     faults = (*poses.faults, *faults, *road.faults)
-    return Run(log, config, plan, schedule, detectors, clock, progress, poses, faults, road.figures)
+    jobs = jobs or (default_jobs() if detectors.own else 1)
+    return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
 
 
 def observe_log(run: Run) -> Observations:
@@ -165,6 +179,7 @@ def observe_log(run: Run) -> Observations:
         lidar_detector=run.detectors.sweeps,
         sweeps=config.lidar.sweeps,
         cache=run.detectors.cache,
+        jobs=run.jobs,
     )
 
 
@@ -214,7 +229,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
             **({"faults": faults} if faults else {}),
         },
     )
-    description = describe(scenario, log, config, plan, observations.lights, clock, run.progress)
+    description = describe(scenario, log, config, plan, run.poses, observations.lights, clock, run.progress)
     outcomes = (*stage_outcomes(plan, observations, homographies, agents, clock), *description.outcomes)
     scenario = replace(description.scenario, stages=tuple(outcome.to_dict() for outcome in outcomes))
     cache = run.detectors.cache

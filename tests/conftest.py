@@ -52,6 +52,8 @@ def own_cache(shared_folder: Path) -> Iterator[Path]:
     folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LOG2SIM_CACHE", str(folder))
+        # One process a run unless a test asks for more: tests run side by side, and count what happens in their process.
+        patch.setenv("OMP_NUM_THREADS", "1")
         yield folder
 
 

@@ -12,7 +12,8 @@ from localization_worlds import HOUSES, drive
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Stream
 from log2sim.geometry import NS_PER_S, PoseTrack, apply, inverse, rotation_from_rpy
-from log2sim.localization.clocks import OFFSET, PITCH, YAW, check_lidars, fit_clock_and_mount, shift_stream, turn_mount
+from log2sim.localization.clocks import OFFSET, PITCH, YAW, check_lidars, fit_clock_and_mount, turn_mount
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.surfaces import MAX_SWEEPS, SweepPairs, adjoint_of, choose_sweeps, exp_of, log_of, pair_sweeps
 from log2sim.plan import Sensors
 

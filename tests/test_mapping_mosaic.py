@@ -1,4 +1,4 @@
-"""The fused bird's-eye view against a ground whose every point is known."""
+"""Pictures laid on flat ground against a ground whose every point is known."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from log2sim.geometry import (
     transform,
     undistort,
 )
-from log2sim.road.mosaic import render_birdseye
-from log2sim.road.pictures import GroundView
+from log2sim.road.ground_map import GroundMap, Raster
+from log2sim.road.pictures import ColorRaster, View, warp_onto
+from log2sim.road.surface import Surface
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 K = np.array([[800.0, 0, 640], [0, 800.0, 360], [0, 0, 1]])
@@ -62,30 +63,43 @@ def shoot(
     return np.repeat(np.rint(total).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def cell_centers(picture: object) -> tuple[Array, Array]:
-    x0, x1, y0, y1 = picture.extent_m  # type: ignore[attr-defined]
-    d = picture.resolution_m  # type: ignore[attr-defined]
+def lay(
+    pictures: list[tuple[np.ndarray, View]], extent_m: tuple[float, ...], cell_m: float = 0.05, z_m: float = 0.0
+) -> GroundMap:
+    raster = Raster.covering(extent_m, cell_m)  # type: ignore[arg-type]
+    flat = Surface(raster, np.zeros(raster.shape, np.float32), np.ones(raster.shape, bool))
+    colors, unknown = ColorRaster(raster), np.full(raster.shape, np.nan, np.float32)
+    for image, view in pictures:
+        warp = warp_onto(view, flat, z_m, raster)
+        if warp is not None:
+            colors.add(view.camera.name, image, warp)
+    return GroundMap(*colors.image(), unknown, unknown, raster.resolution_m, raster.extent_m)
+
+
+def cell_centers(picture: GroundMap) -> tuple[Array, Array]:
+    x0, x1, y0, y1 = picture.extent_m
+    d = picture.resolution_m
     return np.meshgrid(np.arange(x0 + d / 2, x1, d), np.arange(y1 - d / 2, y0, -d))
 
 
-def wrong_cells(picture: object, edge_m: float) -> float:
+def wrong_cells(picture: GroundMap, edge_m: float) -> float:
     """Share of covered cells on the wrong side of mid-gray, cells nearer than `edge_m` to a line left out."""
     x, y = cell_centers(picture)
     clear = np.minimum(np.abs(x - np.rint(x)), np.abs(y - np.rint(y))) > edge_m
-    chosen = clear & (picture.alpha > 128)  # type: ignore[attr-defined]
+    chosen = clear & (picture.alpha > 128)
     assert chosen.sum() > 1000
     bright = checker(np.column_stack([x[chosen], y[chosen]])) > 130
-    return float(np.mean(bright != (picture.image_bgr[..., 1][chosen] > 130)))  # type: ignore[attr-defined]
+    return float(np.mean(bright != (picture.color_bgr[..., 1][chosen] > 130)))
 
 
 @pytest.fixture(scope="module")
-def two_cameras() -> list[GroundView]:
+def two_cameras() -> list[tuple[np.ndarray, View]]:
     camera = make_camera()
-    return [GroundView.from_pose(shoot(camera, p), camera, p) for p in (pose(30, 0, 0.5), pose(-30, 0, -0.5))]
+    return [(shoot(camera, p), View(camera, p)) for p in (pose(30, 0, 0.5), pose(-30, 0, -0.5))]
 
 
-def test_two_cameras_reproduce_the_checkerboard_within_5_cm(two_cameras: list[GroundView]) -> None:
-    picture = render_birdseye(two_cameras, extent_m=(0, 10, -8, 8), resolution_m=0.05)
+def test_two_cameras_reproduce_the_checkerboard_within_5_cm(two_cameras: list[tuple[np.ndarray, View]]) -> None:
+    picture = lay(two_cameras, (0, 10, -8, 8))
     assert picture.coverage.mean() > 0.6
     assert wrong_cells(picture, edge_m=0.05) == 0.0
 
@@ -95,22 +109,19 @@ def test_two_cameras_reproduce_the_checkerboard_within_5_cm(two_cameras: list[Gr
 def test_cells_show_their_own_center(axis: int) -> None:
     """On ground that brightens by 30 a meter, a shift of half a cell would show as 0.75."""
     camera = make_camera()
-    view = GroundView.from_pose(
-        shoot(camera, pose(0), ground_of=lambda xy: 20 + 30 * (xy[:, axis] % 7.5)), camera, pose(0)
-    )
-    picture = render_birdseye([view], extent_m=(4.5, 7.2, 0.3, 2.0) if axis == 0 else (4.5, 7.2, 0.3, 1.6))
-    expected = 20 + 30 * cell_centers(picture)[axis]
-    assert picture.coverage.all()
-    assert abs(float(np.mean(picture.image_bgr[..., 0] - expected))) < 0.2
+    image = shoot(camera, pose(0), ground_of=lambda xy: 20 + 30 * (xy[:, axis] % 7.5))
+    picture = lay([(image, View(camera, pose(0)))], (4, 7.5, 0, 2.2))
+    inner = (slice(10, -10), slice(10, -10))
+    expected = (20 + 30 * cell_centers(picture)[axis])[inner]
+    assert picture.coverage[inner].all()
+    assert abs(float(np.mean(picture.color_bgr[..., 0][inner] - expected))) < 0.2
 
 
 def test_nothing_above_the_horizon_or_behind_the_camera_is_covered() -> None:
     white = np.full((720, 1280, 3), 255, dtype=np.uint8)
-    picture = render_birdseye(
-        [GroundView.from_pose(white, make_camera(), pose(0))], extent_m=(-30, 30, -30, 30), resolution_m=0.1
-    )
+    picture = lay([(white, View(make_camera(), pose(0)))], (-30, 30, -30, 30), 0.1)
     x, _ = cell_centers(picture)
     assert picture.coverage[x > 0].any()
     assert not picture.coverage[x < 0].any()
-    up = GroundView.from_pose(white, make_camera(), pose(0, pitch_deg=-40.0))
-    assert not render_birdseye([up], extent_m=(-30, 30, -30, 30), resolution_m=0.1).coverage.any()
+    up = View(make_camera(), pose(0, pitch_deg=-40.0))
+    assert not lay([(white, up)], (-30, 30, -30, 30), 0.1).coverage.any()

@@ -1,15 +1,16 @@
-"""Poses refined for a map: drift that a log's poses have is taken out, and nothing else is changed."""
+"""Poses refined by sweeps: drift that a log's poses have is taken out, and nothing else is changed."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from log2sim.datatypes import Lidar, Log, Scenario, Stream, Sweep
+from log2sim.config import Config
+from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.localization.choice import localize, localize_like
 from log2sim.localization.pose_refinement import Keyframe, refine_poses, solve_twists
 from log2sim.localization.surfaces import Registration, exp_of, log_of
-from log2sim.perception.frames import RecordReader
 
 T_NS = np.arange(0, 41) * 100_000_000 + 10**18
 MOUNT = transform(rotation_from_rpy(0.0, 0.0, 0.3), [0.5, 0.0, 1.8])
@@ -57,10 +58,6 @@ def street_log(poses: Array, frame: str = "lidar") -> Log:
     return Log("street", "log2sim", {}, {"top": Lidar("top", "ego", MOUNT)}, streams, PoseTrack(T_NS, poses))
 
 
-def whole() -> Scenario:
-    return Scenario("street", int(T_NS[0]), 4.0, ())
-
-
 def relative_errors(poses: Array) -> Array:
     """Errors (K, 6) of the motion from the first pose."""
     true = inverse(true_poses()[:1]) @ true_poses()
@@ -70,13 +67,27 @@ def relative_errors(poses: Array) -> Array:
 @pytest.mark.matrix
 @pytest.mark.parametrize("frame", ["lidar", "map"])
 def test_drift_is_taken_out(frame: str) -> None:
-    log = street_log(drifted(), frame)
-    refined = refine_poses(log, whole(), RecordReader(log))
-    assert refined.ego is not None
-    before, after = (np.abs(relative_errors(p)).max(axis=0) for p in (drifted(), refined.ego.map_T_ego))
+    refined = refine_poses(street_log(drifted(), frame))
+    assert refined is not None
+    before, after = (np.abs(relative_errors(p)).max(axis=0) for p in (drifted(), refined.map_T_ego))
     assert before[:3].max() > 0.5
     assert after[:3].max() < 0.04
     assert np.degrees(after[3:]).max() < 0.15
+
+
+@pytest.mark.slow
+def test_a_run_takes_refined_poses_where_those_of_the_log_drift_and_finds_them_again() -> None:
+    """A sweep in the map, as some logs have it, lies where its refined pose puts it."""
+    log = street_log(drifted(), "map")
+    found, choice = localize(log, Config())
+    assert found.ego is not None
+    assert choice.refined
+    local = apply(inverse(drifted()[30]), log.streams["top"].read(30).xyz_m)
+    np.testing.assert_allclose(found.streams["top"].read(30).xyz_m, apply(found.ego.map_T_ego[30], local), atol=1e-6)
+    again = localize_like(log, {"poses": choice.to_provenance()})
+    assert again.ego is not None
+    np.testing.assert_array_equal(again.ego.map_T_ego, found.ego.map_T_ego)
+    assert localize_like(log, {"poses": {"source": "given"}}) is log  # as of earlier versions
 
 
 def test_one_false_registration_changes_little() -> None:
@@ -95,6 +106,6 @@ def test_one_false_registration_changes_little() -> None:
 def test_logs_without_lidar_or_way_stay_as_they_are() -> None:
     log = street_log(true_poses())
     bare = log.changed(lidars={}, streams={})
-    assert refine_poses(bare, whole(), RecordReader(bare)) is bare
+    assert refine_poses(bare) is None
     standing = street_log(np.repeat(true_poses()[:1], len(T_NS), axis=0))
-    assert refine_poses(standing, whole(), RecordReader(standing)) is standing
+    assert refine_poses(standing) is None

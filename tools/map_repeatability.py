@@ -23,8 +23,8 @@ from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array
 from log2sim.localization.pose_refinement import refine_poses
+from log2sim.localization.replaced import replace_poses
 from log2sim.logs.opening import open_log
-from log2sim.perception.frames import RecordReader
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap
 
@@ -212,7 +212,8 @@ def main() -> None:
     log = open_log(options.log, sequence=options.sequence)
     scenario = scenario_of(log)
     if not options.as_logged:
-        log = refine_poses(log, scenario, RecordReader(log))
+        refined = refine_poses(log)
+        log = log if refined is None else replace_poses(log, refined)
     for title, *pair in parts_of(log):
         try:
             settings = MapConfig(cell_m=options.cell)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.localization.clocks import shift_stream
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.surfaces import exp_of
 from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel

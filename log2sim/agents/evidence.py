@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Support, Timeline
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Doubt, Log, Measurements, Obstacles, Rays
-from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, cross_slab, inverse, project
 from log2sim.perception.boxes import rotate
 from log2sim.perception.sync import Schedule
 
@@ -261,24 +261,20 @@ def classify_rays(
     yaw_rad : (n,) float64
         Of the box.
     size_m : (n, 3) float64
-
-    Notes
-    -----
-    Intersection of lines and boxes by slabs (Kay and Kajiya, SIGGRAPH 1986).
     """
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     # One array for each axis: numpy takes several times as long for short last axes.
     origin = c * start[:, 0] + s * start[:, 1], c * start[:, 1] - s * start[:, 0], np.asarray(start[:, 2], np.float64)
     along = c * to[:, 0] + s * to[:, 1], c * to[:, 1] - s * to[:, 0], np.asarray(to[:, 2], np.float64)
     half = [side / 2 - np.minimum(INSET_M, MAX_INSET_SHARE * side) for side in (size_m[:, 0], size_m[:, 1])]
-    sides = [_slab(origin[k], along[k], -half[k], half[k]) for k in range(2)]
-    wider = [_slab(origin[k], along[k], -half[k] - MARGIN_M, half[k] + MARGIN_M) for k in range(2)]
+    sides = [cross_slab(origin[k], along[k], -half[k], half[k]) for k in range(2)]
+    wider = [cross_slab(origin[k], along[k], -half[k] - MARGIN_M, half[k] + MARGIN_M) for k in range(2)]
     arrive = np.fmax(wider[0][0], wider[1][0])
     length = np.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2)
     least_m = np.minimum(MIN_CHORD_M, MIN_CHORD_SHARE * size_m[:, 1])
     endings = []
     for layer in layers:
-        rising = _slab(origin[2], along[2], (layer.low - 0.5) * size_m[:, 2], (layer.high - 0.5) * size_m[:, 2])
+        rising = cross_slab(origin[2], along[2], (layer.low - 0.5) * size_m[:, 2], (layer.high - 0.5) * size_m[:, 2])
         enter = np.fmax(np.fmax(sides[0][0], sides[1][0]), rising[0])
         leave = np.fmin(np.fmin(sides[0][1], sides[1][1]), rising[1])
         inside = ((leave - enter) * length >= least_m) & (enter > 0)
@@ -287,14 +283,6 @@ def classify_rays(
         ending[inside & ~(arrive > 1) & ((1 - leave) * length > MARGIN_M)] = Ending.THROUGH
         endings.append(ending)
     return endings
-
-
-def _slab(origin: Array, along: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return where lines enter and leave slabs (n,), (n,) in units of their directions; they miss a box that they leave first."""
-    # A line along a face divides 0 by 0, which limits nothing.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (low - origin) / along, (high - origin) / along
-    return np.minimum(a, b), np.maximum(a, b)
 
 
 # Points up to this far outside a box may be its own: error of a box.

@@ -68,7 +68,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], bool]:
     try:
         with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
             log = open_log(job.path, format=job.format, sequence=job.sequence)
-            result = reconstruct(log, config, cache=job.cache)
+            result = reconstruct(log, config, cache=job.cache, jobs=1)
             result.scenario.save(unfinished / SCENARIO_FILE)
             write_json(unfinished / REPORT_FILE, result.report)
             row = done_row(job, result.report, spent())

@@ -138,9 +138,12 @@ def look_line(log: Path, sequence: str | None, out: Path) -> str:
 
 def pose_notes(poses: dict[str, Any]) -> list[str]:
     """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
-    if poses["source"] == poses["requested"] == "given" or poses["source"] == "none":
+    if poses["source"] == "none":
         return []
-    return [f"poses: {poses['source']} ({poses['reason']})", *(f"note: {note}" for note in poses["notes"])]
+    chosen = (
+        [] if poses["source"] == poses["requested"] == "given" else [f"poses: {poses['source']} ({poses['reason']})"]
+    )
+    return [*chosen, *(f"note: {note}" for note in poses["notes"])]
 
 
 def fault_lines(faults: Sequence[dict[str, Any]]) -> list[str]:
@@ -223,6 +226,16 @@ def reconstruct(
     topdown: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Bird's-eye image of all cameras to write.")
     ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            metavar="N",
+            min=1,
+            help="Processes that share the ticks; the result is the same for any number.",
+            show_default="the usable cores",
+        ),
+    ] = None,
     no_cache: NoCache = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -276,7 +289,7 @@ def reconstruct(
     if weakness := describe_weakness(chosen.detect.in_sweeps or ""):
         say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        result = run(opened, chosen, progress=report_progress, cache=not no_cache)
+        result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs)
     for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):
         say(line, quiet=quiet)
     with together():

@@ -44,6 +44,13 @@ class StageClock:
             if self._running:
                 self._running[-1] = (self._running[-1][0], time.perf_counter(), time.process_time())
 
+    def add(self, other: StageClock, jobs: int) -> None:
+        """Add what another clock counted in one of several processes, which run side by side: their share on the wall."""
+        for name, seconds in other.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds / jobs
+            self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + other.cpu_seconds[name]
+            self.peak_mib[name] = max(self.peak_mib.get(name, 0.0), other.peak_mib[name])
+
     def _add(self) -> None:
         """Add what the innermost stage took since it was entered or went on."""
         name, since, cpu_since = self._running[-1]

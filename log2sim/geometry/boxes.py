@@ -69,6 +69,17 @@ def points_in_box(
     return np.asarray((np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(d[:, 2]) <= half[2]))
 
 
+def cross_slab(origin: Array, along: Array, low: ArrayLike, high: ArrayLike) -> tuple[Array, Array]:
+    """Return where lines enter and leave the slabs between two planes, along one axis, in units of their directions (N,).
+
+    Lines are in a box between the latest entry and the earliest exit over its axes (Kay and Kajiya, SIGGRAPH 1986). A line in
+    a plane divides 0 by 0, which limits nothing: both are NaN, which `fmax` and `fmin` leave out.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - origin) / along, (high - origin) / along
+    return np.minimum(a, b), np.maximum(a, b)
+
+
 def box_iou(a_px: ArrayLike, b_px: ArrayLike) -> Array:
     """Compute the IoU (A, B) of axis-aligned image boxes (A, 4), (B, 4), u0, v0, u1, v1 in px; 0 where both are empty."""
     a, b = np.asarray(a_px, dtype=np.float64).reshape(-1, 1, 4), np.asarray(b_px, dtype=np.float64).reshape(1, -1, 4)

@@ -46,12 +46,8 @@ MIN_SHOWN_SHARE = 0.2
 class RoadView:
     """The road before a camera, seen from above.
 
-    Attributes
-    ----------
-    map_uv : (H, W, 2) float32
-        Pixels of the image to look at, for each pixel of the view.
-    shown : (H, W) uint8
-        1 where the image shows the road, away from its border.
+    `map_uv`: (H, W, 2): pixels of the image to look at, for each pixel of the view. `shown`: (H, W) uint8: 1 where the
+    image shows the road, away from its border.
     """
 
     def __init__(self, camera: Camera, height_m: float, scale: float) -> None:
@@ -104,21 +100,11 @@ def _eroded(mask: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> NDArray[np.ui
 
 @dataclass(frozen=True)
 class FollowSettings:
-    """How points are followed.
+    """How points are followed."""
 
-    Attributes
-    ----------
-    window_px : int
-        Side of the patch around a point.
-    levels : int
-        Halvings of the image in which motion is searched first.
-    guess_px : (2,) tuple of float
-        Expected motion.
-    """
-
-    window_px: int
-    levels: int
-    guess_px: tuple[float, float] = (0.0, 0.0)
+    window_px: int  # side of the patch around a point
+    levels: int  # halvings of the image in which motion is searched first
+    guess_px: tuple[float, float] = (0.0, 0.0)  # (2,) tuple of float: expected motion
 
 
 def follow_points(first: Any, second: Any, start: Any, settings: FollowSettings) -> tuple[Array, Array]:
@@ -159,36 +145,21 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """Poses of the ego on a plane, in the ego's frame at the first image.
-
-    Attributes
-    ----------
-    t_ns : (P,) int64
-        Increasing stamps.
-    start_T_ego : (P, 4, 4) float64
-    predicted : (P,) bool
-        Whether an image showed too little, so that the pose is predicted by constant velocity.
-    frames : int
-        Number of images.
-    on_road : float
-        Median number of points on the road that agree on the motion.
-    """
+    """Poses of the ego on a plane, in the ego's frame at the first image."""
 
     camera: str
-    t_ns: NDArray[np.int64]
-    start_T_ego: Array
+    t_ns: NDArray[np.int64]  # (P,): increasing stamps
+    start_T_ego: Array  # (P, 4, 4)
+    # (P,): whether an image showed too little, so that the pose is predicted by constant velocity
     predicted: NDArray[np.bool_]
-    frames: int
-    on_road: float
+    frames: int  # number of images
+    on_road: float  # median number of points on the road that agree on the motion
 
 
 def motion_camera(log: Log) -> str:
     """Choose the camera on the ego to follow: the log's reference where it is one, else the one that looks ahead most.
 
-    Raises
-    ------
-    LogError
-        Where no camera is on the ego, or the height of none is known.
+    Raises `LogError` where no camera is on the ego, or the height of none is known.
     """
     names = [
         n for n, c in log.cameras.items() if c.mount == "ego" and n in log.streams and len(log.streams[n].t_ns) > 1
@@ -218,10 +189,7 @@ def follow_camera(
 ) -> CameraPath:
     """Estimate the path of the ego from the images of a camera.
 
-    Raises
-    ------
-    LogError
-        Where the images are too dark, or show too little of the road for most of their time.
+    Raises `LogError` where the images are too dark, or show too little of the road for most of their time.
 
     Notes
     -----

@@ -24,6 +24,7 @@ from log2sim.localization.odometry import (
     read_ego_sweep,
     run_odometry,
 )
+from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
 from log2sim.localization.verdict import (
     bridge_by_lidar,
@@ -33,49 +34,33 @@ from log2sim.localization.verdict import (
     unsure_share,
 )
 
+# What a scenario says about the ego by the source of its poses.
 ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera": "camera motion"}
-"""What a scenario says about the ego by the source of its poses."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseChoice:
-    """Where the poses of a run come from, and why.
+    """Where the poses of a run come from, and why."""
 
-    Attributes
-    ----------
-    requested : str
-        As the settings say.
-    source : {"given", "lidar", "camera", "none"}
-        "none": no sensor is on an ego whose pose would have to be known.
-    reason : str
-        For people.
-    excess_m : mapping of str to float
-        How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
-        "apart"; empty where nothing was compared.
-    scatter_m : mapping of str to mapping of str to float
-        RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar".
-    estimate : mapping of str to Any
-        Figures of the odometry, JSON values; empty where none was run.
-    notes : tuple of str
-        What is doubtful about estimated poses.
-    during_ns : (int, int), optional
-        First and last stamp of what poses were estimated from; None for the whole log.
-    faults : tuple of Fault
-        Faults of given poses.
-    checked : bool
-        Whether given poses were checked, and repaired where that was needed.
-    """
-
-    requested: str
+    requested: str  # as the settings say
+    # {"given", "lidar", "camera", "none"}: "none": no sensor is on an ego whose pose would have to be known
     source: str
-    reason: str
+    reason: str  # for people
+    # How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
+    # "apart"; empty where nothing was compared
     excess_m: Mapping[str, float | None] = field(default_factory=dict)
+    # RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar"
     scatter_m: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    # Figures of the odometry, JSON values; empty where none was run
     estimate: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what is doubtful about estimated poses
+    # (int, int): first and last stamp of what poses were estimated from; None for the whole log
     during_ns: tuple[int, int] | None = None
-    faults: tuple[Fault, ...] = ()
-    checked: bool = True
+    faults: tuple[Fault, ...] = ()  # faults of given poses
+    checked: bool = True  # whether given poses were checked, and repaired where that was needed
+    refined: bool = False  # whether given poses, which drift, were replaced by those that sweeps show
+    # Poses by which the ground is drawn, where given ones drift by less than agents are misplaced anyway
+    for_map: PoseTrack | None = None
 
     @property
     def origin(self) -> str:
@@ -97,7 +82,8 @@ class PoseChoice:
     def to_provenance(self) -> dict[str, Any]:
         """Return what `localize_like` needs to find the same poses again."""
         during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
-        return {"source": self.source, **during, **({} if self.checked else {"check": False})}
+        unchecked = {} if self.checked else {"check": False}
+        return {"source": self.source, **during, **unchecked, **({"refined": True} if self.refined else {})}
 
 
 GIVEN = PoseChoice("given", "given", "the log's own poses")
@@ -140,6 +126,9 @@ def _median(values: Array) -> float | None:
 
 # Without given poses odometry is still taken where up to this share of its poses is poorly held or predicted.
 MAX_UNSURE_SHARE_ALONE = 0.5
+# Given poses are replaced by refined ones where they drift by more, RMS; less changes agents by no more than chance does, in
+# simulated streets and recorded drives, and markings alone need better.
+MIN_DRIFT_M = 0.1
 # Sweeps this long before and after the time that is used are registered too.
 MARGIN_S = 1.0
 
@@ -149,21 +138,10 @@ Progress = Callable[[str, int, int], None]
 def localize(log: Log, config: Config, *, progress: Progress | None = None) -> tuple[Log, PoseChoice]:
     """Return the log with the poses that the settings ask for, and where they come from.
 
-    Parameters
-    ----------
-    config : Config
-        `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
-    progress : callable, optional
-        Called as `progress(stage, done, total)`.
+    `config`: `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
 
-    Raises
-    ------
-    ConfigError
-        For poses from a sensor that the log does not have.
-    LogError
-        For a log without poses whose sensors do not show how the ego moves.
-    MissingExtra
-        For LiDAR odometry without its library.
+    Raises `ConfigError` for poses from a sensor that the log does not have. Raises `LogError` for a log without poses
+    whose sensors do not show how the ego moves. Raises `MissingExtra` for LiDAR odometry without its library.
     """
     return _localize(
         _Request(
@@ -177,10 +155,7 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
 
     Without such an entry these are the log's own.
 
-    Raises
-    ------
-    LogError, MissingExtra
-        As `localize` does.
+    Raises `LogError, MissingExtra` as `localize` does.
     """
     entry = provenance.get("poses")
     entry = entry if isinstance(entry, Mapping) else {}
@@ -190,19 +165,22 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
     window = None
     if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
         window = (int(during[0]), int(during[1]))
-    check = entry.get("check") is not False
-    return _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))[0]
+    check, refined = entry.get("check") is not False, entry.get("refined") is True
+    report = progress or (lambda *_: None)
+    return _localize(_Request(log, source, window, report, check=check, refine=refined, again=refined))[0]
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """What to localize, how, from which part, and whether poses of the log are checked first."""
+    """What to localize, how, from which part, and whether poses of the log are checked first and refined, `again` as before."""
 
     log: Log
     requested: str
     during_ns: tuple[int, int] | None
     progress: Progress
     check: bool = True
+    refine: bool = True
+    again: bool = False
 
     def answer(self, source: str, reason: str, **found: Any) -> PoseChoice:
         """Return the choice of a source."""
@@ -227,7 +205,18 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     else:
         mended = request.log.changed(ego=checked.track)
     log, choice = _choose(replace(request, log=mended))
-    return log, replace(choice, faults=faults) if faults else choice
+    choice = replace(choice, faults=faults) if faults else choice
+    if choice.source != "given" or not request.refine:
+        return log, choice
+    refined = refine_poses(log, request.during_ns)
+    if refined is None or log.ego is None:
+        return log, choice
+    moved_m = np.linalg.norm(refined.map_T_ego[:, :3, 3] - log.ego.map_T_ego[:, :3, 3], axis=1)
+    if np.sqrt(np.mean(moved_m**2)) < MIN_DRIFT_M and not request.again:
+        return log, replace(choice, for_map=refined)
+    note = f"poses of the log are moved by up to {moved_m.max():.2f} m, by which surfaces in sweeps lie on each other"
+    choice = replace(choice, refined=True, notes=(*choice.notes, note), during_ns=request.during_ns)
+    return replace_poses(log, refined), choice
 
 
 def _choose(request: _Request) -> tuple[Log, PoseChoice]:

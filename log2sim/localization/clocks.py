@@ -11,18 +11,18 @@ sweeps alike and does not show; turned mounts do.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from log2sim.config import CalibrationConfig, Config
-from log2sim.datatypes import Fault, Log, Stream, Sweep, Treatment
+from log2sim.datatypes import Fault, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.surfaces import (
     MOTION_SPAN_NS,
     SweepPairs,
@@ -34,21 +34,6 @@ from log2sim.localization.surfaces import (
     velocities_at,
 )
 from log2sim.plan import Sensors
-
-
-def shift_stream(stream: Stream, shift_ns: int) -> Stream:
-    """Return the stream of a LiDAR with all stamps moved, those of its points too."""
-
-    def read(i: int) -> Sweep:
-        sweep: Sweep = stream.read(i)
-        return replace(
-            sweep,
-            stamp_ns=int(sweep.stamp_ns) + shift_ns,
-            t_ns=None if sweep.t_ns is None else sweep.t_ns + shift_ns,
-            compensated_ns=None if sweep.compensated_ns is None else int(sweep.compensated_ns) + shift_ns,
-        )
-
-    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read)
 
 
 def turn_mount(mount_T_sensor: Array, turn: Array) -> Array:
@@ -69,66 +54,52 @@ LOG_STEPS = (0.8, 0.4, 0.2)
 MAX_NOISE_SHARE = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class Linearized:
-    """Residuals of motions between sweeps, and their derivatives.
-
-    Attributes
-    ----------
-    t_ns : (K,) int64
-        Stamps of the sweeps.
-    residual : (6 P,) float64
-        Of P pairs, m and rad.
-    by_values : (6 P, V) float64
-        Derivatives by what is estimated; the first is a time offset.
-    by_poses : (6 P, 6 K) float64
-        By errors of the poses.
-    information : sequence of (6, 6)
-        Of each pair's registration.
-    prior : (V,) float64
-        Information about what is estimated, before.
-    pull : (V,) float64
-        `prior` times how far the values are below what is expected.
-    """
-
-    t_ns: NDArray[np.int64]
-    residual: Array
-    by_values: Array
-    by_poses: Array
-    information: Sequence[Array]
-    prior: Array
-    pull: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Step of the values (V,), their covariance (V, V), and the share of the offset's information that is noise."""
-
-    step: Array
-    covariance: Array
-    noise_share: float
+OFFSET, ROLL, PITCH, YAW, X, Y, Z = range(7)
 
 
 class PoseNoise:
-    """Linearized residuals with errors of the poses and of the registrations.
+    """Motions between sweeps against those that values (7,) predict, with errors of the poses and of the registrations.
 
-    Errors of the poses are eliminated, which takes factors of the size of the sweeps instead of that of the pairs.
+    Residuals are linear in the values and in the errors of the poses; the latter are eliminated, which takes factors of the
+    size of the sweeps instead of that of the pairs. `prior_sigma` (7,): standard deviations of what is expected.
     """
 
-    def __init__(self, problem: Linearized) -> None:
-        both = np.column_stack([problem.by_values, problem.residual])
-        blocks = problem.by_poses.reshape(len(problem.information), 6, -1)
-        weighted = np.einsum("pij,pjk->pik", np.array(problem.information), blocks).reshape(problem.by_poses.shape)
-        weighted_both = np.einsum(
-            "pij,pjk->pik", np.array(problem.information), both.reshape(len(blocks), 6, -1)
-        ).reshape(both.shape)
+    def __init__(self, seen: SweepPairs, values: Array, prior_sigma: Array) -> None:
+        t_ns = seen.t_ns + round(values[OFFSET] * NS_PER_S)
+        change = mount_change(values, seen.sensor_m)
+        moved = seen.track.at(t_ns)[0] @ change
+        velocity, _ = velocities_at(seen.track, t_ns)
+        back, mount = adjoint_of(inverse(change)), np.eye(6)[:, [3, 4, 5, 0, 1, 2]]
+        mount[:3, :3] = cross_matrix(seen.sensor_m)
+        pairs, row = len(seen.pairs), np.arange(len(seen.pairs))
+        first, second = np.array([(pair.first, pair.second) for pair in seen.pairs]).T
+        predicted = inverse(moved[first]) @ moved[second]
+        second_T_first = adjoint_of(inverse(predicted))
+        found = np.array([pair.found.first_T_second for pair in seen.pairs])
+        of_ego = velocity @ back.T
+        by_offset = of_ego[second] - np.einsum("pij,pj->pi", second_T_first, of_ego[first])
+        by_values = np.concatenate([by_offset[:, :, None], mount - second_T_first @ mount], axis=2)
+        both = np.concatenate([by_values, log_of(inverse(predicted) @ found)[:, :, None]], axis=2)
+        by_poses = np.zeros((pairs, len(t_ns), 6, 6))
+        by_poses[row, second], by_poses[row, first] = back, -second_T_first @ back
+        by_poses = by_poses.transpose(0, 2, 1, 3).reshape(pairs, 6, -1)
+        information = np.linalg.inv(np.array([pair.found.covariance for pair in seen.pairs]))
+        weighted = np.einsum("pij,pjk->pik", information, by_poses).reshape(6 * pairs, -1)
+        weighted_both = np.einsum("pij,pjk->pik", information, both).reshape(6 * pairs, -1)
+        by_poses, both = by_poses.reshape(6 * pairs, -1), both.reshape(6 * pairs, -1)
         # Components first, so that each is a block.
-        order = np.arange(problem.by_poses.shape[1]).reshape(-1, 6).T.ravel()
-        self._of_poses = (problem.by_poses.T @ weighted)[np.ix_(order, order)]
+        order = np.arange(by_poses.shape[1]).reshape(-1, 6).T.ravel()
+        self._of_poses = (by_poses.T @ weighted)[np.ix_(order, order)]
         self._mixed, self._of_both = (weighted.T @ both)[order], both.T @ weighted_both
-        self._prior, self._pull = np.diag(problem.prior), problem.pull
-        apart_s = (problem.t_ns[:, None] - problem.t_ns) / NS_PER_S
-        self._shapes = {tau: _Shape.of(apart_s, tau) for tau in TIMES_S}
+        self._prior, self._pull = np.diag(prior_sigma**-2.0), -values * prior_sigma**-2.0
+        apart_s, span = (seen.t_ns[:, None] - seen.t_ns) / NS_PER_S, 2 * MOTION_SPAN_NS / NS_PER_S
+        # By time constant: the inverse and the logarithm of the determinant of the correlation of errors at the stamps, and
+        # the covariance of velocities, 1/s2.
+        self._shapes: dict[float, tuple[Array, float, Array]] = {}
+        for tau in TIMES_S:
+            alike, before, after = (np.exp(-np.abs(apart_s + d) / tau) for d in (0.0, -span, span))
+            log_det = float(np.linalg.slogdet(alike)[1])
+            self._shapes[tau] = np.linalg.inv(alike), log_det, (2 * alike - before - after) / span**2
 
     def estimate(self) -> list[tuple[float, Array, float]]:
         """Find the sizes (4,) of errors for each time constant, s: tuples of its probability, the sizes, and itself."""
@@ -137,8 +108,10 @@ class PoseNoise:
         weights = np.exp([least - cost for cost, _, _ in found])
         return [(float(w), noise, tau) for w, (_, noise, tau) in zip(weights / weights.sum(), found)]
 
-    def solve(self, noise: Array, tau: float) -> Solution:
+    def solve(self, noise: Array, tau: float) -> tuple[Array, Array, float]:
         """Solve for the values under errors of given sizes (4,) and time constant, s.
+
+        Returns the step (7,), its covariance (7, 7), and the share of the offset's information that is noise.
 
         Notes
         -----
@@ -153,7 +126,7 @@ class PoseNoise:
         reduced[0, 0] -= min(false, MAX_NOISE_SHARE * own)
         covariance = np.linalg.inv(reduced)
         share = false / own if own > 0 else 1.0
-        return Solution(covariance @ right, covariance @ information @ covariance, share)
+        return covariance @ right, covariance @ information @ covariance, share
 
     def _eliminate(self, noise: Array, tau: float) -> tuple[Array, float]:
         """Return the information (V + 1, V + 1) about values and residual, and the logarithm of the determinant of their covariance."""
@@ -164,12 +137,12 @@ class PoseNoise:
 
     def _with_noise(self, noise: Array, tau: float) -> tuple[Array, float]:
         """Return the information (6 K, 6 K) about errors of poses, and the logarithm of the determinant of their prior covariance."""
-        shape, matrix, log_det = self._shapes[tau], self._of_poses.copy(), 0.0
-        k = len(shape.inverse)
+        (unlike, shape_log_det, _), matrix, log_det = self._shapes[tau], self._of_poses.copy(), 0.0
+        k = len(unlike)
         for sigma, components in zip(noise, COMPONENTS):
             for c in components:
-                matrix[c * k : c * k + k, c * k : c * k + k] += shape.inverse / sigma**2
-                log_det += 2 * k * float(np.log(sigma)) + shape.log_det
+                matrix[c * k : c * k + k, c * k : c * k + k] += unlike / sigma**2
+                log_det += 2 * k * float(np.log(sigma)) + shape_log_det
         return matrix, log_det
 
     def _cost(self, noise: Array, tau: float) -> float:
@@ -198,30 +171,12 @@ class PoseNoise:
         """Compute what the errors of the velocities alone would tell about a time offset, 1/s2."""
         matrix, _ = self._with_noise(noise, tau)
         left = self._of_poses - self._of_poses @ np.linalg.solve(matrix, self._of_poses)
-        velocity = self._shapes[tau].velocity
+        velocity = self._shapes[tau][2]
         k = len(velocity)
         blocks = ((sigma, slice(c * k, c * k + k)) for sigma, cs in zip(noise, COMPONENTS) for c in cs)
         return float(sum(sigma**2 * np.sum(left[rows, rows] * velocity) for sigma, rows in blocks))
 
 
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """Inverse (K, K) and logarithm of the determinant of the correlation of errors, and the covariance of velocities, 1/s2."""
-
-    inverse: Array
-    log_det: float
-    velocity: Array
-
-    @classmethod
-    def of(cls, apart_s: Array, tau: float) -> _Shape:
-        """Compute them for stamps `apart_s` (K, K), s, from each other."""
-        span = 2 * MOTION_SPAN_NS / NS_PER_S
-        alike, before, after = (np.exp(-np.abs(apart_s + d) / tau) for d in (0.0, -span, span))
-        return cls(np.linalg.inv(alike), float(np.linalg.slogdet(alike)[1]), (2 * alike - before - after) / span**2)
-
-
-OFFSET, ROLL, PITCH, YAW, X, Y, Z = range(7)
-VALUES = 7
 # Of stamps, s, of rotation, rad, and translation, m, of a mount: what a mistake that nobody sees can be.
 PRIOR_SIGMA = np.array([0.3, 0.05, 0.05, 0.05, 0.3, 0.3, 0.3])
 # A result by chance is farther off once in 2,000 times.
@@ -236,24 +191,14 @@ FIRST_TIME_S, FIRST_STEPS = 2.0, 2
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Time offset and mount of a LiDAR.
+    """Time offset and mount of a LiDAR."""
 
-    Attributes
-    ----------
-    values : (7,) float64
-        What stamps lack, s; rotation vector of the mount in the ego's frame about the sensor, rad, and translation, m, that the
-        mount lacks.
-    covariance : (7, 7) float64
-    shows_offset : bool
-        Whether the ego's motion shows a time offset; without, that is 0 here.
-    pose_error_m : float, m
-        By how much the positions of the poses err, for seconds at a time.
-    """
-
+    # (7,): what stamps lack, s; rotation vector of the mount in the ego's frame about the sensor, rad, and translation,
+    # m, that the mount lacks
     values: Array
-    covariance: Array
-    shows_offset: bool
-    pose_error_m: float
+    covariance: Array  # (7, 7)
+    shows_offset: bool  # whether the ego's motion shows a time offset; without, that is 0 here
+    pose_error_m: float  # by how much the positions of the poses err, for seconds at a time
 
     @property
     def sigma(self) -> Array:
@@ -292,51 +237,18 @@ def _fit(seen: SweepPairs, prior_sigma: Array) -> Estimate:
     Gauss-Newton; sizes of the errors of the poses are estimated after the first steps, and the results for several time
     constants of these are weighed by their likelihood.
     """
-    values = np.zeros(VALUES)
+    values = np.zeros(len(prior_sigma))
     for _ in range(FIRST_STEPS):
-        values = values + PoseNoise(_linearize(seen, values, prior_sigma)).solve(USUAL_NOISE, FIRST_TIME_S).step
-    problem = PoseNoise(_linearize(seen, values, prior_sigma))
+        values = values + PoseNoise(seen, values, prior_sigma).solve(USUAL_NOISE, FIRST_TIME_S)[0]
+    problem = PoseNoise(seen, values, prior_sigma)
     errors = problem.estimate()
-    solved = [(weight, problem.solve(noise, tau)) for weight, noise, tau in errors]
-    step, covariance = _mean(solved)
-    shows_offset = sum(weight * s.noise_share for weight, s in solved) < MAX_NOISE_SHARE
+    # The mixture of the results.
+    solved = [(weight, *problem.solve(noise, tau)) for weight, noise, tau in errors]
+    step = np.sum([weight * one for weight, one, _, _ in solved], axis=0)
+    covariance = sum(w * (spread + np.outer(one - step, one - step)) for w, one, spread, _ in solved)
+    shows_offset = sum(weight * share for weight, _, _, share in solved) < MAX_NOISE_SHARE
     pose_error_m = float(sum(weight * noise[0] for weight, noise, _ in errors))
-    return Estimate(values + step, covariance, shows_offset, pose_error_m)
-
-
-def _mean(solved: list[tuple[float, Solution]]) -> tuple[Array, Array]:
-    """Return mean (V,) and covariance (V, V) of a mixture."""
-    step = np.sum([w * s.step for w, s in solved], axis=0)
-    covariance = sum(w * (s.covariance + np.outer(s.step - step, s.step - step)) for w, s in solved)
-    return step, np.asarray(covariance)
-
-
-def _linearize(seen: SweepPairs, values: Array, prior_sigma: Array) -> Linearized:
-    """Compare predicted motions with those found, at given values (7,)."""
-    t_ns = seen.t_ns + round(values[OFFSET] * NS_PER_S)
-    change = mount_change(values, seen.sensor_m)
-    moved = seen.track.at(t_ns)[0] @ change
-    velocity, _ = velocities_at(seen.track, t_ns)
-    back, mount = adjoint_of(inverse(change)), np.eye(6)[:, [3, 4, 5, 0, 1, 2]]
-    mount[:3, :3] = cross_matrix(seen.sensor_m)
-    first, second = np.array([(pair.first, pair.second) for pair in seen.pairs]).T
-    predicted = inverse(moved[first]) @ moved[second]
-    second_T_first = adjoint_of(inverse(predicted))
-    found = np.array([pair.found.first_T_second for pair in seen.pairs])
-    of_ego = velocity @ back.T
-    by_offset = of_ego[second] - np.einsum("pij,pj->pi", second_T_first, of_ego[first])
-    by_poses = np.zeros((len(seen.pairs), len(t_ns), 6, 6))
-    row = np.arange(len(seen.pairs))
-    by_poses[row, second], by_poses[row, first] = back, -second_T_first @ back
-    return Linearized(
-        seen.t_ns,
-        log_of(inverse(predicted) @ found).ravel(),
-        np.concatenate([by_offset[:, :, None], mount - second_T_first @ mount], axis=2).reshape(-1, VALUES),
-        by_poses.transpose(0, 2, 1, 3).reshape(6 * len(seen.pairs), -1),
-        [np.asarray(np.linalg.inv(pair.found.covariance), np.float64) for pair in seen.pairs],
-        prior_sigma**-2.0,
-        -values * prior_sigma**-2.0,
-    )
+    return Estimate(values + step, np.asarray(covariance), shows_offset, pose_error_m)
 
 
 # What is certain is reported if it matters: 0.2 m, which is how well agents are placed, at 10 m/s and to the side at 40 m; up or down, 0.7 m at 40 m, half
@@ -482,12 +394,8 @@ MAX_POSE_ERROR_M = 0.5
 def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> tuple[Log, tuple[Fault, ...]]:
     """Estimate time offset and mount of each LiDAR on the ego.
 
-    Returns
-    -------
-    log : Log
-        Corrected where the settings ask for it.
-    faults : tuple of Fault
-        What is certain and large enough to matter; and what cannot be corrected although it was asked for.
+    Returns `log`: corrected where the settings ask for it; `faults`: what is certain and large enough to matter; and
+    what cannot be corrected although it was asked for.
 
     Notes
     -----

@@ -76,20 +76,11 @@ WHOLE_TURN_RAD = 8.0
 
 @dataclass(frozen=True, eq=False)
 class DepthEdges:
-    """Edges in one sweep.
+    """Edges in one sweep."""
 
-    Attributes
-    ----------
-    points_map : (N, 3) float64, m
-        The last points on the near side of each edge, map frame.
-    range_m : (N,) float64
-        Their distances from the LiDAR.
-    left : (N,) bool
-        Whether the edge is the left one of what is near, seen from the LiDAR; else the right one.
-    """
-
-    points_map: Array
-    range_m: Array
+    points_map: Array  # (N, 3), m: the last points on the near side of each edge, map frame
+    range_m: Array  # (N,): their distances from the LiDAR
+    # (N,): whether the edge is the left one of what is near, seen from the LiDAR; else the right one
     left: NDArray[np.bool_]
 
 
@@ -129,16 +120,10 @@ def keep_standing(edges: DepthEdges, others: DepthEdges) -> DepthEdges:
 def find_depth_edges(points: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Find the points at which a near surface ends on its left or right.
 
-    Parameters
-    ----------
-    points : (N, 3) float64, m
-        Around the sensor, z along the axis that it turns about.
+    `points`: (N, 3), m: around the sensor, z along the axis that it turns about.
 
-    Returns
-    -------
-    index : (n,) int
-    left : (n,) bool
-        Whether the surface ends on its left, counter-clockwise; else on its right.
+    Returns `index`: (n,) int; `left`: (n,) bool: whether the surface ends on its left, counter-clockwise; else on its
+    right.
     """
     x, y, z = points.T
     range_m = np.sqrt(x * x + y * y + z * z)
@@ -186,24 +171,12 @@ SYSTEMATIC_RAD = np.deg2rad(0.1)
 
 @dataclass(frozen=True, eq=False)
 class EdgeView:
-    """One frame of a camera and the depth edges of the sweep that is nearest in time.
+    """One frame of a camera and the depth edges of the sweep that is nearest in time."""
 
-    Attributes
-    ----------
-    gray : (H, W) uint8
-        The image.
-    scale : float
-        Pixels of `gray` per pixel of the camera.
-    points_mount : (N, 3) float64, m
-        Depth edges in the frame that the camera is fixed in, at the time of the image.
-    left : (N,) bool
-        See `DepthEdges`.
-    """
-
-    gray: NDArray[np.uint8]
-    scale: float
-    points_mount: Array
-    left: NDArray[np.bool_]
+    gray: NDArray[np.uint8]  # (H, W) uint8: the image
+    scale: float  # pixels of `gray` per pixel of the camera
+    points_mount: Array  # (N, 3), m: depth edges in the frame that the camera is fixed in, at the time of the image
+    left: NDArray[np.bool_]  # (N,): see `DepthEdges`
 
     @cached_property
     def upright(self) -> NDArray[np.float32]:
@@ -218,43 +191,24 @@ class EdgeView:
 
 @dataclass(frozen=True, eq=False)
 class FrameScores:
-    """How well a frame and its depth edges agree.
+    """How well a frame and its depth edges agree."""
 
-    Attributes
-    ----------
-    scores : (2, D) float64
-        Sum of the strength of the image at edges on the left and on the right of what is near, for every yaw angle.
-    edges : (2,) int64
-        Numbers of edges in the image at yaw 0.
-    squares : float
-        Sum of the squared numbers of edges on one upright line, over the lines: the variance of `scores` by chance.
-    """
-
+    # (2, D): sum of the strength of the image at edges on the left and on the right of what is near, for every yaw
+    # angle
     scores: Array
-    edges: NDArray[np.int64]
+    edges: NDArray[np.int64]  # (2,): numbers of edges in the image at yaw 0
+    # Sum of the squared numbers of edges on one upright line, over the lines: the variance of `scores` by chance
     squares: float
 
 
 @dataclass(frozen=True)
 class YawEstimate:
-    """How far a camera is turned about the upright axis of what it is fixed in.
+    """How far a camera is turned about the upright axis of what it is fixed in."""
 
-    Attributes
-    ----------
-    yaw_rad : float
-        From its calibration to what the edges show, counter-clockwise seen from above.
-    sigma_rad : float
-        Standard deviation.
-    gain : float
-        Strength of the image at a depth edge, in units of the edges around, above that at other angles.
-    edges : int
-        Depth edges in the images.
-    """
-
-    yaw_rad: float
-    sigma_rad: float
-    gain: float
-    edges: int
+    yaw_rad: float  # from its calibration to what the edges show, counter-clockwise seen from above
+    sigma_rad: float  # standard deviation
+    gain: float  # strength of the image at a depth edge, in units of the edges around, above that at other angles
+    edges: int  # depth edges in the images
 
 
 def find_image_edges(gray: NDArray[np.uint8], *, sideways: bool) -> NDArray[np.float32]:
@@ -398,18 +352,11 @@ MAX_CAMERA_TO_LIDAR_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """The sweeps that are looked at.
-
-    Attributes
-    ----------
-    sweeps : (S,) int64
-        Rows of its stream.
-    t_ns : (S,) int64
-    """
+    """The sweeps that are looked at."""
 
     lidar: str
-    sweeps: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
+    sweeps: NDArray[np.int64]  # (S,): rows of its stream
+    t_ns: NDArray[np.int64]  # (S,)
 
 
 def choose_moments(log: Log, lidar: str, reference: str, during_ns: tuple[int, int] | None) -> Moments:
@@ -427,15 +374,7 @@ def choose_moments(log: Log, lidar: str, reference: str, during_ns: tuple[int, i
 
 
 class EdgeViews:
-    """The views of all cameras at the moments that are looked at; every sweep and every frame is read once, when it is asked for.
-
-    Parameters
-    ----------
-    log : Log
-    moments : Moments
-    progress : callable
-        Called as `progress(done, total)` for every sweep.
-    """
+    """The views of all cameras at the moments that are looked at; every sweep and every frame is read once, when it is asked for."""
 
     def __init__(self, log: Log, moments: Moments, progress: Callable[[int, int], None]) -> None:
         self._log, self._moments, self._progress = log, moments, progress

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +14,9 @@ from log2sim.localization.path import (
     MAX_DENSE_S,
     POSITION_PRIOR,
     YAW_PRIOR,
+    FittedPath,
     Limits,
     RepairedPath,
-    Skip,
     bridge,
     independent_noise,
     repair_path,
@@ -27,35 +27,19 @@ from log2sim.localization.path import (
 
 @dataclass(frozen=True)
 class Stretch:
-    """A time in which poses were repaired or are not known.
+    """A time in which poses were repaired or are not known."""
 
-    Attributes
-    ----------
-    kind : {"pose_jump", "frozen_poses", "gap", "skip", "copies"}
-        A skip is a step that stays: the position may have jumped, or stamps may miss some time.
-    first_ns, last_ns : int
-        Stamps of the first and the last pose in question; of a gap those around it.
-    shift_m, turn_rad : float
-        By how much poses were moved at most.
-    sigma_m : float
-        Largest standard deviation of a repaired position that is used.
-    unknown_s : float, s
-        For how long no pose is known well enough.
-    poses : int
-        Number of poses in question.
-    by : str
-        What bridges it.
-    """
-
+    # {"pose_jump", "frozen_poses", "gap", "skip", "copies"}: a skip is a step that stays: the position may have jumped,
+    # or stamps may miss some time
     kind: str
-    first_ns: int
+    first_ns: int  # `first_ns`, `last_ns`: stamps of the first and the last pose in question; of a gap those around it
     last_ns: int
-    shift_m: float = 0.0
+    shift_m: float = 0.0  # `shift_m`, `turn_rad`: by how much poses were moved at most
     turn_rad: float = 0.0
-    sigma_m: float = 0.0
-    unknown_s: float = 0.0
-    poses: int = 0
-    by: str = "the motion around"
+    sigma_m: float = 0.0  # largest standard deviation of a repaired position that is used
+    unknown_s: float = 0.0  # for how long no pose is known well enough
+    poses: int = 0  # number of poses in question
+    by: str = "the motion around"  # what bridges it
 
     @property
     def duration_s(self) -> float:
@@ -65,16 +49,9 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class CheckedPoses:
-    """Poses after the check.
+    """Poses after the check, in the order of time what was found, and whether given poses are not where they were.
 
-    Attributes
-    ----------
-    track : PoseTrack
-        The very poses that were given where nothing is wrong with them.
-    stretches : tuple of Stretch
-        In the order of time.
-    moved : bool
-        Whether given poses are not where they were, so that what was measured moves with them.
+    The track is the very one that was given where nothing is wrong with it. What was measured moves with poses that moved.
     """
 
     track: PoseTrack
@@ -88,28 +65,7 @@ MAX_COPY_ACCELERATION_MPS2, MIN_COPY_STEP_M = 12.0, 0.1
 MIN_RUNS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Copies:
-    """Poses without those that repeat others.
-
-    Attributes
-    ----------
-    track : PoseTrack
-        The very one that was given where none does.
-    first_ns, last_ns : int
-        Stamps of the first and the last copy.
-    worst_m : float
-        How far the ego has moved on at most.
-    """
-
-    track: PoseTrack
-    first_ns: int = 0
-    last_ns: int = 0
-    count: int = 0
-    worst_m: float = 0.0
-
-
-def leave_out_copies(track: PoseTrack) -> Copies:
+def leave_out_copies(track: PoseTrack) -> tuple[PoseTrack, list[Stretch]]:
     """Leave out poses that are the same as the one before although the next one is far away, if that happens again and again."""
     poses = track.map_T_ego
     copy = np.append(False, (poses[1:] == poses[:-1]).all(axis=(1, 2)))
@@ -123,14 +79,15 @@ def leave_out_copies(track: PoseTrack) -> Copies:
             held.append((first, stop))
             steps_m.append(step_m)
     if len(held) < MIN_RUNS:
-        return Copies(track)
+        return track, []
     rows = np.concatenate([np.arange(*run) for run in held])
     last = len(poses) - int(np.argmin(copy[::-1]))
     if last < len(poses) and len(poses) - last <= 2 * np.median([stop - first for first, stop in held]):
         rows = np.append(rows, np.arange(last, len(poses)))
     kept = np.setdiff1d(np.arange(len(poses)), rows)
+    first_ns, last_ns = int(track.t_ns[rows[0]]), int(track.t_ns[rows[-1]])
     thinned = replace(track, t_ns=track.t_ns[kept], map_T_ego=poses[kept])
-    return Copies(thinned, int(track.t_ns[rows[0]]), int(track.t_ns[rows[-1]]), len(rows), max(steps_m))
+    return thinned, [Stretch("copies", first_ns, last_ns, max(steps_m), poses=len(rows))]
 
 
 # Vehicles on roads brake, speed up and turn with up to 10 m/s2; the rest is how their bodies pitch and bounce. They change their
@@ -154,16 +111,7 @@ MAX_LINEAR_S, ADDED_STEP_S = 0.25, 0.05
 MAX_BRIDGED_S = 8.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Path:
-    """The columns of poses that are checked: positions (P, 3), m, and unwrapped yaws (P,), rad, at times (P,), s."""
-
-    t_s: Array
-    xyz_m: Array
-    yaw_rad: Array
-
-
-def check_poses(track: PoseTrack) -> CheckedPoses:
+def check_poses(given: PoseTrack) -> CheckedPoses:
     """Check given poses and repair them where a vehicle cannot have moved so, or where they are far apart.
 
     Notes
@@ -172,36 +120,58 @@ def check_poses(track: PoseTrack) -> CheckedPoses:
     bridged by the most probable motion between the poses around. Of two parts of a path the one that lasts longer is taken for
     right. Roll and pitch stay as they are. Linear in the number of poses.
     """
-    if len(track.t_ns) < 2:
-        return CheckedPoses(track, ())
-    copies = leave_out_copies(track)
-    track, path = copies.track, _path_of(copies.track)
-    level = repair_path(path.t_s, path.xyz_m[:, :2], POSITION)
-    height = repair_path(path.t_s, path.xyz_m[:, 2:], POSITION, level.at_rest)
-    yaw = repair_path(path.t_s, path.yaw_rad[:, None], YAW, level.at_rest)
-    changed = level.moved | level.bridged | height.moved | height.bridged | yaw.moved | yaw.bridged
-    new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
-    stretches = [_stretch(track, path, new, rows, (level, yaw)) for rows in runs_of(changed)]
-    if copies.count:
-        stretches.append(Stretch("copies", copies.first_ns, copies.last_ns, copies.worst_m, poses=copies.count))
-    stretches += _skips(track, (*level.skips, *height.skips))
-    kept = ~changed | (_sigmas(level, yaw) <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
-    measured = ~(level.bridged | height.bridged | yaw.bridged)
-    if _is_noisy(path.t_s[measured], new.xyz_m[measured, :2]) and not level.skips:
-        level, height, yaw = (_smoothed(path.t_s, r, measured) for r in (level, height, yaw))
-        new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
-        changed = np.ones_like(changed)
-    repaired = _repaired_track(track, path, new, changed, (level, yaw))
-    filled, gaps = _filled(repaired, kept, _Evidence(new, measured, (level.noise, yaw.noise)))
-    return CheckedPoses(
-        filled, tuple(sorted([*stretches, *gaps], key=lambda s: s.first_ns)), bool(changed.any() or copies.count)
-    )
+    if len(given.t_ns) < 2:
+        return CheckedPoses(given, ())
+    track, stretches = leave_out_copies(given)
+    t_s, xyz = (track.t_ns - track.t_ns[0]) / NS_PER_S, track.map_T_ego[:, :3, 3]
+    yaw_rad = np.unwrap(yaw_of(track.map_T_ego))
+    level = repair_path(t_s, xyz[:, :2], POSITION)
+    height = repair_path(t_s, xyz[:, 2:], POSITION, level.at_rest)
+    yaw = repair_path(t_s, yaw_rad[:, None], YAW, level.at_rest)
+    bridged = level.bridged | height.bridged | yaw.bridged
+    changed = level.moved | height.moved | yaw.moved | bridged
+    new_xyz, turn_rad = np.hstack([level.values, height.values]), yaw.values[:, 0] - yaw_rad
+    sigmas = _sigmas(level, yaw)
+    known = np.asarray((sigmas <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1))
+    for first, stop in runs_of(changed):
+        k = slice(first, stop)
+        stretches.append(
+            Stretch(
+                "frozen_poses" if level.at_rest[k].mean() > 0.5 else "pose_jump",
+                int(track.t_ns[first]),
+                int(track.t_ns[stop - 1]),
+                float(np.linalg.norm(new_xyz[k] - xyz[k], axis=1).max()),
+                float(np.abs(turn_rad[k]).max()),
+                float(sigmas[k][known[k], 0].max(initial=0.0)),
+                float(np.sum(~known[k])) * float(np.median(np.diff(t_s))),
+                stop - first,
+            )
+        )
+    stretches += [
+        Stretch("skip", int(track.t_ns[s.first]), int(track.t_ns[s.last]), shift_m=s.size)
+        for s in (*level.skips, *height.skips)
+        if s.size >= MIN_STEP_M
+    ]
+    kept, measured = ~changed | known, ~bridged
+    dense = measured.sum() > 1 and float(np.median(np.diff(t_s[measured]))) < MAX_DENSE_S
+    # The noise of sparse positions does not show.
+    if dense and independent_noise(t_s[measured], new_xyz[measured, :2]) > MIN_SMOOTHED_M and not level.skips:
+        level, height, yaw = (_smoothed(t_s, path, measured) for path in (level, height, yaw))
+        new_xyz, turn_rad = np.hstack([level.values, height.values]), yaw.values[:, 0] - yaw_rad
+        changed, sigmas = np.ones_like(changed), _sigmas(level, yaw)
+    if changed.any():
+        poses = track.map_T_ego.copy()
+        poses[changed] = _placed(poses[changed], new_xyz[changed], turn_rad[changed])
+        track = replace(track, map_T_ego=poses, sigma_m=sigmas[:, 0], sigma_yaw_rad=sigmas[:, 1])
 
+    def bridge_gap(at_s: Array) -> tuple[FittedPath, FittedPath] | None:
+        position = bridge(t_s, new_xyz, measured, at_s, level.noise, POSITION_PRIOR)
+        turned = bridge(t_s, yaw.values, measured, at_s, yaw.noise, YAW_PRIOR)
+        return None if position is None or turned is None else (position, turned)
 
-def _is_noisy(t_s: Array, xy_m: Array) -> bool:
-    """Return whether smoothing makes positions (P, 2) better; the noise of sparse ones does not show."""
-    dense = len(t_s) > 1 and float(np.median(np.diff(t_s))) < MAX_DENSE_S
-    return dense and independent_noise(t_s, xy_m) > MIN_SMOOTHED_M
+    track, gaps = _filled(track, kept, bridge_gap)
+    ordered = tuple(sorted([*stretches, *gaps], key=lambda s: s.first_ns))
+    return CheckedPoses(track, ordered, bool(changed.any() or any(s.kind == "copies" for s in stretches)))
 
 
 def _smoothed(t_s: Array, path: RepairedPath, measured: NDArray[np.bool_]) -> RepairedPath:
@@ -211,30 +181,12 @@ def _smoothed(t_s: Array, path: RepairedPath, measured: NDArray[np.bool_]) -> Re
     return replace(path, values=values, sigma=sigma, noise=float(np.median(sigma[measured])))
 
 
-def _path_of(track: PoseTrack) -> _Path:
-    t_s = (track.t_ns - track.t_ns[0]) / NS_PER_S
-    return _Path(t_s, track.map_T_ego[:, :3, 3], np.unwrap(yaw_of(track.map_T_ego)))
-
-
 def _sigmas(level: RepairedPath, yaw: RepairedPath) -> Array:
     """Return the standard deviations (P, 2) of positions, m, and yaws, rad, after their repair.
 
     Errors that last do not show in the noise of poses: they are not counted.
     """
     return np.stack([np.hypot(level.sigma, USUAL_SIGMA_M), np.hypot(yaw.sigma, USUAL_SIGMA_RAD)], axis=1)
-
-
-def _repaired_track(
-    track: PoseTrack, old: _Path, new: _Path, changed: NDArray[np.bool_], repaired: tuple[RepairedPath, RepairedPath]
-) -> PoseTrack:
-    """Return poses with the repaired positions and yaws where they changed, and their standard deviations."""
-    level, yaw = repaired
-    if not changed.any():
-        return track
-    sigmas = _sigmas(level, yaw)
-    poses = track.map_T_ego.copy()
-    poses[changed] = _placed(poses[changed], new.xyz_m[changed], new.yaw_rad[changed] - old.yaw_rad[changed])
-    return replace(track, map_T_ego=poses, sigma_m=sigmas[:, 0], sigma_yaw_rad=sigmas[:, 1])
 
 
 def _placed(map_T_ego: Array, xyz_m: Array, turn_rad: Array) -> Array:
@@ -246,115 +198,49 @@ def _placed(map_T_ego: Array, xyz_m: Array, turn_rad: Array) -> Array:
     return out
 
 
-def _stretch(
-    track: PoseTrack, old: _Path, new: _Path, rows: tuple[int, int], repaired: tuple[RepairedPath, RepairedPath]
-) -> Stretch:
-    """Describe the repair of the poses from one row up to another."""
-    level, yaw = repaired
-    k = slice(*rows)
-    sigmas = _sigmas(level, yaw)[k]
-    known = (sigmas <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
-    frozen = level.at_rest[k].mean() > 0.5
-    period = float(np.median(np.diff(old.t_s)))
-    return Stretch(
-        "frozen_poses" if frozen else "pose_jump",
-        int(track.t_ns[rows[0]]),
-        int(track.t_ns[rows[1] - 1]),
-        float(np.linalg.norm(new.xyz_m[k] - old.xyz_m[k], axis=1).max()),
-        float(np.abs(new.yaw_rad[k] - old.yaw_rad[k]).max()),
-        float(sigmas[known, 0].max(initial=0.0)),
-        float(np.sum(~known)) * period,
-        rows[1] - rows[0],
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """What tells poses in gaps: a path, which of its samples are measured, and their noise in m and rad."""
-
-    path: _Path
-    measured: NDArray[np.bool_]
-    noise: tuple[float, float]
-
-
-def _skips(track: PoseTrack, skips: Sequence[Skip]) -> list[Stretch]:
-    """List the steps that stay and are worth a word."""
-    return [
-        Stretch("skip", int(track.t_ns[s.first]), int(track.t_ns[s.last]), shift_m=s.size)
-        for s in skips
-        if s.size >= MIN_STEP_M
-    ]
-
-
-def _filled(track: PoseTrack, kept: NDArray[np.bool_], evidence: _Evidence) -> tuple[PoseTrack, list[Stretch]]:
-    """Add poses in gaps that are longer than `MAX_LINEAR_S`, and leave out those that are not kept."""
+def _filled(
+    track: PoseTrack, kept: NDArray[np.bool_], bridge_gap: Callable[[Array], tuple[FittedPath, FittedPath] | None]
+) -> tuple[PoseTrack, list[Stretch]]:
+    """Add poses in gaps that are longer than `MAX_LINEAR_S`, as far as they are known, and leave out those that are not kept."""
     rows = np.flatnonzero(kept)
     t_ns = track.t_ns[rows]
     gaps = np.flatnonzero(np.diff(t_ns) > MAX_LINEAR_S * NS_PER_S)
     if not len(gaps):
-        return (track if kept.all() or not len(rows) else _joined(track, [_taken(track, rows)])), []
-    parts, stretches = [_taken(track, rows)], []
+        return (track if kept.all() or not len(rows) else join_tracks(track, rows)), []
+    parts, stretches = [], []
     line = replace(track, max_gap_s=np.inf)
     for first, last in zip(t_ns[gaps].tolist(), t_ns[gaps + 1].tolist()):
-        added = _bridged(line, evidence, (first, last)) if last - first <= MAX_BRIDGED_S * NS_PER_S else None
+        steps = int(np.ceil((last - first) / NS_PER_S / ADDED_STEP_S))
+        at_ns = first + (np.arange(1, steps) * (last - first)) // steps
+        short = last - first <= MAX_BRIDGED_S * NS_PER_S
+        paths = bridge_gap((at_ns - track.t_ns[0]) / NS_PER_S) if short else None
         ends, worst_m = np.array([first, last]), 0.0
-        if added is not None:
-            parts.append(added)
-            ends, worst_m = np.concatenate([[first], added.t_ns, [last]]), float(added.sigma_m.max())
+        if paths is not None:
+            sigma_m, sigma_rad = np.hypot(paths[0].sigma, USUAL_SIGMA_M), np.hypot(paths[1].sigma, USUAL_SIGMA_RAD)
+            known = (sigma_m <= MAX_SIGMA_M) & (sigma_rad <= MAX_SIGMA_RAD)
+            if known.any():
+                straight = line.at(at_ns[known])[0]
+                poses = _placed(straight, paths[0].value[known], paths[1].value[known, 0] - yaw_of(straight))
+                parts.append(PoseTrack(at_ns[known], poses, sigma_m=sigma_m[known], sigma_yaw_rad=sigma_rad[known]))
+                ends, worst_m = np.concatenate([[first], at_ns[known], [last]]), float(sigma_m[known].max())
         between = np.diff(ends) / NS_PER_S
         unknown_s = float(between[between > MAX_LINEAR_S].sum())
         stretches.append(Stretch("gap", first, last, sigma_m=worst_m, unknown_s=unknown_s))
-    if len(parts) == 1 and kept.all() and np.diff(t_ns)[gaps].min() > track.max_gap_s * NS_PER_S:
+    if not parts and kept.all() and np.diff(t_ns)[gaps].min() > track.max_gap_s * NS_PER_S:
         return track, stretches
-    filled = _joined(track, parts)
+    filled = join_tracks(track, rows, *parts)
     # What is not bridged stays a gap.
     return replace(filled, max_gap_s=MAX_LINEAR_S) if any(s.unknown_s for s in stretches) else filled, stretches
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Stamps, poses and standard deviations of some poses of a track."""
-
-    t_ns: NDArray[np.int64]
-    map_T_ego: Array
-    sigma_m: Array
-    sigma_rad: Array
-
-
-def _taken(track: PoseTrack, rows: NDArray[np.intp]) -> _Rows:
-    sigmas = track.sigmas_at(track.t_ns[rows], (USUAL_SIGMA_M, USUAL_SIGMA_RAD))
-    return _Rows(track.t_ns[rows], track.map_T_ego[rows], sigmas[:, 0], sigmas[:, 1])
-
-
-def _joined(track: PoseTrack, parts: list[_Rows]) -> PoseTrack:
-    """Return a track of the poses of several parts, in the order of time."""
-    order = np.argsort(np.concatenate([p.t_ns for p in parts]), kind="stable")
-    t_ns, poses, sigma_m, sigma_rad = (
-        np.concatenate([getattr(p, name) for p in parts])[order]
-        for name in ("t_ns", "map_T_ego", "sigma_m", "sigma_rad")
-    )
-    return replace(track, t_ns=t_ns, map_T_ego=poses, sigma_m=sigma_m, sigma_yaw_rad=sigma_rad)
-
-
-def _bridged(line: PoseTrack, evidence: _Evidence, around_ns: tuple[int, int]) -> _Rows | None:
-    """Interpolate poses between two stamps by the motion around, as far as they are known well enough; None without any."""
-    first, last = around_ns
-    path, measured, noise = evidence.path, evidence.measured, evidence.noise
-    steps = int(np.ceil((last - first) / NS_PER_S / ADDED_STEP_S))
-    t_ns = first + (np.arange(1, steps) * (last - first)) // steps
-    t_s = (t_ns - line.t_ns[0]) / NS_PER_S
-    xyz = bridge(path.t_s, path.xyz_m, measured, t_s, noise[0], POSITION_PRIOR)
-    yaw = bridge(path.t_s, path.yaw_rad[:, None], measured, t_s, noise[1], YAW_PRIOR)
-    if xyz is None or yaw is None:
-        return None
-    sigma_m = np.hypot(xyz.sigma, USUAL_SIGMA_M)
-    sigma_rad = np.hypot(yaw.sigma, USUAL_SIGMA_RAD)
-    known = (sigma_m <= MAX_SIGMA_M) & (sigma_rad <= MAX_SIGMA_RAD)
-    if not known.any():
-        return None
-    straight = line.at(t_ns[known])[0]
-    turned = yaw.value[known, 0] - yaw_of(straight)
-    return _Rows(t_ns[known], _placed(straight, xyz.value[known], turned), sigma_m[known], sigma_rad[known])
+def join_tracks(track: PoseTrack, rows: NDArray[np.intp], *others: PoseTrack) -> PoseTrack:
+    """Return some poses (rows) of a track together with those of others, in the order of time."""
+    parts = [(track, track.t_ns[rows], track.map_T_ego[rows]), *((o, o.t_ns, o.map_T_ego) for o in others)]
+    t_ns = np.concatenate([t for _, t, _ in parts])
+    order = np.argsort(t_ns, kind="stable")
+    sigmas = np.concatenate([part.sigmas_at(t, (USUAL_SIGMA_M, USUAL_SIGMA_RAD)) for part, t, _ in parts])[order]
+    poses = np.concatenate([poses for _, _, poses in parts])[order]
+    return replace(track, t_ns=t_ns[order], map_T_ego=poses, sigma_m=sigmas[:, 0], sigma_yaw_rad=sigmas[:, 1])
 
 
 # At 3 m/s2, which is brisk driving, a line between poses this far apart is off by 0.25 m; poses of 2 Hz are usual.
@@ -364,12 +250,7 @@ MIN_SPARSE_S = float(np.sqrt(8 * 0.25 / 3.0))
 def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, int] | None) -> tuple[Fault, ...]:
     """List the faults of given poses, those of the time that is used and of which something is recorded.
 
-    Parameters
-    ----------
-    stretches : sequence of Stretch
-        In the order of time.
-    during_ns : (int, int), optional
-        First and last stamp that is used; None for all.
+    `stretches`: in the order of time. `during_ns`: (int, int): first and last stamp that is used; None for all.
     """
     if log.ego is None or not stretches:
         return ()

@@ -43,19 +43,11 @@ MIN_AGREEMENT, MAX_DISAGREEMENT = 0.9, 0.3
 
 @dataclass(frozen=True, eq=False)
 class FlowPair:
-    """Points followed from one frame to another.
+    """Points followed from one frame to another."""
 
-    Attributes
-    ----------
-    first, second : (N, 3) float64
-        Rays of unit length, cam frame.
-    second_T_first : (4, 4) float64
-        The motion of the ego: from its frame at the first frame to that at the second.
-    """
-
-    first: Array
+    first: Array  # `first`, `second`: (N, 3): rays of unit length, cam frame
     second: Array
-    second_T_first: Array
+    second_T_first: Array  # (4, 4): the motion of the ego: from its frame at the first frame to that at the second
 
 
 def follow_pairs(log: Log, name: str, during_ns: tuple[int, int] | None) -> list[FlowPair]:
@@ -98,15 +90,9 @@ def flow_agreement(camera: Camera, pairs: Sequence[FlowPair]) -> float | None:
 def find_exchanged(cameras: Mapping[str, Camera], pairs: Mapping[str, Sequence[FlowPair]]) -> dict[str, str]:
     """Find cameras in whose images points move against their own mounts, but as the mount of the other says in both.
 
-    Parameters
-    ----------
-    pairs : mapping of str to sequence of FlowPair
-        By camera, of those that may be exchanged.
+    `pairs`: by camera, of those that may be exchanged.
 
-    Returns
-    -------
-    dict of str to str
-        The other camera, by camera.
+    Returns dict of str to str: the other camera, by camera.
     """
     own = {name: flow_agreement(cameras[name], pairs[name]) for name in pairs}
     against = [name for name, cosine in own.items() if cosine is not None and cosine < MAX_DISAGREEMENT]
@@ -170,47 +156,23 @@ MAX_ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class MountCheck:
-    """What the mounts of a log are checked with, and what came of it.
-
-    Attributes
-    ----------
-    lidar : str
-        "" without one to check against.
-    views : mapping of str to list of EdgeView
-        By camera, of those beside the LiDAR.
-    yaws : mapping of str to YawEstimate or None
-        By camera, with its own mount; None where it is not known.
-    """
+    """What the mounts of a log are checked with, and what came of it."""
 
     log: Log
-    lidar: str
-    views: Mapping[str, list[EdgeView]]
-    yaws: Mapping[str, YawEstimate | None]
+    lidar: str  # "" without one to check against
+    views: Mapping[str, list[EdgeView]]  # by camera, of those beside the LiDAR
+    yaws: Mapping[str, YawEstimate | None]  # by camera, with its own mount; None where it is not known
 
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
-    """A mount that fits the images of a camera where its own does not.
+    """A mount that fits the images of a camera where its own does not."""
 
-    Attributes
-    ----------
-    kind : str
-        Of the fault.
-    words : str
-        What is wrong, with a place for the LiDAR.
-    mount_T_cam : (4, 4) float64
-        What fits.
-    other : str
-        The camera whose mount it is; "" for none.
-    certain : bool
-        Whether the run rather goes on without the camera.
-    """
-
-    kind: str
-    words: str
-    mount_T_cam: Array
-    other: str = ""
-    certain: bool = True
+    kind: str  # of the fault
+    words: str  # what is wrong, with a place for the LiDAR
+    mount_T_cam: Array  # (4, 4): what fits
+    other: str = ""  # the camera whose mount it is; "" for none
+    certain: bool = True  # whether the run rather goes on without the camera
 
 
 def estimate_mount_yaw(camera: Camera, views: list[EdgeView]) -> YawEstimate | None:
@@ -335,18 +297,9 @@ def check_cameras(
 ) -> tuple[Log, tuple[Fault, ...]]:
     """Return the log, corrected where the settings ask for it, and what is wrong with its cameras.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses and the LiDARs that the run uses.
-    config : Config
-        `calibration.fix_mounts`: whether mounts are corrected.
-    sensors : Sensors
-        Those that the run uses; others are not checked.
-    of_lidars : tuple of Fault
-        Of clocks and mounts of LiDARs. Cameras are not checked against a LiDAR with one that is not corrected.
-    progress : callable
-        Called as `progress(stage, done, total)`.
+    `log`: with the poses and the LiDARs that the run uses. `config`: `calibration.fix_mounts`: whether mounts are
+    corrected. `sensors`: those that the run uses; others are not checked. `of_lidars`: of clocks and mounts of LiDARs.
+    Cameras are not checked against a LiDAR with one that is not corrected.
 
     Notes
     -----
@@ -482,22 +435,10 @@ def check_calibration(
 ) -> tuple[Log, tuple[Fault, ...]]:
     """Estimate offsets of clocks and rotations of mounts from a log.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses that the run uses.
-    config : Config
-        `calibration`: whether to check, and what to correct; `start_s`, `stop_s`: what is looked at.
-    sensors : Sensors
-        Those that the run uses; others are not checked.
-    progress : callable
-        Called as `progress(stage, done, total)`.
+    `log`: with the poses that the run uses. `config`: `calibration`: whether to check, and what to correct; `start_s`,
+    `stop_s`: what is looked at. `sensors`: those that the run uses; others are not checked.
 
-    Returns
-    -------
-    log : Log
-        With the corrections that the settings ask for.
-    faults : tuple of Fault
+    Returns `log`: with the corrections that the settings ask for; `faults`.
     """
     if not config.calibration.check:
         return log, ()

@@ -30,17 +30,14 @@ from log2sim.geometry import (
 KNOT_NS = 5_000_000
 MAX_KNOTS = 4096
 
+# Gives the transforms (K, 4, 4) at stamps (K,) and whether each is known.
 TransformAt = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
-"""Gives the transforms (K, 4, 4) at stamps (K,) and whether each is known."""
 
 
 def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T_src_at: TransformAt) -> Array | None:
     """Transform points (N, 3), m, each by the transform at its own stamp (N,).
 
-    Returns
-    -------
-    (N, 3) float64, m, or None
-        None where a transform is not known.
+    Returns (N, 3) float64, m, or None: None where a transform is not known.
     """
     if len(xyz_m) == 0:
         return np.zeros((0, 3))
@@ -82,20 +79,12 @@ COVERAGE_VOXEL_M = 0.5
 
 @dataclass(frozen=True, eq=False)
 class EgoSweep:
-    """One sweep in the ego's frame.
+    """One sweep in the ego's frame."""
 
-    Attributes
-    ----------
-    t_ref_ns : int
-        Stamp of the pose that the sweep gives, and to which it is compensated where `t_ns` is None.
-    xyz_m : (N, 3) float64, m
-        Points in the ego's frame; at their own times where `t_ns` is given.
-    t_ns : (N,) int64 or None
-        Stamps at which the points were measured; None where the ego's motion is out of them or their times are not known.
-    """
-
-    t_ref_ns: int
-    xyz_m: Array
+    t_ref_ns: int  # stamp of the pose that the sweep gives, and to which it is compensated where `t_ns` is None
+    xyz_m: Array  # (N, 3): points in the ego's frame; at their own times where `t_ns` is given
+    # (N,) or None: stamps at which the points were measured; None where the ego's motion is out of them or their
+    # times are not known
     t_ns: NDArray[np.int64] | None
 
 
@@ -168,11 +157,7 @@ def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:
 def compensated(sweep: EgoSweep, motion: Array, motion_s: float) -> Array:
     """Take a constant motion out of a sweep: points (N, 3), m, in the ego's frame at its reference stamp.
 
-    Parameters
-    ----------
-    motion : (4, 4) float64
-        Pose of the ego after `motion_s` in its frame before.
-    motion_s : float, s
+    `motion`: (4, 4): pose of the ego after `motion_s` in its frame before.
     """
     if sweep.t_ns is None or motion_s <= 0:
         return sweep.xyz_m
@@ -217,39 +202,21 @@ MIN_RETURN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A registered sweep.
+    """A registered sweep."""
 
-    Attributes
-    ----------
-    pose : (4, 4) float64
-        Of the ego in the frame of the map.
-    overlap : float
-        Share of the sweep's points that fall onto known surfaces.
-    residual : float
-        Mean squared Mahalanobis distance of these points, without unit.
-    constraint : float
-        Share of points, as if all were square to it, that hold the weakest direction of translation.
-    weakest : (3,) float64
-        That direction, in the frame of the map.
-    covariance : (6, 6) float64
-        Of rotation vector and translation, rad and m; the inverse of the information matrix, hence optimistic.
-    """
-
-    pose: Array
-    overlap: float
-    residual: float
-    constraint: float
-    weakest: Array
+    pose: Array  # (4, 4): of the ego in the frame of the map
+    overlap: float  # share of the sweep's points that fall onto known surfaces
+    residual: float  # mean squared Mahalanobis distance of these points, without unit
+    constraint: float  # share of points, as if all were square to it, that hold the weakest direction of translation
+    weakest: Array  # (3,): that direction, in the frame of the map
+    # (6, 6): of rotation vector and translation, rad and m; the inverse of the information matrix, hence optimistic
     covariance: Array
 
 
 def load_small_gicp() -> ModuleType:
     """Import the library for registration.
 
-    Raises
-    ------
-    MissingExtra
-        Where it is not installed.
+    Raises `MissingExtra` where it is not installed.
     """
     try:
         import small_gicp
@@ -315,10 +282,7 @@ class SurfaceMap:
 def weakest_direction(information: Array, points: int) -> tuple[float, Array]:
     """Find the direction of translation that a registration holds least: its constraint and unit vector (3,), ego frame.
 
-    Parameters
-    ----------
-    information : (6, 6) float64
-        Of rotation and translation, in this order.
+    `information`: (6, 6): of rotation and translation, in this order.
 
     Notes
     -----
@@ -349,38 +313,20 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """Poses of the ego by LiDAR odometry, in a frame of its own.
-
-    Attributes
-    ----------
-    t_ns : (P,) int64
-        Increasing stamps.
-    odom_T_ego : (P, 4, 4) float64
-    overlap, residual, constraint : (P,) float64
-        See `Fit`; NaN where the pose is only predicted.
-    weakest : (P, 3) float64
-        Direction of the weakest constraint, odometry frame.
-    degenerate : (P,) bool
-        Whether the sweep does not constrain some direction of the motion.
-    predicted : (P,) bool
-        Whether the sweep did not fit to the others and the pose is predicted by constant velocity.
-    sweeps : int
-        Number of sweeps in the log.
-    problems : dict of str to int
-        Sweeps that gave no pose of their own, by reason.
-    """
+    """Poses of the ego by LiDAR odometry, in a frame of its own."""
 
     lidar: str
-    t_ns: NDArray[np.int64]
-    odom_T_ego: Array
-    overlap: Array
+    t_ns: NDArray[np.int64]  # (P,): increasing stamps
+    odom_T_ego: Array  # (P, 4, 4)
+    overlap: Array  # `overlap`, `residual`, `constraint`: (P,): see `Fit`; NaN where the pose is only predicted
     residual: Array
     constraint: Array
-    weakest: Array
-    degenerate: NDArray[np.bool_]
+    weakest: Array  # (P, 3): direction of the weakest constraint, odometry frame
+    degenerate: NDArray[np.bool_]  # (P,): whether the sweep does not constrain some direction of the motion
+    # (P,): whether the sweep did not fit to the others and the pose is predicted by constant velocity
     predicted: NDArray[np.bool_]
-    sweeps: int
-    problems: dict[str, int]
+    sweeps: int  # number of sweeps in the log
+    problems: dict[str, int]  # sweeps that gave no pose of their own, by reason
 
     @property
     def path_m(self) -> float:
@@ -393,21 +339,10 @@ def run_odometry(
 ) -> Odometry:
     """Estimate the motion of the ego from the sweeps of a LiDAR.
 
-    Parameters
-    ----------
-    lidar : str
-        One on the ego.
-    during_ns : (int, int), optional
-        First and last stamp of the sweeps to use; all by default.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps).
+    `lidar`: one on the ego. `during_ns`: (int, int): first and last stamp of the sweeps to use; all by default.
 
-    Raises
-    ------
-    LogError
-        When no sweeps fit to each other.
-    MissingExtra
-        Where the library for registration is not installed.
+    Raises `LogError` when no sweeps fit to each other. Raises `MissingExtra` where the library for registration is not
+    installed.
 
     Notes
     -----

@@ -89,17 +89,11 @@ MIN_SIGMA = 1e-3
 
 @dataclass(frozen=True)
 class PathPrior:
-    """What is known of a path before it is measured, in units u: m of a position, rad of an angle.
+    """What is known of a path before it is measured, in units u: m of a position, rad of an angle."""
 
-    Attributes
-    ----------
-    density : float, u2/s5
-        Spectral density of the third derivative, white noise.
-    place, rate, change : float, u, u/s, u/s2
-        Standard deviations of the first value about the first sample, and of its first and second derivative.
-    """
-
-    density: float
+    density: float  # spectral density of the third derivative, white noise
+    # `place`, `rate`, `change`: u, u/s, u/s2: standard deviations of the first value about the first sample, and of its
+    # first and second derivative
     place: float
     rate: float
     change: float
@@ -113,20 +107,11 @@ YAW_PRIOR = PathPrior(density=0.12, place=4.0, rate=1.0, change=0.5)
 
 @dataclass(frozen=True, eq=False)
 class FittedPath:
-    """A path at the times that were asked for.
+    """A path at the times that were asked for."""
 
-    Attributes
-    ----------
-    value : (T, D) float64
-    sigma : (T,) float64
-        Standard deviation of each coordinate.
-    step : (D,) float64
-        How far the samples after the step are off those before it; 0 without a step.
-    """
-
-    value: Array
-    sigma: Array
-    step: Array
+    value: Array  # (T, D)
+    sigma: Array  # (T,): standard deviation of each coordinate
+    step: Array  # (D,): how far the samples after the step are off those before it; 0 without a step
     step_sigma: float
 
 
@@ -141,15 +126,8 @@ def fit_path(
 ) -> FittedPath:
     """Fit a path to samples and evaluate it, in units u of the samples.
 
-    Parameters
-    ----------
-    t_s : (n,) float64, s
-    samples : (n, D) float64, u
-    sigma : float, u
-        Standard deviation of each sample.
-    asked_s : (T,) float64, s
-    after : (n,) bool, optional
-        Samples that are off all others by one unknown step.
+    `t_s`: (n,). `samples`: (n, D) u. `sigma`: u: standard deviation of each sample. `asked_s`: (T,). `after`: (n,)
+    bool: samples that are off all others by one unknown step.
 
     Notes
     -----
@@ -204,19 +182,10 @@ def smooth_path(
 ) -> tuple[Array, Array]:
     """Smooth the measured samples of a path, in units u; the others stay as they are.
 
-    Parameters
-    ----------
-    t_s : (P,) float64, s
-    values : (P, D) float64, u
-    measured : (P,) bool
-    noise : float, u
-        Standard deviation of the samples, independent of each other.
+    `t_s`: (P,). `values`: (P, D) u. `measured`: (P,) bool. `noise`: u: standard deviation of the samples, independent
+    of each other.
 
-    Returns
-    -------
-    values : (P, D) float64, u
-    sigma : (P,) float64, u
-        Standard deviations of the smoothed samples, 0 of the others.
+    Returns `values`: (P, D) u; `sigma`: (P,) u: standard deviations of the smoothed samples, 0 of the others.
     """
     out, sigma = values.copy(), np.zeros(len(t_s))
     rows = np.flatnonzero(measured)
@@ -261,42 +230,21 @@ MAX_COMPARED = 30
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples of a path.
+    """Samples of a path."""
 
-    Attributes
-    ----------
-    t_s : (P,) float64, s
-        Strictly increasing.
-    values : (P, D) float64, u
-    max_change : float, u/s2
-        Largest second derivative of a vehicle's path.
-    sigma : float, u
-        Standard deviation of their noise, see `noise_of`.
-    """
-
-    t_s: Array
-    values: Array
-    max_change: float
-    sigma: float
+    t_s: Array  # (P,): strictly increasing
+    values: Array  # (P, D) u
+    max_change: float  # u/s2: largest second derivative of a vehicle's path
+    sigma: float  # u: standard deviation of their noise, see `noise_of`
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Successive samples that a vehicle can have driven.
+    """Successive samples that a vehicle can have driven."""
 
-    Attributes
-    ----------
-    rows : (n,) int
-        Rows of `Samples`.
-    right : bool
-        Whether it belongs to the parts that are taken for right.
-    at_rest : bool
-        Whether it stays in one place although the path enters or leaves it at a speed.
-    """
-
-    rows: NDArray[np.intp]
-    right: bool = True
-    at_rest: bool = False
+    rows: NDArray[np.intp]  # (n,) int: rows of `Samples`
+    right: bool = True  # whether it belongs to the parts that are taken for right
+    at_rest: bool = False  # whether it stays in one place although the path enters or leaves it at a speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -458,18 +406,11 @@ def _step_and_limit(samples: Samples, end: _End, start: _End) -> tuple[Array, fl
 
 @dataclass(frozen=True)
 class Skip:
-    """A step between two parts that are used as they are.
+    """A step between two parts that are used as they are."""
 
-    Attributes
-    ----------
-    first, last : int
-        Rows of the last sample before the step and of the first one after it.
-    size : float, u
-    """
-
-    first: int
+    first: int  # `first`, `last`: rows of the last sample before the step and of the first one after it
     last: int
-    size: float
+    size: float  # u
 
 
 def find_skips(samples: Samples, parts: list[Part]) -> list[Skip]:
@@ -513,64 +454,37 @@ MAX_LASTING_S = 0.15
 
 @dataclass(frozen=True)
 class Limits:
-    """What is possible for a path and what is worth a repair, in units u: m or rad.
+    """What is possible for a path and what is worth a repair, in units u: m or rad."""
 
-    Attributes
-    ----------
-    max_change : float, u/s2
-        Largest second derivative of a vehicle's path.
-    min_step : float, u
-        Repairs that move samples by less are not made.
-    min_lasting_step : float, u
-        The same for a step that stays: a smaller one may be an end of a short jump whose other end is hidden in noise.
-    usual_sigma : float, u
-        Standard deviation of samples whose noise does not show because they are few or sparse.
-    """
-
-    max_change: float
+    max_change: float  # u/s2: largest second derivative of a vehicle's path
     prior: PathPrior
-    min_step: float
+    min_step: float  # u: repairs that move samples by less are not made
+    # u: the same for a step that stays: a smaller one may be an end of a short jump whose other end is hidden in noise
     min_lasting_step: float
-    usual_sigma: float
+    usual_sigma: float  # u: standard deviation of samples whose noise does not show because they are few or sparse
 
 
 @dataclass(frozen=True, eq=False)
 class RepairedPath:
-    """A path whose faults are taken out.
-
-    Attributes
-    ----------
-    values : (P, D) float64, u
-    sigma : (P,) float64, u
-        Standard deviation of what the repair adds, 0 where a sample is as it was.
-    noise : float, u
-        Standard deviation of the noise of the samples.
-    moved, bridged, at_rest : (P,) bool
-        Whether a sample was moved with its part, or replaced by what the samples around suggest; whether it stayed in its
-        place while the vehicle moved.
-    skips : tuple of Skip
-        Steps that stay, and that may be of the stamps or one end of a jump: these samples are as they were.
-    """
+    """A path whose faults are taken out."""
 
     limits: Limits
-    values: Array
-    sigma: Array
-    noise: float
+    values: Array  # (P, D) u
+    sigma: Array  # (P,) u: standard deviation of what the repair adds, 0 where a sample is as it was
+    noise: float  # u: standard deviation of the noise of the samples
+    # `moved`, `bridged`, `at_rest`: (P,): whether a sample was moved with its part, or replaced by what the
+    # samples around suggest; whether it stayed in its place while the vehicle moved
     moved: NDArray[np.bool_]
     bridged: NDArray[np.bool_]
     at_rest: NDArray[np.bool_]
+    # Steps that stay, and that may be of the stamps or one end of a jump: these samples are as they were
     skips: tuple[Skip, ...] = ()
 
 
 def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.bool_] | None = None) -> RepairedPath:
     """Find and repair the faults of a path.
 
-    Parameters
-    ----------
-    t_s : (P,) float64, s
-    values : (P, D) float64, u
-    wrong : (P,) bool, optional
-        Samples that are known to be wrong.
+    `t_s`: (P,). `values`: (P, D) u. `wrong`: (P,) bool: samples that are known to be wrong.
     """
     rows = np.arange(len(t_s)) if wrong is None else np.flatnonzero(~wrong)
     new, sigma = values.copy(), np.zeros(len(t_s))

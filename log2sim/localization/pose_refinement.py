@@ -1,88 +1,82 @@
-"""Poses of the ego refined for a map: sweeps from places of its path are registered to each other, all together.
+"""Poses of the ego refined: sweeps from places of its path are registered to each other, all together.
 
-Poses of a log follow GNSS: over seconds they drift by centimeters to decimeters, which would draw every marking several times.
+Poses of a log follow GNSS: over seconds some drift by decimeters, which smears what stands and draws markings several times.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Scenario, Sweep
+from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
-from log2sim.localization.odometry import densest_lidar
-from log2sim.localization.replaced import replace_poses
-from log2sim.localization.surfaces import Registration, Surfaces, adjoint_of, exp_of, log_of, register, surfaces_of
-from log2sim.perception.frames import RecordReader, work_ahead
-from log2sim.perception.lidar.cloud import sweep_to_map
+from log2sim.localization.odometry import densest_lidar, read_ego_sweep
+from log2sim.localization.surfaces import (
+    Registration,
+    Surfaces,
+    adjoint_of,
+    exp_of,
+    log_of,
+    register,
+    surfaces_of_sweep,
+)
+from log2sim.perception.frames import work_ahead
 
-# Poses between sweeps that are registered are interpolated: so many cover braking and curves of a short log, and a long one costs
-# no more than that.
-MAX_KEYFRAMES = 30
+# Poses between sweeps that are registered are interpolated: so many cover braking and curves of a log, unless they are farther
+# apart than errors of GNSS last.
+MAX_KEYFRAMES, MAX_SPACING_S = 30, 3.0
 # An ego that stands has one pose.
 MIN_WAY_M = 0.5
 # Each is registered to those before it at these distances in their order: near ones are precise, far ones hold the drift.
 LAGS = (1, 3, 9, 27)
 MIN_KEYFRAMES = 3
-# What poses of GNSS are off by: a weak prior that leaves the middle of the log where it is.
+# What poses of GNSS with an IMU are off by: a weak prior that leaves the middle of the log where it is, and what they drift by
+# over a second, which holds the directions that surfaces do not.
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 0.02, 0.02, 0.02])
+DRIFT_SIGMA = np.array([0.05, 0.05, 0.05, 0.0025, 0.0025, 0.0025])
 # Registrations that are this many standard deviations off count half.
 CAUCHY = 3.0
 # Directions that a registration tells less well than this, at the distance of usual surfaces, are those that no surface holds.
 MAX_SIGMA_M, LEVER_M = 0.1, 20.0
 MAX_SLIDE_M = 0.1
 ROUNDS = 5
-# Points of a sweep that are looked at.
-MAX_POINTS = 60_000
-MIN_RANGE_M = 2.5
 
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A sweep that is registered.
-
-    Attributes
-    ----------
-    map_T_ego : (4, 4) float64
-    """
+    """A sweep that is registered."""
 
     t_ns: int
-    map_T_ego: Array
+    map_T_ego: Array  # (4, 4)
     surfaces: Surfaces
 
 
-def refine_poses(log: Log, scenario: Scenario, reader: RecordReader) -> Log:
-    """Return the log with poses by which surfaces lie on each other; the log itself without LiDAR or with too few sweeps."""
+def refine_poses(log: Log, during_ns: tuple[int, int] | None = None) -> PoseTrack | None:
+    """Return poses of the ego by which surfaces in the sweeps between two stamps lie on each other.
+
+    None without LiDAR on the ego, with too few sweeps, or over too long a time.
+    """
     lidar = densest_lidar(log)
     if log.ego is None or lidar is None:
-        return log
-    chosen = _choose(log, scenario, lidar)
-    made = work_ahead(lambda index: _keyframe(log, reader, lidar, index), chosen.tolist())
+        return None
+    chosen = _choose(log, lidar, during_ns)
+    made = work_ahead(lambda index: _keyframe(log, lidar, index), chosen.tolist())
     keyframes = [keyframe for keyframe in made if keyframe is not None]
     if len(keyframes) < MIN_KEYFRAMES:
-        return log
+        return None
     pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
-    found = work_ahead(lambda pair: _registered(keyframes[pair[0]], keyframes[pair[1]]), pairs)
+
+    def registered(pair: tuple[int, int]) -> Registration | None:
+        first, second = (keyframes[k] for k in pair)
+        return register(first.surfaces, second.surfaces, inverse(first.map_T_ego) @ second.map_T_ego)
+
+    found = work_ahead(registered, pairs)
     links = [(*pair, registration) for pair, registration in zip(pairs, found, strict=True) if registration is not None]
     twists = solve_twists(keyframes, links)
-    return replace_poses(log, corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists))
-
-
-def place_as_given(points_m: Array, refined: Log, given: Log) -> Array:
-    """Return points (N, 3), m, of a map made by refined poses where they lie by the given poses, which agents have.
-
-    Each moves with the ego as it was nearest to it, so lanes and the agents on them stay together.
-    """
-    if refined.ego is None or given.ego is None or refined.ego is given.ego or not len(points_m):
-        return points_m
-    from scipy.spatial import cKDTree
-
-    nearest = cKDTree(refined.ego.map_T_ego[:, :2, 3]).query(points_m[:, :2])[1]
-    given_T_refined = given.ego.map_T_ego @ inverse(refined.ego.map_T_ego)
-    rotation, translation = given_T_refined[nearest, :3, :3], given_T_refined[nearest, :3, 3]
-    return np.asarray(np.einsum("nij,nj->ni", rotation, points_m) + translation)
+    return corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists)
 
 
 def _told(covariance: Array, measured: Array) -> Array | None:
@@ -100,16 +94,18 @@ def _told(covariance: Array, measured: Array) -> Array | None:
     return np.asarray(length @ (directions * known) @ directions.T @ length)
 
 
-def _choose(log: Log, scenario: Scenario, lidar: str) -> NDArray[np.int64]:
+def _choose(log: Log, lidar: str, during_ns: tuple[int, int] | None) -> NDArray[np.int64]:
     """Choose sweeps evenly by the way and by the time of the ego: poses err along both."""
     t_ns = log.streams[lidar].t_ns
-    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
     pose, known = log.map_T_sensor(lidar, t_ns)
-    usable = np.flatnonzero(known & (t_ns >= scenario.t0_ns) & (t_ns <= end_ns))
+    if during_ns is not None:
+        known &= (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+    usable = np.flatnonzero(known)
     if len(usable) <= MIN_KEYFRAMES:
         return usable.astype(np.int64)
     moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(pose[usable, :3, 3], axis=0), axis=1))])
-    if moved[-1] < MIN_WAY_M:
+    span_s = (t_ns[usable[-1]] - t_ns[usable[0]]) / NS_PER_S
+    if moved[-1] < MIN_WAY_M or span_s > MAX_KEYFRAMES * MAX_SPACING_S:
         return usable[:0].astype(np.int64)
     since = (t_ns[usable] - t_ns[usable[0]]) / float(t_ns[usable[-1]] - t_ns[usable[0]])
     progress = (moved / moved[-1] + since) / 2
@@ -136,6 +132,10 @@ def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registra
     count = 6 * len(keyframes)
     twists: Array = np.zeros(count)
     prior = np.diag(np.tile(PRIOR_SIGMA**-2.0, len(keyframes)))
+    for k, (one, other) in enumerate(pairwise(keyframes)):
+        drift = np.diag(DRIFT_SIGMA**-2.0 * NS_PER_S / (other.t_ns - one.t_ns))
+        rows = slice(6 * k, 6 * k + 12)
+        prior[rows, rows] += np.block([[drift, -drift], [-drift, drift]])
     equations = []
     for i, j, registration in links:
         j_T_i = inverse(keyframes[j].map_T_ego) @ keyframes[i].map_T_ego
@@ -160,26 +160,11 @@ def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registra
     return twists.reshape(-1, 6)
 
 
-def _keyframe(log: Log, reader: RecordReader, lidar: str, index: int) -> Keyframe | None:
+def _keyframe(log: Log, lidar: str, index: int) -> Keyframe | None:
     """Read a sweep and find its surfaces, in the ego's frame at its stamp; None where it has too few."""
-    sweep = reader.get(lidar, index)
-    t_ns = int(log.streams[lidar].t_ns[index])
-    mapped = None if sweep is None else sweep_to_map(log, lidar, _thinned(sweep), compensate=True)
-    assert log.ego is not None
-    pose, known = log.ego.at(t_ns)
-    if mapped is None or not known[0] or reader.watch.lidars[lidar].repeated.get(t_ns, False):
+    sweep = read_ego_sweep(log, lidar, index)
+    if log.ego is None or sweep is None:
         return None
-    local = (mapped[0] - pose[0, :3, 3]) @ pose[0, :3, :3]
-    # The ego itself moves with every sweep.
-    surfaces = surfaces_of(local[np.hypot(local[:, 0], local[:, 1]) > MIN_RANGE_M])
-    return None if surfaces is None else Keyframe(t_ns, pose[0], surfaces)
-
-
-def _thinned(sweep: Sweep) -> Sweep:
-    """Return every second, third ... point of a sweep, as far as there are too many."""
-    step = max(len(sweep.xyz_m) // MAX_POINTS, 1)
-    return replace(sweep, xyz_m=sweep.xyz_m[::step], t_ns=None if sweep.t_ns is None else sweep.t_ns[::step])
-
-
-def _registered(first: Keyframe, second: Keyframe) -> Registration | None:
-    return register(first.surfaces, second.surfaces, inverse(first.map_T_ego) @ second.map_T_ego)
+    pose, known = log.ego.at(sweep.t_ref_ns)
+    surfaces = surfaces_of_sweep(sweep, log.ego) if known[0] else None
+    return None if surfaces is None else Keyframe(sweep.t_ref_ns, pose[0], surfaces)

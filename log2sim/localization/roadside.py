@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log, Stream, Sweep
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform
+from log2sim.datatypes import Fault, Log
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside_fit import (
     DELAY,
     PRIOR_SIGMA,
@@ -52,17 +53,11 @@ MAX_UNIT_M = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """Sensors at one place of the roadside.
-
-    Attributes
-    ----------
-    site_m : (3,) float64, m
-        Mean place of its LiDARs in the map.
-    """
+    """Sensors at one place of the roadside."""
 
     lidars: tuple[str, ...]
     cameras: tuple[str, ...]
-    site_m: Array
+    site_m: Array  # (3,): mean place of its LiDARs in the map
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -95,12 +90,8 @@ def _apart_m(log: Log, first: str, second: str) -> float:
 def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log:
     """Return the log with a unit's sensors moved and its stamps put right.
 
-    Parameters
-    ----------
-    correction : (4, 4) float64
-        Takes places by the unit's poses to right ones, both in the frame of the site: map axes, origin at `site_m`.
-    delay_s : float, s
-        By which its stamps are late.
+    `correction`: (4, 4): takes places by the unit's poses to right ones, both in the frame of the site: map axes,
+    origin at `site_m`. `delay_s`: by which its stamps are late.
     """
     shift = transform(np.eye(3), unit.site_m)
     moved = shift @ correction @ inverse(shift)
@@ -111,28 +102,8 @@ def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log
         cameras[name] = replace(cameras[name], mount_T_cam=moved @ cameras[name].mount_T_cam)
     for name in unit.sensors:
         if name in streams:
-            streams[name] = _corrected_stream(streams[name], moved, -round(delay_s * NS_PER_S))
+            streams[name] = shift_stream(streams[name], -round(delay_s * NS_PER_S), moved)
     return log.changed(lidars=lidars, cameras=cameras, streams=streams)
-
-
-def _corrected_stream(stream: Stream, moved: Array, shift_ns: int) -> Stream:
-    """Move the stamps of all records, and the points of sweeps that are given in the map."""
-
-    def read(i: int) -> Any:
-        record = stream.read(i)
-        return _corrected_sweep(record, moved, shift_ns) if isinstance(record, Sweep) else record
-
-    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded)
-
-
-def _corrected_sweep(sweep: Sweep, moved: Array, shift_ns: int) -> Sweep:
-    return replace(
-        sweep,
-        stamp_ns=int(sweep.stamp_ns) + shift_ns,
-        xyz_m=apply(moved, sweep.xyz_m) if sweep.frame == "map" else sweep.xyz_m,
-        t_ns=None if sweep.t_ns is None else sweep.t_ns + shift_ns,
-        compensated_ns=None if sweep.compensated_ns is None else int(sweep.compensated_ns) + shift_ns,
-    )
 
 
 # An error of 0.5 m and 2 degrees moves what is 40 m away by 1.9 m; then within what noise and edges leave.
@@ -149,18 +120,10 @@ HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What both ends see around a unit, in the frame of its site: map axes, origin at `Unit.site_m`.
+    """What both ends see around a unit, in the frame of its site: map axes, origin at `Unit.site_m`."""
 
-    Attributes
-    ----------
-    view : VehicleView or None
-        Of the vehicle; None where it never comes near.
-    road : RoadView
-        What stands still by the unit's LiDARs.
-    """
-
-    view: VehicleView | None
-    road: RoadView
+    view: VehicleView | None  # of the vehicle; None where it never comes near
+    road: RoadView  # what stands still by the unit's LiDARs
     surfaces: Surfaces | None
     ground: CommonGround | None
     objects: CommonObjects
@@ -168,19 +131,11 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a unit's pose and clock lack.
+    """What a unit's pose and clock lack."""
 
-    Attributes
-    ----------
-    values : (7,) float64
-        Twist (m, rad) of the site that corrects it, and the delay of its stamps, s.
-    covariance : (7, 7) float64
-    structure, objects : pair of MatchedStructure or None, pair of Matched or None
-        Without and with the correction, by the same limit.
-    """
-
-    values: Array
-    covariance: Array
+    values: Array  # (7,): twist (m, rad) of the site that corrects it, and the delay of its stamps, s
+    covariance: Array  # (7, 7)
+    # `structure`, `objects`: without and with the correction, by the same limit
     structure: tuple[MatchedStructure | None, MatchedStructure | None]
     objects: tuple[Matched | None, Matched | None]
 
@@ -331,17 +286,11 @@ HEIGHT_AND_TILT, PLANE = [2, 3, 4], [0, 1, 5]
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a unit is found to lack.
-
-    Attributes
-    ----------
-    visibility : pair of Visibility or None
-        Without and with the correction.
-    """
+    """What a unit is found to lack."""
 
     unit: Unit
     found: Estimate
-    visibility: tuple[Visibility | None, Visibility | None]
+    visibility: tuple[Visibility | None, Visibility | None]  # without and with the correction
 
     @property
     def sigma(self) -> Array:
@@ -531,34 +480,18 @@ MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD = 0.4, np.radians(1.5)
 
 @dataclass(frozen=True, eq=False)
 class RoadRegistration:
-    """What came of the registration of the road's sensors.
+    """What came of the registration of the road's sensors."""
 
-    Attributes
-    ----------
-    log : Log
-        With the corrected mounts and stamps.
-    figures : list of dict
-        For the report, one entry for each roadside unit.
-    """
-
-    log: Log
+    log: Log  # with the corrected mounts and stamps
     faults: tuple[Fault, ...] = ()
-    figures: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)  # for the report, one entry for each roadside unit
 
 
 def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> RoadRegistration:
     """Estimate poses and clocks of the road's sensors against what the vehicle's sensors see.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses that the run uses.
-    config : Config
-        `cooperation.register_road`: whether to do so.
-    sensors : Sensors
-        Those that the run uses.
-    progress : callable
-        Called as `progress(stage, done, total)`.
+    `log`: with the poses that the run uses. `config`: `cooperation.register_road`: whether to do so. `sensors`: those
+    that the run uses.
 
     Notes
     -----

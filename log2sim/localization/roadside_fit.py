@@ -14,14 +14,20 @@ from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Boxes3D, Log, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.localization.odometry import lidars_on_ego
+from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
+from log2sim.localization.surfaces import (
+    CAUCHY,
+    FEW_PIECES,
+    MAD_TO_SIGMA,
+    MAX_REACH_M,
+    MIN_NORMAL_Z,
+    fit_planes,
+    number_voxels,
+    thin,
+)
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Ground, assemble_cloud, estimate_ground, sweep_to_map
 
-# Points farther from a pole than this are too sparse in sweeps of usual LiDARs, and turned farther than any error is meant to be.
-MAX_REACH_M = 60.0
-# Returns nearer to the vehicle's LiDAR are of its own body.
-MIN_RANGE_M = 2.5
 MAX_VEHICLE_SWEEPS, MAX_ROAD_SWEEPS = 16, 10
 MAX_SWEEP_POINTS = 20_000
 # Sweeps of a moving vehicle from places nearer to each other than this show the same.
@@ -32,8 +38,6 @@ VOXEL_M = 0.25
 SCALES_M = ((VOXEL_M, 0.9), (0.7, 3.0), (2.0, 7.0))
 # What an error of 0.5 m and 2 degrees moves at the end of the reach.
 MAX_ERROR_M = 2.5
-# A piece of a plane is thin (RMS over its points, range noise and all) and no line, as the points of one ring are.
-MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
 MIN_UPRIGHT_Z, MAX_POST_WIDTH_M, MIN_POST_LENGTH_M = 0.95, 0.12, 0.25
 # What stands still is in a place in a third of the sweeps or more; what passes is not, unless it waits.
 STATIC_VOXEL_M, MIN_STATIC_SHARE, STEADY_SHARE = 0.4, 0.35, 0.8
@@ -42,23 +46,14 @@ MAX_ROAD_POINTS = 6000
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Pieces of surfaces that the vehicle saw, in the frame of the site: map axes, origin at a pole's LiDARs.
+    """Pieces of surfaces that the vehicle saw, in the frame of the site: map axes, origin at a pole's LiDARs."""
 
-    Attributes
-    ----------
-    xyz_m : (P, 3) float64, m
-    normals : (P, 2, 3) float64
-        Directions in which each piece holds a point: one of a plane, turned to where it was seen from, and NaN; two of a post.
-    reach_m : (P,) float64, m
-        How far along itself each piece goes.
-    tree : cKDTree
-        Of `xyz_m`.
-    """
-
-    xyz_m: Array
+    xyz_m: Array  # (P, 3)
+    # (P, 2, 3): directions in which each piece holds a point: one of a plane, turned to where it was seen from, and
+    # NaN; two of a post
     normals: Array
-    reach_m: Array
-    tree: cKDTree
+    reach_m: Array  # (P,): how far along itself each piece goes
+    tree: cKDTree  # of `xyz_m`
 
     @property
     def post(self) -> NDArray[np.bool_]:
@@ -68,24 +63,12 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class VehicleView:
-    """What the vehicle saw around a site.
+    """What the vehicle saw around a site."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float64, m
-        Points in the frame of the site, those of several sweeps.
-    sensor_m : (S, 3) float64, m
-        Where the LiDAR was in the middle of each sweep.
-    t_ns : (S,) int64
-        Stamps of the sweeps.
-    sweep : (N,) int64
-        Row of `sensor_m` for each point.
-    """
-
-    xyz_m: Array
-    sensor_m: Array
-    t_ns: NDArray[np.int64]
-    sweep: NDArray[np.int64]
+    xyz_m: Array  # (N, 3): points in the frame of the site, those of several sweeps
+    sensor_m: Array  # (S, 3): where the LiDAR was in the middle of each sweep
+    t_ns: NDArray[np.int64]  # (S,): stamps of the sweeps
+    sweep: NDArray[np.int64]  # (N,): row of `sensor_m` for each point
 
     def parts(self, count: int) -> list[VehicleView]:
         """Split into runs of successive sweeps; fewer than `count` where there are fewer sweeps."""
@@ -141,18 +124,10 @@ def _near_sweeps(
 
 @dataclass(frozen=True, eq=False)
 class RoadView:
-    """What stands still around a site by the LiDARs of a pole.
+    """What stands still around a site by the LiDARs of a pole."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float64, m
-        Points in the frame of the site, one a voxel.
-    share : (N,) float64
-        Of the sweeps that have a point in the same place.
-    """
-
-    xyz_m: Array
-    share: Array
+    xyz_m: Array  # (N, 3): points in the frame of the site, one a voxel
+    share: Array  # (N,): of the sweeps that have a point in the same place
 
     @property
     def steady_m(self) -> Array:
@@ -189,7 +164,7 @@ def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, in
         return np.zeros((0, 4))
     xyz = np.concatenate(parts)
     sweep = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    place = _voxels(xyz, STATIC_VOXEL_M)
+    place = number_voxels(xyz, STATIC_VOXEL_M)
     seen = np.unique(place * len(parts) + sweep) // len(parts)
     share = (np.bincount(seen, minlength=int(place.max()) + 1) / len(parts))[place]
     static = share >= MIN_STATIC_SHARE
@@ -208,22 +183,6 @@ def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
     mapped = sweep_to_map(log, lidar, sweep, compensate=True)
     pose, known = log.map_T_sensor(lidar, sweep.stamp_ns)
     return (mapped[0], pose[0, :3, 3]) if mapped is not None and known[0] and len(mapped[0]) else None
-
-
-def _voxels(xyz_m: Array, voxel_m: float) -> NDArray[np.int64]:
-    """Assign numbers (N,), from 0 without gaps, to the voxels of points (N, 3)."""
-    cell = np.floor(xyz_m / voxel_m).astype(np.int64) + (1 << 20)
-    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    return np.asarray(np.unique(key, return_inverse=True)[1], dtype=np.int64)
-
-
-def thin(xyz_m: Array, voxel_m: float) -> Array:
-    """Replace the points (N, D), of which three columns are coordinates, of each voxel by their mean."""
-    if len(xyz_m) == 0:
-        return xyz_m
-    place = _voxels(xyz_m[:, :3], voxel_m)
-    count = np.bincount(place)
-    return np.stack([np.bincount(place, column) / count for column in xyz_m.T], axis=1)
 
 
 def surfaces_of(view: VehicleView, near_m: Array) -> Surfaces | None:
@@ -256,10 +215,7 @@ def _pieces(points: Array, radius_m: float) -> tuple[Array, Array]:
     away, index = cKDTree(points[:, :3]).query(points[:, :3], k=NEIGHBORS)
     near = away[:, -1] < radius_m
     sensor, around = points[near, 3:], points[index[near], :3]
-    middle = around.mean(axis=1)
-    off = around - middle[:, None]
-    spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / NEIGHBORS)
-    plane = (spread[:, 0] < MAX_THICKNESS_M**2) & (spread[:, 1] > MIN_WIDTH_M**2) & (spread[:, 1] > 9 * spread[:, 0])
+    middle, spread, axes, plane = fit_planes(around)
     post = ~plane & (np.abs(axes[:, 2, 2]) > MIN_UPRIGHT_Z) & (spread[:, 1] < MAX_POST_WIDTH_M**2)
     post &= spread[:, 2] > MIN_POST_LENGTH_M**2
     normals = axes.transpose(0, 2, 1)[:, :2].copy()
@@ -283,15 +239,9 @@ MIN_FREE_RANGE_M = 3.0
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the vehicle saw where a roadside unit sees upright things.
+    """What the vehicle saw where a roadside unit sees upright things."""
 
-    Attributes
-    ----------
-    seen, seen_through : int
-        Points with a return there, and with returns from behind alone.
-    """
-
-    seen: int
+    seen: int  # `seen`, `seen_through`: points with a return there, and with returns from behind alone
     seen_through: int
 
     @property
@@ -343,7 +293,6 @@ def _nearest(off: Array) -> Array:
 SPACING_S = 0.2
 # Farther from a pole, boxes have too few points.
 MAX_AWAY_M = 70.0
-REACH_M = 60.0
 MIN_SCORE = 0.4
 NO_DETECTIONS = "lidar:labels"
 GIVEN = LIDAR_PREFIX + GIVEN_PREFIX
@@ -372,10 +321,7 @@ def detect_boxes(
 ) -> list[Boxes3D]:
     """Detect road users in the clouds of some LiDARs nearest to moments (K,).
 
-    Parameters
-    ----------
-    floor_m : (K, 3) float64, m
-        Where clouds begin: a place on the ground, map frame.
+    `floor_m`: (K, 3): where clouds begin: a place on the ground, map frame.
     """
     out, before = [], None
     for moment, floor in zip(moments_ns.tolist(), floor_m):
@@ -385,7 +331,9 @@ def detect_boxes(
         before = index
         sweeps = {name: sweep for name, i in index.items() if (sweep := _read_detections(log, name, i)) is not None}
         cloud = (
-            assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=REACH_M) if sweeps else None
+            assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=MAX_REACH_M)
+            if sweeps
+            else None
         )
         if cloud is not None:
             boxes = detector.detect(cloud)
@@ -422,53 +370,31 @@ def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector
 # What an error may be before anything is known; a direction that nothing holds stays where it was.
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, np.radians(2.0), np.radians(2.0), np.radians(2.0), 0.3])
 DELAY = 6
-MAD_TO_SIGMA = 1.4826
 MIN_SCALE_M = 0.02
-# Points so many standard deviations off count half.
-CAUCHY = 2.0
 # Points on surfaces that face one way err together, as those on all posts do: by so much, m.
 PLANE_BIAS_M, POST_BIAS_M = 0.02, 0.1
-# Pieces that are matched by mistake decide where few hold a direction: so many pieces count half. A turn moves points at this
-# distance as much as a translation does.
-FEW_PIECES, LEVER_M = 30.0, 15.0
-MIN_NORMAL_Z = 0.8
+# A turn moves points at this distance as much as a translation does.
+LEVER_M = 15.0
 # Points nearer than this to a surface lie on it.
 ON_SURFACE_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What some observations say about a correction: translation, m, and rotation vector, rad, of the site, and delay, s.
+    """What some observations say about a correction: translation, m, and rotation vector, rad, of the site, and delay, s."""
 
-    Attributes
-    ----------
-    information : (7, 7) float64
-    gradient : (7,) float64
-        Of half the sum of weighted squares at the correction so far.
-    """
-
-    information: Array
-    gradient: Array
+    information: Array  # (7, 7)
+    gradient: Array  # (7,): of half the sum of weighted squares at the correction so far
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedStructure:
-    """Points of the road on surfaces of the vehicle.
-
-    Attributes
-    ----------
-    points : int
-        Matched points.
-    on_surface : int
-        Those within `ON_SURFACE_M`.
-    rms_m : float, m
-        Robust, of the distances along the normals.
-    """
+    """Points of the road on surfaces of the vehicle."""
 
     evidence: Evidence
-    points: int
-    on_surface: int
-    rms_m: float
+    points: int  # matched points
+    on_surface: int  # those within `ON_SURFACE_M`
+    rms_m: float  # robust, of the distances along the normals
 
 
 def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within_m: float) -> MatchedStructure | None:
@@ -564,21 +490,11 @@ USUAL_BELOW_M = 4.0
 
 @dataclass(frozen=True, eq=False)
 class CommonGround:
-    """Ground around a unit.
+    """Ground around a unit."""
 
-    Attributes
-    ----------
-    surface : Ground
-        By the vehicle, in the frame of the site.
-    known : cKDTree
-        Of the places (x, y) of the vehicle's ground points.
-    road_m : (N, 3) float64, m
-        Ground points of the unit, thinned out.
-    """
-
-    surface: Ground
-    known: cKDTree
-    road_m: Array
+    surface: Ground  # by the vehicle, in the frame of the site
+    known: cKDTree  # of the places (x, y) of the vehicle's ground points
+    road_m: Array  # (N, 3): ground points of the unit, thinned out
 
 
 def ground_below(road_m: Array) -> float:
@@ -659,24 +575,13 @@ MAX_APART_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """Places of one road user as one end saw it.
+    """Places of one road user as one end saw it."""
 
-    Attributes
-    ----------
-    t_s : (K,) float64, s
-        Since a common time, by the clock of the end, increasing.
-    xyz_m : (K, 3) float64, m
-        In the frame of the site.
-    velocity_mps : (K, 2) float64
-    points : float
-        Median number of points in its boxes.
-    """
-
-    t_s: Array
-    xyz_m: Array
-    velocity_mps: Array
+    t_s: Array  # (K,): since a common time, by the clock of the end, increasing
+    xyz_m: Array  # (K, 3): in the frame of the site
+    velocity_mps: Array  # (K, 2)
     group: int
-    points: float = np.inf
+    points: float = np.inf  # median number of points in its boxes
 
     def at(self, t_s: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Interpolate places (N, 3) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
@@ -738,12 +643,7 @@ def track_of(rows: Array) -> ObjectTrack:
 
 @dataclass(frozen=True, eq=False)
 class CommonObjects:
-    """Tracks of the vehicle, with the vehicle itself, and for each those of the road that may show the same road user.
-
-    Attributes
-    ----------
-    pairs : tuple of (ObjectTrack, tuple of ObjectTrack)
-    """
+    """Tracks of the vehicle, with the vehicle itself, and for each those of the road that may show the same road user."""
 
     pairs: tuple[tuple[ObjectTrack, tuple[ObjectTrack, ...]], ...]
 
@@ -765,25 +665,13 @@ def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Places of common objects at common times.
-
-    Attributes
-    ----------
-    pairs : int
-        Of tracks.
-    moving : int
-        Of those, how many move.
-    gain : float
-        How well all fits together: 1 for each place that fits perfectly, 0 for one that does not.
-    rms_m : float, m
-        Robust, of the distances between places.
-    """
+    """Places of common objects at common times."""
 
     evidence: Evidence
-    pairs: int
-    moving: int
-    gain: float
-    rms_m: float
+    pairs: int  # of tracks
+    moving: int  # of those, how many move
+    gain: float  # how well all fits together: 1 for each place that fits perfectly, 0 for one that does not
+    rms_m: float  # robust, of the distances between places
 
 
 def match_objects(objects: CommonObjects, correction: Array, delay_s: float, within_m: float) -> Matched | None:

@@ -69,12 +69,8 @@ def adjoint_of(dst_T_src: Array) -> Array:
 def velocities_at(track: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
     """Compute how the ego moves at stamps (K,), by poses `MOTION_SPAN_NS` before and after.
 
-    Returns
-    -------
-    velocity : (K, 6) float64, m/s and rad/s
-        Twists in the ego's frame.
-    known : (K,) bool
-        Whether these poses are known.
+    Returns `velocity`: (K, 6), m/s and rad/s: twists in the ego's frame; `known`: (K,) bool: whether these poses are
+    known.
     """
     (before, known), (at, is_known), (after, will_be_known) = (
         track.at(t_ns + shift) for shift in (-MOTION_SPAN_NS, 0, MOTION_SPAN_NS)
@@ -112,65 +108,64 @@ FEW_PIECES, LEVER_M = 30.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Pieces of planes of one sweep.
+    """Pieces of planes of one sweep."""
 
-    Attributes
-    ----------
-    xyz_m, normals : (N, 3) float64, m and unit vectors
-        Middles of pieces of planes and their normals: as many that face up, forward and sideways, if there are.
-    middles : (V, 3) float64, m
-        Of all voxels with points, those of `tree`.
-    """
-
+    # `xyz_m`, `normals`: (N, 3), m and unit vectors: middles of pieces of planes and their normals: as many that face
+    # up, forward and sideways, if there are
     xyz_m: Array
     normals: Array
     tree: cKDTree
-    middles: Array
+    middles: Array  # (V, 3), m: of all voxels with points, those of `tree`
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The motion between two sweeps.
+    """The motion between two sweeps."""
 
-    Attributes
-    ----------
-    first_T_second : (4, 4) float64
-    covariance : (6, 6) float64
-        Of a twist (m, rad) of the second sweep in its own frame.
-    overlap : float
-        Share of the pieces of planes that have a match.
-    """
-
-    first_T_second: Array
-    covariance: Array
-    overlap: float
+    first_T_second: Array  # (4, 4)
+    covariance: Array  # (6, 6): of a twist (m, rad) of the second sweep in its own frame
+    overlap: float  # share of the pieces of planes that have a match
 
 
 def surfaces_of(xyz_m: Array) -> Surfaces | None:
     """Find the pieces of planes among points (N, 3), m; None with too few."""
     near = xyz_m[np.einsum("nj,nj->n", xyz_m, xyz_m) < MAX_REACH_M**2]
-    middles = _thin(near)
+    middles = thin(near, VOXEL_M)
     if len(middles) < MIN_PIECES:
         return None
     # Made in a third of the time, and asked as fast; what it finds is the same.
     tree = cKDTree(middles, balanced_tree=False, compact_nodes=False)
     tried = middles[:: -(-len(middles) // MAX_TRIED)]
     _, index = tree.query(tried, k=NEIGHBORS)
-    around = middles[index]
-    off = around - around.mean(axis=1, keepdims=True)
-    spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / NEIGHBORS)
-    plane = (spread[:, 0] < MAX_THICKNESS_M**2) & (spread[:, 1] > MIN_WIDTH_M**2) & (spread[:, 1] > 9 * spread[:, 0])
+    _, _, axes, plane = fit_planes(middles[index])
     normals = np.where(plane[:, None], axes[:, :, 0], np.nan)
     chosen = _choose(normals)
     return Surfaces(tried[chosen], normals[chosen], tree, middles) if len(chosen) >= MIN_PIECES else None
 
 
-def _thin(xyz_m: Array) -> Array:
-    """Replace the points (N, 3) of each voxel by their mean."""
-    cell = np.floor(xyz_m / VOXEL_M).astype(np.int64) + (1 << 20)
+def number_voxels(xyz_m: Array, voxel_m: float) -> NDArray[np.int64]:
+    """Assign numbers (N,), from 0 without gaps, to the voxels of points (N, 3)."""
+    cell = np.floor(xyz_m / voxel_m).astype(np.int64) + (1 << 20)
     key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    _, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    return np.stack([np.bincount(place, xyz_m[:, j]) / count for j in range(3)], axis=1)
+    return np.asarray(np.unique(key, return_inverse=True)[1], dtype=np.int64)
+
+
+def thin(points: Array, voxel_m: float) -> Array:
+    """Replace the points (N, D), of which the first three columns are coordinates, of each voxel by their mean."""
+    if len(points) == 0:
+        return points
+    place = number_voxels(points[:, :3], voxel_m)
+    count = np.bincount(place)
+    return np.stack([np.bincount(place, column) / count for column in points.T], axis=1)
+
+
+def fit_planes(around: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Fit planes to neighborhoods (N, K, 3): middles, variances (N, 3) along axes (N, 3, 3), and which are pieces of planes."""
+    middle = around.mean(axis=1)
+    off = around - middle[:, None]
+    spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / around.shape[1])
+    plane = (spread[:, 0] < MAX_THICKNESS_M**2) & (spread[:, 1] > MIN_WIDTH_M**2) & (spread[:, 1] > 9 * spread[:, 0])
+    return middle, spread, axes, plane
 
 
 def _choose(normals: Array) -> Array:
@@ -265,21 +260,11 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class SweepPairs:
-    """What the sweeps of a LiDAR show of the ego's motion.
+    """What the sweeps of a LiDAR show of the ego's motion."""
 
-    Attributes
-    ----------
-    track : PoseTrack
-        The ego's poses.
-    sensor_m : (3,) float64, m
-        Where the LiDAR is in the ego's frame.
-    t_ns : (K,) int64
-        Stamps of the sweeps.
-    """
-
-    track: PoseTrack
-    sensor_m: Array
-    t_ns: NDArray[np.int64]
+    track: PoseTrack  # the ego's poses
+    sensor_m: Array  # (3,): where the LiDAR is in the ego's frame
+    t_ns: NDArray[np.int64]  # (K,): stamps of the sweeps
     pairs: tuple[Pair, ...]
 
 
@@ -288,17 +273,10 @@ def pair_sweeps(
 ) -> SweepPairs | None:
     """Compare sweeps of a LiDAR on the ego with each other.
 
-    Parameters
-    ----------
-    during_ns : (2,) tuple of int or None
-        First and last stamp to look at; None for all.
-    report : callable
-        Called as `report(done, total)`.
+    `during_ns`: (2,) tuple of int or None: first and last stamp to look at; None for all.
 
-    Returns
-    -------
-    SweepPairs or None
-        None where the ego hardly moves, sweeps show too little, or points are given in the map, which hides clock and mount.
+    Returns SweepPairs or None: None where the ego hardly moves, sweeps show too little, or points are given in the map,
+    which hides clock and mount.
     """
     track = log.ego
     if track is None:
@@ -314,7 +292,7 @@ def pair_sweeps(
         if record.frame == "map":
             return None
         sweep = ego_sweep_of(log, lidar, record)
-        if sweep is not None and (found := _surfaces(sweep, track)) is not None:
+        if sweep is not None and (found := surfaces_of_sweep(sweep, track)) is not None:
             places.append(sweep.t_ref_ns)
             surfaces.append(found)
     if len(surfaces) < 2:
@@ -373,7 +351,7 @@ def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np
     return parts
 
 
-def _surfaces(sweep: EgoSweep, track: PoseTrack) -> Surfaces | None:
+def surfaces_of_sweep(sweep: EgoSweep, track: PoseTrack) -> Surfaces | None:
     """Find the surfaces of a sweep with the ego's motion taken out."""
     xyz = sweep.xyz_m
     if sweep.t_ns is not None:

@@ -33,7 +33,14 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
-from log2sim.localization.given_poses import MAX_SIGMA_M, USUAL_SIGMA_M, USUAL_SIGMA_RAD, CheckedPoses, Stretch
+from log2sim.localization.given_poses import (
+    MAX_SIGMA_M,
+    USUAL_SIGMA_M,
+    USUAL_SIGMA_RAD,
+    CheckedPoses,
+    Stretch,
+    join_tracks,
+)
 from log2sim.localization.odometry import (
     EgoSweep,
     Odometry,
@@ -74,17 +81,10 @@ def fit_to_given(estimated: PoseTrack, given: PoseTrack) -> Array | None:
 def level_on_ground(xyz_m: Array, ground_z_m: float) -> Array | None:
     """Fit the ground around the ego: the pose (4, 4) of the ego in a frame with this ground level at `ground_z_m`.
 
-    Parameters
-    ----------
-    xyz_m : (N, 3) float64, m
-        One sweep in the ego's frame.
-    ground_z_m : float
-        Expected height of the road in the ego's frame, m.
+    `xyz_m`: (N, 3): one sweep in the ego's frame. `ground_z_m`: expected height of the road in the ego's frame, m.
 
-    Returns
-    -------
-    level_T_ego : (4, 4) float64, or None
-        None where there are too few points on a ground. The origin keeps its place above the ground, and the x axis its direction.
+    Returns `level_T_ego`: (4, 4) or None: None where there are too few points on a ground. The origin keeps its place
+    above the ground, and the x axis its direction.
 
     Notes
     -----
@@ -120,28 +120,19 @@ MAX_REACH_M, MATCH_WITHIN_M, MAX_DISTANCE_M = 50.0, 2.0, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Distances between the surfaces of pairs of sweeps under some poses.
+    """Distances between the surfaces of pairs of sweeps under some poses."""
 
-    Attributes
-    ----------
-    neighbors_m, apart_m : (K,) float64, m
-        RMS over the surfaces of each pair of neighbors, and of sweeps `apart_s` apart; NaN for a pair that shows too little.
-    apart_s : float, s
-        `APART_S`, or half of a shorter log.
-    """
-
+    # `neighbors_m`, `apart_m`: (K,): RMS over the surfaces of each pair of neighbors, and of sweeps `apart_s` apart;
+    # NaN for a pair that shows too little
     neighbors_m: Array
     apart_m: Array
-    apart_s: float
+    apart_s: float  # `APART_S`, or half of a shorter log
 
 
 def compare_poses(log: Log, lidar: str, tracks: Mapping[str, PoseTrack], t_ns: NDArray[np.int64]) -> dict[str, Scatter]:
     """Measure how sharp the surroundings are under several poses, on the same pairs of sweeps.
 
-    Parameters
-    ----------
-    t_ns : (P,) int64
-        Stamps of the sweeps to choose from, two at least.
+    `t_ns`: (P,) int64: stamps of the sweeps to choose from, two at least.
     """
     library, stream_t_ns = load_small_gicp(), log.streams[lidar].t_ns
     apart_ns = min(round(APART_S * NS_PER_S), int(t_ns[-1] - t_ns[0]) // 2)
@@ -228,19 +219,11 @@ Figures = dict[str, float | None]
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Whether given poses are kept.
-
-    Attributes
-    ----------
-    reason : str
-        For people.
-    excess_m, scatter_m : dict
-        See `PoseChoice`.
-    """
+    """Whether given poses are kept."""
 
     keep: bool
-    reason: str
-    excess_m: Figures
+    reason: str  # for people
+    excess_m: Figures  # `excess_m`, `scatter_m`: see `PoseChoice`
     scatter_m: dict[str, Figures]
 
 
@@ -327,12 +310,7 @@ Progress = Callable[[int, int], None]
 def bridge_by_lidar(log: Log, checked: CheckedPoses, progress: Progress) -> CheckedPoses:
     """Take poses from LiDAR odometry where given ones are not known, as far as sweeps and its library are there.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses that were given, by which its sweeps may be placed.
-    progress : callable
-        Called with (sweeps done, all sweeps).
+    `log`: with the poses that were given, by which its sweeps may be placed.
     """
     if not any(s.unknown_s for s in checked.stretches) or not is_installed():
         return checked
@@ -365,7 +343,7 @@ def _bridge(
         return None
     rows = (track.t_ns < placed.t_ns[0]) | (track.t_ns > placed.t_ns[-1])
     rows &= (track.t_ns < stretch.first_ns) | (track.t_ns > stretch.last_ns)
-    joined = _joined(track, np.flatnonzero(rows), placed)
+    joined = join_tracks(replace(track, max_gap_s=max(track.max_gap_s, MAX_STEP_S)), np.flatnonzero(rows), placed)
     assert placed.sigma_m is not None
     bridged = replace(stretch, unknown_s=0.0, sigma_m=float(placed.sigma_m.max()), by="LiDAR odometry")
     return joined, bridged
@@ -373,24 +351,12 @@ def _bridge(
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """Odometry laid on the poses before or after a stretch.
+    """Odometry laid on the poses before or after a stretch."""
 
-    Attributes
-    ----------
-    poses : (n, 4, 4) float64
-        Of the stretch.
-    away_m : (n,) float64, m
-        Way from the nearest of the poses before or after.
-    misfit_m : float, m
-        RMS distance from these.
-    fitted_m : float, m
-        Length of the path along these.
-    """
-
-    poses: Array
-    away_m: Array
-    misfit_m: float
-    fitted_m: float
+    poses: Array  # (n, 4, 4): of the stretch
+    away_m: Array  # (n,): way from the nearest of the poses before or after
+    misfit_m: float  # RMS distance from these
+    fitted_m: float  # length of the path along these
 
     @property
     def sigma_m(self) -> Array:
@@ -447,19 +413,3 @@ def _between(first: Array, last: Array, share: Array) -> Array:
     rotation = slerp(quaternion_from_rotation(first[:, :3, :3]), quaternion_from_rotation(last[:, :3, :3]), share)
     place = (1 - share)[:, None] * first[:, :3, 3] + share[:, None] * last[:, :3, 3]
     return transform(rotation_from_quaternion(rotation), place)
-
-
-def _joined(track: PoseTrack, rows: NDArray[np.intp], other: PoseTrack) -> PoseTrack:
-    """Return some poses of a track together with those of another one."""
-    usual = USUAL_SIGMA_M, USUAL_SIGMA_RAD
-    t_ns = np.concatenate([track.t_ns[rows], other.t_ns])
-    order = np.argsort(t_ns, kind="stable")
-    sigmas = np.concatenate([track.sigmas_at(track.t_ns[rows], usual), other.sigmas_at(other.t_ns, usual)])[order]
-    return replace(
-        track,
-        t_ns=t_ns[order],
-        map_T_ego=np.concatenate([track.map_T_ego[rows], other.map_T_ego])[order],
-        max_gap_s=max(track.max_gap_s, MAX_STEP_S),
-        sigma_m=sigmas[:, 0],
-        sigma_yaw_rad=sigmas[:, 1],
-    )

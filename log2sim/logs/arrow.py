@@ -10,6 +10,7 @@ trusts the offsets of text and lists that it reads.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping
@@ -413,6 +414,7 @@ class ParquetRows:
         self._path, self._wanted, self._optional, self._limits = path, dict(wanted), optional, limits
         self._lock = Lock()
         self._file: Any = None
+        self._process = 0  # whose file it is
         self._names: list[str] = []
         # First rows of the row groups, and their end.
         self._starts = np.zeros(1, dtype=np.int64)
@@ -447,8 +449,9 @@ class ParquetRows:
                 raise
 
     def _open(self) -> None:
-        if self._file is not None:
+        if self._file is not None and self._process == os.getpid():
             return
+        self._process, self._group = os.getpid(), -1
         import_pyarrow()
         from pyarrow.parquet import ParquetFile
 

@@ -330,6 +330,16 @@ class DetectionCache:
         if content is not None:
             self.kept += self._store.put(self._name_of(key), content)
 
+    def counts(self, back_to: tuple[int, int] = (0, 0)) -> tuple[int, int]:
+        """Return found and kept, and count on from other numbers."""
+        counted = self.found, self.kept
+        self.found, self.kept = back_to
+        return counted
+
+    def add(self, found: int, kept: int) -> None:
+        """Add what a part of the log found and kept."""
+        self.found, self.kept = self.found + found, self.kept + kept
+
     def finish(self) -> None:
         """Keep the limit of the cache, and note there what this run did; at the end of a run."""
         self._store.finish({"found": self.found, "kept": self.kept})

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -13,19 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Fault, Log, Measurements, Obstacles, Rays, Sweep
+from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles, Rays, Sweep
 from log2sim.files.arrays import ArrayFile, ArrayList
+from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Array
 from log2sim.perception.alignment import align_parts
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.detection_cache import DetectionCache, LightBox
-from log2sim.perception.frames import BACKGROUND_THREADS, FrameDetector, RecordReader
+from log2sim.perception.detection_cache import MAX_CROPS, DetectionCache, LightBox
+from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, sample_rays
-from log2sim.perception.observe_tick import TickObserver
-from log2sim.perception.records import sketch_sweep
+from log2sim.perception.observe_tick import Observed, TickObserver
+from log2sim.perception.records import Look, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.sync import Schedule
 from log2sim.plan import FusionLevel, Plan, Stage
 
@@ -104,17 +104,18 @@ class ObstacleList(Sequence["Obstacles | None"]):
 OBSTACLE_REACH_M = 70.0
 OBSTACLE_VOXEL_M = 0.12
 RANK_BITS = 25  # more than the points of any sweep
-# Ticks that are prepared ahead of the one that is measured, so that two threads have work.
-TICKS_AHEAD = 2
+# Sweeps of each LiDAR that are kept for the next ticks.
+SWEEPS_KEPT = 4
+# Ticks that are worked on together; where frames are skipped between some of them, a multiple of these.
+PART_TICKS = 5
 
 Key = tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class CloudOptions:
-    """How clouds are made and searched.
+class CloudMaker:
+    """Make the clouds of successive ticks and search them; ticks share the clouds of the same sweeps, each read once.
 
-    Attributes
+    Parameters
     ----------
     max_range_m : float
         Points farther from the origin along an axis are left out.
@@ -122,20 +123,13 @@ class CloudOptions:
         Searches the clouds of the reference sensor.
     sweeps : int
         Successive clouds that the detector sees as one.
-    """
-
-    max_range_m: float
-    detector: LidarDetector | None = None
-    sweeps: int = 1
-
-
-class CloudPrefetcher:
-    """Make the clouds of coming ticks in the background; ticks share the clouds of the same sweeps, each read once.
 
     Attributes
     ----------
-    compensated : Counter of str
-        Number of sweeps by how they were compensated, see `compensation_of`.
+    before : list of (Key, Boxes3D)
+        The last two clouds that were searched, and what was found in them.
+    compensated : dict
+        How each sweep was compensated, see `compensation_of`, by LiDAR and index.
     """
 
     def __init__(
@@ -143,105 +137,103 @@ class CloudPrefetcher:
         log: Log,
         schedule: Schedule,
         plan: Plan,
-        records: RecordReader,
-        pool: ThreadPoolExecutor,
-        options: CloudOptions,
+        *,
+        max_range_m: float,
+        detector: LidarDetector | None = None,
+        sweeps: int = 1,
     ) -> None:
-        self._log, self._schedule, self._plan, self._records = log, schedule, plan, records
-        self._pool, self._options = pool, options
-        self._counting = threading.Lock()
-        self.compensated: Counter[str] = Counter()
-        self._sweeps: dict[tuple[str, int], Future[Sweep | None]] = {}
-        self._latest: dict[str, Future[Sweep | None]] = {}
-        self._clouds: dict[Key, Future[Cloud | None]] = {}
-        self._boxes: dict[Key, Future[Boxes3D]] = {}
-        self._earlier: list[Key] = []
-        # Boxes of the two clouds before, by whose motion the points of both ends are put to one time.
-        self._before: list[Future[Boxes3D]] = []
+        self._log, self._schedule, self._plan = log, schedule, plan
+        self._max_range_m, self._detector, self._most_seen = max_range_m, detector, sweeps
+        self.before: list[tuple[Key, Boxes3D]] = []
+        self.compensated: dict[tuple[str, int], str] = {}
+        self._next = 0
+        self._sweeps: dict[tuple[str, int], tuple[Sweep, SweepSketch] | None] = {}
+        self._live: set[tuple[str, int]] = set()
+        self._clouds: dict[Key, Cloud | None] = {}
+        self._earlier: list[tuple[Key, Cloud | None]] = []
 
-    def prefetch(self, tick: int) -> None:
-        """Start making what a tick and the ones after it need, and forget what only earlier ticks needed."""
-        ticks = range(max(tick - 1, 0), min(tick + TICKS_AHEAD, len(self._schedule)))
-        keys = {key: None for k in ticks for row in range(self._schedule.rows) for key in [self._key(k, row)]}
-        sweeps = {(name, i): None for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0}
-        kept = {*keys, *self._earlier}
-        self._clouds = {k: v for k, v in self._clouds.items() if k in kept}
-        self._boxes = {k: v for k, v in self._boxes.items() if k in keys}
-        self._sweeps = {k: v for k, v in self._sweeps.items() if k in sweeps}
-        # What waits for something else goes after it: it must never keep that from being made.
-        for name, i in sorted(sweeps):
-            if (name, i) not in self._sweeps:
-                reading = self._pool.submit(self._read, name, i, self._latest.get(name))
-                self._sweeps[name, i] = self._latest[name] = reading
-        for key in keys:
-            if key not in self._clouds:
-                read = {n: self._sweeps[n, i] for n, i in zip(self._schedule.sweeps, key) if i >= 0}
-                self._clouds[key] = self._pool.submit(self._make, read)
-        if self._options.detector is not None:
-            self._search([self._key(k, self._schedule.reference_row) for k in ticks], self._options.detector)
-
-    def cloud(self, tick: int, row: int) -> Cloud | None:
-        """Return the cloud for a row of the schedule; waits until it is made."""
-        return self._clouds[self._key(tick, row)].result()
+    def clouds(self, tick: int, records: RecordReader) -> list[Cloud | None]:
+        """Return the clouds of a tick for every row of the schedule."""
+        rows = [self._sweeps_of(tick, row) for row in range(self._schedule.rows)]
+        earlier = [] if tick == self._next else self._searched_before(tick)
+        self._read([*earlier, *rows], records)
+        if tick != self._next:
+            self._earlier = [(key, self._cloud(key)) for key in map(self._shown, earlier)]
+        self._next = tick + 1
+        keys = [self._shown(sweeps) for sweeps in rows]
+        self._clouds = {key: self._cloud(key) for key in dict.fromkeys(keys)}
+        return [self._clouds[key] for key in keys]
 
     def boxes(self, tick: int) -> Boxes3D:
-        """Return what the detector found in the cloud of the reference sensor; waits until it is found."""
-        return self._boxes[self._key(tick, self._schedule.reference_row)].result()
+        """Return what the detector found in the cloud of the reference sensor, after `clouds` of this tick."""
+        assert self._detector is not None
+        key = self._shown(self._sweeps_of(tick, self._schedule.reference_row))
+        if not self.before or self.before[-1][0] != key:
+            found, cloud = Boxes3D.empty(), self._clouds[key]
+            if cloud is not None:
+                aligns = self._plan.fusion is FusionLevel.POINTS
+                cloud = align_parts(cloud, [boxes for _, boxes in self.before] if aligns else [])
+                found = self._detector.detect(cloud, [c for _, c in self._earlier if c is not None])
+            self.before = [*self.before, (key, found)][-2:]
+            kept = max(len(self._earlier) + 2 - self._most_seen, 0)
+            self._earlier = [*self._earlier, (key, self._clouds[key])][kept:]
+        return self.before[-1][1]
 
-    def _key(self, tick: int, row: int) -> Key:
+    def _sweeps_of(self, tick: int, row: int) -> Key:
         """Return the sweep of every LiDAR, -1 for none, that a row of a tick uses."""
         return tuple(int(index[row, tick]) for index in self._schedule.sweeps.values())
 
-    def _search(self, keys: list[Key], detector: LidarDetector) -> None:
-        """Start searching the clouds at successive keys that are not searched yet."""
-        for key in keys:
-            if key not in self._boxes:
-                earlier = [self._clouds[k] for k in self._earlier]
-                self._boxes[key] = self._pool.submit(_boxes_in, detector, self._clouds[key], earlier, self._before)
-                if self._plan.fusion is FusionLevel.POINTS:
-                    self._before = [*self._before, self._boxes[key]][-2:]
-                self._earlier = [*self._earlier, key][max(len(self._earlier) + 2 - self._options.sweeps, 0) :]
+    def _shown(self, sweeps: Key) -> Key:
+        """Return the same, -1 for those that cannot be read or repeat another."""
+        return tuple(i if (name, i) in self._live else -1 for name, i in zip(self._schedule.sweeps, sweeps))
 
-    def _read(self, name: str, index: int, before: Future[Sweep | None] | None) -> Sweep | None:
-        """Read a sweep; None where it cannot be read or repeats another, which is known once those before it are read."""
-        sweep: Sweep | None = self._records.get(name, index)
-        sketch = None if sweep is None else sketch_sweep(self._log, name, sweep)
-        if before is not None:
-            before.exception()
-        if sweep is None or sketch is None:
-            return None
-        if self._records.watch.lidars[name].is_repeated(int(self._log.streams[name].t_ns[index]), sketch):
-            return None
-        kind = compensation_of(self._log, name, sweep) if self._plan.keeps(Stage.MOTION_COMPENSATION) else "left out"
-        with self._counting:
-            self.compensated[kind] += 1
-        return sweep
+    def _searched_before(self, tick: int) -> list[Key]:
+        """Return the sweeps of the clouds that the detector sees along with that of a tick."""
+        row, wanted, found = self._schedule.reference_row, self._most_seen - 1, list[Key]()
+        last = self._sweeps_of(tick, row)
+        for k in range(tick - 1, -1, -1) if self._detector is not None else ():
+            sweeps = self._sweeps_of(k, row)
+            if len(found) == wanted:
+                break
+            if sweeps != last:
+                found.append(sweeps)
+                last = sweeps
+        return found[::-1]
 
-    def _make(self, reading: dict[str, Future[Sweep | None]]) -> Cloud | None:
-        sweeps = {name: sweep for name, future in reading.items() if (sweep := future.result()) is not None}
+    def _read(self, keys: Sequence[Key], records: RecordReader) -> None:
+        """Read and judge the sweeps of some clouds in their order, and forget those that only earlier ticks needed."""
+        wanted = {(name, i) for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0}
+        self._live = set()
+        for name, i in sorted(wanted):
+            if (name, i) in self._sweeps:
+                self._sweeps[name, i] = self._sweeps.pop((name, i))  # to the end
+            else:
+                sweep: Sweep | None = records.get(name, i)
+                self._sweeps[name, i] = None if sweep is None else (sweep, sketch_sweep(self._log, name, sweep))
+            read = self._sweeps[name, i]
+            if read is not None and records.is_live(name, i, read[1]):
+                self._live.add((name, i))
+                compensates = self._plan.keeps(Stage.MOTION_COMPENSATION)
+                kind = compensation_of(self._log, name, read[0]) if compensates else "left out"
+                self.compensated[name, i] = kind
+        for key in list(self._sweeps)[: -max(SWEEPS_KEPT * len(self._schedule.sweeps), len(wanted), 1)]:
+            del self._sweeps[key]
+
+    def _cloud(self, key: Key) -> Cloud | None:
+        """Return the cloud of some sweeps, which is made if the tick before had another."""
+        if key in self._clouds:
+            return self._clouds[key]
+        sweeps = {name: read[0] for name, i in zip(self._schedule.sweeps, key) if (read := self._sweeps.get((name, i)))}
         if not sweeps:
             return None
         origin, ground_z = cloud_origin(self._log, next(iter(sweeps.values())).stamp_ns)
         cloud = assemble_views(
-            self._log, sweeps, origin=origin, ground_z=ground_z, max_range_m=self._options.max_range_m,
+            self._log, sweeps, origin=origin, ground_z=ground_z, max_range_m=self._max_range_m,
             compensate=self._plan.keeps(Stage.MOTION_COMPENSATION),
         )  # fmt: skip
         if cloud is not None:
             cloud.prepare(ground=self._plan.keeps(Stage.HOMOGRAPHY))
         return cloud
-
-
-def _boxes_in(
-    detector: LidarDetector,
-    making: Future[Cloud | None],
-    earlier: list[Future[Cloud | None]],
-    found: list[Future[Boxes3D]],
-) -> Boxes3D:
-    cloud = making.result()
-    if cloud is None:
-        return Boxes3D.empty()
-    cloud = align_parts(cloud, [boxes.result() for boxes in found])
-    return detector.detect(cloud, [before for future in earlier if (before := future.result()) is not None])
 
 
 def obstacles_of(cloud: Cloud) -> Obstacles:
@@ -320,6 +312,113 @@ class Observations:
         return {"": sweeps} | {camera: index >= 0 for camera, index in frames.items()}
 
 
+@dataclass(eq=False)
+class SeenTick:
+    """What the first pass takes from one tick.
+
+    Attributes
+    ----------
+    found : dict of str to int
+        Number of detections by camera and by name of the detector in sweeps.
+    frames : int
+        How many were searched.
+    skipped, unseen : list of str
+        Cameras whose frame was not searched, and those of which it says nothing.
+    """
+
+    seen: Observed = field(default_factory=Observed)
+    obstacles: Obstacles | None = None
+    lights: list[LightBox] = field(default_factory=list)
+    found: dict[str, int] = field(default_factory=dict)
+    frames: int = 0
+    skipped: list[str] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Part:
+    """What the first pass takes from successive ticks, with what it knew of their records.
+
+    Attributes
+    ----------
+    before : list of (Key, Boxes3D)
+        See `CloudMaker`, after these ticks.
+    """
+
+    ticks: list[SeenTick]
+    looks: list[Look]
+    read: dict[str, int]
+    failed: dict[str, list[str]]
+    compensated: dict[tuple[str, int], str]
+    before: list[tuple[Key, Boxes3D]]
+    cached: tuple[int, int]
+    clock: StageClock
+
+
+Task = tuple[range, RecordWatch, list[tuple[Key, Boxes3D]]]
+"""Ticks, what is known of the records before them, and what was found in the two clouds before them."""
+
+
+@dataclass(frozen=True, eq=False)
+class FirstPass:
+    """Detection and measurement of parts of a log; what a part holds does not depend on those that this process made before."""
+
+    log: Log
+    schedule: Schedule
+    plan: Plan
+    clouds: CloudMaker
+    observer: TickObserver
+    frames: FrameDetector | None
+    lidar_detector: LidarDetector | None
+    cache: DetectionCache | None
+
+    def observe(self, task: Task) -> Part:
+        """Detect and measure in some ticks."""
+        ticks, watch, self.clouds.before = task
+        watch.attach(self.log)
+        records, clock, self.clouds.compensated = RecordReader(self.log, watch), StageClock(), {}
+        known = (0, 0) if self.cache is None else self.cache.counts()
+        seen = [self._tick(tick, records, clock) for tick in ticks]
+        cached = (0, 0) if self.cache is None else self.cache.counts(known)
+        return Part(
+            seen, list(records.looks.values()), records.read, records.failed, self.clouds.compensated,
+            self.clouds.before, cached, clock,
+        )  # fmt: skip
+
+    def _tick(self, tick: int, records: RecordReader, clock: StageClock) -> SeenTick:
+        out, plan, live = SeenTick(), self.plan, dict[str, Detections]()
+        searched = {} if self.frames is None else self.frames.search(tick, records, clock)
+        for camera, findings in searched.items():
+            index = int(self.schedule.frames[camera][tick])
+            if findings is None:
+                out.skipped.append(camera)
+                if plan.picture_stride > 1:
+                    continue
+            boxes = Detections.empty() if findings is None else findings.detections
+            thumbnail = None if findings is None or not findings.thumbnail.size else findings.thumbnail
+            out.frames += findings is not None
+            decodes = plan.keeps(Stage.IMAGE_DECODING)
+            if not decodes or records.is_live(camera, index, thumbnail, found=len(boxes) > 0):
+                live[camera] = boxes
+                out.lights += () if findings is None else findings.lights
+        if self.frames is not None:
+            out.unseen = [c for c in plan.cameras if self.schedule.frames[c][tick] >= 0 and c not in live]
+        with clock.stage("cloud"):
+            clouds = self.clouds.clouds(tick, records)
+        boxes_3d = None
+        if self.lidar_detector is not None:
+            with clock.stage("detect"):
+                boxes_3d = self.clouds.boxes(tick)
+            out.found[self.lidar_detector.name] = len(boxes_3d)
+        with clock.stage("measure"):
+            out.seen = self.observer.measure(tick, live, clouds, boxes_3d)
+            out.found |= {camera: len(boxes) for camera, boxes in live.items()}
+            out.lights = self.observer.range_lights(tick, out.lights, clouds)
+        with clock.stage("cloud"):
+            out.obstacles = None if clouds[0] is None else obstacles_of(clouds[0])
+        return out
+
+
 def observe(
     log: Log,
     schedule: Schedule,
@@ -333,6 +432,7 @@ def observe(
     lidar_detector: LidarDetector | None = None,
     sweeps: int = 1,
     cache: DetectionCache | None = None,
+    jobs: int = 1,
 ) -> Observations:
     """Run detection and measurement over all ticks.
 
@@ -346,46 +446,59 @@ def observe(
         Successive clouds that it sees as one.
     cache : DetectionCache, optional
         Of the detector in images: frames that it knows are not searched again.
+    jobs : int
+        Processes that share the ticks. The result is the same for any number; with fusion of points each cloud needs the
+        one before, so that one process does all.
+
+    Notes
+    -----
+    Whether a record repeats another depends on all before it. A part is made with what is known when it begins; its records are
+    judged again when all before are known, and it is made again, by then in this process, where that changes anything.
     """
     out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
-    records = out.records = RecordReader(log)
     obstacles = out.obstacles = ObstacleList(out.points)
-    options = CloudOptions(max_range_m, lidar_detector, sweeps)
+    clouds = CloudMaker(log, schedule, plan, max_range_m=max_range_m, detector=lidar_detector, sweeps=sweeps)
+    frames = None if detector is None else FrameDetector(log, schedule, detector, plan, cache)
     observer = TickObserver(log, schedule, plan, mode, max_range_m)
-    with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
-        clouds = CloudPrefetcher(log, schedule, plan, records, pool, options)
-        frames = None if detector is None else FrameDetector(log, schedule, detector, plan, records, pool, clock, cache)
-        clouds.prefetch(0)
-        for tick in range(len(schedule)):
-            known_lights = 0 if frames is None else len(frames.lights)
-            found = {} if frames is None else frames.detections_at(tick)
-            for camera in plan.cameras if frames is not None else ():
-                if schedule.frames[camera][tick] >= 0 and camera not in found:
-                    out.unseen.setdefault(camera, []).append(tick)
-            with clock.stage("cloud"):
-                ready = [clouds.cloud(tick, row) for row in range(schedule.rows)]
-            if lidar_detector is not None:
-                with clock.stage("detect"):
-                    boxes = clouds.boxes(tick)
-                out.detections[lidar_detector.name] = out.detections.get(lidar_detector.name, 0) + len(boxes)
-            clouds.prefetch(tick + 1)
-            with clock.stage("measure"):
-                seen = observer.measure(tick, found, ready, boxes if lidar_detector is not None else None)
-                out.measurements.append(seen.measurements.stored(out.points))
-                for camera, detections in found.items():
-                    out.detections[camera] = out.detections.get(camera, 0) + len(detections)
-                for kept, new in ((out.feet, seen.feet), (out.ground, seen.ground)):
+    first_pass = FirstPass(log, schedule, plan, clouds, observer, frames, lidar_detector, cache)
+    step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
+    ranges = [range(k, min(k + step, len(schedule))) for k in range(0, len(schedule), step)]
+    jobs = 1 if plan.fusion is FusionLevel.POINTS else min(jobs, len(ranges))
+    records = out.records = RecordReader(log)
+    before: list[tuple[Key, Boxes3D]] = []
+    compensated: dict[tuple[str, int], str] = {}
+    skipped: Counter[str] = Counter()
+
+    parts = map_in_processes(first_pass.observe, ((ticks, records.watch, before) for ticks in ranges), jobs)
+    with closing(parts):
+        for ticks, part in zip(ranges, parts):
+            states = [records.watch.judge(look) for look in part.looks]
+            if states != [look.state for look in part.looks]:
+                part = first_pass.observe((ticks, records.watch, before))
+            before = part.before
+            records.add(part.read, part.failed)
+            compensated |= part.compensated
+            clock.add(part.clock, jobs)
+            if cache is not None:
+                cache.add(*part.cached)
+            for tick, seen in zip(ticks, part.ticks):
+                out.measurements.append(seen.seen.measurements.stored(out.points))
+                obstacles.append(seen.obstacles)
+                for kept, new in ((out.feet, seen.seen.feet), (out.ground, seen.seen.ground)):
                     for camera, correspondences in new.items():
                         kept[camera].append(correspondences)
-                if frames is not None:
-                    frames.lights[known_lights:] = observer.range_lights(tick, frames.lights[known_lights:], ready)
-            with clock.stage("cloud"):
-                obstacles.append(None if ready[0] is None else obstacles_of(ready[0]))
-            progress(tick + 1, len(schedule))
+                for name, number in seen.found.items():
+                    out.detections[name] = out.detections.get(name, 0) + number
+                if len(out.lights) < MAX_CROPS:
+                    out.lights += seen.lights
+                out.frames_detected += seen.frames
+                skipped.update(seen.skipped)
+                for camera in seen.unseen:
+                    out.unseen.setdefault(camera, []).append(tick)
+                progress(tick + 1, len(schedule))
     records.require_some()
     if cache is not None:
         cache.finish()
-    out.sweeps, out.faults = clouds.compensated, records.watch.faults(schedule)
-    if frames is not None:
-        out.frames_detected, out.frames_skipped, out.lights = frames.detected, frames.skipped, frames.lights
+    out.sweeps, out.faults = Counter(compensated.values()), records.watch.faults(schedule)
+    out.frames_skipped = dict(skipped)
     return out

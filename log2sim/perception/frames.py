@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,13 +12,13 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Detections, Frame, Log, Sweep
+from log2sim.datatypes import Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.stages import StageClock
 from log2sim.perception.detect.detectors import Detector, detect_all
-from log2sim.perception.detection_cache import MAX_CROPS, DetectionCache, LightBox, PictureFindings, crop_lights
-from log2sim.perception.records import RecordWatch, Thumbnail, shrink
+from log2sim.perception.detection_cache import DetectionCache, PictureFindings, crop_lights
+from log2sim.perception.records import Look, RecordWatch, SweepSketch, Thumbnail, shrink
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
 
@@ -56,7 +55,7 @@ EMPTY: Thumbnail = np.zeros((0, 0), np.float32)
 
 
 class RecordReader:
-    """Read records of a log and count those that cannot be read; safe to share between threads.
+    """Read records of a log, count those that cannot be read, and judge what they show.
 
     Attributes
     ----------
@@ -67,14 +66,16 @@ class RecordReader:
         Messages of the records that could not be read, by stream.
     watch : RecordWatch
         Which of them repeat others or show nothing.
+    looks : dict of (str, int) to Look
+        What was judged, by sensor and stamp, in this order.
     """
 
-    def __init__(self, log: Log) -> None:
+    def __init__(self, log: Log, watch: RecordWatch | None = None) -> None:
         self.log = log
         self.read: dict[str, int] = {}
         self.failed: dict[str, list[str]] = {}
-        self.watch = RecordWatch(log)
-        self._lock = threading.Lock()
+        self.watch = RecordWatch(log) if watch is None else watch
+        self.looks: dict[tuple[str, int], Look] = {}
 
     def get(self, stream: str, index: int) -> Any | None:
         """Read a record; None when it cannot be read."""
@@ -83,18 +84,29 @@ class RecordReader:
             if isinstance(record, Sweep) and not len(record.xyz_m):
                 raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
         except RecordError as error:
-            with self._lock:
-                problems = self.failed.setdefault(stream, [])
-                if str(error) not in problems:  # a record that is asked for again fails again
-                    problems.append(str(error))
+            self.add({}, {stream: [str(error)]})
             return None
         self.count(stream)
         return record
 
     def count(self, stream: str) -> None:
         """Count a record of a stream as read, also one whose content is known already."""
-        with self._lock:
-            self.read[stream] = self.read.get(stream, 0) + 1
+        self.read[stream] = self.read.get(stream, 0) + 1
+
+    def add(self, read: Mapping[str, int], failed: Mapping[str, Sequence[str]]) -> None:
+        """Add what another reader of the log counted; a record that was requested again failed again."""
+        for stream, number in read.items():
+            self.read[stream] = self.read.get(stream, 0) + number
+        for stream, problems in failed.items():
+            known = self.failed.setdefault(stream, [])
+            known += [problem for problem in problems if problem not in known]
+
+    def is_live(self, sensor: str, index: int, shown: Thumbnail | SweepSketch | None, *, found: bool = False) -> bool:
+        """Judge a record by what is kept of it: whether it shows what is there."""
+        look = Look(sensor, int(self.log.streams[sensor].t_ns[index]), shown, found, "")
+        state = self.watch.judge(look)
+        self.looks[sensor, look.t_ns] = replace(look, state=state)
+        return state == "live"
 
     def require_some(self) -> None:
         """Require that every stream of which records were requested gave at least one.
@@ -117,146 +129,81 @@ class RecordReader:
 
 
 class FrameDetector:
-    """Detect objects in the camera frames of every tick, tick by tick in order.
+    """Detect objects in the camera frames of successive ticks.
 
     With a `stride` above 1 the detector first runs at every `stride`-th tick; frames between two such ticks are skipped
     for cameras in which both found nothing. An object visible for less than a stride, and only there, is missed. With a
     `picture_stride` above 1 the frames of each camera are searched at every so many ticks, and what is found nowhere else is
     measured as often.
-
-    Attributes
-    ----------
-    detected : int
-        Number of frames in which the detector ran, now or in an earlier run.
-    skipped : dict of str to int
-        Number of frames skipped, by camera.
-    lights : list of LightBox
-        Traffic lights in the frames, in the order of the ticks.
     """
 
     def __init__(
-        self, log: Log, schedule: Schedule, detector: Detector, plan: Plan, reader: RecordReader,
-        pool: ThreadPoolExecutor, clock: StageClock, cache: DetectionCache | None = None,
-    ) -> None:  # fmt: skip
-        self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
-        self._reader, self._pool, self._clock, self._cache = reader, pool, clock, cache
-        self._pending: dict[int, dict[str, Detections]] = {}
-        self._thumbnails: dict[tuple[str, int], Thumbnail] = {}
-        self._lights: dict[tuple[str, int], list[LightBox]] = {}
-        self.lights: list[LightBox] = []
-        self.detected = 0
-        self.skipped: dict[str, int] = {}
-
-    def detections_at(self, tick: int) -> dict[str, Detections]:
-        """Return the detections of a tick by camera; must be called for every tick in order.
-
-        A camera is left out where its frame cannot be read, repeats an earlier one, shows nothing, or is not searched: what it
-        does not show may be there.
-        """
-        last, stride = len(self._schedule) - 1, self._plan.detector_stride
-        if self._plan.picture_stride > 1:
-            self._pending[tick] = self._detect(tick, self._cameras_due(tick))
-        elif tick not in self._pending:
-            self._pending[tick] = self._detect(tick, self._plan.cameras)
-        if stride > 1 and tick < last and tick % stride == 0:
-            self._detect_between(tick, min(tick + stride, last))
-        found = self._pending.pop(tick)
-        live = {camera: boxes for camera, boxes in found.items() if self._is_live(camera, tick, boxes)}
-        for camera in found:
-            lights = self._lights.pop((camera, tick), [])
-            if camera in live and len(self.lights) < MAX_CROPS:
-                self.lights += lights
-        return live
-
-    def _cameras_due(self, tick: int) -> list[str]:
-        """Return the cameras whose frames are searched at a tick: they take turns, so that each tick takes as long."""
-        stride, due = self._plan.picture_stride, list[str]()
-        for k, camera in enumerate(self._plan.cameras):
-            if (tick + k) % stride == 0:
-                due.append(camera)
-            elif self._schedule.frames[camera][tick] >= 0:
-                self.skipped[camera] = self.skipped.get(camera, 0) + 1
-        return due
-
-    def _is_live(self, camera: str, tick: int, found: Detections) -> bool:
-        """Return whether a frame shows what is there; nothing is said of frames that are not decoded."""
-        if not self._plan.keeps(Stage.IMAGE_DECODING):
-            return True
-        watch, thumbnail = self._reader.watch.cameras[camera], self._thumbnails.pop((camera, tick), None)
-        t_ns = int(self._log.streams[camera].t_ns[self._schedule.frames[camera][tick]])
-        state = (
-            watch.assume_unchanged(t_ns) if thumbnail is None else watch.judge(t_ns, thumbnail, found=len(found) > 0)
-        )
-        return state == "live"
-
-    def _detect_between(self, start: int, end: int) -> None:
-        """Detect at the tick `end` and at those before it, except in cameras that are empty at `start` and `end`."""
-        self._pending[end] = self._detect(end, self._plan.cameras)
-        ends = self._pending[start], self._pending[end]
-        empty = {c for c in self._plan.cameras if all(c in found and not len(found[c]) for found in ends)}
-        for tick in range(start + 1, end):
-            self._pending[tick] = self._detect(tick, [c for c in self._plan.cameras if c not in empty])
-            for camera in sorted(empty):
-                if self._schedule.frames[camera][tick] >= 0:
-                    self._pending[tick][camera] = Detections.empty()
-                    self.skipped[camera] = self.skipped.get(camera, 0) + 1
-
-    def _detect(self, tick: int, cameras: Iterable[str]) -> dict[str, Detections]:
-        """Search a tick's frames by camera; unreadable frames are left out."""
-        frames, found = self._frames(tick, cameras), dict[str, PictureFindings]()
-        with self._clock.stage("detect"):
-            keys = self._recall(frames, found)
-        self._search({name: frame for name, frame in frames.items() if name not in found}, keys, found)
-        self.detected += len(found)
-        for name in frames:
-            if name in found:
-                if found[name].thumbnail.size:
-                    self._thumbnails[name, tick] = found[name].thumbnail
-                self._lights[name, tick] = list(found[name].lights)
-        return {name: found[name].detections for name in frames if name in found}
-
-    def _recall(self, frames: dict[str, Frame], found: dict[str, PictureFindings]) -> dict[str, bytes | None]:
-        """Add what the cache knows of frames to `found`; returns the keys of all frames."""
-        cache = self._cache
-        if cache is None:
-            return {}
-        keys = dict(zip(frames, self._pool.map(cache.key_of, frames.values())))
-        for name, key in keys.items():
-            findings = None if key is None else cache.get(key, frames[name])
-            if findings is not None:
-                found[name] = findings
-                self._reader.count(name)
-        cache.found += sum(name in found for name in keys)
-        return keys
-
-    def _search(
-        self, frames: dict[str, Frame], keys: dict[str, bytes | None], found: dict[str, PictureFindings]
+        self, log: Log, schedule: Schedule, detector: Detector, plan: Plan, cache: DetectionCache | None = None
     ) -> None:
-        """Run the detector on frames, all of which decode in parallel, and add to `found` what it finds."""
+        self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
+        self._cache, self._empty = cache, set[str]()
+        self._known: dict[tuple[str, int], PictureFindings | None] = {}
+
+    def search(self, tick: int, reader: RecordReader, clock: StageClock) -> dict[str, PictureFindings | None]:
+        """Search the frames of a tick by camera; None for one that is skipped.
+
+        Ticks come in order, from one that a stride divides. A camera is left out where it has no frame or its frame cannot be
+        read.
+        """
+        plan, last = self._plan, len(self._schedule) - 1
+        self._known = {key: found for key, found in self._known.items() if key[1] >= tick}
+        recorded = [camera for camera in plan.cameras if self._schedule.frames[camera][tick] >= 0]
+        if plan.picture_stride > 1:  # cameras take turns, so that each tick takes as long
+            turn = (tick + np.arange(len(plan.cameras))) % plan.picture_stride == 0
+            self._empty = {camera for camera, due in zip(plan.cameras, turn) if not due}
+        elif plan.detector_stride > 1 and tick % plan.detector_stride == 0:
+            empty = [c for c, found in self._look(tick, recorded, reader, clock).items() if not len(found.detections)]
+            ahead = min(tick + plan.detector_stride, last)
+            seen = self._look(ahead, empty, reader, clock) if ahead > tick + 1 else {}
+            self._empty = {camera for camera, found in seen.items() if not len(found.detections)}
+        starts = plan.picture_stride == 1 and (tick % plan.detector_stride == 0 or tick == last)
+        skipped = [] if starts else [camera for camera in recorded if camera in self._empty]
+        found = self._look(tick, [camera for camera in recorded if camera not in skipped], reader, clock)
+        return {camera: found.get(camera) for camera in recorded if camera in found or camera in skipped}
+
+    def _look(
+        self, tick: int, cameras: Iterable[str], reader: RecordReader, clock: StageClock
+    ) -> dict[str, PictureFindings]:
+        """Search a tick's frames of some cameras, each once; those that have none or cannot be read are left out."""
+        frames, keys = dict[str, Frame](), dict[str, bytes | None]()
+        for name in cameras:
+            index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
+            if index >= 0 and (name, tick) not in self._known:
+                encoded = None if stream.encoded is None else partial(stream.encoded, index)
+                image = _LazyImage(reader, name, index)
+                frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
+        with clock.stage("detect"):
+            for name, frame in frames.items() if self._cache is not None else ():
+                assert self._cache is not None
+                key = keys[name] = self._cache.key_of(frame)
+                findings = None if key is None else self._cache.get(key, frame)
+                if findings is not None:
+                    self._known[name, tick] = findings
+                    self._cache.found += 1
+                    reader.count(name)
+        frames = {name: frame for name, frame in frames.items() if (name, tick) not in self._known}
         thumbnails: dict[str, Thumbnail | None] = dict.fromkeys(frames, EMPTY)
         if self._plan.keeps(Stage.IMAGE_DECODING):
-            with self._clock.stage("decode"):
-                thumbnails = dict(zip(frames, self._pool.map(_thumbnail_of, frames.values())))
-        with self._clock.stage("detect"):
-            readable = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
+            with clock.stage("decode"):
+                thumbnails = {name: _thumbnail_of(frame) for name, frame in frames.items()}
+        self._known |= {(name, tick): None for name, small in thumbnails.items() if small is None}
+        readable = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
+        with clock.stage("detect"):
             searched = detect_all(self._detector, list(readable.values()))
             for (name, frame), boxes in zip(readable.items(), searched, strict=True):
                 lights, thumbnail = boxes.traffic_lights, thumbnails[name]
                 cut = crop_lights(name, frame.t_ns, frame.image(), lights) if len(lights) else []
-                found[name] = PictureFindings(boxes, EMPTY if thumbnail is None else thumbnail, tuple(cut))
+                findings = PictureFindings(boxes, EMPTY if thumbnail is None else thumbnail, tuple(cut))
+                self._known[name, tick] = findings
                 key = keys.get(name)
                 if self._cache is not None and key is not None:
-                    self._cache.put(key, found[name])
-
-    def _frames(self, tick: int, cameras: Iterable[str]) -> dict[str, Frame]:
-        frames = {}
-        for name in cameras:
-            index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
-            if index >= 0:
-                encoded = None if stream.encoded is None else partial(stream.encoded, index)
-                image = _LazyImage(self._reader, name, index)
-                frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
-        return frames
+                    self._cache.put(key, findings)
+        return {name: found for name in cameras if (found := self._known.get((name, tick))) is not None}
 
 
 class _LazyImage:

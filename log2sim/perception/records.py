@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -405,6 +405,8 @@ class CameraWatch:
         show what it sees of all that stands. Pictures that are nearly identical are copies where the poses say at every step
         that they cannot be; poses that drift or scatter while the ego stands do not.
         """
+        if t_ns in self.states:
+            return self.states[t_ns]
         last = self._last
         if not found and shows_nothing(thumbnail):
             state: PictureState = "black"
@@ -420,8 +422,7 @@ class CameraWatch:
 
     def assume_unchanged(self, t_ns: int) -> PictureState:
         """Return the state of a picture that was not looked at: that of the one before it."""
-        self.states[t_ns] = next(reversed(self.states.values()), "live")
-        return self.states[t_ns]
+        return self.states.setdefault(t_ns, next(reversed(self.states.values()), "live"))
 
     def _is_copy(self, last: _Picture, t_ns: int, thumbnail: Thumbnail) -> bool:
         """Compare a picture with the one before it."""
@@ -508,6 +509,8 @@ class LidarWatch:
         A LiDAR that stands in a synthetic world without noise gives the same points again and again, and rightly so. Hence a
         sweep is a copy where the LiDAR moved meanwhile, or where its sweeps are known to differ even from one place.
         """
+        if t_ns in self.repeated:
+            return self.repeated[t_ns]
         self.points[t_ns] = sketch.points
         last, same, copy = self._last, False, False
         if last is not None and min(sketch.obstacles, last.sketch.obstacles) >= MIN_OBSTACLES:
@@ -544,8 +547,35 @@ MAX_SPARSE_SHARE = 0.1
 MIN_USUAL_POINTS = 100
 
 
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What is kept of a record to judge it.
+
+    Attributes
+    ----------
+    shown : Thumbnail, SweepSketch or None
+        None of a picture that was not decoded.
+    found : bool
+        Whether a detector found something in it.
+    state : str
+        "live", "black", "frozen" or, of a sweep, "repeated", as far as it was known then.
+    """
+
+    sensor: str
+    t_ns: int
+    shown: Thumbnail | SweepSketch | None
+    found: bool
+    state: str
+
+
+# States that a watch takes along to another process: no record of a tick is this many earlier than another.
+STATES_SENT = 64
+
+
 class RecordWatch:
-    """Judge pictures and sweeps as they are read.
+    """Judge pictures and sweeps as they are read, each once.
+
+    Another process gets what it needs to go on, and `attach` gives it the log.
 
     Attributes
     ----------
@@ -557,6 +587,33 @@ class RecordWatch:
         self._log = log
         self.cameras = {name: CameraWatch(log, name) for name in log.cameras}
         self.lidars = {name: LidarWatch(log, name) for name in log.lidars}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the watches without the log and with their last states."""
+
+        def last(states: dict[int, Any]) -> dict[int, Any]:
+            return dict(list(states.items())[-STATES_SENT:])
+
+        no_log: Any = None
+        cameras = {n: replace(w, log=no_log, states=last(w.states)) for n, w in self.cameras.items()}
+        lidars = {
+            n: replace(w, log=no_log, repeated=last(w.repeated), points=last(w.points)) for n, w in self.lidars.items()
+        }
+        return {"cameras": cameras, "lidars": lidars}
+
+    def attach(self, log: Log) -> None:
+        """Give the log to a watch that came from another process."""
+        for watch in (self, *self.cameras.values(), *self.lidars.values()):
+            setattr(watch, "_log" if watch is self else "log", log)
+
+    def judge(self, look: Look) -> str:
+        """Return the state of a record, which is judged if it was not yet; records of a sensor come in the order of their stamps."""
+        if isinstance(look.shown, SweepSketch):
+            return "repeated" if self.lidars[look.sensor].is_repeated(look.t_ns, look.shown) else "live"
+        camera = self.cameras[look.sensor]
+        if look.shown is None:
+            return camera.assume_unchanged(look.t_ns)
+        return camera.judge(look.t_ns, look.shown, found=look.found)
 
     def faults(self, schedule: Schedule) -> tuple[Fault, ...]:
         """List what was found, a fault for each span of each sensor."""

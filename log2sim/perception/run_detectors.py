@@ -13,8 +13,8 @@ from log2sim.datatypes import Labels, Log
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT_IN_CLOUD, find_call_defect
 from log2sim.perception.cooperative import create_for_ends
-from log2sim.perception.detect.detectors import Detector, FunctionDetector, checked, create_detector
-from log2sim.perception.detect3d.detectors import PREFIX, LidarDetector, create_lidar_detector
+from log2sim.perception.detect.detectors import CheckedDetector, Detector, FunctionDetector, checked, create_detector
+from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
 from log2sim.perception.detect3d.detectors import checked as checked_lidar
 from log2sim.perception.detection_cache import DetectionCache, open_cache
 
@@ -124,6 +124,11 @@ class Detectors:
     images: Detector | None
     sweeps: LidarDetector | None
     cache: DetectionCache | None = None
+
+    @property
+    def own(self) -> bool:
+        """Whether both are detectors of log2sim itself."""
+        return not isinstance(self.images, CheckedDetector) and not isinstance(self.sweeps, CheckedLidarDetector)
 
     @property
     def name(self) -> str:

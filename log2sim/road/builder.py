@@ -15,6 +15,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
+from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import RecordReader, look_again, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
@@ -110,10 +111,7 @@ def roadside_places(log: Log, scenario: Scenario) -> Array:
 def extent_of(path: Array, roadside: Array) -> Extent:
     """Return the extent of a map, m, around places (K, 3) of the ego and of roadside sensors.
 
-    Raises
-    ------
-    LogError
-        Where there are neither, as in a log without poses.
+    Raises `LogError` where there are neither, as in a log without poses.
     """
     low, high = [], []
     for places, margin in ((path, MARGIN_M), (roadside, ROADSIDE_MARGIN_M)):
@@ -155,27 +153,12 @@ class _Ground:
 class GroundMapBuilder:
     """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
 
-    Parameters
-    ----------
-    log : Log
-        With refined poses, see `refine_poses`.
-    scenario : Scenario
-        Its agents hide the ground: moving ones where they are at the time of a record, standing ones always.
-    settings : MapConfig
-    reader : RecordReader, optional
-        Reads the sweeps and counts those that cannot be read.
-    progress : callable, optional
-        Called as `progress(done, total)` while sweeps are read.
+    `log`: with refined poses, see `refine_poses`. `scenario`: its agents hide the ground: moving ones where they are at
+    the time of a record, standing ones always. `reader`: reads the sweeps and counts those that cannot be read.
 
-    Attributes
-    ----------
-    notes : list of str
-        What could not be mapped, and why.
+    `notes`: what could not be mapped, and why.
 
-    Raises
-    ------
-    LogError
-        When no pose is known.
+    Raises `LogError` when no pose is known.
     """
 
     def __init__(
@@ -216,7 +199,7 @@ class GroundMapBuilder:
         map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
         if self._colors is None or not known[0]:
             return
-        view = View(self._log, self._log.cameras[camera], t_ns, map_T_cam[0])
+        view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
         users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
         if view.camera.mount == "map":
             self._standing.setdefault(camera, (view, StandingPictures()))[1].add(image_bgr, users)
@@ -376,7 +359,9 @@ def map_ground(
     """
     reader, settings = reader or RecordReader(log), settings or MapConfig()
     if refine:
-        log = refine_poses(log, scenario, reader)
+        end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        refined = refine_poses(log, (scenario.t0_ns, end_ns))
+        log = log if refined is None else replace_poses(log, refined)
     builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
     look_again(log, reader, [builder], partial(progress, "map: pictures"))
     reader.require_some()

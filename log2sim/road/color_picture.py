@@ -72,21 +72,11 @@ LEAST_RATIO = 0.01
 
 @dataclass(frozen=True, eq=False)
 class PaintModel:
-    """Paints and the distributions of their pixels.
+    """Paints and the distributions of their pixels."""
 
-    Attributes
-    ----------
-    lab : (C, 3) float64
-        The paints.
-    log_prior : (C,) float64
-        Each name is as frequent as `odds_of_names` says, whatever number of paints it has.
-    log_cells : (C, cells) float32
-        Logarithms of the probabilities of the cells.
-    """
-
-    lab: Array
-    log_prior: Array
-    log_cells: NDArray[np.float32]
+    lab: Array  # (C, 3): the paints
+    log_prior: Array  # (C,): each name is as frequent as `odds_of_names` says, whatever number of paints it has
+    log_cells: NDArray[np.float32]  # (C, cells): logarithms of the probabilities of the cells
 
     def explain(self, lab: Array, weight: Array) -> Array:
         """Return the probability (C,) of each paint, of pixels (N, 3) in CIELAB with weights (N,), not all of them 0."""
@@ -178,30 +168,17 @@ PHOTO_WHITE = 0.7
 
 @dataclass(frozen=True, eq=False)
 class PictureColor:
-    """Color of a vehicle in a photo.
+    """Color of a vehicle in a photo."""
 
-    Attributes
-    ----------
-    color : dict
-        As `Agent.color` holds it.
-    probability : (K,) float64
-        Of each of `COLOR_NAMES`.
-    weight : (H, W) float32
-        Which pixels of the photo, scaled down, it was taken from.
-    """
-
-    color: dict[str, Any]
-    probability: Array
-    weight: NDArray[np.float32]
+    color: dict[str, Any]  # as `Agent.color` holds it
+    probability: Array  # (K,): of each of `COLOR_NAMES`
+    weight: NDArray[np.float32]  # (H, W): which pixels of the photo, scaled down, it was taken from
 
 
 def color_of_picture(image_bgr: Image, box_px: ArrayLike | None = None) -> PictureColor | None:
     """Name the color of the vehicle in a photo (H, W, 3); None where the box is too small or nothing in it is seen.
 
-    Parameters
-    ----------
-    box_px : (4,), optional
-        u0, v0, u1, v1 of the vehicle; the whole photo without it.
+    `box_px`: (4,): u0, v0, u1, v1 of the vehicle; the whole photo without it.
     """
     height, width = image_bgr.shape[:2]
     box = np.array([0, 0, width, height], float) if box_px is None else np.asarray(box_px, float)

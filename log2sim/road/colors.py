@@ -76,18 +76,10 @@ DARKER_QUANTILE, LIGHT_L = 0.2, 60.0
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Colors that a surface may have.
+    """Colors that a surface may have."""
 
-    Attributes
-    ----------
-    lab : (C, 3) float64
-        CIELAB, the most probable first.
-    probability : (C,) float64
-        They sum to 1.
-    """
-
-    lab: Array
-    probability: Array
+    lab: Array  # (C, 3): CIELAB, the most probable first
+    probability: Array  # (C,): they sum to 1
 
     @property
     def mean(self) -> Array:
@@ -170,21 +162,11 @@ ITERATIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What one picture says about a color.
+    """What one picture says about a color."""
 
-    Attributes
-    ----------
-    lab : (3,) float64
-        The most probable color.
-    sigma : (3,) float64
-        Standard deviations of its lightness, chroma, and across the chroma.
-    probability : (K,) float64
-        Of each of `COLOR_NAMES`.
-    """
-
-    lab: Array
-    sigma: Array
-    probability: Array
+    lab: Array  # (3,): the most probable color
+    sigma: Array  # (3,): standard deviations of its lightness, chroma, and across the chroma
+    probability: Array  # (K,): of each of `COLOR_NAMES`
     weight: float
 
     @classmethod
@@ -262,15 +244,10 @@ MIN_HEIGHT_PX = 20.0  # doors are a third of the height: six lines of pixels
 def choose_views(log: Log, scenario: Scenario, wanted: Sequence[str]) -> dict[str, dict[int, list[str]]]:
     """Choose frames in which to look at agents.
 
-    Parameters
-    ----------
-    wanted : sequence of str
-        Ids of the agents.
+    `wanted`: ids of the agents.
 
-    Returns
-    -------
-    dict of str to dict of int to list of str
-        By camera and index of the frame: ids of the agents to look at there.
+    Returns dict of str to dict of int to list of str: by camera and index of the frame: ids of the agents to look at
+    there.
     """
     agents = scenario.others
     rows = [k for k, agent in enumerate(agents) if agent.id in set(wanted)]
@@ -352,10 +329,7 @@ class ColorSampler:
 
     A consumer of `log2sim.perception.frames.look_again`.
 
-    Attributes
-    ----------
-    gray : set of str
-        Cameras whose pictures have no color.
+    `gray`: cameras whose pictures have no color.
     """
 
     def __init__(self, log: Log, scenario: Scenario) -> None:

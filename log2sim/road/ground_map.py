@@ -22,30 +22,17 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Raster:
-    """Cells of a north-up raster: R rows from north to south, C columns from west to east.
+    """Cells of a north-up raster: R rows from north to south, C columns from west to east."""
 
-    Attributes
-    ----------
-    extent_m : (float, float, float, float)
-        x0, x1, y0, y1 of the outer edges, m, map frame.
-    resolution_m : float, m
-        Edge of a cell.
-    shape : (int, int)
-        Rows and columns.
-    """
-
-    extent_m: Extent
-    resolution_m: float
-    shape: tuple[int, int]
+    extent_m: Extent  # (float, float, float, float): x0, x1, y0, y1 of the outer edges, m, map frame
+    resolution_m: float  # edge of a cell
+    shape: tuple[int, int]  # (int, int): rows and columns
 
     @classmethod
     def covering(cls, extent_m: Extent, resolution_m: float) -> Raster:
         """Make the raster that covers an extent (x0, x1, y0, y1), m; its north-west corner stays.
 
-        Raises
-        ------
-        ConfigError
-            For an extent without area, and one of more than `MAX_CELLS` cells.
+        Raises `ConfigError` for an extent without area, and one of more than `MAX_CELLS` cells.
         """
         x0, x1, y0, y1 = extent_m
         if not (np.all(np.isfinite(extent_m)) and x1 > x0 and y1 > y0 and resolution_m > 0):

@@ -42,11 +42,10 @@ from log2sim.road.sections import (
 )
 from log2sim.road.strips import PARALLEL_RAD, LaneStrip, find_strips, list_road_lines
 
+# How far interpolation may be from a point that is left out: below the centimeter to which lanes are exact.
 TOLERANCE_M = 0.004
-"""How far interpolation may be from a point that is left out: below the centimeter to which lanes are exact."""
-
+# Longest chord, so that heights and widths are sampled too.
 MAX_STEP_M = 20.0
-"""Longest chord, so that heights and widths are sampled too."""
 
 
 def thin(lane: MapLane) -> MapLane:
@@ -77,11 +76,11 @@ def _kept_rows(columns: Array) -> NDArray[np.intp]:
     return np.array(sorted(kept))
 
 
+# A line this near to the edge of a lane is its edge: vehicles, and so lanes along their paths, keep half a meter off the
+# middle.
 NEAR_M = 0.7
-"""A line this near to the edge of a lane is its edge: vehicles, and so lanes along their paths, keep half a meter off the middle."""
-
+# Of a lane's length that a line has to accompany.
 MIN_SHARE = 0.5
-"""Of a lane's length that a line has to accompany."""
 
 
 def name_lines(lanes: Sequence[MapLane], markings: Sequence[Marking], borders: Sequence[RoadBorder]) -> list[MapLane]:
@@ -116,11 +115,10 @@ def _named(lane: MapLane, lines: Sequence[Polyline], names: Sequence[str]) -> Ma
     return replace(lane, left=lane.left or left, right=lane.right or right)
 
 
+# A lane of its own overlaps the lanes that a path leaves by as much; two stretches nearer than twice of it become one.
 OVERLAP_M = 10.0
-"""A lane of its own overlaps the lanes that a path leaves by as much; two stretches nearer than twice of it become one."""
-
+# So far beyond the end of a lane a vehicle is still on it: less than half a step between two samples of its path.
 BEYOND_M = 0.3
-"""So far beyond the end of a lane a vehicle is still on it: less than half a step between two samples of its path."""
 
 
 def find_covered(lanes: Sequence[MapLane], line: Polyline, aside_m: float | None = None) -> NDArray[np.bool_]:
@@ -156,16 +154,13 @@ def find_uncovered(lanes: Sequence[MapLane], path: DrivenPath) -> Iterator[tuple
             yield path.line.points_m[rows], width
 
 
+# Traffic that comes towards a vehicle within this distance is on the same road: two lanes each way and a strip between.
 ONCOMING_M = 15.0
-"""Traffic that comes towards a vehicle within this distance is on the same road: two lanes each way and a strip between."""
-
+# Probabilities of a direction: somebody drives that way; the lane beside it, away from oncoming traffic, must lead the same
+# way; the one towards oncoming traffic may lead either way; nothing is known. Not measured, but for the order.
 DRIVEN, OUTER, INNER, UNKNOWN = 0.98, 0.9, 0.7, 0.5
-"""Probabilities of a direction: somebody drives that way; the lane beside it, away from oncoming traffic, must lead the same way;
-the one towards oncoming traffic may lead either way; nothing is known. Not measured, but for the order."""
-
-
+# Directions of lanes that somebody drives or that lie next to such a one, not those told across two lines.
 SURE = 0.65
-"""Directions of lanes that somebody drives or that lie next to such a one, not those told across two lines."""
 
 
 def find_side_of_traffic(paths: Sequence[DrivenPath]) -> int:
@@ -263,14 +258,12 @@ def _from_neighbor(
     return replace(turned, directed=probability * known.directed)
 
 
+# That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles.
 PATH_PROBABILITY = 0.6
-"""That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles."""
-
+# A point nearer than this to where a lane begins, or behind it, is left out.
 MIN_AHEAD_M = 0.05
-"""A point nearer than this to where a lane begins, or behind it, is left out."""
-
+# Paths alone never prove a lane.
 MAX_CONFIDENCE = 0.95
-"""Paths alone never prove a lane."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,35 +16,22 @@ from log2sim.geometry import Array
 from log2sim.road.lane_graph import infer_lanes
 from log2sim.road.polyline import MAX_TURN_RAD, Polyline
 
+# Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time.
 STEP_S = 0.1
-"""Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time."""
-
+# An agent is in the next lane when its middle is so far beyond the line between both: it does not go to and fro with noise.
 CROSSED_M = 0.2
-"""An agent is in the next lane when its middle is so far beyond the line between both: it does not go to and fro with noise."""
-
+# Positions of agents that move less say nothing of how they drive.
 MIN_MOVED_M = 1.0
-"""Positions of agents that move less say nothing of how they drive."""
 
 
 @dataclass(frozen=True, eq=False)
 class LanePosition:
-    """Positions of an agent in lanes.
+    """Positions of an agent in lanes."""
 
-    Attributes
-    ----------
-    t_s : (T,) float64, s
-    lane : (T,) int
-        Index of the lane, -1 where it is in none.
-    aside_m : (T,) float64, m
-        Of the box center to the left of the lane's middle; NaN in no lane.
-    width_m : (T,) float64, m
-        Of the lane there.
-    """
-
-    t_s: Array
-    lane: NDArray[np.intp]
-    aside_m: Array
-    width_m: Array
+    t_s: Array  # (T,)
+    lane: NDArray[np.intp]  # (T,): index of the lane, -1 where it is in none
+    aside_m: Array  # (T,): of the box center to the left of the lane's middle; NaN in no lane
+    width_m: Array  # (T,): of the lane there
 
     @property
     def known(self) -> NDArray[np.bool_]:

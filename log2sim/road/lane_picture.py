@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, Camera, apply, inverse, project
-from log2sim.road.ground_map import GroundMap
+from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.markings import list_markings
-from log2sim.road.mosaic import render_birdseye
-from log2sim.road.pictures import GroundView, Image
+from log2sim.road.pictures import Image, View, sample_at, warp_onto
 from log2sim.road.ridges import log_color
+from log2sim.road.surface import Surface
 
 WIDTH_PX = 960  # pictures are made smaller, so that grain is no line
 MIN_LENGTH = 0.02  # of the width
@@ -177,15 +177,9 @@ MIN_WEIGHT = 0.8
 
 @dataclass(frozen=True, eq=False)
 class RoadShape:
-    """y = offset + slope x + bend x**2 of all lane lines, each with its own offset.
+    """y = offset + slope x + bend x**2 of all lane lines, each with its own offset."""
 
-    Attributes
-    ----------
-    slope, bend : float
-        bend in 1/m.
-    """
-
-    slope: float
+    slope: float  # `slope`, `bend`: bend in 1/m
     bend: float
 
     def course(self, x: Array) -> Array:
@@ -195,30 +189,17 @@ class RoadShape:
 
 @dataclass(frozen=True, eq=False)
 class LaneLine:
-    """Markings that are one line beside a lane, and its course from end to end of what can be seen.
+    """Markings that are one line beside a lane, and its course from end to end of what can be seen."""
 
-    Attributes
-    ----------
-    offset_m : float
-        To the left of the camera.
-    points_m : (N, 3) float64, m
-        Beyond the markings by the course of the others.
-    """
-
-    offset_m: float
+    offset_m: float  # to the left of the camera
     markings: tuple[Marking, ...]
-    points_m: Array
+    points_m: Array  # (N, 3): beyond the markings by the course of the others
 
 
 def find_shape(markings: list[Marking], weights: Array) -> tuple[RoadShape, list[int]] | None:
     """Find the course that most lane lines follow, by weight, and the indices of those that do.
 
-    Parameters
-    ----------
-    markings : list of Marking
-        Lane lines.
-    weights : (N,) float64
-        What each counts.
+    `markings`: lane lines. `weights`: (N,): what each counts.
     """
     points = [_even(marking.points_m) for marking in markings]
     best: tuple[float, RoadShape, list[int]] | None = None
@@ -338,28 +319,14 @@ MAX_PITCH_STEP_RAD = np.deg2rad(3)
 
 @dataclass(frozen=True, eq=False)
 class PictureMarkings:
-    """What one picture shows of the road.
+    """What one picture shows of the road."""
 
-    Attributes
-    ----------
-    markings : tuple of Marking
-        In the frame of the ground below the camera: x forward, y left, z up.
-    lane_lines : tuple of LaneLine
-        The lines of which lane markings are parts, from left to right.
-    camera : Camera
-        Its `mount_T_cam` is its pose in that frame.
-    ground : GroundMap
-        The ground as the picture shows it.
-    notes : tuple of str
-        What was not seen or is assumed.
-    """
-
-    markings: tuple[Marking, ...]
+    markings: tuple[Marking, ...]  # in the frame of the ground below the camera: x forward, y left, z up
     borders: tuple[RoadBorder, ...]
-    lane_lines: tuple[LaneLine, ...]
-    camera: Camera
-    ground: GroundMap
-    notes: tuple[str, ...]
+    lane_lines: tuple[LaneLine, ...]  # the lines of which lane markings are parts, from left to right
+    camera: Camera  # its `mount_T_cam` is its pose in that frame
+    ground: GroundMap  # the ground as the picture shows it
+    notes: tuple[str, ...]  # what was not seen or is assumed
 
     def project(self, points_m: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) of the ground, NaN where they are not in front of the camera."""
@@ -371,20 +338,12 @@ def find_markings_in_picture(
 ) -> PictureMarkings:
     """Find markings in one picture that looks along a road.
 
-    Parameters
-    ----------
-    image_bgr : (H, W, 3) uint8
-        Without lens distortion, unless a camera states it.
-    camera : Camera, optional
-        `mount_T_cam` is its pose above the ground z = 0 of its mount, x forward. Without it, the direction is that in which
-        lines of the road meet, the field of view is assumed, and lengths along the road are no better than that.
-    height_m : float, m
-        Of the camera above the road, where there is no camera.
+    `image_bgr`: (H, W, 3) uint8: without lens distortion, unless a camera states it. `camera`: `mount_T_cam` is its
+    pose above the ground z = 0 of its mount, x forward. Without it, the direction is that in which lines of the road
+    meet, the field of view is assumed, and lengths along the road are no better than that. `height_m`: of the camera
+    above the road, where there is no camera.
 
-    Returns
-    -------
-    PictureMarkings
-        Without markings where no lines meet.
+    Returns PictureMarkings: without markings where no lines meet.
 
     Notes
     -----
@@ -454,12 +413,16 @@ def _visible(found: PictureMarkings, marking: Marking) -> float:
 
 def _lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
     """Lay the ground in front of a camera out flat."""
-    view = GroundView.from_pose(image_bgr, camera, camera.mount_T_cam)
     x, y = camera.mount_T_cam[:2, 3]
-    extent = (x, x + REACH_M, y - HALF_WIDTH_M, y + HALF_WIDTH_M)
-    laid = render_birdseye([view], extent_m=extent, resolution_m=CELL_M, coarsest_m=COARSEST_M, frame="ego")
-    unknown = np.full(laid.alpha.shape, np.nan, np.float32)
-    ground = GroundMap(laid.image_bgr, laid.alpha, unknown, unknown, laid.resolution_m, laid.extent_m)
+    raster = Raster.covering((x, x + REACH_M, y - HALF_WIDTH_M, y + HALF_WIDTH_M), CELL_M)
+    color, alpha = np.zeros((*raster.shape, 3), np.uint8), np.zeros(raster.shape, np.uint8)
+    unknown = np.full(raster.shape, np.nan, np.float32)
+    flat = Surface(raster, np.zeros(raster.shape, np.float32), np.ones(raster.shape, bool))
+    warp = warp_onto(View(camera, camera.mount_T_cam), flat, 0.0, raster, COARSEST_M)
+    if warp is not None:
+        color[warp.rows, warp.columns] = sample_at(image_bgr, warp.u, warp.v, warp.scale)
+        alpha[warp.rows, warp.columns] = np.rint(255 * warp.opacity)
+    ground = GroundMap(color, alpha, unknown, unknown, raster.resolution_m, raster.extent_m)
     return keep_road(ground, float(x), float(y))
 
 

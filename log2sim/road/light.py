@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cross_slab
 
 # The camera's own white balance and exposure: white surfaces in the scene's main light look white, up to the errors of
 # automatic white balance (about 5 degrees of angular error, Barnard et al. 2002) and one photographic stop.
@@ -55,20 +55,13 @@ LEAST_DIFFUSE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Light on a vehicle.
+    """Light on a vehicle."""
 
-    Attributes
-    ----------
-    white : (3,) float64
-        What a white, diffuse, upright surface would look like, linear RGB.
-    around : (3,) float64
-        What doors and hoods mirror: the mean of what rises above the middle of the picture, sky and facades.
-    exposure_sigma, tone_sigma : float
-        Standard deviations of the logarithm of its brightness, and of the ratios of its channels.
-    """
-
-    white: Array
+    white: Array  # (3,): what a white, diffuse, upright surface would look like, linear RGB
+    # (3,): what doors and hoods mirror: the mean of what rises above the middle of the picture, sky and facades
     around: Array
+    # `exposure_sigma`, `tone_sigma`: standard deviations of the logarithm of its brightness, and of the ratios of its
+    # channels
     exposure_sigma: float
     tone_sigma: float
 
@@ -88,14 +81,8 @@ _TABLE = _linear(np.arange(256) / 255)
 def reflectances(pixels: Array, light: Light, facing: Array, veil: Array) -> Array:
     """Return the diffuse reflectances (N, 3) of glossy surfaces: without what they mirror, and without haze.
 
-    Parameters
-    ----------
-    pixels : (N, 3)
-        Linear RGB.
-    facing : (N,)
-        Cosines of the angles at which they are seen.
-    veil : (3,)
-        Light that haze and the lens add, see `veil_of`.
+    `pixels`: (N, 3): linear RGB. `facing`: (N,): cosines of the angles at which they are seen. `veil`: (3,): light that
+    haze and the lens add, see `veil_of`.
     """
     # The darkest parts of a vehicle mirror something too: the veil contains a part of what the paint mirrors.
     added = np.maximum(mirrored_share(facing)[:, None] * light.around, veil)
@@ -124,12 +111,8 @@ def mirrored_share(facing: Array) -> Array:
 def estimate_light(below: Array, above: Array, ground: Array) -> Light:
     """Estimate the light from pixels of the surroundings, linear RGB.
 
-    Parameters
-    ----------
-    below, above : (N, 3)
-        Of the lower and the upper half of the picture.
-    ground : (G, 3)
-        Of the road around the vehicle; may be empty.
+    `below, above`: (N, 3): of the lower and the upper half of the picture. `ground`: (G, 3): of the road around the
+    vehicle; may be empty.
     """
     tones, levels = [(np.zeros(3), CAMERA_TONE_SIGMA)], [(np.log(CAMERA_WHITE), CAMERA_EXPOSURE_SIGMA)]
     usable = below[_is_usable(below)]
@@ -176,27 +159,14 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a vehicle and the weights of its sides.
+    """A block of a vehicle and the weights of its sides."""
 
-    Attributes
-    ----------
-    u : (float, float)
-        From rear to front, in lengths.
-    h : (float, float)
-        From bottom to top, in heights.
-    half : float
-        Half of its width, in widths.
-    band : (float, float)
-        Heights between which its sides are painted, in heights.
-    side, end, top : float
-        How much a pixel there says about the paint, 0 for glass: panels more than ends with lights, plates and grilles, and these more
-        than level faces, which mirror the sky.
-    """
-
-    u: tuple[float, float]
-    h: tuple[float, float]
-    half: float
-    band: tuple[float, float]
+    u: tuple[float, float]  # (float, float): from rear to front, in lengths
+    h: tuple[float, float]  # (float, float): from bottom to top, in heights
+    half: float  # half of its width, in widths
+    band: tuple[float, float]  # (float, float): heights between which its sides are painted, in heights
+    # `side`, `end`, `top`: how much a pixel there says about the paint, 0 for glass: panels more than ends with lights,
+    # plates and grilles, and these more than level faces, which mirror the sky
     side: float
     end: float
     top: float
@@ -229,56 +199,28 @@ EDGE_M = 0.06  # the outline of a box is less sure than its middle, and pixels t
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays meet a vehicle.
+    """Where rays meet a vehicle."""
 
-    Attributes
-    ----------
-    distance : (N,) float64
-        Along the rays, infinite where they miss it.
-    weight : (N,) float64
-        How much the place says about the paint.
-    facing : (N,) float64
-        Cosine of the angle between the ray and the surface's normal.
-    """
-
-    distance: Array
-    weight: Array
-    facing: Array
+    distance: Array  # (N,): along the rays, infinite where they miss it
+    weight: Array  # (N,): how much the place says about the paint
+    facing: Array  # (N,): cosine of the angle between the ray and the surface's normal
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Pixels of a vehicle's surface.
+    """Pixels of a vehicle's surface."""
 
-    Attributes
-    ----------
-    pixels : (N, 3) float64
-        Linear RGB.
-    weight : (N,) float64
-        How much each says about the paint.
-    facing : (N,) float64
-        Cosines of the angles at which it is seen.
-    height_px : float
-        Of the whole vehicle in the picture.
-    """
-
-    pixels: Array
-    weight: Array
-    facing: Array
-    height_px: float
+    pixels: Array  # (N, 3): linear RGB
+    weight: Array  # (N,): how much each says about the paint
+    facing: Array  # (N,): cosines of the angles at which it is seen
+    height_px: float  # of the whole vehicle in the picture
 
 
 def hit_vehicle(category: str, size_m: Array, origin: Array, rays: Array) -> Hits:
     """Intersect rays with a vehicle.
 
-    Parameters
-    ----------
-    category : {"car", "truck", "bus"}
-    size_m : (3,), m
-    origin : (3,), m
-        Of the rays, in the frame of the box (origin at its center, x to the front).
-    rays : (N, 3)
-        Directions in that frame.
+    `category`: {"car", "truck", "bus"}. `size_m`: (3,). `origin`: (3,), m: of the rays, in the frame of the box (origin
+    at its center, x to the front). `rays`: (N, 3): directions in that frame.
     """
     distance, weight, facing = np.full(len(rays), np.inf), np.zeros(len(rays)), np.ones(len(rays))
     cosines = np.abs(rays) / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -298,18 +240,11 @@ def hit_vehicle(category: str, size_m: Array, origin: Array, rays: Array) -> Hit
 def hit_block(low: Array, high: Array, origin: Array, rays: Array) -> tuple[Array, NDArray[np.intp]]:
     """Return the distances (N,) at which rays enter a block, infinite for none, and the axes (N,) of the faces there.
 
-    Notes
-    -----
-    Slabs (Kay and Kajiya 1986). A block around the origin of the rays is not entered.
+    A block around the origin of the rays is not entered.
     """
     # By axis: reductions over rows of three take many times as long.
-    near, far = [], []
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(3):
-            a, b = (low[k] - origin[k]) / rays[:, k], (high[k] - origin[k]) / rays[:, k]
-            near.append(np.fmin(a, b))
-            far.append(np.fmax(a, b))
-    entry, leave = np.maximum(np.maximum(near[0], near[1]), near[2]), np.minimum(np.minimum(far[0], far[1]), far[2])
+    near, far = zip(*(cross_slab(origin[k], rays[:, k], low[k], high[k]) for k in range(3)))
+    entry, leave = np.fmax(np.fmax(near[0], near[1]), near[2]), np.fmin(np.fmin(far[0], far[1]), far[2])
     axis = np.where(near[0] == entry, 0, np.where(near[1] == entry, 1, 2))
     return np.where((entry <= leave) & (entry > 0), entry, np.inf), axis
 

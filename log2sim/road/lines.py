@@ -30,18 +30,10 @@ BASE_M, LONG_BASE_M = 6.0, 15.0  # the direction of a chain's end is that of its
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Pieces in their order along a line.
+    """Pieces in their order along a line."""
 
-    Attributes
-    ----------
-    members : (K,) int
-        Indices of pieces.
-    flipped : (K,) bool
-        Whether a piece's own direction points backwards.
-    """
-
-    members: NDArray[np.int64]
-    flipped: NDArray[np.bool_]
+    members: NDArray[np.int64]  # (K,): indices of pieces
+    flipped: NDArray[np.bool_]  # (K,): whether a piece's own direction points backwards
 
     def corners(self, pieces: Pieces) -> Array:
         """List the ends of all pieces in order, (2 K, 2), m."""
@@ -264,29 +256,15 @@ PARALLEL_RAD = np.deg2rad(15)
 
 @dataclass(frozen=True, eq=False)
 class PaintedLine:
-    """A line of paint.
+    """A line of paint."""
 
-    Attributes
-    ----------
-    xy : (P, 2) float64, m
-        Middle, from end to end.
-    kind : str
-        "solid" or "dashed".
-    pieces : Pieces
-        What shows it.
-    painted_m : float
-        Length with paint.
-    log_odds : float
-        That it is a marking.
-    """
-
-    xy: Array
-    kind: str
+    xy: Array  # (P, 2), m: middle, from end to end
+    kind: str  # "solid" or "dashed"
     width_m: float
-    pieces: Pieces
-    painted_m: float
+    pieces: Pieces  # what shows it
+    painted_m: float  # length with paint
     dashes: int
-    log_odds: float
+    log_odds: float  # that it is a marking
 
     @property
     def length_m(self) -> float:

@@ -42,18 +42,12 @@ METHODS: dict[str, tuple[int, dict[str, int]]] = {
 
 @dataclass(frozen=True)
 class GeoKeys:
-    """Contents of the tags of a georeference.
-
-    Attributes
-    ----------
-    problem : str or None
-        Why the keys say nothing about the place on Earth; None where they do.
-    """
+    """Contents of the tags of a georeference."""
 
     directory: tuple[int, ...]
     doubles: tuple[float, ...]
     ascii: str
-    problem: str | None = None
+    problem: str | None = None  # why the keys say nothing about the place on Earth; None where they do
 
 
 def geokeys_of(frame: MapFrame) -> GeoKeys:
@@ -143,19 +137,11 @@ def write_map(
 ) -> None:
     """Write a layer of a map, whole or not at all.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in one of `SUFFIXES`.
-    layer : {"color", "intensity", "height"}
-        In a PNG heights are steps of `HEIGHT_STEP_M` from one below the lowest, 0 where unknown; in a GeoTIFF they are m.
-    frame : MapFrame, optional
-        Where the map lies on Earth; only a GeoTIFF holds it, see `write_world_file` for others.
+    `path`: ends in one of `SUFFIXES`. `layer`: {"color", "intensity", "height"}: in a PNG heights are steps of
+    `HEIGHT_STEP_M` from one below the lowest, 0 where unknown; in a GeoTIFF they are m. `frame`: where the map lies on
+    Earth; only a GeoTIFF holds it, see `write_world_file` for others.
 
-    Raises
-    ------
-    ConfigError
-        For another suffix, a file that exists and may not be replaced or cannot be written.
+    Raises `ConfigError` for another suffix, a file that exists and may not be replaced or cannot be written.
     """
     check_name(path)
     refuse_existing(path, overwrite=overwrite)
@@ -204,10 +190,7 @@ def world_text(ground: GroundMap, frame: MapFrame) -> str:
 def read_png_map(path: Path, frame: MapFrame) -> GroundMap:
     """Read the colors of a PNG map with its world file, in a map frame.
 
-    Raises
-    ------
-    LogError
-        When one of the files is missing, too large, damaged, or not north-up.
+    Raises `LogError` when one of the files is missing, too large, damaged, or not north-up.
     """
     data = read_file(path, MAX_MAP_BYTES, LogError)
     if data[:8] != PNG_HEAD or len(data) < 33:

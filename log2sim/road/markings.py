@@ -53,26 +53,13 @@ OUTLINE_ERROR_M, HULL_ERROR_M = 0.03, 0.15
 
 @dataclass(frozen=True, eq=False)
 class PaintedArea:
-    """Paint with an outline.
+    """Paint with an outline."""
 
-    Attributes
-    ----------
-    kind : str
-        "crosswalk" or "other".
-    outline : (P, 2) float64, m
-    width_m : float
-        Of a crosswalk its extent along the road, of others the lesser extent.
-    pieces : Pieces
-        What shows it.
-    log_odds : float
-        That it is a marking.
-    """
-
-    kind: str
-    outline: Array
-    width_m: float
-    pieces: Pieces
-    log_odds: float
+    kind: str  # "crosswalk" or "other"
+    outline: Array  # (P, 2), m
+    width_m: float  # of a crosswalk its extent along the road, of others the lesser extent
+    pieces: Pieces  # what shows it
+    log_odds: float  # that it is a marking
 
 
 @dataclass(frozen=True, eq=False)
@@ -475,18 +462,9 @@ MIN_LINE_M = 2.0  # shorter plain strokes tell no lane
 def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBorder, ...], tuple[str, ...]]:
     """Find markings and road borders in a map of the ground.
 
-    Parameters
-    ----------
-    ground : GroundMap
-        Color, LiDAR intensity and height; each may be missing in part or altogether.
+    `ground`: color, LiDAR intensity and height; each may be missing in part or altogether.
 
-    Returns
-    -------
-    markings : tuple of Marking
-        Sure ones first.
-    borders : tuple of RoadBorder
-    notes : tuple of str
-        What was not found, and why.
+    Returns `markings`: sure ones first; `borders`; `notes`: what was not found, and why.
 
     Notes
     -----

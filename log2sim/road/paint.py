@@ -48,39 +48,23 @@ SIDES_M = ((0.03, 0.13), (0.1, 0.3))
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Straight pieces of ridges.
+    """Straight pieces of ridges."""
 
-    Attributes
-    ----------
-    xy : (N, 2) float64, m
-        Middles.
-    direction : (N,) float64, rad in [0, pi)
-    length_m, width_m : (N,) float64
-        Width at half of the contrast.
-    color, color_sigma : (N,) float64
-        Contrast of the logarithm of color to the brighter side, and its standard error; NaN where no camera saw it.
-    edge_m : (N,) float64
-        Length in which the edges rise from a quarter to three quarters of the contrast.
-    uneven : (N,) float64
-        Difference of both sides.
-    outshines : (N,) float64
-        Logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side.
-    yellow : (N,) float64
-        Contrast of yellowness.
-    reflected, reflected_sigma : (N,) float64
-        Contrast of the logarithm of LiDAR intensity, and its standard error; NaN where LiDAR saw too little.
-    """
-
-    xy: Array
-    direction: Array
-    length_m: Array
+    xy: Array  # (N, 2), m: middles
+    direction: Array  # (N,), rad in [0, pi)
+    length_m: Array  # `length_m`, `width_m`: (N,): width at half of the contrast
     width_m: Array
+    # `color`, `color_sigma`: (N,): contrast of the logarithm of color to the brighter side, and its standard error; NaN
+    # where no camera saw it
     color: Array
     color_sigma: Array
-    edge_m: Array
-    uneven: Array
+    edge_m: Array  # (N,): length in which the edges rise from a quarter to three quarters of the contrast
+    uneven: Array  # (N,): difference of both sides
+    # (N,): logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side
     outshines: Array
-    yellow: Array
+    yellow: Array  # (N,): contrast of yellowness
+    # `reflected`, `reflected_sigma`: (N,): contrast of the logarithm of LiDAR intensity, and its standard error; NaN
+    # where LiDAR saw too little
     reflected: Array
     reflected_sigma: Array
 

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    distort,
-    fold_radius,
-    ground_homography,
-    inverse,
-    project,
-    project_moving,
-)
+from log2sim.geometry import NS_PER_S, Array, Camera, inverse, project, project_moving
 from log2sim.road.ground_map import Raster
 from log2sim.road.surface import Surface, upsample
 
@@ -33,145 +23,10 @@ SAMPLES_A_ROW = 1024
 Image = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, eq=False)
-class GroundView:
-    """Camera frame with the homography from its pixels to the ground.
-
-    Attributes
-    ----------
-    image_bgr : (H, W, 3) uint8
-    ground_H_image : (3, 3) float64
-        Undistorted pixels to ground positions, m, in the frame of the bird's-eye view.
-    camera : Camera or None
-        Needed only to distort: without it the image counts as undistorted.
-    weight : float
-        Trust relative to other views, > 0.
-    signed : bool
-        Whether the third row of `ground_H_image` is known to be positive below the horizon, as `ground_homography` has
-        it. Otherwise the middle of the lowest image row is assumed to see the ground.
-    """
-
-    image_bgr: Image
-    ground_H_image: Array
-    camera: Camera | None = None
-    weight: float = 1.0
-    signed: bool = False
-
-    @classmethod
-    def from_pose(
-        cls, image_bgr: Image, camera: Camera, map_T_cam: Array, ground_z_m: float = 0.0, **options: Any
-    ) -> GroundView:
-        """Make the view of a camera with pose (4, 4) onto the plane z = `ground_z_m` of the frame of the pose."""
-        return cls(image_bgr, ground_homography(camera, map_T_cam, ground_z_m), camera, signed=True, **options)
-
-
-def signed_inverse(view: GroundView) -> Array:
-    """Invert the homography to `image_H_ground` (3, 3), with a third row that is positive in front of the camera."""
-    height, width = view.image_bgr.shape[:2]
-    image_H_ground: Array = np.linalg.inv(view.ground_H_image).astype(np.float64)
-    below = view.ground_H_image[2] @ np.array([width / 2, height - 1, 1.0])
-    return -image_H_ground if not view.signed and below < 0 else image_H_ground
-
-
-def project_cells(
-    view: GroundView, image_H_cell: Array, rows: NDArray[Any], columns: NDArray[Any], coarsest_cells: float
-) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32], NDArray[np.float32]]:
-    """Project the cells of `rows` and `columns` of a raster into the image.
-
-    Parameters
-    ----------
-    image_H_cell : (3, 3) float64
-        Column and row of a cell to undistorted pixels.
-    rows, columns : (R,), (C,) int
-    coarsest_cells : float
-        Cells longer than this under one pixel are left out.
-
-    Returns
-    -------
-    uv : pair of (R, C) float32
-        Pixels of the cell centers.
-    scale : (R, C) float32
-        Pixels along a cell's edge, geometric mean of the two directions.
-    opacity : (R, C) float32
-        In [0, 1], 0 outside the image.
-    """
-    h = image_H_cell
-    x, y = columns[None, :].astype(np.float64), rows[:, None].astype(np.float64)
-    un, vn, w = ((h[k, 0] * x + (h[k, 1] * y + h[k, 2])).astype(np.float32) for k in range(3))
-    front = w > np.float32(1e-9 * np.abs(h[2]).max())
-    inverse_w = np.divide(1, w, out=np.zeros_like(w), where=front)
-    u, v = un * inverse_w, vn * inverse_w
-    # Squares would overflow far outside the image, where nothing is needed.
-    height, width = view.image_bgr.shape[:2]
-    front &= (np.abs(u) < 4 * width) & (np.abs(v) < 4 * height)
-    u, v, inverse_w = (np.where(front, a, 0) for a in (u, v, inverse_w))
-    ju, jv = (h[0, 0] - u * h[2, 0], h[0, 1] - u * h[2, 1]), (h[1, 0] - v * h[2, 0], h[1, 1] - v * h[2, 1])
-    norm = sum(np.square(j, dtype=np.float32) for j in (*ju, *jv)) * inverse_w**2
-    area = np.abs(np.float32(np.linalg.det(h))) * inverse_w**3
-    # Singular values a >= b of the Jacobian: a b = area, a^2 + b^2 = norm; b is the coarse direction.
-    largest = np.sqrt((norm + np.sqrt(np.maximum(norm**2 - 4 * area**2, 0))) / 2)
-    finest_px = np.divide(area, largest, out=np.zeros_like(area), where=largest > 0)
-    if view.camera is not None and view.camera.distortion_model != "none" and any(view.camera.distortion):
-        u, v = _distort_pixels(view.camera, u, v, front)
-    edge = np.minimum(np.minimum(u, width - 1 - u), np.minimum(v, height - 1 - v)) / (FEATHER_SHARE * width)
-    fine = (finest_px * np.float32(coarsest_cells) - 1) / 0.5
-    opacity = np.where(front, np.clip(np.minimum(edge, fine), 0, 1), 0).astype(np.float32)
-    return (u.astype(np.float32), v.astype(np.float32)), np.sqrt(area).astype(np.float32), opacity
-
-
-def _distort_pixels(camera: Camera, u: Array, v: Array, front: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Apply the lens distortion to pixels; those beyond the radius where the model folds back lie outside the image."""
-    uv = np.stack([u[front], v[front]], axis=1).astype(np.float64)
-    xy = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    seen = np.hypot(xy[:, 0], xy[:, 1]) < fold_radius(camera)
-    distorted = distort(camera, np.where(seen[:, None], xy, 0.0)) @ camera.K[:2, :2].T + camera.K[:2, 2]
-    out = np.full((2, *u.shape), -1e6)
-    out[:, front] = np.where(seen[:, None], distorted, -1e6).T
-    return out[0], out[1]
-
-
-def visible_window(
-    view: GroundView, image_H_cell: Array, shape: tuple[int, ...], coarsest_cells: float, step: int = 8
-) -> tuple[slice, slice] | None:
-    """Find the rows and columns around all cells inside the view, on every `step`-th cell; None if there are none."""
-    rows, columns = np.arange(0, shape[0] + step, step), np.arange(0, shape[1] + step, step)
-    seen = project_cells(view, image_H_cell, rows, columns, coarsest_cells)[2] > 0
-    if not seen.any():
-        return None
-    r, c = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    return (
-        slice(max(int(rows[r[0]]) - step, 0), min(int(rows[r[-1]]) + step, shape[0])),
-        slice(max(int(columns[c[0]]) - step, 0), min(int(columns[c[-1]]) + step, shape[1])),
-    )
-
-
-def sample_colors(
-    image: Image,
-    uv: tuple[NDArray[np.float32], NDArray[np.float32]],
-    scale: NDArray[np.float32],
-    wanted: NDArray[np.bool_] | None = None,
-) -> Image:
-    """Sample colors at pixels, from higher levels of an image pyramid where a cell holds several pixels.
-
-    Parameters
-    ----------
-    image : (H, W, 3) uint8
-    uv : pair of (R, C) float32
-    scale : (R, C) float32
-        Pixels along a cell's edge.
-    wanted : (R, C) bool, optional
-        The others stay black.
-    """
-    chosen = np.ones(scale.shape, bool) if wanted is None else wanted
-    out = np.zeros((*scale.shape, 3), dtype=np.uint8)
-    out[chosen] = sample_at(image, uv[0][chosen], uv[1][chosen], scale[chosen])
-    return out
-
-
 def sample_at(
     image: Image, u: NDArray[np.float32], v: NDArray[np.float32], scale: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """Sample colors (N, 3) at pixels (N,) as `sample_colors` does."""
+    """Sample colors (N, 3) at pixels (N,), from higher levels of an image pyramid where a cell's edge is several pixels (N,) long."""
     level = np.clip(np.rint(np.log2(np.maximum(scale, 1e-6))), 0, PYRAMID_LEVELS).astype(np.int8)
     out = np.zeros((len(level), 3), dtype=np.uint8)
     highest = int(level.max(initial=0))
@@ -208,28 +63,15 @@ Pixel = TypeVar("Pixel", np.uint8, np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Where the cells of a map that are in view appear in a picture, N cells.
+    """Where the cells of a map that are in view appear in a picture, N cells."""
 
-    Attributes
-    ----------
-    rows, columns : (N,) int64
-        Of the cells in the map.
-    u, v : (N,) float32, px
-    scale : (N,) float32
-        Pixels along a cell's edge, geometric mean of both directions.
-    opacity : (N,) float32
-        In (0, 1].
-    depth_m : (N,) float32, m
-        Along the optical axis.
-    """
-
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int64]  # `rows`, `columns`: (N,): of the cells in the map
     columns: NDArray[np.int64]
-    u: NDArray[np.float32]
+    u: NDArray[np.float32]  # `u`, `v`: (N,), px
     v: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    opacity: NDArray[np.float32]
-    depth_m: NDArray[np.float32]
+    scale: NDArray[np.float32]  # (N,): pixels along a cell's edge, geometric mean of both directions
+    opacity: NDArray[np.float32]  # (N,): in (0, 1]
+    depth_m: NDArray[np.float32]  # (N,): along the optical axis
 
     def take(self, kept: NDArray[np.bool_]) -> Warp:
         """Choose cells by a mask (N,)."""
@@ -238,53 +80,44 @@ class Warp:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture's camera at the time of the picture.
+    """A picture's camera at the time of the picture."""
 
-    Attributes
-    ----------
-    map_T_cam : (4, 4) float64
-    """
-
-    log: Log
     camera: Camera
-    t_ns: int
-    map_T_cam: Array
+    map_T_cam: Array  # (4, 4)
+    t_ns: int = 0
+    log: Log | None = None  # where the camera is while its lines are read, one after the other
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Project points (N, 3), m, map frame: pixels (N, 2), NaN behind the camera, and depths (N,), m.
-
-        Lines that are read one after the other see the ground from where the camera is then.
-        """
-        if self.camera.rolling_shutter is None or self.camera.mount == "map":
+        """Project points (N, 3), m, map frame: pixels (N, 2), NaN behind the camera, and depths (N,), m."""
+        log = self.log
+        if log is None or self.camera.rolling_shutter is None or self.camera.mount == "map":
             cam_T_map = inverse(self.map_T_cam)
             local = points @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
             return project(self.camera, local)[0], local[:, 2]
-        uv, depth, _ = project_moving(self.camera, points, self._cam_T_map)
+
+        def cam_T_map_at(t_s: Array) -> Array:
+            t_ns = self.t_ns + np.round(t_s * NS_PER_S).astype(np.int64)
+            poses, known = log.map_T_sensor(self.camera.name, t_ns)
+            return inverse(np.where(known[:, None, None], poses, self.map_T_cam))
+
+        uv, depth, _ = project_moving(self.camera, points, cam_T_map_at)
         return uv, depth
 
-    def _cam_T_map(self, t_s: Array) -> Array:
-        poses, known = self.log.map_T_sensor(self.camera.name, self.t_ns + np.round(t_s * NS_PER_S).astype(np.int64))
-        return inverse(np.where(known[:, None, None], poses, self.map_T_cam))
 
-
-def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster) -> Warp | None:
+def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster, coarsest_m: float = COARSEST_M) -> Warp | None:
     """Find the cells of a raster in a picture; None where it shows none.
 
-    Parameters
-    ----------
-    surface : Surface
-        With the north-west corner of the raster and cells a whole number of times as long.
-    z0_m : float
-        Height of reference of the surface, m.
+    `surface`: with the north-west corner of the raster and cells a whole number of times as long. `z0_m`: height of
+    reference of the surface, m. `coarsest_m`: ground longer than this under one pixel is left out, m.
     """
-    window = _window(view, surface, z0_m)
+    window = _window(view, surface, z0_m, coarsest_m)
     if window is None:
         return None
     rows, columns = window
     every = [np.arange(k.start, k.stop) for k in window]
     uv, depth, usable = _project_nodes(view, surface, z0_m, every[0], every[1])
     factor = round(surface.raster.resolution_m / raster.resolution_m)
-    scale, opacity = _quality(view.camera, uv, usable, factor, raster.resolution_m)
+    scale, opacity = _quality(view.camera, uv, usable, factor, coarsest_m / raster.resolution_m)
     if not opacity.any():
         return None
     shape = (
@@ -302,18 +135,15 @@ def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster) -> Warp
     return Warp(*place, u, v, fine_scale, fine_opacity[row, column], fine_depth)
 
 
-def reach_of(camera: Camera, height_m: float) -> float:
-    """Return how far from the camera a pixel is as long on the ground as `COARSEST_M`, m."""
-    return min(float(np.sqrt(COARSEST_M * camera.K[1, 1] * max(height_m, 0.5))), MAX_REACH_M)
-
-
-def _window(view: View, surface: Surface, z0_m: float) -> tuple[slice, slice] | None:
+def _window(view: View, surface: Surface, z0_m: float, coarsest_m: float) -> tuple[slice, slice] | None:
     """Rows and columns of the surface around all cells in view."""
     raster, place = surface.raster, view.map_T_cam[:3, 3]
     (row,), (column,) = raster.cells_of(place[None, :2])
     r, c = (int(np.clip(round(at), 0, n - 1)) for at, n in zip((row, column), raster.shape))
     height_m = float(place[2] - z0_m - surface.z_m[r, c])
-    reach = int(reach_of(view.camera, height_m) / raster.resolution_m)
+    # As far from the camera a pixel is that long on the ground.
+    reach_m = min(float(np.sqrt(coarsest_m * view.camera.K[1, 1] * max(height_m, 0.5))), MAX_REACH_M)
+    reach = int(reach_m / raster.resolution_m)
     low = [max(round(at) - reach, 0) for at in (row, column)]
     high = [min(round(at) + reach + 1, n) for at, n in zip((row, column), raster.shape)]
     if low[0] >= high[0] or low[1] >= high[1]:
@@ -343,7 +173,7 @@ def _project_nodes(
 
 
 def _quality(
-    camera: Camera, uv: Array, usable: NDArray[np.bool_], factor: int, cell_m: float
+    camera: Camera, uv: Array, usable: NDArray[np.bool_], factor: int, coarsest_cells: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pixels along the edge of a fine cell, and opacity, of nodes (r, c)."""
     if min(usable.shape) < 2:
@@ -356,7 +186,7 @@ def _quality(
         largest = np.sqrt((norm + np.sqrt(np.maximum(norm**2 - 4 * area**2, 0))) / 2)
         finest = np.divide(area, largest, out=np.zeros_like(area), where=largest > 0)
         edge = np.minimum(uv, np.array([camera.width_px - 1, camera.height_px - 1]) - uv).min(axis=2)
-        opacity = np.minimum(edge / (FEATHER_SHARE * camera.width_px), (finest * COARSEST_M / cell_m - 1) / 0.5)
+        opacity = np.minimum(edge / (FEATHER_SHARE * camera.width_px), (finest * coarsest_cells - 1) / 0.5)
     known = cv2.erode((usable & np.isfinite(area)).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     opacity = np.where(known, np.clip(opacity, 0, 1), 0)
     return np.where(known, np.sqrt(area), 0).astype(np.float32), opacity.astype(np.float32)

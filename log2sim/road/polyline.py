@@ -14,55 +14,33 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO, GROUP_OF, Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
 
+# Of the vertices: on the tightest curve of a car (5 m) the middle of a chord is 6 mm off.
 SPACING_M = 0.5
-"""Of the vertices: on the tightest curve of a car (5 m) the middle of a chord is 6 mm off."""
-
+# Headings that differ by a radian count as much as so many meters when the nearest vertex is looked for.
 TURN_M = 6.0
-"""Headings that differ by a radian count as much as so many meters when the nearest vertex is looked for."""
-
+# Length of the chords whose intersections are computed: on a curve of 10 m they are 5 cm off, which only shifts a junction's
+# edge.
 CROSSING_STEP_M = 2.0
-"""Length of the chords whose intersections are computed: on a curve of 10 m they are 5 cm off, which only shifts a junction's edge."""
-
-
+# Feet this far beyond an end are on the line: resampling moves ends by less.
 INSIDE_M = 0.01
-"""Feet this far beyond an end are on the line: resampling moves ends by less."""
-
+# Lines that meet at less than a degree run into each other, and where they do is not known.
 MIN_SINE = 0.02
-"""Lines that meet at less than a degree run into each other, and where they do is not known."""
 
 
 class Projection(NamedTuple):
-    """Where points are relative to a polyline.
+    """Where points are relative to a polyline."""
 
-    Attributes
-    ----------
-    s_m : (N,) float64, m
-        Stations of the feet, beyond the ends where a point is before or after it.
-    aside_m : (N,) float64, m
-        To the left.
-    turn_rad : (N,) float64
-        Headings of the points minus that of the line, in [-pi, pi).
-    inside : (N,) bool
-        Whether the foot is on the polyline.
-    """
-
-    s_m: Array
-    aside_m: Array
-    turn_rad: Array
-    inside: NDArray[np.bool_]
+    s_m: Array  # (N,): stations of the feet, beyond the ends where a point is before or after it
+    aside_m: Array  # (N,): to the left
+    turn_rad: Array  # (N,): headings of the points minus that of the line, in [-pi, pi)
+    inside: NDArray[np.bool_]  # (N,): whether the foot is on the polyline
 
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A directed line.
+    """A directed line."""
 
-    Attributes
-    ----------
-    points_m : (N, 3) float64
-        Vertices in the map frame, N >= 2, about `SPACING_M` apart, none twice in a row.
-    """
-
-    points_m: Array
+    points_m: Array  # (N, 3): vertices in the map frame, N >= 2, about `SPACING_M` apart, none twice in a row
 
     @classmethod
     def through(cls, points_m: Array, spacing_m: float = SPACING_M) -> Polyline:
@@ -205,55 +183,36 @@ def _features(xy_m: Array, heading_rad: Array) -> Array:
     return np.column_stack([xy_m, TURN_M * np.cos(heading_rad), TURN_M * np.sin(heading_rad)])
 
 
+# A vehicle that moves back by less is settling; more begins a new path.
 REVERSAL_M = 0.1
-"""A vehicle that moves back by less is settling; more begins a new path."""
-
+# Shorter paths say nothing of a lane: half a car's length, as one moves when it parks.
 MIN_PATH_M = 2.0
-"""Shorter paths say nothing of a lane: half a car's length, as one moves when it parks."""
-
+# Points closer than this along a path are merged: below the error of any position.
 MIN_STEP_M = 0.01
-"""Points closer than this along a path are merged: below the error of any position."""
-
+# Greatest distance of points between waypoints.
 STEP_M = 0.5
-"""Greatest distance of points between waypoints."""
-
+# Between waypoints farther apart in time nobody knows where an agent went: the trajectory is a guess that can overshoot.
 MAX_GAP_S = 60.0
-"""Between waypoints farther apart in time nobody knows where an agent went: the trajectory is a guess that can overshoot."""
-
+# Points between two waypoints, which bounds what a jump in a trajectory costs.
 MAX_STEPS = 200
-"""Points between two waypoints, which bounds what a jump in a trajectory costs."""
-
+# Standard deviation of the smoothing of observed paths along them: a curve of 6 m becomes 8 cm tighter, and no car turns in
+# less.
 SMOOTH_M = 1.0
-"""Standard deviation of the smoothing of observed paths along them: a curve of 6 m becomes 8 cm tighter, and no car turns in less."""
-
+# Standard deviation of the smoothing of heights of observed agents: roads curve over tens of meters.
 LEVEL_M = 8.0
-"""Standard deviation of the smoothing of heights of observed agents: roads curve over tens of meters."""
-
+# Categories whose paths make lanes; two-wheelers make some only where those have none.
 VEHICLES_FIRST = ("car", "truck", "bus")
-"""Categories whose paths make lanes; two-wheelers make some only where those have none."""
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenPath:
-    """A stretch of an agent's path without a reversal.
-
-    Attributes
-    ----------
-    line : Polyline
-        Ground under the middle of the box, in the direction of the heading.
-    width_m : float
-        Of the agent.
-    rank : int
-        0 for the ego, 1 for vehicles, 2 for two-wheelers: in this order paths make lanes.
-    confidence : float
-        Of the agent.
-    """
+    """A stretch of an agent's path without a reversal."""
 
     agent: str
-    line: Polyline
-    width_m: float
-    rank: int
-    confidence: float
+    line: Polyline  # ground under the middle of the box, in the direction of the heading
+    width_m: float  # of the agent
+    rank: int  # 0 for the ego, 1 for vehicles, 2 for two-wheelers: in this order paths make lanes
+    confidence: float  # of the agent
 
     def with_points(self, points_m: Array) -> DrivenPath:
         """Return the same path along other points (N, 3)."""
@@ -360,20 +319,16 @@ def _monotone_stretches(progress: Array) -> Iterator[tuple[int, int, int]]:
         yield start, extreme, sign
 
 
+# A vehicle closer than this to a route is on it: half of the narrowest usual lane, 3.0 m (RAA 2008, urban roads).
 ENTER_M = 1.5
-"""A vehicle closer than this to a route is on it: half of the narrowest usual lane, 3.0 m (RAA 2008, urban roads)."""
-
+# It is on it until it is farther away than the narrowest lane of roadworks is wide; a lane beside cannot be nearer.
 STAY_M = 2.2
-"""It is on it until it is farther away than the narrowest lane of roadworks is wide; a lane beside cannot be nearer."""
-
+# Larger differences of heading are crossings of a route.
 MAX_TURN_RAD = float(np.deg2rad(30.0))
-"""Larger differences of heading are crossings of a route."""
-
+# Stations of two neighboring samples that differ by more belong to two passes of the same route.
 JUMP_M = 5.0
-"""Stations of two neighboring samples that differ by more belong to two passes of the same route."""
-
+# Stretches off all routes that are shorter are gaps between two routes.
 SHORT_M = 2.0
-"""Stretches off all routes that are shorter are gaps between two routes."""
 
 
 class Run(NamedTuple):
@@ -386,17 +341,11 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Where a path is on routes.
+    """Where a path is on routes."""
 
-    Attributes
-    ----------
-    runs : tuple of Run
-        In order; together they hold every sample once.
-    s_m, aside_m, turn_rad : (N,) float64
-        Station on the route of the run, offset to its left and difference of heading; NaN off all routes.
-    """
-
-    runs: tuple[Run, ...]
+    runs: tuple[Run, ...]  # in order; together they hold every sample once
+    # `s_m`, `aside_m`, `turn_rad`: (N,): station on the route of the run, offset to its left and difference of heading;
+    # NaN off all routes
     s_m: Array
     aside_m: Array
     turn_rad: Array

@@ -34,35 +34,18 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class CoarseTile:
-    """Part of a map in cells of about `COARSE_M`, with margins that neighboring tiles repeat.
+    """Part of a map in cells of about `COARSE_M`, with margins that neighboring tiles repeat."""
 
-    Attributes
-    ----------
-    paint : (R, C) float32
-        Logarithm of brightness, plus that of yellowness.
-    peak, dip : (R, C) float32
-        The same of the brightest and the darkest cell of the map in each: lines, and gaps between a line and a curb, that are
-        as narrow as a coarse cell seldom fill one.
-    seen : (R, C) float32
-        Share of each cell that a camera saw.
-    intensity : (R, C) float32
-        Logarithm of LiDAR intensity.
-    hit : (R, C) float32
-        1 where LiDAR saw the ground.
-    core : (slice, slice)
-        Rows and columns without the margins.
-    origin : (int, int)
-        Row and column of the coarse map at which the tile begins.
-    """
-
-    paint: Layer
+    paint: Layer  # (R, C): logarithm of brightness, plus that of yellowness
+    # `peak`, `dip`: (R, C): the same of the brightest and the darkest cell of the map in each: lines, and gaps between
+    # a line and a curb, that are as narrow as a coarse cell seldom fill one
     peak: Layer
     dip: Layer
-    seen: Layer
-    intensity: Layer
-    hit: Layer
-    core: tuple[slice, slice]
-    origin: tuple[int, int]
+    seen: Layer  # (R, C): share of each cell that a camera saw
+    intensity: Layer  # (R, C): logarithm of LiDAR intensity
+    hit: Layer  # (R, C): 1 where LiDAR saw the ground
+    core: tuple[slice, slice]  # (slice, slice): rows and columns without the margins
+    origin: tuple[int, int]  # (int, int): row and column of the coarse map at which the tile begins
 
 
 def coarse_factor(ground: GroundMap) -> int:
@@ -131,19 +114,11 @@ def _extremes(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a map holds at points.
+    """What a map holds at points."""
 
-    Attributes
-    ----------
-    bright, yellow : (...,) float32
-        Logarithms; NaN where no camera saw the ground.
-    intensity : (...,) float32
-        Logarithm of LiDAR intensity; NaN where it saw nothing.
-    """
-
-    bright: Layer
+    bright: Layer  # `bright`, `yellow`: (...,): logarithms; NaN where no camera saw the ground
     yellow: Layer
-    intensity: Layer
+    intensity: Layer  # (...,): logarithm of LiDAR intensity; NaN where it saw nothing
 
     @property
     def paint(self) -> Layer:
@@ -196,20 +171,11 @@ EXPECTED_COLOR, EXPECTED_INTENSITY = 0.5, 1.1
 
 @dataclass(frozen=True, eq=False)
 class RidgePoints:
-    """Points in the middle of ridges, one for each coarse cell along them.
+    """Points in the middle of ridges, one for each coarse cell along them."""
 
-    Attributes
-    ----------
-    xy_map : (N, 2) float64, m
-    direction : (N,) float64
-        rad in [0, pi), map frame.
-    strength : (N,) float64
-        Response in sigmas of the texture.
-    """
-
-    xy_map: Array
-    direction: Array
-    strength: Array
+    xy_map: Array  # (N, 2), m
+    direction: Array  # (N,): rad in [0, pi), map frame
+    strength: Array  # (N,): response in sigmas of the texture
 
 
 def find_ridges(ground: GroundMap) -> RidgePoints:

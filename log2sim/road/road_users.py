@@ -28,29 +28,17 @@ MAX_CORNER_PX = 1e4
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of road users with their margins, map frame, one row each.
+    """Boxes of road users with their margins, map frame, one row each."""
 
-    Attributes
-    ----------
-    center_m, size_m : (M, 3) float64, m
-    yaw_rad : (M,) float64
-    """
-
-    center_m: Array
+    center_m: Array  # `center_m`, `size_m`: (M, 3)
     size_m: Array
-    yaw_rad: Array
+    yaw_rad: Array  # (M,)
 
 
 class RoadUsers:
     """The agents of a scenario at chosen times.
 
-    Parameters
-    ----------
-    log : Log
-        Whose ego hides the ground too.
-    scenario : Scenario
-    t_ns : (T,) int64
-        All times that will be asked for.
+    `log`: whose ego hides the ground too. `t_ns`: (T,) int64: all times that will be asked for.
     """
 
     def __init__(self, log: Log, scenario: Scenario, t_ns: NDArray[np.int64]) -> None:

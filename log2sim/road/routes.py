@@ -23,39 +23,26 @@ from log2sim.road.polyline import (
     match,
 )
 
+# Stations at which distances are taken.
 STEP_M = 2.0
-"""Stations at which distances are taken."""
-
+# Between the middles of neighboring lanes: from the narrowest of roadworks to the widest.
 MIN_APART_M, MAX_APART_M = 2.2, 5.0
-"""Between the middles of neighboring lanes: from the narrowest of roadworks to the widest."""
-
+# Lanes of one road differ less in heading; ramps leave at 3 to 5 degrees and are apart soon.
 PARALLEL_RAD = float(np.deg2rad(8.0))
-"""Lanes of one road differ less in heading; ramps leave at 3 to 5 degrees and are apart soon."""
-
+# Lines that pass each other at a small angle are that near for less than this.
 MIN_LENGTH_M = 8.0
-"""Lines that pass each other at a small angle are that near for less than this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """A stretch of a route with another beside it.
-
-    Attributes
-    ----------
-    s_m, other_s_m : (K,) float64
-        Stations on both; those of `other` fall where it leads the other way.
-    aside_m : (K,) float64
-        Of the other, to the left.
-    same_way : bool
-        Whether both lead the same way.
-    """
+    """A stretch of a route with another beside it."""
 
     route: int
     other: int
-    s_m: Array
+    s_m: Array  # `s_m`, `other_s_m`: (K,): stations on both; those of `other` fall where it leads the other way
     other_s_m: Array
-    aside_m: Array
-    same_way: bool
+    aside_m: Array  # (K,): of the other, to the left
+    same_way: bool  # whether both lead the same way
 
 
 def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
@@ -125,17 +112,14 @@ def _stretches(rows: NDArray[np.intp], other_s: Array) -> list[NDArray[np.intp]]
     return np.split(rows, np.flatnonzero(cut) + 1)
 
 
+# Two vehicles in one lane are less apart than this: each keeps within some half meter of its middle.
 SAME_M = 1.3
-"""Two vehicles in one lane are less apart than this: each keeps within some half meter of its middle."""
-
+# An offset that stays within this is that of a vehicle which keeps its lane.
 SETTLED_M = 0.4
-"""An offset that stays within this is that of a vehicle which keeps its lane."""
-
+# Two cars' lengths: so long two vehicles are in the same lane, or beside each other, before and after a change.
 PLATEAU_M = 8.0
-"""Two cars' lengths: so long two vehicles are in the same lane, or beside each other, before and after a change."""
-
+# Changes of lane of one vehicle in one log; a bound for odd paths.
 MAX_CHANGES = 20
-"""Changes of lane of one vehicle in one log; a bound for odd paths."""
 
 
 @dataclass(frozen=True)
@@ -258,67 +242,45 @@ def _parts(path: DrivenPath, other: DrivenPath, change: _Change) -> tuple[Driven
     return path.with_points(one), path.with_points(two)
 
 
+# Width of a lane where none is measured: 3.5 m on rural roads (RAL 2012), 3.25 to 3.75 m elsewhere.
 LANE_M = 3.5
-"""Width of a lane where none is measured: 3.5 m on rural roads (RAL 2012), 3.25 to 3.75 m elsewhere."""
-
+# Free space beside the vehicle that a lane is made for, both sides together.
 CLEARANCE_M = 0.8
-"""Free space beside the vehicle that a lane is made for, both sides together."""
-
+# Wider strips are two lanes or a parking lane more.
 MAX_LANE_M = 5.0
-"""Wider strips are two lanes or a parking lane more."""
-
+# A path that leaves a route within this distance of its end goes on where the other vehicle was last seen.
 JOIN_M = 5.0
-"""A path that leaves a route within this distance of its end goes on where the other vehicle was last seen."""
-
+# Over this length a path that lengthens a route comes to its own offset from it: 2.5 degrees at most, as a driver steers.
 BLEND_M = 20.0
-"""Over this length a path that lengthens a route comes to its own offset from it: 2.5 degrees at most, as a driver steers."""
-
+# Between two routes that a vehicle drove one after the other, for the way from the middle of one to that of the next.
 GAP_M = 8.0
-"""Between two routes that a vehicle drove one after the other, for the way from the middle of one to that of the next."""
-
+# Center lines stay this close to every path on them, so that all lie within half of a lane of `LANE_M`.
 KEEP_M = 1.6
-"""Center lines stay this close to every path on them, so that all lie within half of a lane of `LANE_M`."""
-
+# Stations at which offsets of paths are compared.
 GRID_M = 2.0
-"""Stations at which offsets of paths are compared."""
-
+# Standard deviation of the smoothing along the lane of the mean offset, which jumps by up to a meter where a vehicle appears.
 SMOOTH_M = 8.0
-"""Standard deviation of the smoothing along the lane of the mean offset, which jumps by up to a meter where a vehicle appears."""
-
+# A path that comes back to a place after this distance, which is less than the smallest roundabout, is there a second time.
 RETURN_M = 15.0
-"""A path that comes back to a place after this distance, which is less than the smallest roundabout, is there a second time."""
-
+# Two-wheelers ride beside the middle of a lane by up to its width: nearer ones make no lane of their own.
 BESIDE_M = 3.5
-"""Two-wheelers ride beside the middle of a lane by up to its width: nearer ones make no lane of their own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A center line that vehicles follow.
-
-    Attributes
-    ----------
-    width_m : (K,) float64
-        At the stations `width_s_m` (K,), constant beyond.
-    width_s_m : (K,) float64
-    free : (2,) tuple of bool
-        Whether start and end are where a vehicle was first or last seen, so that others may lengthen it.
-    marked_m : (2,) tuple of float or None
-        Stations between which markings make it; elsewhere its middle is that of the paths.
-    left, right : str or None
-        Ids of the markings or borders beside it, there.
-    confidence : float
-        That it is a lane in this direction, by its markings.
-    """
+    """A center line that vehicles follow."""
 
     line: Polyline
-    width_m: Array
-    width_s_m: Array
+    width_m: Array  # (K,): at the stations `width_s_m` (K,), constant beyond
+    width_s_m: Array  # (K,)
+    # (2,) tuple of bool: whether start and end are where a vehicle was first or last seen, so that others may lengthen
+    # it
     free: tuple[bool, bool] = (True, True)
+    # (2,) tuple of float or None: stations between which markings make it; elsewhere its middle is that of the paths
     marked_m: tuple[float, float] | None = None
-    left: str | None = None
+    left: str | None = None  # `left`, `right`: ids of the markings or borders beside it, there
     right: str | None = None
-    confidence: float = 0.0
+    confidence: float = 0.0  # that it is a lane in this direction, by its markings
 
     def width_at(self, s_m: Array) -> Array:
         """Return the width (N,) at stations (N,)."""
@@ -501,11 +463,10 @@ def _smoothed(values: Array, step_m: float) -> Array:
     return np.asarray(gaussian_filter1d(values, SMOOTH_M / step_m, mode="nearest"))
 
 
+# How far: through a junction of four lanes each way.
 REACH_M = 30.0
-"""How far: through a junction of four lanes each way."""
-
+# A vehicle that is turned more against the route is about to leave it, or has come from elsewhere.
 MAX_KINK_RAD = float(np.deg2rad(12.0))
-"""A vehicle that is turned more against the route is about to leave it, or has come from elsewhere."""
 
 
 def continued(routes: Sequence[Route], path: DrivenPath, match: Match) -> DrivenPath:

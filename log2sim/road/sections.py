@@ -14,20 +14,16 @@ from log2sim.geometry import Array
 from log2sim.road.polyline import JUMP_M, STAY_M, DrivenPath, Match, Polyline, Projection, Run, crossings
 from log2sim.road.routes import JOIN_M, LANE_M, MAX_LANE_M, Beside, Route
 
+# A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two.
 ALIGNED_RAD = float(np.deg2rad(2.0))
-"""A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two."""
-
+# How far before it leaves a route a path may begin to turn.
 MAX_TURNOFF_M = 20.0
-"""How far before it leaves a route a path may begin to turn."""
-
+# Routes that differ less in heading run side by side; a path from one to the other changes lanes.
 CHANGE_RAD = float(np.deg2rad(10.0))
-"""Routes that differ less in heading run side by side; a path from one to the other changes lanes."""
-
+# Between where two lanes touch and where a junction begins: vehicles there overlap no lane but their own.
 MARGIN_M = 2.0
-"""Between where two lanes touch and where a junction begins: vehicles there overlap no lane but their own."""
-
+# Half of the length of the place where two lanes cross at a small angle.
 MAX_HALF_M = 15.0
-"""Half of the length of the place where two lanes cross at a small angle."""
 
 
 @dataclass(frozen=True)
@@ -41,16 +37,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Conflict:
-    """Stretches of routes that share ground.
-
-    Attributes
-    ----------
-    crossing : bool
-        Whether lanes cross there; else they branch, merge or follow each other.
-    """
+    """Stretches of routes that share ground."""
 
     intervals: tuple[Interval, ...]
-    crossing: bool
+    crossing: bool  # whether lanes cross there; else they branch, merge or follow each other
 
 
 def find_transitions(match: Match) -> Iterator[tuple[Run, Run]]:
@@ -157,27 +147,18 @@ def _first(mask: NDArray[np.bool_]) -> int:
     return int(mask.argmax()) if mask.any() else len(mask) - 1
 
 
+# Between two conflicts nearer than this no vehicle can wait: they are one junction.
 MIN_SECTION_M = 4.0
-"""Between two conflicts nearer than this no vehicle can wait: they are one junction."""
-
+# First and last station on a route, and the conflict or area that it belongs to.
 Stretch = tuple[float, float, int]
-"""First and last station on a route, and the conflict or area that it belongs to."""
 
 
 @dataclass(frozen=True)
 class Areas:
-    """Conflicts that belong together.
+    """Conflicts that belong together."""
 
-    Attributes
-    ----------
-    stretches : mapping of int to list of Stretch
-        By route, in order and apart.
-    crossing : frozenset of int
-        Areas in which lanes cross.
-    """
-
-    stretches: Mapping[int, Sequence[Stretch]]
-    crossing: frozenset[int]
+    stretches: Mapping[int, Sequence[Stretch]]  # by route, in order and apart
+    crossing: frozenset[int]  # areas in which lanes cross
 
 
 class Union:
@@ -258,56 +239,35 @@ def _spread(routes: Sequence[Route], stretches: dict[int, list[Stretch]], beside
     return grown
 
 
+# What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes.
 FREE, CUT = -1, -2
-"""What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes."""
-
+# Of a path that begins or ends within a junction, this much is a section, from which its way through the junction leads on.
 FIRST_M = 3.0
-"""Of a path that begins or ends within a junction, this much is a section, from which its way through the junction leads on."""
-
+# Shorter sections are what rounding leaves: a sample of a path.
 MIN_LENGTH_M = 0.5
-"""Shorter sections are what rounding leaves: a sample of a path."""
-
+# Over this length a lane comes to the width that it has beside others: 6 cm a meter at most.
 TAPER_M = 10.0
-"""Over this length a lane comes to the width that it has beside others: 6 cm a meter at most."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A stretch of a route.
-
-    Attributes
-    ----------
-    first_m, last_m : float
-        Stations on the route.
-    start, end : int
-        The area there, `FREE` or `CUT`.
-    """
+    """A stretch of a route."""
 
     route: int
-    first_m: float
+    first_m: float  # `first_m`, `last_m`: stations on the route
     last_m: float
-    start: int
+    start: int  # `start`, `end`: the area there, `FREE` or `CUT`
     end: int
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """A section's ground.
-
-    Attributes
-    ----------
-    line : Polyline
-        Its center line.
-    width_m : (N,) float64
-        At the vertices.
-    left, right : int or None
-        Sections beside it, as indices, which have the same ends.
-    """
+    """A section's ground."""
 
     section: Section
-    line: Polyline
-    width_m: Array
-    left: int | None = None
+    line: Polyline  # its center line
+    width_m: Array  # (N,): at the vertices
+    left: int | None = None  # `left`, `right`: sections beside it, as indices, which have the same ends
     right: int | None = None
 
 
@@ -513,37 +473,24 @@ def _lay_out_group(
     return out
 
 
+# Over this length from its ends a connection comes from the lanes' middles to the path that was driven.
 BLEND_M = 15.0
-"""Over this length from its ends a connection comes from the lanes' middles to the path that was driven."""
-
+# A path that is first seen, or last, this far from the end of a section did not pass it.
 MISSED_M = 3.0
-"""A path that is first seen, or last, this far from the end of a section did not pass it."""
-
+# Sections that are nearer meet.
 MIN_CONNECTION_M = 1.0
-"""Sections that are nearer meet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """A way from the end of a section to the start of another.
+    """A way from the end of a section to the start of another."""
 
-    Attributes
-    ----------
-    origin, target : int
-        Sections.
-    width_m : (N,) float64
-    area : int
-        Where it is.
-    agents : tuple of str
-        Who drove it.
-    """
-
-    origin: int
+    origin: int  # `origin`, `target`: sections
     target: int
     line: Polyline
-    width_m: Array
-    area: int
-    agents: tuple[str, ...]
+    width_m: Array  # (N,)
+    area: int  # where it is
+    agents: tuple[str, ...]  # who drove it
 
 
 def connect(

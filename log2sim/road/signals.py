@@ -144,12 +144,8 @@ def rates() -> Array:
 def most_probable_states(t_s: Array, evidence: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the most probable course of states (T,), and the probability (T,) of each given all pictures.
 
-    Parameters
-    ----------
-    t_s : (T,), s
-        Increasing times of pictures; equal ones are of several cameras.
-    evidence : (T, S)
-        Log-likelihoods of `STATES`.
+    `t_s`: (T,): increasing times of pictures; equal ones are of several cameras. `evidence`: (T, S): log-likelihoods of
+    `STATES`.
 
     Notes
     -----
@@ -221,20 +217,12 @@ MAX_SHARED = 0.15
 
 @dataclass(eq=False)
 class Housing:
-    """A traffic light as far as it is known.
+    """A traffic light as far as it is known."""
 
-    Attributes
-    ----------
-    position : (3,) float64, m, map frame
-    covariance : (3, 3) float64
-    eyes : list of (3,) float64
-        Where each was seen from.
-    """
-
-    position: Array
-    covariance: Array
+    position: Array  # (3,), m, map frame
+    covariance: Array  # (3, 3)
     boxes: list[LightBox] = field(default_factory=list)
-    eyes: list[Array] = field(default_factory=list)
+    eyes: list[Array] = field(default_factory=list)  # where each was seen from
 
     @property
     def sigma_m(self) -> float:
@@ -400,12 +388,8 @@ SURE_BOXES = 6.0
 def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tuple[tuple[Signal, ...], str]:
     """Find the traffic lights among boxes of frames.
 
-    Returns
-    -------
-    signals : tuple of Signal
-        Ordered by when they are first seen.
-    seen : str
-        How many there are, and how many places of boxes were left out, in words.
+    Returns `signals`: ordered by when they are first seen; `seen`: how many there are, and how many places of boxes
+    were left out, in words.
     """
     if not boxes:
         return (), "no traffic light seen"

@@ -12,57 +12,35 @@ from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, wrap_angle
 from log2sim.road.polyline import Polyline
 
+# Stations at which the distance to the next line is taken.
 STEP_M = 1.0
-"""Stations at which the distance to the next line is taken."""
-
+# Of a lane: from the narrowest of roadworks (2.2 m) to the widest of ramps.
 MIN_WIDTH_M, MAX_WIDTH_M = 2.2, 5.0
-"""Of a lane: from the narrowest of roadworks (2.2 m) to the widest of ramps."""
-
+# Lines nearer than this belong together: double lines, a curb beside an edge line.
 SAME_LINE_M = 1.0
-"""Lines nearer than this belong together: double lines, a curb beside an edge line."""
-
+# Edges of a lane differ less in heading, also where it widens.
 PARALLEL_RAD = float(np.deg2rad(8.0))
-"""Edges of a lane differ less in heading, also where it widens."""
-
+# Shorter strips are between arrows, letters and pieces of crosswalks: a dash and its gap are 9 m (RMS 1993) to 12 m long.
 MIN_LENGTH_M = 8.0
-"""Shorter strips are between arrows, letters and pieces of crosswalks: a dash and its gap are 9 m (RMS 1993) to 12 m long."""
-
+# Between two pieces of a strip whose lines are worn: the longest gap between dashes of motorways (12 m) and some more.
 MAX_GAP_M = 15.0
-"""Between two pieces of a strip whose lines are worn: the longest gap between dashes of motorways (12 m) and some more."""
-
+# How far the second piece may lie aside of where the first leads, and how much wider it may be: less than any next lane.
 MAX_ASIDE_M, MAX_WIDENING_M = 0.5, 0.8
-"""How far the second piece may lie aside of where the first leads, and how much wider it may be: less than any next lane."""
-
-
+# What may be the edge of a lane.
 RoadLine = Marking | RoadBorder
-"""What may be the edge of a lane."""
 
 
 @dataclass(frozen=True, eq=False)
 class LaneStrip:
-    """A strip between two lines; its direction is that of one of them.
+    """A strip between two lines; its direction is that of one of them."""
 
-    Attributes
-    ----------
-    line : Polyline
-        Its middle.
-    width_m, width_s_m : (K,) float64
-        Widths and their stations.
-    left, right : str
-        Ids of the lines beside it; of the longest if there are several.
-    confidence : float
-        That both lines are there.
-    directed : float
-        Probability that it leads the way of its line.
-    """
-
-    line: Polyline
-    width_m: Array
+    line: Polyline  # its middle
+    width_m: Array  # `width_m`, `width_s_m`: (K,): widths and their stations
     width_s_m: Array
-    left: str
+    left: str  # `left`, `right`: ids of the lines beside it; of the longest if there are several
     right: str
-    confidence: float
-    directed: float = 0.5
+    confidence: float  # that both lines are there
+    directed: float = 0.5  # probability that it leads the way of its line
 
     def reversed(self) -> LaneStrip:
         """Return the strip in the other direction."""

@@ -27,14 +27,9 @@ ROUNDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Points at equal distances along a line.
+    """Points at equal distances along a line."""
 
-    Attributes
-    ----------
-    xy : (P, 2) float64, m
-    """
-
-    xy: Array
+    xy: Array  # (P, 2), m
 
     @property
     def s(self) -> Array:
@@ -149,20 +144,11 @@ SOLID_DASHES = 2.5  # a stroke so many times as long as the dashes beside it is 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Paint along a curve, every `STEP_M`.
+    """Paint along a curve, every `STEP_M`."""
 
-    Attributes
-    ----------
-    s : (P,) float64, m
-    on : (P,) bool
-        Whether there is paint.
-    seen : (P,) bool
-        Whether a sensor saw the ground.
-    """
-
-    s: Array
-    on: NDArray[np.bool_]
-    seen: NDArray[np.bool_]
+    s: Array  # (P,), m
+    on: NDArray[np.bool_]  # (P,): whether there is paint
+    seen: NDArray[np.bool_]  # (P,): whether a sensor saw the ground
 
     def strokes(self) -> Array:
         """Begin and end (K, 2) of the parts with paint, m, without flakes and small gaps."""
@@ -187,20 +173,12 @@ class Trace:
 
 @dataclass(frozen=True)
 class Stretch:
-    """A part of a curve that is one marking.
-
-    Attributes
-    ----------
-    kind : str
-        "solid" or "dashed".
-    dashes : int
-        Number of dashes, 1 for a solid line.
-    """
+    """A part of a curve that is one marking."""
 
     begin_m: float
     end_m: float
-    kind: str
-    dashes: int
+    kind: str  # "solid" or "dashed"
+    dashes: int  # number of dashes, 1 for a solid line
 
 
 def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:

@@ -35,66 +35,33 @@ ELEVATION_BINS = 900
 
 @dataclass(frozen=True, eq=False)
 class GroundPoints:
-    """Points near the ground, N of all sweeps.
+    """Points near the ground, N of all sweeps."""
 
-    Attributes
-    ----------
-    xy : (N, 2) float32, m
-        From the north-west corner of the raster: east, south.
-    z : (N,) float32, m
-        From the height of reference.
-    range_m : (N,) float32, m
-        From the sensor.
-    intensity : (N,) float32
-        NaN where unknown.
-    beam : (N,) int16
-        Number of the elevation from the sensor, from straight down in steps of `ELEVATION_BIN_RAD`.
-    lidar : (N,) int8
-        Number of the LiDAR.
-    """
-
-    xy: NDArray[np.float32]
-    z: NDArray[np.float32]
-    range_m: NDArray[np.float32]
-    intensity: NDArray[np.float32]
+    xy: NDArray[np.float32]  # (N, 2), m: from the north-west corner of the raster: east, south
+    z: NDArray[np.float32]  # (N,), m: from the height of reference
+    range_m: NDArray[np.float32]  # (N,): from the sensor
+    intensity: NDArray[np.float32]  # (N,): NaN where unknown
+    # (N,) int16: number of the elevation from the sensor, from straight down in steps of `ELEVATION_BIN_RAD`
     beam: NDArray[np.int16]
-    lidar: NDArray[np.int8]
+    lidar: NDArray[np.int8]  # (N,) int8: number of the LiDAR
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedSweep:
-    """What is taken of one sweep.
-
-    Attributes
-    ----------
-    hiding : (H, 3) float64
-        Points above the ground, m, map frame.
-    columns : tuple of arrays
-        Those of `GroundPoints`.
-    """
+    """What is taken of one sweep."""
 
     stamp_ns: int
-    hiding: Array
-    columns: tuple[NDArray[np.generic], ...]
+    hiding: Array  # (H, 3): points above the ground, m, map frame
+    columns: tuple[NDArray[np.generic], ...]  # those of `GroundPoints`
 
 
 class PointCollector:
     """Gather the points near the ground of chosen sweeps.
 
-    Parameters
-    ----------
-    log : Log
-    raster : Raster
-        Points outside of it are dropped.
-    sweeps : int
-        How many will come, which says how many points of each are kept.
-    z0_m : float
-        Height of reference, m, map frame.
+    `raster`: points outside of it are dropped. `sweeps`: how many will come, which says how many points of each are
+    kept. `z0_m`: height of reference, m, map frame.
 
-    Attributes
-    ----------
-    hiding : dict of int to (H, 3) float64
-        Points above the ground, m, map frame, by stamp of the sweep.
+    `hiding`: points above the ground, m, map frame, by stamp of the sweep.
     """
 
     def __init__(self, log: Log, raster: Raster, sweeps: int, z0_m: float) -> None:
@@ -208,19 +175,11 @@ UNKNOWN_WEIGHT = np.float32(0.05)
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Heights of the ground.
-
-    Attributes
-    ----------
-    z_m : (R, C) float32, m
-        Above the height of reference, everywhere.
-    known : (R, C) bool
-        Where points are near.
-    """
+    """Heights of the ground."""
 
     raster: Raster
-    z_m: NDArray[np.float32]
-    known: NDArray[np.bool_]
+    z_m: NDArray[np.float32]  # (R, C): above the height of reference, everywhere
+    known: NDArray[np.bool_]  # (R, C): where points are near
 
     def smoothed(self) -> Surface:
         """Return the surface that pictures are laid on: cells of half the resolution, smoothed over `WARP_SMOOTHING_M`.
@@ -244,12 +203,8 @@ class Surface:
 def estimate_surface(points: GroundPoints, raster: Raster, path: Array, z0_m: float) -> Surface:
     """Estimate the ground of a raster.
 
-    Parameters
-    ----------
-    path : (K, 3) float64, m
-        Places on the ground, map frame, which say how high it is where there are no points.
-    z0_m : float
-        Height of reference, m.
+    `path`: (K, 3), m: places on the ground, map frame, which say how high it is where there are no points. `z0_m`:
+    height of reference, m.
     """
     base = _base_of(path, raster, z0_m)
     cell = cells_of_points(points, raster)
@@ -385,12 +340,8 @@ def map_intensity(
 ) -> NDArray[np.float32]:
     """Map relative intensities of points onto a raster: (R, C) in [0, 1], NaN where there are none.
 
-    Parameters
-    ----------
-    surface : Surface
-        Points off it are left out.
-    road : (r, c) bool
-        Cells of the surface's raster that are road surely, because the ego drove there.
+    `surface`: points off it are left out. `road`: (r, c) bool: cells of the surface's raster that are road surely,
+    because the ego drove there.
     """
     cell = cells_of_points(points, surface.raster)
     kept = np.isfinite(points.intensity) & (np.abs(points.z - surface.z_m.ravel()[cell]) < ON_SURFACE_M)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
-from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, Array, cross_slab, inverse, rotation_from_rpy, transform
 from log2sim.synth.actors import EGO_COLOR, Actor, MovingScene
 from log2sim.synth.light import weather_of
 from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
@@ -165,17 +165,11 @@ def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool
     """Distance (N,) at which rays (N, 3) enter a box of size (3,) around the zero point, inf where they miss it.
 
     Rays that start inside miss it too, unless `from_inside`: then the distance is negative.
-
-    Slab method of Kay & Kajiya, "Ray Tracing Complex Scenes" (SIGGRAPH 1986).
     """
-    parallel = ray == 0
-    d = np.where(parallel, 1.0, ray)
-    a, b = (-size_m / 2 - origin) / d, (size_m / 2 - origin) / d
-    outside = parallel & (np.abs(origin) > size_m / 2)
-    enter = np.where(parallel, -np.inf, np.minimum(a, b)).max(1)
-    leave = np.where(parallel, np.inf, np.maximum(a, b)).min(1)
+    sides = [cross_slab(origin[..., k], ray[:, k], -size_m[k] / 2, size_m[k] / 2) for k in range(3)]
+    enter, leave = np.fmax.reduce([near for near, _ in sides]), np.fmin.reduce([far for _, far in sides])
     ahead = leave > 0 if from_inside else enter > 0
-    return np.where((enter <= leave) & ahead & ~outside.any(1), enter, np.inf)
+    return np.where((enter <= leave) & ahead, enter, np.inf)
 
 
 def _standing_distance(triangles: Array, origin: Array, ray: Array) -> tuple[NDArray[np.int64], Array]:

@@ -17,7 +17,6 @@ WORDS = {
     "track": "tracking",
     "smooth": "smoothing trajectories",
     "judge": "comparing agents with the recording",
-    "map poses": "aligning the map",
     "pictures": "mapping the ground and reading colors",
     "lanes": "finding markings and lanes",
     "map: sweeps": "mapping the ground: LiDAR sweeps",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,8 +16,8 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.localization.choice import PoseChoice
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.first_pass import CloudOptions, CloudPrefetcher
-from log2sim.perception.frames import BACKGROUND_THREADS, RecordReader
+from log2sim.perception.first_pass import CloudMaker
+from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import outside_ego
 from log2sim.perception.sync import sweep_middle_ns
@@ -44,14 +43,14 @@ class SearchedCloud:
 
 
 def clouds(run: Run, records: RecordReader, detector: LidarDetector | None) -> Iterator[SearchedCloud]:
-    """Yield the clouds of all ticks of a run without cameras; the next ones are made and searched in the background."""
-    options = CloudOptions(run.config.measure.max_range_m, detector, run.config.lidar.sweeps)
-    with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
-        coming = CloudPrefetcher(run.log, run.schedule, run.plan, records, pool, options)
-        for tick in range(len(run.schedule)):
-            coming.prefetch(tick)
-            cloud = coming.cloud(tick, 0)
-            yield SearchedCloud(tick, cloud, Boxes3D.empty() if detector is None else coming.boxes(tick))
+    """Yield the clouds of all ticks of a run without cameras."""
+    maker = CloudMaker(
+        run.log, run.schedule, run.plan, max_range_m=run.config.measure.max_range_m, detector=detector,
+        sweeps=run.config.lidar.sweeps,
+    )  # fmt: skip
+    for tick in range(len(run.schedule)):
+        (cloud,) = maker.clouds(tick, records)
+        yield SearchedCloud(tick, cloud, Boxes3D.empty() if detector is None else maker.boxes(tick))
 
 
 def stamps_of(run: Run) -> NDArray[np.int64]:

@@ -160,12 +160,11 @@ class ChunkedFile:
         """Read `count` bytes; `ValueError` where the file ends before."""
         if count < 0 or position < 0 or position + count > self.size:
             raise ValueError(f"{count} bytes at byte {position} of a file of {self.size}; it is truncated or damaged")
-        with self._lock:
-            self._file.seek(position)
-            parts, missing = [], count
-            while missing and (part := self._file.read(missing)):
-                parts.append(part)
-                missing -= len(part)
+        parts, missing = [], count
+        # Without a position of the file, which other threads and forked processes share.
+        while missing and (part := os.pread(self._file.fileno(), missing, position + count - missing)):
+            parts.append(part)
+            missing -= len(part)
         if missing:
             raise ValueError(f"{count} bytes at byte {position}, but the file ends {missing} bytes before")
         return b"".join(parts)

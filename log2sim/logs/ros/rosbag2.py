@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 import threading
@@ -231,12 +232,11 @@ class SqliteBag:
         if wal.is_file() and wal.stat().st_size:
             self.notes.append(f"{path.name}: the recording was not closed; what is in {wal.name} only is not read")
         # As a URI: read-only, no journal is looked for, no other file is opened.
-        uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+        self._uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
         try:
-            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._open()
         except sqlite3.Error as problem:
             raise LogError(f"{path}: cannot be opened as an SQLite database: {one_line(problem)}") from None
-        weakref.finalize(self, self._database.close)
         try:
             self._read_index(compression)
         except (sqlite3.Error, TypeError, ValueError, KeyError, OverflowError) as problem:
@@ -247,6 +247,9 @@ class SqliteBag:
         compression = self.channels[int(self.entries.channel[k])].compression
         wanted = COMPRESSED_HEAD_BYTES if compression and limit_bytes else limit_bytes
         try:
+            with self._lock:
+                if self._process != os.getpid():  # a connection must not be used in a forked process
+                    self._open()
             with (
                 self._lock,
                 self._database.blobopen("messages", "data", int(self.entries.place[k]), readonly=True) as blob,
@@ -257,10 +260,15 @@ class SqliteBag:
             raise ValueError(f"the database cannot be read there: {one_line(problem)}") from None
         return decompress_message(data, compression, limit_bytes)
 
+    def _open(self) -> None:
+        self._process = os.getpid()
+        self._database = sqlite3.connect(self._uri, uri=True, check_same_thread=False)
+        weakref.finalize(self, self._database.close)
+        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
+        self._database.execute("PRAGMA trusted_schema = OFF")
+
     def _read_index(self, compression: str) -> None:
         database = self._database
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
-        database.execute("PRAGMA trusted_schema = OFF")
         tables = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
         for name in ("topics", "messages"):
             # A view or a virtual table of that name could compute anything.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Frame
 from log2sim.errors import ConfigError
 from log2sim.files.inputs import read_file, require_readable
-from log2sim.files.stages import usable_threads
 from log2sim.geometry import Array, box_iou
 from log2sim.perception.detect.layouts import (
     LAYOUTS,
@@ -54,7 +52,6 @@ class OnnxModel:
     spec: InputSpec
     metadata: Mapping[str, str]  # custom metadata of the file, such as class names
     session: Any  # runs in the thread that calls it
-    threads: int  # that may run it side by side
 
     def digest(self) -> str | None:
         """Return the SHA-256 of the file; None for one whose weights are in other files."""
@@ -70,11 +67,10 @@ class OnnxModel:
             raise ConfigError(f"{self.path}: the model fails on an image {tensor.shape}: {first_line(error)}") from None
 
 
-def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
+def load_model(path: Path) -> OnnxModel:
     """Load an ONNX file.
 
-    `threads`: that may run it side by side, None for as many as `log2sim.files.stages.usable_threads` says. Raises
-    `ConfigError`: a missing, oversized or broken file, or a model whose inputs are not one image.
+    Raises `ConfigError`: a missing, oversized or broken file, or a model whose inputs are not one image.
     """
     import onnxruntime
 
@@ -88,7 +84,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     except Exception as error:  # as above
         raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
     metadata = dict(session.get_modelmeta().custom_metadata_map)
-    return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session, threads or usable_threads())
+    return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session)
 
 
 def check_file(path: Path) -> None:
@@ -343,19 +339,12 @@ class OnnxDetector:
         return self.detect_images([frame.image() for frame in frames])
 
     def detect_images(self, images: Sequence[NDArray[np.uint8]]) -> list[Detections]:
-        """Detect road users and traffic lights in each of several images (H, W, 3) uint8 BGR.
-
-        Tiles are searched side by side, each by one thread: threads that share a tile wait for each other.
-        """
+        """Detect road users and traffic lights in each of several images (H, W, 3) uint8 BGR."""
         tiles = [self._tiles_of(image) for image in images]
         jobs = [(image, tile) for image, planned in zip(images, tiles) for tile in planned]
-        together = max(1, min(self.together, -(-len(jobs) // self.model.threads)))
-        runs = [jobs[i : i + together] for i in range(0, len(jobs), together)]
-        with ThreadPoolExecutor(self.model.threads) as pool:
-            found = chain.from_iterable(pool.map(self._detect_tiles, runs))
-            return [
-                self._merged([(tile, next(found)) for tile in planned], image) for image, planned in zip(images, tiles)
-            ]
+        runs = [jobs[i : i + self.together] for i in range(0, len(jobs), self.together)]
+        found = chain.from_iterable(map(self._detect_tiles, runs))
+        return [self._merged([(tile, next(found)) for tile in planned], image) for image, planned in zip(images, tiles)]
 
     def _tiles_of(self, image: NDArray[np.uint8]) -> list[Tile]:
         height, width = image.shape[:2]

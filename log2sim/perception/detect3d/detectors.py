@@ -373,19 +373,23 @@ def checked(detector: Any, source: str) -> LidarDetector:
         When it lacks a member of `LidarDetector`, or its `detect` cannot be called.
     """
     require_members(detector, MEMBERS, DETECT_IN_CLOUD, source)
-    return _CheckedLidarDetector(detector, source)
+    return CheckedLidarDetector(detector, source)
 
 
 @dataclass(frozen=True, eq=False)
-class _CheckedLidarDetector:
+class CheckedLidarDetector:
+    """A detector of somebody else; what it raises and what it returns is checked."""
+
     inner: LidarDetector
     source: str
 
     @property
     def name(self) -> str:
+        """Name in the provenance of a scenario."""
         return self.inner.name
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        """Detect road users in one cloud; `PluginError` when the detector raises something, or returns no `Boxes3D`."""
         try:
             found = self.inner.detect(cloud, earlier)
         except (Log2SimError, MemoryError):
