@@ -20,7 +20,6 @@ from log2sim.files.documents import check_targets, replaced, write_json
 from log2sim.files.outputs import (
     claim,
     holding_claims,
-    refusing_to_replace,
     replaced_folder,
     temporary_beside,
     together,
@@ -51,17 +50,17 @@ def test_files_appear_together(tmp_path: Path) -> None:
 
 def test_what_another_run_wrote_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     out = tmp_path / "a.json"
-    with refusing_to_replace():
+    with holding_claims():
         check_targets(out, overwrite=False)
         out.write_text("of another")
         with pytest.raises(ConfigError, match=r"a\.json: another run has written it meanwhile"):
             write_json(out, 1)
         assert out.read_text() == "of another"
-        assert names(tmp_path) == ["a.json"]
         check_targets(out, overwrite=True)
+    assert names(tmp_path) == ["a.json"]
     write_json(out, 2)  # a library call replaces as it always did
     assert out.read_text() == "2\n"
-    with refusing_to_replace():
+    with holding_claims():
         check_targets(tmp_path / "b.json", overwrite=False)
         write_json(tmp_path / "b.json", 3)
         write_json(tmp_path / "b.json", 4)  # its own
@@ -125,29 +124,6 @@ def test_output_that_nobody_can_read_changes_no_exit_code(end: str) -> None:
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="names are exchanged at once on Linux")
-def test_a_folder_that_is_replaced_is_there_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "log"
-    target.mkdir()
-    (target / "old").write_text("x")
-    monkeypatch.setattr(Path, "rename", lambda self, new: pytest.fail(f"{self} is renamed"))
-    seen = []
-    sound = output_folders.exchange_names
-
-    def watched(one: Path, other: Path) -> bool:
-        seen.append((names(one), names(other)))
-        done = sound(one, other)
-        seen.append((names(one), names(other)))
-        return done
-
-    monkeypatch.setattr(output_folders, "exchange_names", watched)
-    with replaced_folder(target, overwrite=True) as folder:
-        (folder / "new").write_text("x")
-    assert seen == [(["new"], ["old"]), (["old"], ["new"])]
-    assert names(target) == ["new"]
-    assert names(tmp_path) == ["log"]
-
-
 def test_with_overwrite_another_run_does_not_matter(tmp_path: Path) -> None:
     contexts = [contextvars.copy_context() for _ in range(3)]
     holders = [holding_claims() for _ in contexts]
@@ -178,4 +154,27 @@ def test_a_folder_that_cannot_be_placed_leaves_the_earlier_one(tmp_path: Path, m
     with pytest.raises(ConfigError, match="log: cannot be written: No space"), replaced_folder(target, overwrite=True):
         pass
     assert names(target) == ["a"]
+    assert names(tmp_path) == ["log"]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="names are exchanged at once on Linux")
+def test_a_folder_that_is_replaced_is_there_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "log"
+    target.mkdir()
+    (target / "old").write_text("x")
+    monkeypatch.setattr(Path, "rename", lambda self, new: pytest.fail(f"{self} is renamed"))
+    seen = []
+    sound = output_folders.exchange_names
+
+    def watched(one: Path, other: Path) -> bool:
+        seen.append((names(one), names(other)))
+        done = sound(one, other)
+        seen.append((names(one), names(other)))
+        return done
+
+    monkeypatch.setattr(output_folders, "exchange_names", watched)
+    with replaced_folder(target, overwrite=True) as folder:
+        (folder / "new").write_text("x")
+    assert seen == [(["new"], ["old"]), (["old"], ["new"])]
+    assert names(target) == ["new"]
     assert names(tmp_path) == ["log"]

@@ -59,7 +59,7 @@ def test_markings_lie_where_the_road_says_at_every_level(level: int) -> None:
 
 def test_a_picture_of_the_ground_agrees_with_the_geometry() -> None:
     road = {"line": [[0.0, 0.0], [80.0, 0.0]], "width_m": 6.0, "marking": "none", "sidewalk_m": 0.0}
-    backdrop = Backdrop(tiny_scene([], road=[road]), 0)
+    backdrop = Backdrop.of(tiny_scene([], road=[road]), 0)
     for roll in (0.0, 4.0):
         pose = looking(0.0, height_m=4.0, pitch_deg=-12.0, roll_deg=roll)
         image = picture(backdrop, pose).astype(float).mean(2)

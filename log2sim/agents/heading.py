@@ -467,7 +467,7 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     """Decide which end of the vehicles and two-wheelers is the front.
 
     Each keeps its yaw or is turned round as a whole. How likely its heading is goes to its quality as
-    `heading_confidence`; an unlikely one is doubted.
+    `heading_confidence`; an unlikely one is doubted, and so is what moves as nothing of its category does.
 
     Parameters
     ----------
@@ -482,8 +482,6 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     of traffic beside it and with its neighbors (`rows.headings_of`), for traffic on either side of the road.
     """
     of = [k for k, c in enumerate(candidates) if GROUP_OF[c.agent.category] in ("vehicle", "two_wheeler")]
-    if not of:
-        return list(candidates)
     road_users = [candidates[k] for k in of]
     alone = np.array([_own_log_odds(c, timeline) for c in road_users])
     own = continued_log_odds([c.agent.waypoints for c in road_users], alone)
@@ -500,7 +498,7 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     decided = list(candidates)
     for k, candidate, along in zip(of, road_users, chance.tolist()):
         decided[k] = _decided(candidate, along)
-    return decided
+    return [c.doubted(motion_doubts(c.agent.category, c.agent.waypoints)) for c in decided]
 
 
 def _own_log_odds(candidate: AgentCandidate, timeline: Timeline) -> float:
@@ -548,8 +546,7 @@ def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:
     if along < 0.5:
         w = agent.waypoints
         w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=0.0 - w.speed_mps)  # never -0.0
-        kept = [doubt for doubt in agent.doubts if doubt.flag not in ("speed", "reversing")]
-        agent = replace(agent, waypoints=w, doubts=(*kept, *motion_doubts(agent.category, w)))
+        agent = replace(agent, waypoints=w)
     agent = replace(agent, quality={**agent.quality, "heading_confidence": round(confidence, 3)})
     doubts = (
         [Doubt("heading_ambiguous", "front and back may be swapped")] if confidence < MIN_HEADING_CONFIDENCE else []

@@ -344,8 +344,7 @@ def moving_candidate(
     z = np.interp(at, t, _running_median(geometry.z_m))
     waypoints = _waypoints(path, _headings(path, group), z, observed)
     sigma_m = np.sqrt(np.trace(positions.covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
-    doubts = limit_doubts(path.broken) + motion_doubts(track.category, waypoints)
-    doubts += jump_doubts(positions.t_s, path.residual_m, sigma_m)
+    doubts = limit_doubts(path.broken) + jump_doubts(positions.t_s, path.residual_m, sigma_m)
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, OtherView, Track
-from log2sim.geometry import Array
+from log2sim.geometry import Array, weighted_quantile
 from log2sim.perception import boxes
 from log2sim.perception.boxes import box_sigma
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
@@ -50,7 +50,7 @@ def typical_box_size(m: BoxEvidence) -> Array | None:
     if len(rows) == 0:
         return None
     weight = box_sigma(m.points[rows]) ** -2
-    return np.array([weighted_median(m.box_size_m[rows, axis], weight) for axis in range(3)])
+    return np.array([weighted_quantile(m.box_size_m[rows, axis], weight, 0.5) for axis in range(3)])
 
 
 def mean_box_center(m: BoxEvidence) -> tuple[Array, float]:
@@ -59,7 +59,7 @@ def mean_box_center(m: BoxEvidence) -> tuple[Array, float]:
     if len(rows) == 0:
         return np.full(2, np.nan), np.nan
     sigma = box_sigma(m.points[rows])
-    center = np.array([weighted_median(m.box_center_m[rows, axis], sigma**-2) for axis in range(2)])
+    center = np.array([weighted_quantile(m.box_center_m[rows, axis], sigma**-2, 0.5) for axis in range(2)])
     return center, float(np.median(sigma)) / np.sqrt(independent(len(rows)))
 
 
@@ -70,18 +70,6 @@ def mean_box_axis(m: BoxEvidence) -> float | None:
         return None
     weight, doubled = box_sigma(m.points[rows]) ** -2, 2 * m.box_yaw_rad[rows]
     return float(np.arctan2(weight @ np.sin(doubled), weight @ np.cos(doubled))) / 2
-
-
-def weighted_median(values: Array, weight: Array) -> float:
-    """Return the smallest of the values (N,), N > 0, that half of the weight (N,) does not exceed."""
-    return weighted_quantile(values, weight, 0.5)
-
-
-def weighted_quantile(values: Array, weight: Array, share: float) -> float:
-    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
-    order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(reached, reached[-1] * share)]])
 
 
 # Points of a static object are persistent if so many of the ticks have points in their cell.

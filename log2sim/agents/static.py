@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
 from log2sim.agents.evidence import Ending, classify_rays
-from log2sim.agents.hypotheses import Part, main_place, robust_line
+from log2sim.agents.hypotheses import Part, main_place
 from log2sim.agents.size import TrackGeometry, independent, static_geometry
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
@@ -270,9 +270,18 @@ def left_free(
 
 
 def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
-    """Return where rays start and end (K, 3) along the axes of a box, relative to the middle of its bottom at their times."""
-    place = np.append(box.xy_m, box.bottom_m) - origin + rays.t_s[:, None] * np.append(box.velocity_mps, 0.0)
-    start, end = rays.start - place, rays.end - place
+    """Return where rays that pass near a box start and end (K, 3) along its axes, relative to the middle of its bottom then."""
+    position, velocity = rays.position[:, :2].astype(np.float64), rays.velocity_mps[:, :2]
+    # Box and LiDAR move past each other while the rays are sent.
+    drift_m = np.hypot(*(velocity - box.velocity_mps).T).max() * np.abs(rays.t_s).max()
+    reach_m = np.hypot(*box.size_m[:2]) / 2 + 2 * drift_m + MAX_GAP_M + MAX_SHIFT_SHARE * box.size_m.max() + MAX_SHIFT_M
+    to_x, to_y = (box.xy_m - origin[:2] - position).T.astype(np.float32)
+    x, y = rays.end[:, 0] - rays.position[rays.sensor, 0], rays.end[:, 1] - rays.position[rays.sensor, 1]
+    across = np.abs(to_x[rays.sensor] * y - to_y[rays.sensor] * x)
+    near = np.flatnonzero(across <= np.float32(reach_m) * np.hypot(x, y))
+    end, sensor, t_s = rays.end[near], rays.sensor[near], rays.t_s[near, None]
+    place = np.append(box.xy_m, box.bottom_m) - origin + t_s * np.append(box.velocity_mps, 0.0)
+    start, end = rays.position[sensor] + rays.velocity_mps[sensor] * t_s - place, end - place
     start[:, :2], end[:, :2] = rotate(start[:, :2], -box.yaw_rad), rotate(end[:, :2], -box.yaw_rad)
     return start, end
 
@@ -400,6 +409,49 @@ def _geometry_of(part: Part) -> TrackGeometry:
 
 def _is_too_large(geometry: TrackGeometry, category: str) -> bool:
     return bool(np.any(geometry.size_m[:2] >= MAX_SIZE_M[category][:2]))
+
+
+# Tuning constant of Cauchy's weights with 95 % efficiency for normal errors (Holland & Welsch, 1977).
+CAUCHY_SIGMAS = 2.385
+REWEIGHTINGS = 5
+
+
+def robust_line(t: Array, xy: Array, variance: Array) -> tuple[Array, Array, float]:
+    """Fit uniform motion to positions by weighted least squares that outliers move little.
+
+    Parameters
+    ----------
+    t : (n,) float64, s
+    xy : (n, d) float64, m
+    variance : (n,) float64, m2
+        Of a position in each direction.
+
+    Returns
+    -------
+    center : (d,)
+        The weighted mean of the positions.
+    velocity : (d,)
+        In m/s; zero where all times are the same.
+    sigma_mps : float
+        Standard deviation of the velocity in each direction, larger where positions scatter more than their variances say
+        (Birge, 1932), infinite where all times are the same.
+
+    Notes
+    -----
+    Iteratively reweighted by Cauchy's function of the residuals (Holland & Welsch, "Robust regression using iteratively
+    reweighted least-squares", 1977).
+    """
+    weight, robust = 1.0 / variance, np.ones(len(t))
+    for _ in range(REWEIGHTINGS):
+        w = weight * robust
+        mean_t, center = w @ t / w.sum(), w @ xy / w.sum()
+        known = float(w @ (t - mean_t) ** 2)
+        velocity = (w * (t - mean_t)) @ (xy - center) / known if known > 0 else np.zeros(xy.shape[1])
+        residual = xy - center - (t - mean_t)[:, None] * velocity
+        squared = weight * (residual**2).sum(axis=1)
+        robust = 1.0 / (1.0 + squared / CAUCHY_SIGMAS**2)
+    scatter = float(squared.mean()) / xy.shape[1]
+    return center, velocity, (max(scatter, 1.0) / known) ** 0.5 if known > 0 else np.inf
 
 
 def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:

@@ -43,7 +43,7 @@ from log2sim.cli.shared import (
 )
 from log2sim.errors import Log2SimError
 from log2sim.files.inputs import OPTION, following_links
-from log2sim.files.outputs import holding_claims, refusing_to_replace
+from log2sim.files.outputs import holding_claims
 from log2sim.version import __version__
 
 INTERRUPTED = 130
@@ -96,7 +96,7 @@ add_command(app, map.map_, "map")
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
-    with tolerating_lost_output(), ending_by_signals() as ended, refusing_to_replace(), holding_claims():
+    with tolerating_lost_output(), ending_by_signals() as ended, holding_claims():
         _run(ended)
 
 

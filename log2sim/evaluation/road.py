@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from log2sim.datatypes import COLOR_NAMES, GROUP_OF, Agent, MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, weighted_quantile, wrap_angle
 
 WITHIN_M, CLOSE_M = 40.0, 20.0  # of the ego's path
 STEP_M = 0.1  # between points at which lines are compared
@@ -212,8 +212,8 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
         "precision": share(ours.length_m, right),
         "recall": share(theirs.length_m, missed_by <= MATCH_M),
         "recall_20_m": share(theirs.length_m[close], missed_by[close] <= MATCH_M),
-        "lateral_median_m": weighted_quantile(away[beside], ours.length_m[beside], 0.5),
-        "lateral_p95_m": weighted_quantile(away[beside], ours.length_m[beside], 0.95),
+        "lateral_median_m": _quantile(away[beside], ours.length_m[beside], 0.5),
+        "lateral_p95_m": _quantile(away[beside], ours.length_m[beside], 0.95),
         "false_m_per_100_m": None if area.path_m < 1 else 100 * false_m / area.path_m,
         **_agreement(found, true, ours.where(right), nearest_true[right]),
     }
@@ -247,14 +247,8 @@ def share(weight: Array, chosen: NDArray[np.bool_]) -> float | None:
     return float(weight[chosen].sum()) / total if total > 0 else None
 
 
-def weighted_quantile(values: Array, weight: Array, q: float) -> float | None:
-    """Smallest of values (N,) that `q` of the weight (N,) does not exceed, None without any."""
-    if len(values) == 0 or weight.sum() <= 0:
-        return None
-    order = np.argsort(values)
-    reached = np.cumsum(weight[order])
-    k = min(int(np.searchsorted(reached, q * reached[-1])), len(order) - 1)
-    return float(values[order[k]])
+def _quantile(values: Array, weight: Array, share: float) -> float | None:
+    return weighted_quantile(values, weight, share) if weight.sum() > 0 else None
 
 
 STOP_LINE_REACH_M = 0.5
@@ -337,8 +331,8 @@ def lane_figures(found: Sequence[MapLane], true: Sequence[MapLane], area: Area) 
         "found_m": float(weight.sum()),
         "precision": share(weight, away <= CENTER_MATCH_M),
         "recall": share(true_weight, missed <= CENTER_MATCH_M),
-        "center_median_m": weighted_quantile(away[near], weight[near], 0.5),
-        "center_p95_m": weighted_quantile(away[near], weight[near], 0.95),
+        "center_median_m": _quantile(away[near], weight[near], 0.5),
+        "center_p95_m": _quantile(away[near], weight[near], 0.95),
     }
 
 

@@ -15,6 +15,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,7 +121,8 @@ class DiskCache:
         except OSError:
             return None
         if time.time() - state.st_mtime > USED_EVERY_S:
-            _mark_used(path)
+            with suppress(OSError):  # in a folder that may only be read it keeps its time
+                os.utime(path)
         return content
 
     def put(self, name: str, content: bytes) -> bool:
@@ -260,14 +262,6 @@ def _remove(path: Path) -> bool:
     except OSError:
         return False
     return True
-
-
-def _mark_used(path: Path) -> None:
-    """Set the time of a file to now; in a folder that may only be read it keeps its time."""
-    try:
-        os.utime(path)
-    except OSError:
-        return
 
 
 def _is_own(state: os.stat_result) -> bool:

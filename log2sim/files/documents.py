@@ -156,7 +156,9 @@ def _schema_at(schema: dict[str, Any], location: Sequence[Any]) -> dict[str, Any
     node = schema
     for part in [None, *location]:
         if isinstance(part, str):
-            node = node.get("properties", {}).get(part) or _schema_of_free_keys(node)
+            free = [*node.get("patternProperties", {}).values(), node.get("additionalProperties")]
+            any_key: dict[str, Any] = next((schema for schema in free if isinstance(schema, dict)), {})
+            node = node.get("properties", {}).get(part) or any_key
         elif isinstance(part, int):
             places = node.get("prefixItems", [])
             node = places[part] if part < len(places) else node.get("items", {})
@@ -165,12 +167,6 @@ def _schema_at(schema: dict[str, Any], location: Sequence[Any]) -> dict[str, Any
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rpartition("/")[2]]
     return node
-
-
-def _schema_of_free_keys(node: dict[str, Any]) -> dict[str, Any]:
-    """Sub-schema of the values of a table whose keys are free; empty without one."""
-    schemas = [*node.get("patternProperties", {}).values(), node.get("additionalProperties")]
-    return next((schema for schema in schemas if isinstance(schema, dict)), {})
 
 
 def _count(schema: dict[str, Any]) -> str:
@@ -231,6 +227,15 @@ def refuse_existing(path: Path | str, *, overwrite: bool) -> None:
     """Raise `ConfigError` when `path` exists and may not be overwritten."""
     if not overwrite and Path(path).exists():
         raise ConfigError(f"{path}: exists already; choose another name or pass --overwrite")
+
+
+def refuse_folder(folder: Path, *, overwrite: bool, holding: str, kind: str) -> None:
+    """Raise `ConfigError` for a folder with files that may not be replaced: never one that lacks the file that marks its kind."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    refuse_existing(folder, overwrite=overwrite)
+    if not (folder / holding).is_file():
+        raise ConfigError(f"{folder}: exists and is no {kind}, so it is not replaced; choose another name")
 
 
 def refuse_below_file(path: Path | str) -> None:

@@ -25,13 +25,14 @@ _claims: ContextVar[dict[Path, _Lock] | None] = ContextVar("claims", default=Non
 
 @contextmanager
 def holding_claims() -> Iterator[None]:
-    """Within the block what `claim` takes is kept from other runs; at its end all is released."""
+    """Within the block what `claim` takes is kept from other runs, and files of `expect_new` replace none that others wrote since."""
     held: dict[Path, _Lock] = {}
-    token = _claims.set(held)
+    token, new = _claims.set(held), _expected_new.set(set())
     try:
         yield
     finally:
         _claims.reset(token)
+        _expected_new.reset(new)
         # The first one made the folders for the others.
         for lock in reversed(held.values()):
             lock.release()
@@ -131,8 +132,7 @@ def temporary_beside(target: Path) -> Path:
     The name holds the machine since its last start and the process, so that of another living run nothing is removed.
     """
     for left in target.parent.glob(f".{glob.escape(target.stem)}.*"):
-        found = _TEMPORARY.search(left.name, len(target.stem) + 1)
-        if found and found["machine"] == _machine() and not _is_alive(int(found["process"])):
+        if is_left_over(left):
             remove(left)
     return target.with_name(f".{target.stem}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
 
@@ -171,9 +171,14 @@ def put(temporary: Path, target: Path) -> bool:
         os.replace(temporary, target)
         return False
     try:
-        _rename_to_new(temporary, target)
+        os.link(temporary, target)  # a renaming would replace what is there
+        temporary.unlink()
     except FileExistsError:
         raise written_meanwhile(target) from None
+    except OSError:  # a file system without hard links
+        if target.exists():
+            raise written_meanwhile(target) from None
+        os.replace(temporary, target)
     expected_new.discard(target.resolve())
     return False
 
@@ -181,20 +186,6 @@ def put(temporary: Path, target: Path) -> bool:
 def written_meanwhile(target: Path) -> ConfigError:
     """Return the error for a target that another run wrote while this one worked."""
     return ConfigError(f"{target}: another run has written it meanwhile; choose another name or pass --overwrite")
-
-
-def _rename_to_new(temporary: Path, target: Path) -> None:
-    """Rename a file; raise `FileExistsError` when there is such a file, which a renaming would replace."""
-    try:
-        os.link(temporary, target)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without hard links
-        if target.exists():
-            raise FileExistsError from None
-        os.replace(temporary, target)
-    else:
-        temporary.unlink()
 
 
 @contextmanager
@@ -237,18 +228,8 @@ def place_all(files: Sequence[tuple[Path, Path]]) -> None:
         raise
 
 
-@contextmanager
-def refusing_to_replace() -> Iterator[None]:
-    """Within the block files of `expect_new` replace none that others wrote since."""
-    token = _expected_new.set(set())
-    try:
-        yield
-    finally:
-        _expected_new.reset(token)
-
-
 def expect_new(targets: Iterable[Path]) -> None:
-    """Remember that there are no such files yet, and that none may be replaced, within `refusing_to_replace`."""
+    """Remember that there are no such files yet, and that none may be replaced, within `holding_claims`."""
     expected = _expected_new.get()
     if expected is not None:
         expected.update(target.resolve() for target in targets)
@@ -310,7 +291,8 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
             elif isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise written_meanwhile(target) from None
             raise
-        for replaced in _earlier_copies(target):  # of runs that died before this line, too
+        # Also those of runs that died before this line.
+        for replaced in list(target.parent.glob(f".{glob.escape(target.name)}.{'[0-9a-f]' * 8}.old")):
             remove(replaced)
 
 
@@ -345,11 +327,6 @@ def unfinished_folder(temporary: Path, target: Path) -> Iterator[Path]:
         raise ConfigError(f"{target / inside}: cannot be written: {error.strerror or error}") from error
     finally:
         remove(temporary)
-
-
-def _earlier_copies(target: Path) -> list[Path]:
-    """Return what was at a target and made room for a new folder."""
-    return list(target.parent.glob(f".{glob.escape(target.name)}.{'[0-9a-f]' * 8}.old"))
 
 
 def _latest_in(folder: Path) -> Path:

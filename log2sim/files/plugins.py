@@ -52,7 +52,6 @@ FUNCTIONS = {
 
 DETECT = Call("detect(frame)", 1)
 DETECT_IN_CLOUD = Call("detect(cloud, earlier)", 2)
-POLICY = Call("policy(observation)", 1)
 
 
 def find_defect(kind: str, found: Any) -> str | None:
@@ -76,18 +75,14 @@ def require_members(found: Any, members: tuple[str, ...], call: Call, source: st
 
     Raises `PluginError` in one line that begins with `source`.
     """
-    defect = _find_member_defect(found, members, call)
-    if defect is not None:
-        raise PluginError(f"{source}: {defect}")
-
-
-def _find_member_defect(found: Any, members: tuple[str, ...], call: Call) -> str | None:
-    """Return which of its members an object lacks, or why its method `detect` cannot be called; None where nothing is wrong."""
     missing = [name for name in members if not hasattr(found, name)]
     if missing:
         lacking = ", ".join(repr(name) for name in missing)
-        return f"is a {type(found).__name__} without {lacking}; expected an object with {', '.join(members)}"
-    return find_call_defect(found.detect, call)
+        expected = f"expected an object with {', '.join(members)}"
+        raise PluginError(f"{source}: is a {type(found).__name__} without {lacking}; {expected}")
+    defect = find_call_defect(found.detect, call)
+    if defect is not None:
+        raise PluginError(f"{source}: {defect}")
 
 
 def find_call_defect(function: Callable[..., Any], call: Call) -> str | None:

@@ -55,21 +55,10 @@ class City:
 # The development kit states the origins as latitude and longitude (av2.geometry.utm); in UTM they are these multiples of 30 m,
 # to 0.07 m in Palo Alto and 0.03 m elsewhere.
 CITIES: Mapping[str, City] = {
-    "ATX": City(14, 621_150.0, 3_349_890.0),
-    "DTW": City(17, 320_670.0, 4_685_370.0),
-    "MIA": City(17, 580_560.0, 2_850_960.0),
-    "PAO": City(10, 576_480.0, 4_141_380.0),
-    "PIT": City(17, 583_710.0, 4_477_260.0),
-    "WDC": City(18, 323_460.0, 4_306_470.0),
-}
-
-
-def find_city(log: Path) -> str | None:
-    """Return the three letters of the city in the names of a log's map files; None without any."""
-    folder = log / "map"
-    names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    found = [match[1] for match in map(CITY_IN_NAME.search, names) if match]
-    return found[0] if found else None
+    "ATX": City(14, 621_150.0, 3_349_890.0), "DTW": City(17, 320_670.0, 4_685_370.0),
+    "MIA": City(17, 580_560.0, 2_850_960.0), "PAO": City(10, 576_480.0, 4_141_380.0),
+    "PIT": City(17, 583_710.0, 4_477_260.0), "WDC": City(18, 323_460.0, 4_306_470.0),
+}  # fmt: skip
 
 
 def map_frame_of(city: str | None, offset_m: tuple[float, float, float], notes: list[str]) -> MapFrame:
@@ -103,8 +92,7 @@ def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float
     city_T_ego = transforms_of(columns, path)
     if not len(city_T_ego):
         raise LogError(f"{path}: no poses; expected at least one")
-    keep, problems = strictly_increasing(columns["timestamp_ns"], path.name)
-    notes += problems
+    keep = strictly_increasing(columns["timestamp_ns"], path.name, notes)
     east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / OFFSET_STEP_M) * OFFSET_STEP_M)
     map_T_ego = shift_poses(city_T_ego[keep], np.array([east, north, 0.0]))
     return PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
@@ -140,13 +128,8 @@ def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
 LIDARS = {"up_lidar": 0, "down_lidar": 32}
 LASERS = 32
 COLUMNS: dict[str, Kind] = {
-    "x": "float",
-    "y": "float",
-    "z": "float",
-    "laser_number": "int",
-    "offset_ns": "int",
-    "intensity": "float",
-}
+    "x": "float", "y": "float", "z": "float", "laser_number": "int", "offset_ns": "int", "intensity": "float",
+}  # fmt: skip
 OPTIONAL = ("intensity",)
 SWEEP_LIMITS = TableLimits(rows=MAX_SWEEP_POINTS, file_bytes=MAX_SWEEP_BYTES, unpacked_bytes=MAX_SWEEP_BYTES)
 # A sweep lasts 0.1 s, those of both LiDARs together 0.106 s in the sample log.
@@ -199,27 +182,12 @@ LABEL_COLUMNS: dict[str, Kind] = {
 
 # By the taxonomy of the data set's user guide.
 CATEGORY_OF = {
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "motorcycle",
-    "BICYCLE": "bicycle",
-    "BICYCLIST": "cyclist",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "VEHICULAR_TRAILER": "other",
-    "RAILED_VEHICLE": "other",
-    "WHEELED_DEVICE": "other",
-    "WHEELED_RIDER": "other",
-    "WHEELCHAIR": "other",
-    "STROLLER": "other",
-}
+    "REGULAR_VEHICLE": "car", "LARGE_VEHICLE": "truck", "BOX_TRUCK": "truck", "TRUCK": "truck", "TRUCK_CAB": "truck",
+    "BUS": "bus", "SCHOOL_BUS": "bus", "ARTICULATED_BUS": "bus", "MOTORCYCLE": "motorcycle",
+    "MOTORCYCLIST": "motorcycle", "BICYCLE": "bicycle", "BICYCLIST": "cyclist", "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian", "VEHICULAR_TRAILER": "other", "RAILED_VEHICLE": "other",
+    "WHEELED_DEVICE": "other", "WHEELED_RIDER": "other", "WHEELCHAIR": "other", "STROLLER": "other",
+}  # fmt: skip
 NO_ROAD_USERS = {
     "BOLLARD", "CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STOP_SIGN", "SIGN", "MOBILE_PEDESTRIAN_SIGN",
     "MOBILE_PEDESTRIAN_CROSSING_SIGN", "MESSAGE_BOARD_TRAILER", "TRAFFIC_LIGHT_TRAILER", "DOG", "ANIMAL",
@@ -411,7 +379,11 @@ class _Folder:
         streams |= sweeps
         if not streams:
             raise LogError(f"{self.path / 'sensors'}: neither sweeps nor images; expected lidar/STAMP.feather")
-        city = find_city(self.path)
+        # Three letters in the names of the map files.
+        folder = self.path / "map"
+        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+        found = [match[1] for match in map(CITY_IN_NAME.search, names) if match]
+        city = found[0] if found else None
         map_frame = map_frame_of(city, offset_m, notes)
         notes.append("stamps count from an unknown moment: only their differences are known")
         upper_lidar_xy = mounts.get("up_lidar", np.eye(4))[:2, 3]

@@ -53,27 +53,23 @@ def declared_size(data: bytes) -> tuple[int, int]:
         start = len(data) - 10 - length
         if length <= 0 or start < 8:
             raise ValueError("the footer of the Arrow file is damaged")
-        return _sum_blocks(data, start)
+        footer = _indirect(data, start)
+        rows = size = buffers = 0
+        for field in (FOOTER_DICTIONARIES, FOOTER_BATCHES):
+            for place in _vector(data, footer, field, BLOCK.size):
+                offset, message_bytes, _ = BLOCK.unpack_from(data, place)
+                batch = _batch(data, offset)
+                places = _vector(data, batch, BATCH_BUFFERS, BUFFER.size)
+                buffers += len(places) + 1
+                if buffers > MAX_BUFFERS:
+                    raise ValueError(f"more than the {MAX_BUFFERS} buffers that an Arrow file may have")
+                packed = bool(_field(data, batch, BATCH_COMPRESSION))
+                size += sum(_unpacked_bytes(data, offset + message_bytes, p, packed) for p in places)
+                at = _field(data, batch, BATCH_LENGTH)
+                rows += struct.unpack_from("<q", data, at)[0] if at and field == FOOTER_BATCHES else 0
+        return rows, size
     except struct.error:
         raise ValueError("the structure of the Arrow file is damaged") from None
-
-
-def _sum_blocks(data: bytes, start: int) -> tuple[int, int]:
-    footer = _indirect(data, start)
-    rows = size = buffers = 0
-    for field in (FOOTER_DICTIONARIES, FOOTER_BATCHES):
-        for place in _vector(data, footer, field, BLOCK.size):
-            offset, message_bytes, _ = BLOCK.unpack_from(data, place)
-            batch = _batch(data, offset)
-            places = _vector(data, batch, BATCH_BUFFERS, BUFFER.size)
-            buffers += len(places) + 1
-            if buffers > MAX_BUFFERS:
-                raise ValueError(f"more than the {MAX_BUFFERS} buffers that an Arrow file may have")
-            packed = bool(_field(data, batch, BATCH_COMPRESSION))
-            size += sum(_unpacked_bytes(data, offset + message_bytes, p, packed) for p in places)
-            at = _field(data, batch, BATCH_LENGTH)
-            rows += struct.unpack_from("<q", data, at)[0] if at and field == FOOTER_BATCHES else 0
-    return rows, size
 
 
 def _unpacked_bytes(data: bytes, body: int, place: int, packed: bool) -> int:
@@ -267,7 +263,15 @@ def read_columns(
     pyarrow is not installed.
     """
     with translate_errors(path, error):
-        table = _read_table(path, wanted, optional, limits)
+        with open_regular(path) as file:
+            magic = file.read(len(ARROW_MAGIC))
+        if magic.startswith(PARQUET_MAGIC):
+            table = _read_parquet(path, wanted, optional, limits)
+        elif magic == ARROW_MAGIC:
+            table = _read_feather(path, wanted, optional, limits)
+        else:
+            raise ValueError("neither an Arrow (feather, version 2) nor a parquet file")
+        table.validate(full=True)
         return {name: _values(table.column(name), name, wanted[name]) for name in wanted if name in table.column_names}
 
 
@@ -317,20 +321,6 @@ def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection
         if extension or isinstance(field.type, pyarrow.BaseExtensionType):
             raise ValueError(f"column '{field.name}' is of the extension type {field.type}, expected a plain type")
     return chosen
-
-
-def _read_table(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
-    """Read the wanted columns as a pyarrow table whose offsets were validated."""
-    with open_regular(path) as file:
-        magic = file.read(len(ARROW_MAGIC))
-    if magic.startswith(PARQUET_MAGIC):
-        table = _read_parquet(path, wanted, optional, limits)
-    elif magic == ARROW_MAGIC:
-        table = _read_feather(path, wanted, optional, limits)
-    else:
-        raise ValueError("neither an Arrow (feather, version 2) nor a parquet file")
-    table.validate(full=True)
-    return table
 
 
 def _read_parquet(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels, Log
 from log2sim.geometry import NS_PER_S, Camera, Mount, fold_radius, nearest_index, undistort
 from log2sim.geometry.transforms import Array
-from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of
+from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of, take_labels
 from log2sim.logs.records import MAX_POSITION_M
 
 # As a scenario may state; a freight train is not longer.
 MAX_SIZE_M = 1000.0
-_ROWS = ("t_ns", "track_id", "category", "center_m", "size_m", "yaw_rad", "visible", "kind", "occlusion")
 
 
 def find_possible(labels: Labels) -> NDArray[np.bool_]:
@@ -38,9 +36,7 @@ def without_impossible_labels(log: Log) -> Log:
         possible = find_possible(labels)
         if possible.all():
             return labels, 0
-        rows: dict[str, Any] = {name: getattr(labels, name) for name in _ROWS}
-        kept: dict[str, Any] = {name: None if column is None else column[possible] for name, column in rows.items()}
-        return replace(labels, **kept), int((~possible).sum())
+        return take_labels(labels, possible), int((~possible).sum())
 
     def notes() -> tuple[str, ...]:
         count = checked()[1]
@@ -87,8 +83,7 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
     camera = log.cameras.get(name)
     if camera is not None:
         where = f"{place}, camera '{name}'"
-        yield from _focal_lengths(camera, where)
-        yield from _principal_point(camera, where)
+        yield from _pinhole(camera, where)
         yield from _distortion(camera, where)
         yield from _mount(camera.mount, camera.mount_T_cam, where)
     elif name in log.lidars:
@@ -96,7 +91,7 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
         yield from _mount(lidar.mount, lidar.mount_T_lidar, f"{place}, LiDAR '{name}'")
 
 
-def _focal_lengths(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     for field, value_px in (("fx", camera.K[0, 0]), ("fy", camera.K[1, 1])):
         widths = float(value_px) / camera.width_px
         if not MIN_FOCAL_WIDTHS <= widths <= MAX_FOCAL_WIDTHS:
@@ -105,9 +100,6 @@ def _focal_lengths(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
                 f"{MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the size of the images",
                 True,
             )
-
-
-def _principal_point(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     limit = np.tan(np.radians(MAX_RAY_DEGREES))
     for field, axis, size_px in (("cx", 0, camera.width_px), ("cy", 1, camera.height_px)):
         value_px = float(camera.K[axis, 2])

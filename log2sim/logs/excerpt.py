@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from log2sim.errors import ConfigError
 from log2sim.files.documents import rounded
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, PoseTrack
+
+B = TypeVar("B", ImageLabels, ImageRegions)
 
 # Beyond the first and the last tick, so that each still finds its nearest sweep, which may be a turn of 10 Hz away.
 RECORD_MARGIN_NS = 200_000_000
@@ -64,24 +66,17 @@ def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = No
         notes = [f"{name}: no record from --start to --stop" for name, s in streams.items() if not len(s.t_ns)]
         streams = {name: stream for name, stream in streams.items() if len(stream.t_ns)}
     kept = {name: chosen[name] for name in chosen if name in streams}
-    return Log(
-        name=log.name,
-        format=log.format,
+    return log.changed(
         cameras=kept,
         lidars={name: lidar for name, lidar in log.lidars.items() if name in streams},
         streams=streams,
         ego=log.ego if log.ego is None or span is None else _cut_poses(log.ego, span),
-        ego_vehicle=log.ego_vehicle,
-        map=log.map,
         labels=lambda: _cut_labels(log.labels, list(kept), span),
-        image_labels={n: _cut_image_labels(b, span, margins[n]) for n, b in log.image_labels.items() if n in kept},
-        ignored_regions={n: _cut_regions(r, span, margins[n]) for n, r in log.ignored_regions.items() if n in kept},
-        ground_z_ego_m=log.ground_z_ego_m,
+        image_labels={n: _cut_boxes(b, span, margins[n]) for n, b in log.image_labels.items() if n in kept},
+        ignored_regions={n: _cut_boxes(r, span, margins[n]) for n, r in log.ignored_regions.items() if n in kept},
         reference_camera=log.reference_camera if log.reference_camera in kept else None,
         digest=hashlib.sha256(f"{log.digest} {sorted(streams)} {span}".encode()).hexdigest(),
         notes=lambda: (*log.notes, *notes),
-        calibrations=log.calibrations,
-        details=log.details,
     )
 
 
@@ -104,17 +99,9 @@ def _span(ticks: NDArray[np.int64], reference: str, start_s: float | None, stop_
 
 def _cut_stream(stream: Stream, span: _Span, margin_ns: int) -> Stream:
     rows = np.flatnonzero(span.contains(stream.t_ns, margin_ns)).tolist()
-    encoded = stream.encoded
-    return Stream(
-        stream.name,
-        stream.t_ns[rows],
-        _shifted(stream.read, rows),
-        None if encoded is None else _shifted(encoded, rows),
-    )
-
-
-def _shifted(read: Callable[[int], Any], rows: list[int]) -> Callable[[int], Any]:
-    return lambda i: read(rows[i])
+    read, encoded = stream.read, stream.encoded
+    files = None if encoded is None else lambda i: encoded(rows[i])
+    return Stream(stream.name, stream.t_ns[rows], lambda i: read(rows[i]), files)
 
 
 def _cut_poses(track: PoseTrack, span: _Span) -> PoseTrack:
@@ -139,15 +126,16 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
     labeled = labels.labeled_ns
     if labeled is not None:
         labeled = labeled[_with_neighbors(labeled, np.arange(len(labeled)), span)]
-    optional = ("cameras", "labeled_ns", "never_labeled")
+    return replace(take_labels(labels, keep), cameras=labeled_cameras, labeled_ns=labeled)
+
+
+def take_labels(labels: Labels, rows: NDArray[Any]) -> Labels:
+    """Select rows of labels."""
+    of_all = ("cameras", "labeled_ns", "never_labeled")
     columns: dict[str, Any] = {
-        name: column if column is None else column[keep]
-        for name, column in vars(labels).items()
-        if name not in optional
+        name: v[rows] for name, v in vars(labels).items() if name not in of_all and v is not None
     }
-    return Labels(
-        **{**columns, "cameras": labeled_cameras, "labeled_ns": labeled, "never_labeled": labels.never_labeled}
-    )
+    return replace(labels, **columns)
 
 
 def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:
@@ -163,20 +151,12 @@ def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span
     return mark
 
 
-def _cut_image_labels(labels: ImageLabels, span: _Span | None, margin_ns: int) -> ImageLabels:
-    """Keep the boxes of the frames that are kept."""
+def _cut_boxes(boxes: B, span: _Span | None, margin_ns: int) -> B:
+    """Keep the boxes or regions of the frames that are kept."""
     if span is None:
-        return labels
-    rows = span.contains(labels.t_ns, margin_ns + STAMP_TOLERANCE_NS)
-    return ImageLabels(labels.t_ns[rows], labels.box_px[rows], labels.category[rows])
-
-
-def _cut_regions(regions: ImageRegions, span: _Span | None, margin_ns: int) -> ImageRegions:
-    """Keep the regions of the frames that are kept."""
-    if span is None:
-        return regions
-    rows = span.contains(regions.t_ns, margin_ns + STAMP_TOLERANCE_NS)
-    return ImageRegions(regions.t_ns[rows], regions.box_px[rows])
+        return boxes
+    rows = span.contains(boxes.t_ns, margin_ns + STAMP_TOLERANCE_NS)
+    return replace(boxes, **{name: column[rows] for name, column in vars(boxes).items()})
 
 
 def digest_of(texts: Iterable[str], files: Iterable[Path]) -> str:

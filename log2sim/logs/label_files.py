@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, ImageRegions, Labels, Log
 from log2sim.errors import LogError
@@ -102,7 +101,16 @@ def _labels_of(log: Log, path: Path, boxes: Iterator[_Box], notes: list[str]) ->
         if frame == "map":
             map_T_box[rows, :3, 3] -= np.array(log.map.offset_m)
             continue
-        map_T_frame, known[rows] = _frame_poses(log, str(frame), t_ns[rows], found[rows[0]].where)
+        where = found[rows[0]].where
+        if frame == "ego":
+            if log.ego is None:
+                raise LogError(f"{where}: is in the frame of the ego, and the log has none; state boxes in the map")
+            map_T_frame, known[rows] = log.ego.at(t_ns[rows])
+        elif frame in log.cameras or frame in log.lidars:
+            map_T_frame, known[rows] = log.map_T_sensor(str(frame), t_ns[rows])
+        else:
+            there = ", ".join(["map", "ego", *log.cameras, *log.lidars])
+            raise LogError(f"{where}: coordinate system '{frame}' is not known; known: {there}")
         map_T_box[rows] = map_T_frame @ map_T_box[rows]
     if not known.all():
         notes.append(f"{int((~known).sum())} labels left out: the pose is not known at their time")
@@ -116,18 +124,6 @@ def _labels_of(log: Log, path: Path, boxes: Iterator[_Box], notes: list[str]) ->
         kind=np.array([box.word for box in found])[known],
         labeled_ns=np.unique(t_ns),
     )
-
-
-def _frame_poses(log: Log, frame: str, t_ns: NDArray[np.int64], where: str) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the poses (N, 4, 4) of the ego or of a sensor, and where they are known (N,)."""
-    if frame == "ego":
-        if log.ego is None:
-            raise LogError(f"{where}: is in the frame of the ego, and the log has none; state boxes in the map")
-        return log.ego.at(t_ns)
-    if frame not in log.cameras and frame not in log.lidars:
-        known = ", ".join(["map", "ego", *log.cameras, *log.lidars])
-        raise LogError(f"{where}: coordinate system '{frame}' is not known; known: {known}")
-    return log.map_T_sensor(frame, t_ns)
 
 
 def _kitti_labels(log: Log, path: Path, notes: list[str]) -> tuple[Labels, dict[str, ImageRegions]]:
@@ -172,7 +168,12 @@ def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
         if not isinstance(results, dict) or not all(isinstance(boxes, list) for boxes in results.values()):
             raise LogError(f"{path}: JSON of no known kind of boxes; expected {EXPECTED}")
         entries = [{"sample_token": t, **b} for t, boxes in results.items() for b in boxes if isinstance(b, dict)]
-    tables = {name: _by_token(path.parent / f"{name}.json") for name in ("sample", "instance", "category")}
+    tables: dict[str, dict[str, Any]] = {}
+    for name in ("sample", "instance", "category"):
+        file = path.parent / f"{name}.json"
+        table = read_json(file) if file.is_file() else []
+        rows = table if isinstance(table, list) else []
+        tables[name] = {str(row.get("token")): row for row in rows if isinstance(row, dict)}
     for k, entry in enumerate(entries):
         where = f"{path}, box {k}"
         if not isinstance(entry, dict):
@@ -200,15 +201,6 @@ def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
         rotation = rotation_from_quaternion(_unit(_numbers(entry.get("rotation"), (4,), f"{where}, rotation"), where))
         pose = transform(rotation, _numbers(entry.get("translation"), (3,), f"{where}, translation"))
         yield _Box(where, _stamp_ns(stamp, log, where), str(track), str(word), pose, (length, width, height))
-
-
-def _by_token(path: Path) -> dict[str, dict[str, Any]]:
-    """Read a table of nuScenes by its tokens; empty where the file is absent."""
-    if not path.is_file():
-        return {}
-    table = read_json(path)
-    rows = table if isinstance(table, list) else []
-    return {str(row.get("token")): row for row in rows if isinstance(row, dict)}
 
 
 def _openlabel_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -134,9 +133,9 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
     if not root.exists():
         raise LogError(f"{root}: no such folder; give the folder of a log, or its file")
     # Once: each asks which distributions are installed.
-    usable = _usable_readers() if format == "auto" else None
-    name = format if usable is None else _find_reader(root, usable)
-    reader: Reader = plugins.load("log", name) if usable is None else usable.readers[name]
+    readers, defects = _usable_readers() if format == "auto" else ({}, [])
+    name = format if format != "auto" else _find_reader(root, readers, defects)
+    reader: Reader = plugins.load("log", name) if format != "auto" else readers[name]
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     with plugins.blaming("log", name):
@@ -147,22 +146,25 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
             opened = reader.open(root, chosen)
         plugins.require_type("log", name, opened, Log)
         log = without_impossible_labels(guard_log(opened, str(root)))
-    notes = [] if usable is None else [*_other_formats_note(root, name, usable.readers), *usable.defects]
+    notes = list(defects)
+    if format == "auto" and root.is_dir():  # of downloads, perhaps
+        others = [other for other, some in readers.items() if other != name and _seems_to_match(other, some, root)]
+        if others:
+            notes.insert(0, f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one")
     # Notes may wait for labels.
     return log.changed(notes=lambda: (*notes, *log.notes, *list_calibration_problems(log), *list_time_problems(log)))
 
 
 def find_reader(root: Path) -> str:
     """Name of the reader that matches a folder or file; `LogError` when none does."""
-    return _find_reader(root, _usable_readers())
+    return _find_reader(root, *_usable_readers())
 
 
-def _find_reader(root: Path, usable: _UsableReaders) -> str:
-    readers = usable.readers
+def _find_reader(root: Path, readers: Mapping[str, Reader], defects: list[str]) -> str:
     for name, reader in readers.items():
         if _matches(name, reader, root):
             return name
-    broken = "".join(f"; {defect}" for defect in usable.defects)
+    broken = "".join(f"; {defect}" for defect in defects)
     if root.is_file():
         suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
         raise LogError(
@@ -178,15 +180,7 @@ def _find_reader(root: Path, usable: _UsableReaders) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _UsableReaders:
-    """All readers by name but those of other packages that cannot be used, and what is wrong with these."""
-
-    readers: Mapping[str, Reader]
-    defects: list[str]
-
-
-def _usable_readers() -> _UsableReaders:
+def _usable_readers() -> tuple[dict[str, Reader], list[str]]:
     """Load all readers; a broken plug-in is told, and does not keep logs of other formats from being opened."""
     readers: dict[str, Reader] = {}
     defects = []
@@ -195,7 +189,7 @@ def _usable_readers() -> _UsableReaders:
             readers[name] = plugins.load("log", name)
         except PluginError as error:
             defects.append(str(error))
-    return _UsableReaders(readers, defects)
+    return readers, defects
 
 
 def _matches(name: str, reader: Reader, root: Path) -> bool:
@@ -210,14 +204,6 @@ def _seems_to_match(name: str, reader: Reader, root: Path) -> bool:
         return _matches(name, reader, root)
     except PluginError:
         return False
-
-
-def _other_formats_note(root: Path, name: str, readers: Mapping[str, Reader]) -> list[str]:
-    """Say of which further formats a folder holds logs, as a folder of downloads may; nothing where there are none."""
-    if root.is_file():
-        return []
-    others = [other for other, reader in readers.items() if other != name and _seems_to_match(other, reader, root)]
-    return [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []
 
 
 def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:
@@ -239,7 +225,7 @@ def _logs_below(root: Path) -> list[str]:
 
 def is_log_file(path: Path) -> bool:
     """Return whether a file has a suffix of a format of which a file is a log."""
-    return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers().readers.values())
+    return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers()[0].values())
 
 
 def _may_read(reader: Reader, root: Path) -> bool:

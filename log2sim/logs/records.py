@@ -11,8 +11,9 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, Literal, TypeVar
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,6 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.name.lower().endswith(suffixes))
 
 
-T = TypeVar("T")
 MAX_REASON_CHARACTERS = 300
 
 
@@ -94,59 +94,44 @@ def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]
 
 
 def guard_log(log: Log, where: str) -> Log:
-    """Return the log with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
+    """Return the log of a reader with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
 
-    `log`: as a reader returns it. `where`: its path, for errors. Raises `LogError` for poses of the ego that are not
-    finite, or farther from the origin of the map than any place on Earth.
+    `where`: its path, for errors. Raises `LogError` for poses of the ego that are not finite, or farther from the origin of
+    the map than any place on Earth.
     """
-    _require_possible_poses(log, where)
+    if log.ego is not None:
+        wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
+        if len(wrong):
+            position = ", ".join(f"{v:.6g}" for v in log.ego.map_T_ego[wrong[0], :3, 3])
+            raise LogError(
+                f"{where}: the position of the ego at stamp {log.ego.t_ns[wrong[0]]} is {position}, expected finite numbers up to "
+                f"{MAX_POSITION_M:g} m; {len(wrong)} of {len(log.ego.t_ns)} poses are so"
+            )
+
+    def guarded(read: Callable[[], Any], what: str) -> Callable[[], Any]:
+        def reading() -> Any:
+            with translate_parser_errors(f"{where}: {what}", LogError):
+                return read()
+
+        return reading
+
+    def guarded_stream(stream: Stream) -> Stream:
+        def record(read: Callable[[int], Any], i: int) -> Any:
+            with translate_parser_errors(f"{where}: record {i} of '{stream.name}' cannot be read", RecordError):
+                return read(i)
+
+        stamps = guarded(lambda: stream.t_ns, f"the stamps of '{stream.name}' cannot be read")
+        encoded = None if stream.encoded is None else partial(record, stream.encoded)
+        return Stream(stream.name, stamps, partial(record, stream.read), encoded)
+
     return log.changed(
-        streams={name: _guarded_stream(stream, where) for name, stream in log.streams.items()},
-        labels=_guarded(lambda: log.labels, f"{where}: the labels cannot be read"),
-        notes=_guarded(lambda: log.notes, f"{where}: cannot be read"),
+        streams={name: guarded_stream(stream) for name, stream in log.streams.items()},
+        labels=guarded(lambda: log.labels, "the labels cannot be read"),
+        notes=guarded(lambda: log.notes, "cannot be read"),
     )
 
 
-def _require_possible_poses(log: Log, where: str) -> None:
-    if log.ego is None:
-        return
-    wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
-    if len(wrong):
-        position = ", ".join(f"{v:.6g}" for v in log.ego.map_T_ego[wrong[0], :3, 3])
-        raise LogError(
-            f"{where}: the position of the ego at stamp {log.ego.t_ns[wrong[0]]} is {position}, expected finite numbers up to "
-            f"{MAX_POSITION_M:g} m; {len(wrong)} of {len(log.ego.t_ns)} poses are so"
-        )
-
-
-def _guarded_stream(stream: Stream, where: str) -> Stream:
-    """Return a stream whose records are returned or raise `RecordError`."""
-    stamps = _guarded(lambda: stream.t_ns, f"{where}: the stamps of '{stream.name}' cannot be read")
-    encoded = stream.encoded
-    return Stream(
-        stream.name,
-        stamps,
-        _guarded_record(stream, stream.read, where),
-        None if encoded is None else _guarded_record(stream, encoded, where),
-    )
-
-
-def _guarded_record(stream: Stream, read: Callable[[int], T], where: str) -> Callable[[int], T]:
-    def guarded(i: int) -> T:
-        with translate_parser_errors(f"{where}: record {i} of '{stream.name}' cannot be read", RecordError):
-            return read(i)
-
-    return guarded
-
-
-def _guarded(read: Callable[[], Any], where: str) -> Callable[[], Any]:
-    def guarded() -> Any:
-        with translate_parser_errors(where, LogError):
-            return read()
-
-    return guarded
-
-
+JPEG_MAGIC = b"\xff\xd8"
 MAX_IMAGE_PX = 100_000_000
 MAX_IMAGE_BYTES = 256 * 1024 * 1024
 
@@ -162,16 +147,42 @@ def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[n
     `where`: names file and stamp in errors. `size_px` (int, int): width and height that the calibration is for. Raises
     `RecordError` when it is truncated, no JPEG or PNG, or of another size.
     """
-    jpeg = data[:2] == b"\xff\xd8"
     width, height = image_size(data, where)
     if (width, height) != size_px:
         raise RecordError(f"{where}: {width}x{height} px, the calibration is for {size_px[0]}x{size_px[1]}")
-    return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
+    if data[:2] == JPEG_MAGIC:
+        import simplejpeg
+
+        try:
+            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="BGR"))
+        except ValueError as error:
+            raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
+    import cv2
+
+    # OpenCV returns the upper part of a truncated PNG as if it were whole.
+    if b"IEND" not in data[-64:]:
+        raise RecordError(f"{where}: PNG is truncated")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise RecordError(f"{where}: PNG cannot be decoded")
+    return image.astype(np.uint8, copy=False)
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
     """Return width and height in px of a JPEG or PNG file from its header; `RecordError` for anything else, also for an impossible size."""
-    width, height = _jpeg_size(data, where) if data[:2] == b"\xff\xd8" else _png_size(data, where)
+    if data[:2] == JPEG_MAGIC:
+        import simplejpeg
+
+        try:
+            height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+        except ValueError as error:
+            raise RecordError(f"{where}: not a readable JPEG: {error}") from None
+    elif data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
+        raise RecordError(f"{where}: neither a JPEG nor a PNG image")
+    elif zlib.crc32(data[12:29]) != int.from_bytes(data[29:33], "big"):
+        raise RecordError(f"{where}: the check sum of the PNG header is wrong")
+    else:
+        width, height = struct.unpack(">II", data[16:24])
     if not 0 < width * height <= MAX_IMAGE_PX:
         raise RecordError(f"{where}: {width}x{height} px, expected 1 to {MAX_IMAGE_PX} px")
     return width, height
@@ -215,46 +226,6 @@ def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:
     """Read the file of one record; `RecordError` when it is missing, no regular file or larger than `limit_bytes`."""
     missing = "cannot be read: No such file or directory"
     return read_file(path, limit_bytes, RecordError, where=f"{path} (stamp {t_ns})", missing=missing)
-
-
-def _jpeg_size(data: bytes, where: str) -> tuple[int, int]:
-    import simplejpeg
-
-    try:
-        height, width, _, _ = simplejpeg.decode_jpeg_header(data)
-    except ValueError as error:
-        raise RecordError(f"{where}: not a readable JPEG: {error}") from None
-    return width, height
-
-
-def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
-    import simplejpeg
-
-    try:
-        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="BGR")
-        return image
-    except ValueError as error:
-        raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
-
-
-def _png_size(data: bytes, where: str) -> tuple[int, int]:
-    if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
-        raise RecordError(f"{where}: neither a JPEG nor a PNG image")
-    if zlib.crc32(data[12:29]) != int.from_bytes(data[29:33], "big"):
-        raise RecordError(f"{where}: the check sum of the PNG header is wrong")
-    return struct.unpack(">II", data[16:24])
-
-
-def _decode_png(data: bytes, where: str) -> NDArray[np.uint8]:
-    import cv2
-
-    # OpenCV returns the upper part of a truncated PNG as if it were whole.
-    if b"IEND" not in data[-64:]:
-        raise RecordError(f"{where}: PNG is truncated")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise RecordError(f"{where}: PNG cannot be decoded")
-    return image.astype(np.uint8, copy=False)
 
 
 MAX_HEADER_BYTES = 16 * 1024

@@ -82,15 +82,13 @@ def checked_offset_ns(t_ns: NDArray[np.number], stamp_ns: int = 0) -> NDArray[np
     return t_ns.astype(np.int64) - stamp_ns
 
 
-def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:
-    """Select and sort rows so that their stamps strictly increase.
+def strictly_increasing(t_ns: NDArray[np.int64], what: str, notes: list[str]) -> NDArray[np.intp]:
+    """Select rows (M,) of stamps (N,), sorted so that they strictly increase; of several rows with one stamp the first.
 
-    `t_ns` (N,) int64. `what`: names the records in notes. Returns `rows` (M,) int: sorted by stamp; of several rows
-    with one stamp the first. Rows are left out whose stamps are farther than `MAX_DISTANCE_NS` from the middle one: a
-    single stamp of 0 would make a log of decades; `notes`: remarks on wrong, unsorted and repeated stamps.
+    Rows are left out whose stamps are farther than `MAX_DISTANCE_NS` from the middle one: a single stamp of 0 would make a
+    log of decades. `notes` takes remarks on wrong, unsorted and repeated stamps; `what` names the records in them.
     """
     order = np.argsort(t_ns, kind="stable")
-    notes = []
     # As floats: differences of int64 may overflow.
     distance_ns = np.abs(t_ns.astype(np.float64) - float(t_ns[order[len(order) // 2]])) if len(order) else np.zeros(0)
     far = distance_ns > MAX_DISTANCE_NS
@@ -99,8 +97,7 @@ def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.
             f"{what}: {int(far.sum())} of {len(t_ns)} records have stamps more than {MAX_DISTANCE_NS // NS_PER_S} s off the others, "
             f"first {t_ns[far][0]}; left out"
         )
-        rows, others = strictly_increasing(t_ns[~far], what)
-        return np.flatnonzero(~far)[rows], notes + others
+        return np.flatnonzero(~far)[strictly_increasing(t_ns[~far], what, notes)]
     late = np.flatnonzero(t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]) + 1
     if len(late):
         notes.append(f"{what}: {len(late)} of {len(t_ns)} records out of order, first at stamp {t_ns[late[0]]}; sorted")
@@ -108,7 +105,7 @@ def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.
     if len(repeated):
         first = t_ns[order[repeated[0]]]
         notes.append(f"{what}: {len(repeated)} of {len(t_ns)} records repeat a stamp, first at stamp {first}; dropped")
-    return np.delete(order, repeated), notes
+    return np.delete(order, repeated)
 
 
 def compute_turn_share(xy_lidar: Array, start_azimuth_rad: float = np.pi) -> Array:

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from log2sim.datatypes.color_names import name_indices, odds_of_names
-from log2sim.geometry import Array
+from log2sim.geometry import Array, weighted_quantile
 from log2sim.road.colors import (
     WHITEST_L,
     Look,
@@ -34,7 +34,6 @@ from log2sim.road.colors import (
     find_paint,
     lab_of_linear,
     linear_of_lab,
-    weighted_quantile,
 )
 from log2sim.road.light import (
     CAMERA_EXPOSURE_SIGMA,

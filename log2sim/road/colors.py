@@ -20,7 +20,17 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import COLOR_NAMES, AgentTable, Log, Scenario
 from log2sim.datatypes.color_names import name_probabilities, to_rgb
-from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera, inverse, line_time_s, project, undistort
+from log2sim.geometry import (
+    MIN_DEPTH_M,
+    NS_PER_S,
+    Array,
+    Camera,
+    inverse,
+    line_time_s,
+    project,
+    undistort,
+    weighted_quantile,
+)
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 from log2sim.road.light import (
     MIRRORED_SIGMA,
@@ -141,13 +151,6 @@ def _mode(values: Array, weight: Array) -> float:
     level = steps[int(np.argmax(kernel @ weight))]
     near = np.abs(values - level) <= LIGHTNESS_BANDWIDTH
     return weighted_quantile(values[near], weight[near], 0.5)
-
-
-def weighted_quantile(values: Array, weight: Array, share: float) -> float:
-    """Return the value below which a share of the weights lies."""
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order][min(int(np.searchsorted(total, share * total[-1])), len(values) - 1)])
 
 
 # Half of the errors of light are common to all looks: the same road, the same camera.

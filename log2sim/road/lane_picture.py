@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Marking, RoadBorder
-from log2sim.geometry import Array, Camera, apply, inverse, project
+from log2sim.geometry import Array, Camera, apply, inverse, project, weighted_quantile
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.markings import list_markings
 from log2sim.road.pictures import Image, View, sample_at, warp_onto
@@ -472,14 +472,8 @@ def _robust_line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
     i, j = np.triu_indices(len(x), 1)
     apart = np.abs(x[i] - x[j]) >= MIN_APART_M
     i, j = i[apart], j[apart]
-    slope = _weighted_median((y[i] - y[j]) / (x[i] - x[j]), weight[i] * weight[j] * np.abs(x[i] - x[j]))
-    return slope, _weighted_median(y - slope * x, weight)
-
-
-def _weighted_median(values: Array, weight: Array) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+    slope = weighted_quantile((y[i] - y[j]) / (x[i] - x[j]), weight[i] * weight[j] * np.abs(x[i] - x[j]), 0.5)
+    return slope, weighted_quantile(y - slope * x, weight, 0.5)
 
 
 def _offset_and_slope(points: Array) -> tuple[float, float, float] | None:

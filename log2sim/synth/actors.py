@@ -124,13 +124,6 @@ class EgoMotion:
         return self.map_T_ego((np.asarray(t_ns, np.int64) - self._start_ns) / NS_PER_S)
 
 
-def _ego_body(ego: Ego, motion: EgoMotion) -> Actor:
-    # The id "ego" is refused in scene files, so nothing is validated here.
-    spec = AgentSpec.model_construct(id="ego", category="car", size_m=ego.size_m, color=EGO_COLOR, shape="sedan")
-    appearance = Appearance("car", ego.size_m, EGO_COLOR, "sedan")
-    return Actor(spec, appearance, motion.path, offset_m=ego.rear_axle_offset_m)
-
-
 @dataclass(frozen=True, eq=False)
 class MovingScene:
     """A scene with the motion of everything in it."""
@@ -144,7 +137,12 @@ class MovingScene:
     def of(cls, scene: Scene) -> MovingScene:
         """Set a scene in motion."""
         motion = None if scene.ego is None else EgoMotion(scene.ego, scene.start_ns)
-        body = None if scene.ego is None or motion is None else _ego_body(scene.ego, motion)
+        body = None
+        if scene.ego is not None and motion is not None:
+            # The id "ego" is refused in scene files, so nothing is validated here.
+            size, offset_m = scene.ego.size_m, scene.ego.rear_axle_offset_m
+            spec = AgentSpec.model_construct(id="ego", category="car", size_m=size, color=EGO_COLOR, shape="sedan")
+            body = Actor(spec, Appearance("car", size, EGO_COLOR, "sedan"), motion.path, offset_m=offset_m)
         return cls(scene, motion, actors_of(scene), body)
 
     def map_T_mount(self, mount: Mount, t_ns: NDArray[np.int64]) -> Array:

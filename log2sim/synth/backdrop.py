@@ -130,19 +130,34 @@ class Wall:
     @cached_property
     def texture(self) -> tuple[NDArray[np.uint8], ...]:
         """Images (H, W, 3), sRGB as BGR, the first row at the ground, in pixels of `FACADE_M_PER_PX`, then ever twice as large."""
-        return _pyramid(_facade(self.length_m, self.height_m, self.color, self.seed))
+        levels = [_facade(self.length_m, self.height_m, self.color, self.seed)]
+        while len(levels) < FACADE_LEVELS and min(levels[-1].shape[:2]) >= 8:
+            levels.append(
+                np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+            )
+        return tuple(levels)
 
 
+@dataclass(frozen=True, eq=False)
 class Backdrop:
-    """The ground and the facades of a scene, painted when and where they are looked at."""
+    """The static parts of a scene: the ground and facades, painted when and where they are looked at."""
 
-    def __init__(self, scene: Scene, seed: int) -> None:
-        self.terrain: Terrain | None = None  # level
-        self.ground = Ground(GroundPlan.of(scene), seed)
-        self.buildings = tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building))
+    ground: Ground
+    terrain: Terrain | None = None  # heights of the ground, None where it is level
+    buildings: tuple[tuple[Wall, ...], ...] = ()  # sides of each
+    shadows: tuple[Array, ...] = ()  # convex outlines (P, 2), m, of the shadows of what does not move
+
+    @classmethod
+    def of(cls, scene: Scene, seed: int) -> Backdrop:
+        """Take that of a scene file."""
         sun = light_of(scene.environment).sun
         thrown = [_shadow(building, sun) for building in scene.building if building.shadow]
-        self.shadows: tuple[Array, ...] = (*(_hull(np.array(s.outline)) for s in scene.shadow), *thrown)
+        return cls(
+            Ground(GroundPlan.of(scene), seed),
+            None,
+            tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building)),
+            (*(_hull(np.array(s.outline)) for s in scene.shadow), *thrown),
+        )
 
 
 def _shadow(building: Building, sun: tuple[float, float, float]) -> Array:
@@ -194,14 +209,6 @@ def _facade(length_m: float, height_m: float, color: Sequence[int], seed: tuple[
             image[pane[0] : pane[1], middle - 1 : middle + 1] = np.minimum(np.array(color[::-1]) * 1.05, 255)
     shade = 1 + (grain(seed[0], 0, (0, int(rng.integers(1024))), (h, w)) - 1) * np.float32(GRAIN)
     return np.clip(image * shade[..., None], 0, 255).astype(np.uint8)
-
-
-def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    """Halve an image again and again: copies, each half as large as the one before."""
-    levels = [image]
-    while len(levels) < FACADE_LEVELS and min(levels[-1].shape[:2]) >= 8:
-        levels.append(np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8))
-    return tuple(levels)
 
 
 SUBPIXEL_BITS = 4  # of the coordinates of polygons

@@ -29,26 +29,40 @@ PATCHES = ((8, 0.8), (32, 1.3), (256, 1.7))  # sizes in pixels and their strengt
 def grain(seed: int, level: int, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
     """Factors of brightness around 1 for a part of an endless surface.
 
-    `level`: pixels are 2**level times as large as the finest. `first`, `shape`: row and column of the first pixel at
+    Pixels of a `level` are 2**level times as large as the finest. `first`, `shape`: row and column of the first pixel at
     this level, and the number of rows and columns.
     """
-    noise = _noise(seed, level)
-    rows, columns = ((f + np.arange(n)) % len(noise) for f, n in zip(first, shape))
-    return noise.take(rows, axis=0).take(columns, axis=1)
+    return _window(_noise(seed, level), first, shape)
+
+
+def _window(image: NDArray[np.float32], first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Part of an image that repeats for ever."""
+    rows, columns = ((f + np.arange(n)) % len(image) for f, n in zip(first, shape))
+    return image.take(rows, axis=0).take(columns, axis=1)
+
+
+def _halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _add_patches(
+    out: NDArray[np.float32], patches: Sequence[tuple[int, float]], sigma: float, rng: np.random.Generator
+) -> None:
+    """Add noise of several sizes in pixels and strengths relative to `sigma`."""
+    for size, strength in patches:
+        count = NOISE_PX // size
+        coarse = np.pad(rng.normal(0, strength * sigma, (count, count)).astype(np.float32), 2, mode="wrap")
+        wide = cv2.resize(coarse, None, fx=size, fy=size, interpolation=cv2.INTER_CUBIC)
+        out += wide[2 * size : -2 * size, 2 * size : -2 * size]
 
 
 @lru_cache(maxsize=16)
 def _noise(seed: int, level: int) -> NDArray[np.float32]:
     if level:
-        finer = _noise(seed, level - 1)
-        return np.asarray(cv2.resize(finer, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32)
+        return _halved(_noise(seed, level - 1))
     rng = np.random.default_rng([seed, 3])
     shade = rng.standard_normal((NOISE_PX, NOISE_PX), dtype=np.float32) * np.float32(SIGMA)
-    for size, share in PATCHES:
-        count = NOISE_PX // size
-        coarse = np.pad(rng.normal(0, share * SIGMA, (count, count)).astype(np.float32), 2, mode="wrap")
-        wide = cv2.resize(coarse, None, fx=size, fy=size, interpolation=cv2.INTER_CUBIC)
-        shade += wide[2 * size : -2 * size, 2 * size : -2 * size]
+    _add_patches(shade, PATCHES, SIGMA, rng)
     return np.asarray(1 + shade, np.float32)
 
 
@@ -56,37 +70,19 @@ def _noise(seed: int, level: int) -> NDArray[np.float32]:
 WEAR_PATCHES = ((2, 0.6), (8, 1.0), (64, 0.9))
 
 
-def paint_left(
-    seed: int, level: int, first: tuple[int, int], shape: tuple[int, int], worn: float
-) -> NDArray[np.float32]:
-    """Share of paint that is left in each pixel of a part of an endless surface, from 0 to 1.
-
-    `level`: pixels are 2**level times as large as the finest. `first`, `shape`: row and column of the first pixel at
-    this level, and the number of rows and columns. `worn`: share of the surface on which paint is missing.
-    """
-    left = _left(seed, level, worn)
-    rows, columns = ((f + np.arange(n)) % len(left) for f, n in zip(first, shape))
-    return left.take(rows, axis=0).take(columns, axis=1)
-
-
 @lru_cache(maxsize=24)
-def _left(seed: int, level: int, worn: float) -> NDArray[np.float32]:
+def _paint_left(seed: int, level: int, worn: float) -> NDArray[np.float32]:
+    """Share of paint that is left in each pixel of an endless surface of which the share `worn` has none."""
     if level:
-        finer = _left(seed, level - 1, worn)
-        return np.asarray(cv2.resize(finer, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32)
+        return _halved(_paint_left(seed, level - 1, worn))
     return (_depth(seed) >= worn).astype(np.float32)
 
 
 @lru_cache(maxsize=2)
 def _depth(seed: int) -> NDArray[np.float32]:
     """Share of the surface (NOISE_PX, NOISE_PX) that wears off before each pixel does."""
-    rng = np.random.default_rng([seed, 6])
     noise = np.zeros((NOISE_PX, NOISE_PX), np.float32)
-    for size, strength in WEAR_PATCHES:
-        count = NOISE_PX // size
-        coarse = np.pad(rng.normal(0, strength, (count, count)).astype(np.float32), 2, mode="wrap")
-        wide = cv2.resize(coarse, None, fx=size, fy=size, interpolation=cv2.INTER_CUBIC)
-        noise += wide[2 * size : -2 * size, 2 * size : -2 * size]
+    _add_patches(noise, WEAR_PATCHES, 1.0, np.random.default_rng([seed, 6]))
     rank = np.empty(noise.size, np.float32)
     rank[np.argsort(noise, axis=None, kind="stable")] = np.arange(noise.size, dtype=np.float32) / noise.size
     return rank.reshape(noise.shape)
@@ -132,10 +128,6 @@ class Stroke:
 
     line: Array  # (P, 2), m
     width_m: float
-
-    def wider(self, by_m: float) -> Stroke:
-        """Add to the width."""
-        return Stroke(self.line, self.width_m + by_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,7 +344,7 @@ class Ground:
         if drawn is None or (layer.worn <= 0 and layer.strength >= 1):
             return drawn
         level, i, j = where
-        left = paint_left(self._seed, level, (j * TILE_PX, i * TILE_PX), (TILE_PX, TILE_PX), layer.worn)
+        left = _window(_paint_left(self._seed, level, layer.worn), (j * TILE_PX, i * TILE_PX), (TILE_PX, TILE_PX))
         return np.asarray(drawn * (left * np.float32(layer.strength)))
 
 

@@ -85,15 +85,9 @@ DUSK = Light(
     lamps=4.0, noise=2.0, exposure=0.2,
 )  # fmt: skip
 NIGHT = Light(
-    _HIGH,
-    (0.0, 0.0, 0.0),
-    (0.030, 0.023, 0.019),
-    (0.030, 0.024, 0.022),
-    (0.012, 0.008, 0.006),
-    lamps=10.0,
-    noise=5.0,
-    exposure=1.0,
-)
+    _HIGH, (0.0, 0.0, 0.0), (0.030, 0.023, 0.019), (0.030, 0.024, 0.022), (0.012, 0.008, 0.006),
+    lamps=10.0, noise=5.0, exposure=1.0,
+)  # fmt: skip
 LIGHTS = {"noon": NOON, "overcast": OVERCAST, "dusk": DUSK, "night": NIGHT}
 
 
@@ -157,7 +151,12 @@ def reflected(
     openness = (0.62 + 0.38 * n[:, 2]) * np.clip(0.55 + 0.6 * height, 0.0, 1.0)
     sun, facing = np.clip(n_sun, 0, 1), np.clip(n_camera, 0, 1)
     gloss = surface.gloss * (0.35 + 0.65 * (1 - facing) ** 3)
-    sky_share, house_share, road_share = _surroundings(2 * facing * n[:, 2] - to_camera[:, 2])
+    up = 2 * facing * n[:, 2] - to_camera[:, 2]
+    blend = np.clip((up - 0.12) / 0.1, 0, 1)
+    below = np.clip((-up - 0.02) / 0.08, 0, 1)
+    # What mirrors show that look up by this sine: the sky (and how high), houses and the road.
+    sky_share = (blend * (1 - below), np.clip(up * 1.6, 0, 1))
+    house_share, road_share = (1 - blend) * (1 - below), below
     glint = 2.0 * surface.gloss * _power_60(np.clip(2 * facing * n_sun - camera_sun, 0, 1))
     surrounding = np.float32(np.mean(light.sky_color) / np.mean(NOON.sky_color))
     emission = np.float32(max(1.0, light.lamps))
@@ -172,15 +171,6 @@ def reflected(
         sparkle = glint * np.float32(light.sun_color[c] / NOON.sun_color[c])
         out[:, c] = surface.albedo[:, c] * lit + surface.glow[:, c] * emission + gloss * mirrored + sparkle
     return out
-
-
-def _surroundings(
-    up: NDArray[np.float32],
-) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32], NDArray[np.float32]]:
-    """Say what mirrors show that look up by a sine (P,): shares of the sky (and how high), of houses and of the road."""
-    blend = np.clip((up - 0.12) / 0.1, 0, 1)
-    below = np.clip((-up - 0.02) / 0.08, 0, 1)
-    return (blend * (1 - below), np.clip(up * 1.6, 0, 1)), (1 - blend) * (1 - below), below
 
 
 def _power_60(x: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -373,7 +363,6 @@ STREET_SPACING_M, STREET_HEIGHT_M = 30.0, 7.0
 MAX_LAMPS, MAX_LAMP_DISTANCE_M = 14, 90.0
 COARSENESS = 4  # of the grid on which the light of lamps on the static scene is computed
 GLARE = 0.5
-GROUND_BAND_M = 0.2  # what is lower counts as ground, which lamps light at a grazing angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,17 +415,17 @@ def lamplight(lamps: Sequence[Lamp], exposure: float, points: Image, normals: Im
         reach = STREET_REACH_M if lamp.forward is None else HEADLIGHT_REACH_M
         power = STREET_POWER if lamp.forward is None else HEADLIGHT_POWER
         strength = np.float32(power * exposure) / (1 + square * np.float32(reach**-2))
-        strength *= _downward(offset, square) if lamp.forward is None else _beam(offset, lamp.forward)
+        away = np.sqrt(np.maximum(square, np.float32(1e-6)))
+        if lamp.forward is None:
+            strength *= np.asarray(np.clip(-offset[:, 2] / away + 0.1, 0, 1), np.float32)
+        else:
+            strength *= _beam(offset, lamp.forward)
         if normals is not None:
-            toward = -np.einsum("ni,ni->n", offset, normals) / np.sqrt(np.maximum(square, np.float32(1e-6)))
+            toward = -np.einsum("ni,ni->n", offset, normals) / away
             strength *= np.clip(np.float32(0.15) + np.float32(0.85) * toward, 0, 1)
         for channel, value in enumerate(STREET_COLOR if lamp.forward is None else HEADLIGHT_COLOR):
             out[:, channel] += strength * np.float32(value)
     return out
-
-
-def _downward(offset: Image, square: Image) -> Image:
-    return np.asarray(np.clip(-offset[:, 2] / np.sqrt(np.maximum(square, np.float32(1e-6))) + 0.1, 0, 1), np.float32)
 
 
 def _beam(offset: Image, forward: Array) -> Image:

@@ -96,7 +96,20 @@ class TimedPath:
         vehicle: bool = True,
     ) -> None:
         w = np.asarray(waypoints, dtype=np.float64)
-        _check_waypoints(w, dict(wait_s), where)
+        if w.ndim != 2 or w.shape[1] != 3 or len(w) < 2:
+            raise ConfigError(
+                f"{where}: waypoints must be two or more rows [x, y, speed]; for a static agent give 'pose'"
+            )
+        step = np.linalg.norm(np.diff(w[:, :2], axis=0), axis=1)
+        if np.any(step < 1e-3):
+            raise ConfigError(
+                f"{where}: waypoints {int(step.argmin())} and {int(step.argmin()) + 1} are the same point; use 'wait_s' to stand"
+            )
+        if np.any(w[:, 2] < 0):
+            raise ConfigError(f"{where}: waypoint {int(w[:, 2].argmin())} has a negative speed")
+        for index, _ in wait_s:
+            if not 0 <= index < len(w) or w[index, 2] != 0:
+                raise ConfigError(f"{where}: wait_s names waypoint {index}, which must exist and have speed 0")
         self.path = RoundedPath(w[:, :2], rounding_m)
         if vehicle:
             peak = float(np.abs(self.path.curvature_1pm()).max())
@@ -122,21 +135,6 @@ class TimedPath:
         distance = start_m[i] + moved
         xy, yaw = self.path.at(distance)
         return PathStates(xy, wrap_angle(yaw), speed, distance)
-
-
-def _check_waypoints(w: Array, wait_s: dict[int, float], where: str) -> None:
-    if w.ndim != 2 or w.shape[1] != 3 or len(w) < 2:
-        raise ConfigError(f"{where}: waypoints must be two or more rows [x, y, speed]; for a static agent give 'pose'")
-    step = np.linalg.norm(np.diff(w[:, :2], axis=0), axis=1)
-    if np.any(step < 1e-3):
-        raise ConfigError(
-            f"{where}: waypoints {int(step.argmin())} and {int(step.argmin()) + 1} are the same point; use 'wait_s' to stand"
-        )
-    if np.any(w[:, 2] < 0):
-        raise ConfigError(f"{where}: waypoint {int(w[:, 2].argmin())} has a negative speed")
-    for index in wait_s:
-        if not 0 <= index < len(w) or w[index, 2] != 0:
-            raise ConfigError(f"{where}: wait_s names waypoint {index}, which must exist and have speed 0")
 
 
 def _timetable(at_m: Array, speed: Array, wait_s: dict[int, float], start_s: float, where: str) -> Array:

@@ -2,8 +2,6 @@
 
 Colors are linear BGR in [0, 1].
 
-Colors are linear BGR in [0, 1].
-
 Glass beads in paint send light back to where it comes from, so at 905 nm markings return two to four times as much as
 asphalt; on flat lines a film of water ends that (Burghardt et al., Visibility of flat line and structured road markings for
 machine vision, Case Studies in Construction Materials 18, 2023).
@@ -106,25 +104,17 @@ def _car(patch: Patch) -> None:
     patch.fill(linear_bgr(appearance.color), 0.16)
     side = np.abs(n[:, 1]) > 0.55
     # Seams of the doors, a dark sill and the handles.
-    seams = (
-        side
-        & (h > 0.24)
-        & (h < BELT)
-        & (np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008)
-    )
-    patch.set(seams, linear_bgr(appearance.color) * 0.25)
-    handle = (
-        side & (np.abs(h - 0.565) < 0.012) & (np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07)
-    )
-    patch.set(handle, linear_bgr(appearance.color) * 0.5, 0.1)
+    at_seam = np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008
+    patch.set(side & (h > 0.24) & (h < BELT) & at_seam, linear_bgr(appearance.color) * 0.25)
+    at_handle = np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07
+    patch.set(side & (np.abs(h - 0.565) < 0.012) & at_handle, linear_bgr(appearance.color) * 0.5, 0.1)
     patch.set(h < 0.225, (0.05, 0.05, 0.05))
     fender = np.min(np.hypot(x[:, None] - length * np.array([WHEEL_AT, -WHEEL_AT]), z[:, None] - WHEEL_RADIUS_M), 1)
     patch.set((fender < WHEEL_RADIUS_M + 0.055) & (np.abs(y) > 0.3 * width), (0.008, 0.008, 0.008))
     # Windows: the sides with three pillars, the windshield and the rear window with a frame.
     glass_side = side & (h > BELT + 0.035) & (h < top - 0.075) & (h < 0.93) & (u > -0.40)
-    pillar = (
-        np.min(np.abs(x[:, None] + 0.12 * (z[:, None] - height * 0.8) - length * np.array([-0.03, -0.245])), 1) < 0.035
-    )
+    leaning = x[:, None] + 0.12 * (z[:, None] - height * 0.8)
+    pillar = np.min(np.abs(leaning - length * np.array([-0.03, -0.245])), 1) < 0.035
     patch.set(glass_side & ~pillar, GLASS, 0.34)
     frame = 0.43 * width - 0.10 * np.clip((h - BELT) / 0.36, 0, 1) * width
     ahead = (n[:, 0] > 0.25) & (h > 0.685) & (h < 0.955) & (np.abs(y) < frame)
@@ -145,10 +135,8 @@ def _front(patch: Patch, h: Array, u: Array) -> None:
     patch.set(front & (np.abs(y) < 0.05) & (np.abs(h - 0.42) < 0.03), (0.6, 0.6, 0.6), 0.3)
     patch.set(front & (np.abs(y) < 0.36 * width) & (h > 0.235) & (h < 0.305), (0.02, 0.02, 0.02))
     patch.set(front & (np.abs(y) < 0.26) & (h > 0.30) & (h < 0.37), (0.75, 0.75, 0.75))
-    patch.set(
-        front & (np.abs(y) < 0.21) & (np.abs(h - 0.335) < 0.018) & (np.floor(y * 22) % 2 > 0),
-        (0.05, 0.05, 0.05),
-    )
+    letters = (np.abs(y) < 0.21) & (np.floor(y * 22) % 2 > 0)
+    patch.set(front & letters & (np.abs(h - 0.335) < 0.018), (0.05, 0.05, 0.05))
 
 
 def _rear(patch: Patch, h: Array, u: Array) -> None:
@@ -159,10 +147,8 @@ def _rear(patch: Patch, h: Array, u: Array) -> None:
     patch.set(lamp & (np.abs(h - 0.535) < 0.012), (0.6, 0.6, 0.7), 0.2)
     patch.set(rear & (h > 0.635) & (h < 0.645), (0.02, 0.02, 0.02))
     patch.set(rear & (np.abs(y) < 0.26) & (h > 0.44) & (h < 0.515), (0.75, 0.75, 0.75))
-    patch.set(
-        rear & (np.abs(y) < 0.21) & (np.abs(h - 0.477) < 0.018) & (np.floor(y * 22) % 2 > 0),
-        (0.05, 0.05, 0.05),
-    )
+    letters = (np.abs(y) < 0.21) & (np.floor(y * 22) % 2 > 0)
+    patch.set(rear & letters & (np.abs(h - 0.477) < 0.018), (0.05, 0.05, 0.05))
     patch.set(rear & (h > 0.225) & (h < 0.3), (0.03, 0.03, 0.03))
 
 
@@ -207,10 +193,8 @@ def _cab(patch: Patch) -> None:
     window = (np.abs(n[:, 1]) > 0.6) & (z > 0.55 * top) & (z < 0.9 * top) & (x > front - 1.35) & (x < front - 0.28)
     patch.set(window, GLASS, 0.34)
     nose = n[:, 0] > 0.5
-    patch.set(
-        nose & (np.abs(y) < 0.34 * width) & (z > 0.27 * top) & (z < 0.47 * top) & (np.floor(z * 14) % 2 > 0),
-        (0.03, 0.03, 0.03),
-    )
+    grille = (np.abs(y) < 0.34 * width) & (z > 0.27 * top) & (z < 0.47 * top) & (np.floor(z * 14) % 2 > 0)
+    patch.set(nose & grille, (0.03, 0.03, 0.03))
     patch.set(nose & (z < 0.25 * top), (0.06, 0.06, 0.06))
     patch.set(nose & (np.abs(y) > 0.32 * width) & (z > 0.25 * top) & (z < 0.33 * top), (0.8, 0.8, 0.8), 0.2, 0.3)
     patch.set(nose & (np.abs(y) < 0.26) & (z > 0.16 * top) & (z < 0.21 * top), (0.75, 0.75, 0.75))
@@ -242,22 +226,13 @@ def _bus(patch: Patch) -> None:
     row = side & (z > 0.43 * height) & (z < 0.80 * height) & (np.abs(x) < 0.475 * length)
     patch.set(row & (np.mod(x + 0.5 * length, 1.45) > 0.09), GLASS, 0.34)
     patch.set(side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(appearance.second_color), 0.1)
-    doors = (
-        side
-        & (n[:, 1] < 0)
-        & (z > 0.42)
-        & (z < 0.8 * height)
-        & (np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6)
-    )
+    at_door = np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6
+    doors = side & (n[:, 1] < 0) & (z > 0.42) & (z < 0.8 * height) & at_door
     patch.set(doors, GLASS, 0.3)
     patch.set(doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(appearance.color) * 0.6)
     patch.set(front & (z > 0.36 * height) & (z < 0.80 * height) & (np.abs(y) < 0.45 * width), GLASS, 0.36)
-    patch.set(
-        front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width),
-        (0.02, 0.12, 0.2),
-        0.0,
-        0.8,
-    )
+    display = front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width)
+    patch.set(display, (0.02, 0.12, 0.2), 0.0, 0.8)
     patch.set(rear & (z > 0.52 * height) & (z < 0.82 * height) & (np.abs(y) < 0.4 * width), GLASS, 0.34)
     patch.set(front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
     patch.set(rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
@@ -280,16 +255,14 @@ def _cloth(patch: Patch) -> None:
 
 def _plain(patch: Patch) -> None:
     appearance = patch.appearance
+    body = linear_bgr(appearance.color)
     albedo, gloss = {
         Material.SKIN: (linear_bgr(appearance.skin), 0.02),
         Material.HAIR: (linear_bgr(appearance.hair), 0.03),
         Material.SHOE: (np.array((0.03, 0.03, 0.035)), 0.05),
-        Material.FRAME: (linear_bgr(appearance.color)[::-1] * 0.6 + 0.02, 0.15),
+        Material.FRAME: (body[::-1] * 0.6 + 0.02, 0.15),
         Material.TIRE: (np.array(RUBBER), 0.02),
-        Material.MIRROR: (
-            linear_bgr(appearance.color) if appearance.category == "car" else np.array((0.35, 0.35, 0.35)),
-            0.12,
-        ),
+        Material.MIRROR: (body if appearance.category == "car" else np.array((0.35, 0.35, 0.35)), 0.12),
     }.get(patch.part, (np.array((0.02, 0.02, 0.02)), 0.0))
     patch.fill(albedo, gloss)
 

@@ -99,58 +99,21 @@ def windows_of(solids: Sequence[Solid], sensor: SensorState) -> Windows:
     )
 
 
-def _columns(windows: Windows, index: int, azimuth: Array) -> NDArray[np.intp]:
-    """Return the firings (C,) within a window, which may lie across the sweep's seam."""
-    off = (azimuth - windows.azimuth[index] + np.pi) % (2 * np.pi) - np.pi
-    return np.flatnonzero((off >= windows.half[index, 0]) & (off <= windows.half[index, 1]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Approach:
-    """Rays that meet an object's bounding box, in the object's frame: rays n, directions (3, n)."""
-
-    line: NDArray[np.intp]
-    firing: NDArray[np.intp]
-    direction: NDArray[np.float32]
-    origin: NDArray[np.float32]
-    drift: NDArray[np.float32] | None
-
-
 def cast_solid(
     rays: Rays, solid: Solid, index: int, windows: Windows, sensor: SensorState, rng: np.random.Generator
 ) -> None:
-    """Let one object stop the rays that reach it."""
-    near = _approach(rays, solid, index, windows, sensor)
-    if near is None:
-        return
-    crossings = _Crossings.of(near, solid.parts, rays.column_s)
-    enter = crossings.enter
-    for k in np.flatnonzero(np.isfinite(enter).any(axis=1)).tolist():
-        if solid.parts[k].material in (Material.LEAVES, Material.GLASS, Material.MESH):
-            enter[k] = _passed(enter[k], crossings.leave[k], solid.parts[k].material, solid, rng)
-    part = enter.argmin(axis=0)
-    t = enter[part, np.arange(len(part))]
-    first = np.flatnonzero(t < rays.range_m[near.line, near.firing])
-    if not len(first):
-        return
-    line, firing, part = near.line[first], near.firing[first], part[first]
-    rays.range_m[line, firing] = t[first]
-    rays.hit[line, firing] = index
-    rays.material[line, firing] = np.array([p.material for p in solid.parts], np.int8)[part]
-    rays.incidence[line, firing] = crossings.incidence(first, part, solid.parts)
-
-
-def _approach(rays: Rays, solid: Solid, index: int, windows: Windows, sensor: SensorState) -> _Approach | None:
-    """Choose the rays of an object's window that meet its bounding box before anything else."""
+    """Let one object stop the rays of its window that reach it; below, n rays meet P parts with K faces in all."""
     low, high = windows.elevation[index]
     rows = np.flatnonzero((rays.elevation >= low) & (rays.elevation <= high))
-    cols = _columns(windows, index, rays.azimuth)
+    # The window may lie across the sweep's seam.
+    off = (rays.azimuth - windows.azimuth[index] + np.pi) % (2 * np.pi) - np.pi
+    cols = np.flatnonzero((off >= windows.half[index, 0]) & (off <= windows.half[index, 1]))
     if not len(rows) or not len(cols):
-        return None
+        return
     # Rays that meet something nearer than the object's nearest point need no test.
     line, firing = np.nonzero(rays.range_m[np.ix_(rows, cols)] > windows.near_m[index])
     if not len(line):
-        return None
+        return
     line, firing = rows[line], cols[firing]
     c, s = np.cos(solid.yaw_rad), np.sin(solid.yaw_rad)
     to_object = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
@@ -165,55 +128,45 @@ def _approach(rays: Rays, solid: Solid, index: int, windows: Windows, sensor: Se
         ends = [(edge[index].astype(np.float32)[:, None] - start) / direction for edge in (windows.low, windows.high)]
     first, last = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
     met = np.flatnonzero((first <= last) & (last > 0) & (first < rays.range_m[line, firing]))
-    return _Approach(line[met], firing[met], direction[:, met], origin, drift) if len(met) else None
-
-
-@dataclass(frozen=True, eq=False)
-class _Crossings:
-    """Where n rays cross the half-spaces of P parts with K faces in all."""
-
-    enter: NDArray[np.float32]  # (P, n), m: infinite where a ray misses the part
-    leave: NDArray[np.float32]  # (P, n), m: infinite where a ray misses the part
-    latest: NDArray[np.float32]  # (K, n), m: of the faces that a ray enters by, -inf of the others
-    slope: NDArray[np.float32]  # (K, n): normals times directions
-    start: NDArray[np.int64]  # (P,): of each part's faces
-    count: NDArray[np.int64]  # (P,): of each part's faces
-
-    @classmethod
-    def of(cls, near: _Approach, parts: Sequence[Polytope], column_s: NDArray[np.float32]) -> _Crossings:
-        """Intersect rays with all parts of an object."""
-        normals, offsets = np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
-        count = np.array([len(p.offsets) for p in parts])
-        start = np.cumsum(count) - count
-        slope = normals @ near.direction
-        gap = (offsets - normals @ near.origin)[:, None]
-        if near.drift is not None:
-            gap = gap - (normals @ near.drift)[:, None] * column_s[near.firing]
-        slope[slope == 0] = np.float32(1e-12)
-        crossing = gap / slope
-        entering = slope < 0
-        enter, leave = np.empty((2, len(parts), len(near.line)), np.float32)
-        latest = np.where(entering, crossing, np.float32(-np.inf))
-        earliest = np.where(entering, np.float32(np.inf), crossing)
-        for k, (a, n) in enumerate(zip(start.tolist(), count.tolist(), strict=True)):
-            latest[a : a + n].max(axis=0, out=enter[k])
-            earliest[a : a + n].min(axis=0, out=leave[k])
-        enter = np.where((enter < leave) & (enter > MIN_RANGE_M), enter, np.float32(np.inf))
-        return cls(enter, leave, latest, slope, start, count)
-
-    def incidence(
-        self, ray: NDArray[np.intp], part: NDArray[np.intp], parts: Sequence[Polytope]
-    ) -> NDArray[np.float32]:
-        """Return the cosine (m,) between rays and the faces by which they enter a part each."""
-        out = np.full(len(ray), np.float32(LEAF_INCIDENCE))
-        for k in np.unique(part).tolist():
-            if parts[k].material != Material.LEAVES:
-                own = part == k
-                faces = slice(self.start[k], self.start[k] + self.count[k])
-                # A ray enters by the face that it crosses last.
-                face = self.latest[faces][:, ray[own]].argmax(axis=0)
-                out[own] = -self.slope[self.start[k] + face, ray[own]]
-        return out
+    if not len(met):
+        return
+    line, firing, direction, parts = line[met], firing[met], direction[:, met], solid.parts
+    normals, offsets = np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
+    count = np.array([len(p.offsets) for p in parts])
+    faces = [slice(end - n, end) for n, end in zip(count.tolist(), np.cumsum(count).tolist())]
+    slope = normals @ direction  # (K, n)
+    gap = (offsets - normals @ origin)[:, None]
+    if drift is not None:
+        gap = gap - (normals @ drift)[:, None] * rays.column_s[firing]
+    slope[slope == 0] = np.float32(1e-12)
+    crossing, entering = gap / slope, slope < 0
+    latest = np.where(entering, crossing, np.float32(-np.inf))
+    earliest = np.where(entering, np.float32(np.inf), crossing)
+    enter, leave = np.empty((2, len(parts), len(line)), np.float32)  # infinite where a ray misses the part
+    for k, own in enumerate(faces):
+        latest[own].max(axis=0, out=enter[k])
+        earliest[own].min(axis=0, out=leave[k])
+    enter = np.where((enter < leave) & (enter > MIN_RANGE_M), enter, np.float32(np.inf))
+    for k in np.flatnonzero(np.isfinite(enter).any(axis=1)).tolist():
+        if parts[k].material in (Material.LEAVES, Material.GLASS, Material.MESH):
+            enter[k] = _passed(enter[k], leave[k], parts[k].material, solid, rng)
+    part = enter.argmin(axis=0)
+    t = enter[part, np.arange(len(part))]
+    ray = np.flatnonzero(t < rays.range_m[line, firing])
+    if not len(ray):
+        return
+    line, firing, part = line[ray], firing[ray], part[ray]
+    rays.range_m[line, firing] = t[ray]
+    rays.hit[line, firing] = index
+    rays.material[line, firing] = np.array([p.material for p in parts], np.int8)[part]
+    incidence = np.full(len(ray), np.float32(LEAF_INCIDENCE))
+    for k in np.unique(part).tolist():
+        if parts[k].material != Material.LEAVES:
+            own = part == k
+            # A ray enters by the face that it crosses last.
+            face = latest[faces[k]][:, ray[own]].argmax(axis=0)
+            incidence[own] = -slope[faces[k].start + face, ray[own]]
+    rays.incidence[line, firing] = incidence
 
 
 def _passed(

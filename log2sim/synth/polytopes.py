@@ -219,16 +219,13 @@ def _faces(planes: Array, offsets: Array) -> tuple[Array, Array, NDArray[np.int6
     point /= np.where(meets, volume, 1.0)[..., None]
     outside = np.einsum("bki,bti->btk", planes, point) > offsets[:, None, :] + INSIDE_M
     corner = meets & ~outside.any(2)
-    out = [_fan(planes[:, k], point[:, on], corner[:, on]) for k, on in enumerate(_triples_with(triples, count))]
+    on_face = [np.flatnonzero((triples == k).any(1)) for k in range(count)]
+    out = [_fan(planes[:, k], point[:, on], corner[:, on]) for k, on in enumerate(on_face)]
     return (
         np.concatenate([t for t, _, _ in out]),
         np.concatenate([n for _, n, _ in out]),
         np.concatenate([o for _, _, o in out]),
     )
-
-
-def _triples_with(triples: NDArray[np.int64], count: int) -> list[NDArray[np.intp]]:
-    return [np.flatnonzero((triples == k).any(1)) for k in range(count)]
 
 
 def _fan(normal: Array, point: Array, corner: NDArray[np.bool_]) -> tuple[Array, Array, NDArray[np.int64]]:

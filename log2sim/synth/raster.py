@@ -29,7 +29,10 @@ def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
     groups = _groups_of(triangles)
     ordered = triangles[np.concatenate(groups)]
     ends = np.cumsum([len(rows) for rows in groups])
-    planes, (centers, radii) = _Planes.of(ordered), _spheres_around(ordered, ends)
+    planes, starts = _Planes.of(ordered), np.concatenate([[0], ends[:-1]])
+    low, high = np.minimum.reduceat(ordered.min(1), starts), np.maximum.reduceat(ordered.max(1), starts)
+    # Spheres are larger by more than the rounding of the distances between rays and centers.
+    centers, radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + SPHERE_MARGIN_M
     moment, along_origin = cross_products(origin, ray), np.einsum("ni,ni->n", origin, ray)
     square_origin = np.einsum("ni,ni->n", origin, origin)
     for center, radius, rows, end in zip(centers, radii, groups, ends.tolist()):
@@ -55,14 +58,6 @@ def _groups_of(triangles: Array) -> list[NDArray[np.intp]]:
             halves += [order[: len(order) // 2], order[len(order) // 2 :]]
         groups = halves
     return groups
-
-
-def _spheres_around(triangles: Array, ends: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Centers (G, 3) and radii (G,) of spheres around groups of triangles (F, 3, 3) that end at `ends` (G,)."""
-    starts = np.concatenate([[0], ends[:-1]])
-    low, high = np.minimum.reduceat(triangles.min(1), starts), np.maximum.reduceat(triangles.max(1), starts)
-    # Larger by more than the rounding of the distances between rays and centers.
-    return (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + SPHERE_MARGIN_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +150,15 @@ class Samples:
         cls, vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int,
         passes: NDArray[np.float32] | None = None,
     ) -> Samples:  # fmt: skip
-        """Cover the faces of a mesh, as `rasterize` describes; `passes` (F,) is the share of samples to leave out of each."""
+        """Cover the faces of a mesh for a pinhole camera; `passes` (F,) is the share of samples to leave out of each.
+
+        `vertices_cam` (V, 3) float64, m, cam frame. `faces` (F, 3) int: counter-clockwise from outside; faces that look
+        away are left out, and so is what is nearer than `NEAR_M`. `K` (3, 3) float64, px: pixel centers are whole
+        numbers, as in OpenCV.
+
+        Edge functions in homogeneous coordinates, so that faces which reach behind the camera need no clipping: Olano &
+        Greer, Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).
+        """
         triangles = vertices_cam[faces]  # (F, 3 vertices, 3)
         planes, facing = _edge_planes(triangles, K)
         low, high = _row_ranges(triangles, K, height_px)
@@ -174,7 +177,10 @@ class Samples:
         out = cls(pixel, nearness, row, face, v, planes, width_px)
         if passes is None:
             return out
-        stopped = _hashed(pixel) >= passes[face][row]
+        # Numbers in [0, 1) that look random and depend on the pixel alone.
+        mixed = pixel.astype(np.uint32) * np.uint32(2654435761)
+        mixed = (mixed ^ (mixed >> np.uint32(15))) * np.uint32(1274126177)
+        stopped = (mixed >> np.uint32(16)).astype(np.float32) / 65536 >= passes[face][row]
         return cls(pixel[stopped], nearness[stopped], row[stopped], face, v, planes, width_px)
 
     def fragments(self, rows: Index) -> Fragments:
@@ -209,29 +215,9 @@ class ZBuffer:
         return np.flatnonzero(self._winner[pixel] == np.arange(first, first + len(pixel), dtype=np.int32))
 
 
-def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int) -> Fragments:
-    """Rasterize a mesh for a pinhole camera.
-
-    `vertices_cam` (V, 3) float64, m, cam frame. `faces` (F, 3) int: counter-clockwise from outside; faces that look
-    away are left out, and so is what is nearer than `NEAR_M`. `K` (3, 3) float64, px: pixel centers are whole numbers,
-    as in OpenCV.
-
-    Edge functions in homogeneous coordinates, so that faces which reach behind the camera need no clipping: Olano & Greer,
-    Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).
-    """
-    return nearest_of(Samples.of(vertices_cam, faces, K, width_px, height_px))
-
-
 def nearest_of(samples: Samples) -> Fragments:
     """Select the nearest sample of each pixel, by ascending pixel."""
     return samples.fragments(_nearest(samples.pixel, samples.nearness))
-
-
-def _hashed(pixel: Index) -> NDArray[np.float32]:
-    """Numbers (P,) in [0, 1) that look random and depend on the pixel alone."""
-    mixed = pixel.astype(np.uint32) * np.uint32(2654435761)
-    mixed = (mixed ^ (mixed >> np.uint32(15))) * np.uint32(1274126177)
-    return np.asarray((mixed >> np.uint32(16)).astype(np.float32) / 65536)
 
 
 def _counted(counts: Index) -> Index:

@@ -15,7 +15,7 @@ from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflect
 from log2sim.synth.raster import first_hit
 from log2sim.synth.render import triangles_of
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
-from log2sim.synth.scene import Building, LidarSpec, Scene
+from log2sim.synth.scene import LidarSpec, Scene
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
@@ -89,7 +89,10 @@ def cast_sweep(
     down = -ray[:, 2] > MIN_GRAZING_SINE
     distance[down] = origin[down, 2] / -ray[down, 2]
     for building in scene.building:
-        nearer = _box_distance(building, origin, ray)
+        c, s = np.cos(np.deg2rad(building.yaw_deg)), np.sin(np.deg2rad(building.yaw_deg))
+        rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+        size = np.array(building.size_m)
+        nearer = slab_distance(size, (origin - [*building.center, size[2] / 2]) @ rotation.T, ray @ rotation.T)
         closer = nearer < distance
         distance[closer], hit[closer] = nearer[closer], BUILDING
     for triangles in triangles_of(scene):
@@ -109,35 +112,21 @@ def cast_sweep(
     xyz = directions[keep] * (distance + noise)[keep, None]
     if spec.resolution_m > 0:
         xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
-    met = _Returns(origin[keep], ray[keep], distance[keep], hit[keep])
-    intensity = None if ground is None else _intensity(met, scene, ground, rng)
+    intensity = None
+    if ground is not None:
+        # What is no ground is taken to face the sensor. The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`,
+        # counted from the end.
+        solid = [body_reflectance(agent.color) for agent in scene.agent]
+        by_hit = [*solid, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
+        reflectance = np.array(by_hit, np.float32)[hit[keep]]
+        incidence = np.ones(len(reflectance), np.float32)
+        met, on = hit[keep] == GROUND, np.flatnonzero(keep)[hit[keep] == GROUND]
+        xy = origin[on, :2] + ray[on, :2] * distance[on, None]
+        reflectance[met], incidence[met] = ground.at(xy, spot_m(distance[on], -ray[on, 2])), -ray[on, 2]
+        intensity = intensity_of(reflectance, incidence, rng)
     # Column after column in memory, which packs a quarter smaller.
     points = np.asfortranarray(xyz, dtype=np.float32)
     return LabeledSweep(Sweep(stamp_ns, points, "lidar", t_ns[keep], intensity=intensity), hit[keep])
-
-
-@dataclass(frozen=True, eq=False)
-class _Returns:
-    """Rays that came back, map frame."""
-
-    origin: Array  # (N, 3)
-    ray: Array  # (N, 3)
-    distance_m: Array  # (N,), m
-    hit: NDArray[np.int64]  # (N,): as in `LabeledSweep`
-
-
-def _intensity(met: _Returns, scene: Scene, ground: GroundReflectance, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Intensities (N,) of returns; what is no ground is taken to face the sensor."""
-    solid = [body_reflectance(agent.color) for agent in scene.agent]
-    # The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`, counted from the end.
-    by_hit = [*solid, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
-    reflectance = np.array(by_hit, np.float32)[met.hit]
-    incidence = np.ones(len(met.hit), np.float32)
-    on = met.hit == GROUND
-    down, range_m = -met.ray[on, 2], met.distance_m[on]
-    xy = met.origin[on, :2] + met.ray[on, :2] * range_m[:, None]
-    reflectance[on], incidence[on] = ground.at(xy, spot_m(range_m, down)), down
-    return intensity_of(reflectance, incidence, rng)
 
 
 def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng: np.random.Generator) -> None:
@@ -151,14 +140,6 @@ def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng:
     distance[np.flatnonzero(solid)[~detected(signal, ReturnModel(dropout=0.0), rng)]] = np.inf
     early = np.isfinite(air)
     distance[early], hit[early] = air[early], AIR
-
-
-def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
-    """Distance (N,) at which rays enter a building, inf where they miss it (slab method)."""
-    c, s = np.cos(np.deg2rad(building.yaw_deg)), np.sin(np.deg2rad(building.yaw_deg))
-    rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-    size = np.array(building.size_m)
-    return slab_distance(size, (origin - [*building.center, size[2] / 2]) @ rotation.T, ray @ rotation.T)
 
 
 def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool = False) -> Array:

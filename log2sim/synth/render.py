@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -14,8 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Signal
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth.actors import Actor
-from log2sim.synth.backdrop import Wall, draw_buildings, draw_terrain, hide_behind_buildings
-from log2sim.synth.ground import Ground
+from log2sim.synth.backdrop import Backdrop, draw_buildings, draw_terrain, hide_behind_buildings
 from log2sim.synth.light import (
     FAR_M,
     GAMMA,
@@ -35,7 +33,6 @@ from log2sim.synth.light import (
     reflected,
 )
 from log2sim.synth.paint import Paint, linear_bgr, paint
-from log2sim.synth.polytope_caster import Terrain
 from log2sim.synth.raster import NEAR_M, Fragments, Samples, ZBuffer, nearest_of
 from log2sim.synth.scene import CameraSpec, Scene, TrafficLight
 from log2sim.synth.shapes import Mesh, block, merged, surface
@@ -45,14 +42,6 @@ SAMPLES_SHIFT = np.int32(1)  # a sample's row and column shifted by it are its p
 MAX_SHADED_SAMPLES = 6000  # of a body; a larger one has one color a pixel, which shows its details well enough
 SHADOW_RANGE_M = 80.0
 Values = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class Lighting:
-    """Light on bodies."""
-
-    light: Light
-    lamps: tuple[Lamp, ...] = ()
 
 
 Painter = Callable[[NDArray[np.int64], Values, Values], Paint]  # of materials, points and normals
@@ -108,7 +97,7 @@ def samples_of(view: RenderCamera, body: Body) -> Samples:
     return Samples.of(vertices, body.mesh.faces, view.K, view.width_px, view.height_px, passes)
 
 
-def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: Lighting, color: Image, depth: Image) -> None:
+def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: SceneInstant, color: Image, depth: Image) -> None:
     """Draw bodies where they are nearer than the depth (H, W) so far, softening their outlines."""
     fine = view.enlarged(SAMPLES)
     behind = np.repeat(np.repeat((1 / depth).astype(np.float32), SAMPLES, axis=0), SAMPLES, axis=1)
@@ -133,7 +122,13 @@ def _coarse(fragments: Fragments, width_px: int) -> NDArray[np.int32]:
 
 
 def _add(
-    view: RenderCamera, fine: RenderCamera, body: Body, lit: Lighting, fragments: Fragments, light: Image, share: Image
+    view: RenderCamera,
+    fine: RenderCamera,
+    body: Body,
+    lit: SceneInstant,
+    fragments: Fragments,
+    light: Image,
+    share: Image,
 ) -> None:
     """Add samples of a body to the light (N, 3) of the pixels and to the shares (N,) of them that bodies cover."""
     coarse = _coarse(fragments, view.width_px)
@@ -156,7 +151,7 @@ def _add(
     light[first + chosen] += shaded
 
 
-def shade(view: RenderCamera, body: Body, lit: Lighting, fragments: Fragments) -> NDArray[np.float32]:
+def shade(view: RenderCamera, body: Body, lit: SceneInstant, fragments: Fragments) -> NDArray[np.float32]:
     """Light (P, 3) from fragments of a body, dimmed by haze."""
     R, eye = body.map_T_body[:3, :3].astype(np.float32), view.map_T_cam[:3, 3] - body.map_T_body[:3, 3]
     rays = view.directions(fragments.u, fragments.v).astype(np.float32)
@@ -177,7 +172,7 @@ def shade(view: RenderCamera, body: Body, lit: Lighting, fragments: Fragments) -
 def draw_shadows(
     view: RenderCamera,
     bodies: Sequence[Body],
-    lit: Lighting,
+    lit: SceneInstant,
     color: Image,
     ground: NDArray[np.bool_],
     standing: Sequence[Array] = (),
@@ -362,7 +357,7 @@ MAX_GLARE = 3.0  # of the brightest white; more than a picture can show
 WET_COARSENESS = 2  # of the grid on which it is computed
 
 
-def mirror_lights(view: RenderCamera, lit: Lighting, color: Image, depth: Image, ground: NDArray[np.bool_]) -> None:
+def mirror_lights(view: RenderCamera, lit: SceneInstant, color: Image, depth: Image, ground: NDArray[np.bool_]) -> None:
     """Let wet ground (H, W) mirror the sun and lamps towards the camera; in place, nothing without glare.
 
     Facets with Gaussian slopes (Beckmann & Spizzichino, 1963), the reflectance of water after Schlick (1994).
@@ -436,35 +431,11 @@ class Visibility:
     silhouette_box_px: Array  # (4,), px: box of the whole silhouette in the image
 
 
-class Scenery(Protocol):
-    """The static parts of a scene."""
-
-    @property
-    def ground(self) -> Ground:
-        """Colors of the ground."""
-        ...
-
-    @property
-    def terrain(self) -> Terrain | None:
-        """Heights of the ground, None where it is level."""
-        ...
-
-    @property
-    def buildings(self) -> tuple[tuple[Wall, ...], ...]:
-        """Sides of each building."""
-        ...
-
-    @property
-    def shadows(self) -> tuple[Array, ...]:
-        """Convex outlines (P, 2), m, of the shadows of what does not move."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class SceneInstant:
     """Everything in a scene at one time."""
 
-    backdrop: Scenery
+    backdrop: Backdrop
     bodies: Sequence[Body]
     light: Light = NOON
     lamps: Sequence[Lamp] = ()  # headlights and street lights that are on
@@ -473,24 +444,30 @@ class SceneInstant:
 def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Render an image (H, W, 3) uint8 BGR."""
     view, light = RenderCamera.of(camera, map_T_cam), instant.light
-    lit = Lighting(light, nearest_lamps(view, instant.lamps))
+    instant = replace(instant, lamps=nearest_lamps(view, instant.lamps))
     color, depth = draw_sky(view, light)
     if instant.backdrop.terrain is None:
         draw_ground(view, instant.backdrop.ground, light, color, depth)
     else:
         draw_terrain(view, instant.backdrop.ground, instant.backdrop.terrain, light, color, depth)
     ground = depth.copy()
-    draw_shadows(view, instant.bodies, lit, color, ground < FAR_M, instant.backdrop.shadows)
+    draw_shadows(view, instant.bodies, instant, color, ground < FAR_M, instant.backdrop.shadows)
     draw_buildings(view, instant.backdrop.buildings, light, color, depth)
-    light_scenery(view, lit.lamps, light, color, depth)
+    light_scenery(view, instant.lamps, light, color, depth)
     open_ground = (ground < FAR_M) & (depth == ground)
     mirror_sky(view, light, color, open_ground)
-    mirror_lights(view, lit, color, depth, open_ground)
+    mirror_lights(view, instant, color, depth, open_ground)
     color = light.hazy(color, depth)
-    draw_bodies(view, instant.bodies, lit, color, depth)
-    glare(view, lit.lamps, light, color, depth)
+    draw_bodies(view, instant.bodies, instant, color, depth)
+    glare(view, instant.lamps, light, color, depth)
     draw_rain(view, light, color, rng)
-    return _developed(color, light, rng)
+    # Lens blur, sensor noise and gamma
+    image = cv2.GaussianBlur(color, (3, 3), LENS_BLUR_PX)
+    np.clip(image, 0, 1, out=image)
+    np.power(image, np.float32(1 / GAMMA), out=image)
+    image *= 255
+    image += rng.standard_normal(image.shape[:2], dtype=np.float32)[..., None] * np.float32(GRAIN * light.noise)
+    return np.asarray(cv2.convertScaleAbs(np.maximum(image, 0, out=image)), np.uint8)
 
 
 def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Visibility | None]:
@@ -515,13 +492,3 @@ def _visibility(silhouette: Fragments, visible: Fragments) -> Visibility | None:
         return None
     boxes = (np.array([f.u.min(), f.v.min(), f.u.max() + 1, f.v.max() + 1], float) for f in (visible, silhouette))
     return Visibility(len(visible.u), len(silhouette.u), *boxes)
-
-
-def _developed(color: Image, light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Lens blur, sensor noise and gamma."""
-    image = cv2.GaussianBlur(color, (3, 3), LENS_BLUR_PX)
-    np.clip(image, 0, 1, out=image)
-    np.power(image, np.float32(1 / GAMMA), out=image)
-    image *= 255
-    image += rng.standard_normal(image.shape[:2], dtype=np.float32)[..., None] * np.float32(GRAIN * light.noise)
-    return np.asarray(cv2.convertScaleAbs(np.maximum(image, 0, out=image)), np.uint8)

@@ -138,17 +138,10 @@ def lidar_model(name_or_path: str) -> LidarModel:
 
 # Least and greatest reflectance at 905 nm and normal incidence, drawn for each object; dark paint and tires send little.
 REFLECTANCE: dict[Material, tuple[float, float]] = {
-    Material.GROUND: (0.1, 0.35),
-    Material.PAINT: (0.06, 0.75),
-    Material.GLASS: (0.02, 0.1),
-    Material.DARK: (0.03, 0.15),
-    Material.CLOTH: (0.08, 0.6),
-    Material.WALL: (0.1, 0.6),
-    Material.LEAVES: (0.2, 0.55),
-    Material.METAL: (0.2, 0.9),
-    Material.MESH: (0.1, 0.5),
-    Material.WOOD: (0.15, 0.5),
-}
+    Material.GROUND: (0.1, 0.35), Material.PAINT: (0.06, 0.75), Material.GLASS: (0.02, 0.1),
+    Material.DARK: (0.03, 0.15), Material.CLOTH: (0.08, 0.6), Material.WALL: (0.1, 0.6), Material.LEAVES: (0.2, 0.55),
+    Material.METAL: (0.2, 0.9), Material.MESH: (0.1, 0.5), Material.WOOD: (0.15, 0.5),
+}  # fmt: skip
 # A target of reflectance 0.1 is seen to about 60 m, to what makers of sensors with a range of 100 to 150 m state.
 REFERENCE_RANGE_M = 60.0
 MIN_SIGNAL = 0.04

@@ -132,17 +132,8 @@ def block(low: ArrayLike, high: ArrayLike, part: int, *, bevel_m: float = 0.0) -
         top = np.column_stack([ring, np.full(4, z1)])
         return merged([*sides, _fan(bottom[::-1], part), _fan(top, part)])
     b = bevel_m
-    outline = [
-        (x0 + b, y0),
-        (x1 - b, y0),
-        (x1, y0 + b),
-        (x1, y1 - b),
-        (x1 - b, y1),
-        (x0 + b, y1),
-        (x0, y1 - b),
-        (x0, y0 + b),
-    ]
-    ring = np.array(outline)
+    right = [(x0 + b, y0), (x1 - b, y0), (x1, y0 + b), (x1, y1 - b)]
+    ring = np.array([*right, (x1 - b, y1), (x0 + b, y1), (x0, y1 - b), (x0, y0 + b)])
     center = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
     inner = center + (ring - center) * (1 - b / np.array([(x1 - x0) / 2, (y1 - y0) / 2]))
     sides = [_quad(ring[i], ring[(i + 1) % 8], z0, z1 - b, part) for i in range(8)]
@@ -161,16 +152,9 @@ def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int, *,
     angle = -np.arange(count) * 2 * np.pi / count
     rings = []
     for side, scale in ((-0.5, 0.93), (-0.38, 1.0), (0.38, 1.0), (0.5, 0.93)):
-        rings.append(
-            np.stack(
-                [
-                    x + radius_m * scale * np.cos(angle),
-                    np.full(count, y + side * width_m),
-                    z + radius_m * scale * np.sin(angle),
-                ],
-                1,
-            )
-        )
+        reach = radius_m * scale
+        ring = [x + reach * np.cos(angle), np.full(count, y + side * width_m), z + reach * np.sin(angle)]
+        rings.append(np.stack(ring, 1))
     return loft(np.array(rings), part)
 
 
@@ -234,23 +218,16 @@ def car(size_m: tuple[float, float, float], kind: str) -> Mesh:
     floor = block(
         [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Material.CHASSIS
     )
-    wheels = [
-        disc_wheel(
-            [s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M], WHEEL_RADIUS_M, 0.22, Material.WHEEL
-        )
-        for s in (-1, 1)
-        for side in (-1, 1)
-    ]
+    hubs = [[s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M] for s in (-1, 1) for side in (-1, 1)]
+    wheels = [disc_wheel(hub, WHEEL_RADIUS_M, 0.22, Material.WHEEL) for hub in hubs]
     mirrors = [block(*_mirror(length, width, height, side), Material.MIRROR, bevel_m=0.03) for side in (-1, 1)]
     return merged([skin, floor, *wheels, *mirrors]).fitted(size_m)
 
 
 def _mirror(length: float, width: float, height: float, side: int) -> tuple[list[float], list[float]]:
     inner, outer = side * width * 0.44, side * width * 0.5
-    return (
-        [0.165 * length, min(inner, outer), 0.63 * height],
-        [0.165 * length + 0.12, max(inner, outer), 0.63 * height + 0.13],
-    )
+    x, z = 0.165 * length, 0.63 * height
+    return [x, min(inner, outer), z], [x + 0.12, max(inner, outer), z + 0.13]
 
 
 def _car_section(u: float, top: float) -> Array:
@@ -275,10 +252,13 @@ def _car_section(u: float, top: float) -> Array:
         (0.5 * roof_half, top),
         (0.0, top + 0.004),
     ]
-    # Seen from the front the ring runs counter-clockwise: up the left side (+y), down the right.
-    left = side[:-1]
-    right = [(-y, z) for y, z in side[:0:-1]]
-    return np.array([(u, y, z) for y, z in left + right])
+    # Both ends lie in the middle; the one at the top is drawn once, from the right.
+    return np.array([(u, y, z) for y, z in side[:-1] + [(-y, z) for y, z in side[:0:-1]]])
+
+
+def _mirrored(x: float, side: list[tuple[float, float]]) -> list[tuple[float, float, float]]:
+    """Ring at x of the outline (y, z) of a left side, up it and down the right one: counter-clockwise from the front."""
+    return [(x, y, z) for y, z in side + [(-y, z) for y, z in side[-2:0:-1]]]
 
 
 @lru_cache(maxsize=32)
@@ -308,17 +288,8 @@ def _cab(rear: float, front: float, half: float, low: float, high: float) -> Mes
     rings = []
     for xi, ti, wi in zip(x, top, squeeze):
         h = half * wi
-        left = [
-            (0.0, low),
-            (0.96 * h, low),
-            (h, low + 0.08),
-            (h, ti - 0.12),
-            (0.97 * h, ti - 0.04),
-            (0.88 * h, ti),
-            (0.0, ti),
-        ]
-        right = [(-y, z) for y, z in left[-2:0:-1]]
-        rings.append([(xi, y, z) for y, z in left + right])
+        side = [(0.0, low), (0.96 * h, low), (h, low + 0.08), (h, ti - 0.12), (0.97 * h, ti - 0.04), (0.88 * h, ti)]
+        rings.append(_mirrored(xi, [*side, (0.0, ti)]))
     return loft(np.array(rings), Material.CAB)
 
 
@@ -333,15 +304,11 @@ def bus(size_m: tuple[float, float, float]) -> Mesh:
     rings = []
     for xi, wi, ti in zip(x, squeeze, top):
         h = half * wi
-        left = [(0.0, 0.28), (0.97 * h, 0.28), (h, 0.4), (h, ti - 0.3), (0.97 * h, ti - 0.1), (0.88 * h, ti), (0.0, ti)]
-        right = [(-y, z) for y, z in left[-2:0:-1]]
-        rings.append([(xi, y, z) for y, z in left + right])
+        side = [(0.0, 0.28), (0.97 * h, 0.28), (h, 0.4), (h, ti - 0.3), (0.97 * h, ti - 0.1), (0.88 * h, ti), (0.0, ti)]
+        rings.append(_mirrored(xi, side))
     radius = 0.48
-    wheels = [
-        disc_wheel([s * length, side * (half - 0.165), radius], radius, 0.3, Material.WHEEL)
-        for s in (-0.26, 0.27)
-        for side in (-1, 1)
-    ]
+    hubs = [[s * length, side * (half - 0.165), radius] for s in (-0.26, 0.27) for side in (-1, 1)]
+    wheels = [disc_wheel(hub, radius, 0.3, Material.WHEEL) for hub in hubs]
     return merged([loft(np.array(rings), Material.BUS_BODY), *wheels]).fitted(size_m)
 
 
@@ -351,17 +318,12 @@ def bus(size_m: tuple[float, float, float]) -> Mesh:
 STRIDE_M = 1.5  # two steps of a walking adult
 PEDAL_M = 5.2  # distance that a bicycle covers per turn of the pedals
 PHASES = 24
+THIGH_M, SHIN_M = 0.44, 0.43
 # Height as a fraction from hips to neck, half the width and half the depth in m.
 TORSO = (
-    (0.0, 0.13, 0.10),
-    (0.08, 0.165, 0.115),
-    (0.3, 0.15, 0.10),
-    (0.55, 0.175, 0.115),
-    (0.78, 0.195, 0.115),
-    (0.9, 0.185, 0.10),
-    (0.965, 0.13, 0.08),
-    (1.0, 0.06, 0.06),
-)
+    (0.0, 0.13, 0.10), (0.08, 0.165, 0.115), (0.3, 0.15, 0.10), (0.55, 0.175, 0.115), (0.78, 0.195, 0.115),
+    (0.9, 0.185, 0.10), (0.965, 0.13, 0.08), (1.0, 0.06, 0.06),
+)  # fmt: skip
 
 
 @lru_cache(maxsize=512)
@@ -399,21 +361,15 @@ def _walker(phase: float, standing: bool) -> Mesh:
         knee = hip + 0.44 * np.array([np.sin(thigh), 0, -np.cos(thigh)])
         ankle = knee + 0.42 * np.array([np.sin(shin), 0, -np.cos(shin)])
         toe = ankle + 0.19 * np.array([np.cos(shin + 0.05), 0.0, np.sin(shin + 0.05) - 0.12])
-        parts.append(
-            limb(
-                [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
-                [0.095, 0.085, 0.062, 0.058, 0.045],
-                Material.TROUSERS,
-            )
-        )
+        leg = [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle]
+        parts.append(limb(leg, [0.095, 0.085, 0.062, 0.058, 0.045], Material.TROUSERS))
         parts.append(limb([ankle + [-0.04, 0, -0.03], toe], [0.05, 0.04], Material.SHOE))
         arm = -0.45 * s
         shoulder = np.array([0.0, side * 0.195, shoulder_z])
         elbow = shoulder + 0.29 * np.array([np.sin(arm - 0.06), side * 0.13, -np.cos(arm)])
         wrist = elbow + 0.25 * np.array([np.sin(arm + 0.32), -side * 0.02, -np.cos(arm + 0.32)])
-        parts.append(
-            limb([shoulder, (shoulder + elbow) / 2, elbow, wrist], [0.062, 0.055, 0.047, 0.038], Material.SHIRT)
-        )
+        sleeve = [shoulder, (shoulder + elbow) / 2, elbow, wrist]
+        parts.append(limb(sleeve, [0.062, 0.055, 0.047, 0.038], Material.SHIRT))
         parts.append(ellipsoid(wrist + [0.015, 0, -0.05], [0.035, 0.025, 0.06], Material.SKIN, count=8))
     parts.append(_torso(0.02, 0.86, shoulder_z + 0.08))
     parts += _head(np.array([0.03, 0.0, 1.68]))
@@ -471,14 +427,16 @@ def _rider(step: int) -> Mesh:
             limb([crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]], [0.014, 0.014], Material.MIRROR, count=6)
         )
         hip, ankle = np.array([-0.22, side * 0.09, hip_z]), pedal + [-0.06, 0, 0.1]
-        knee = _knee(hip, ankle, 0.44, 0.43)
-        parts.append(
-            limb(
-                [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
-                [0.10, 0.09, 0.065, 0.06, 0.045],
-                Material.TROUSERS,
-            )
-        )
+        # The knee bends forward between hip and ankle.
+        reach = ankle - hip
+        distance = min(float(np.linalg.norm(reach)), 0.999 * (THIGH_M + SHIN_M))
+        along = (THIGH_M**2 - SHIN_M**2 + distance**2) / (2 * distance)
+        off = np.sqrt(max(THIGH_M**2 - along**2, 0.0))
+        axis = reach / np.linalg.norm(reach)
+        forward = np.array([-axis[2], 0.0, axis[0]])
+        knee = np.asarray(hip + axis * along + off * forward / np.linalg.norm(forward))
+        leg = [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle]
+        parts.append(limb(leg, [0.10, 0.09, 0.065, 0.06, 0.045], Material.TROUSERS))
         parts.append(limb([ankle + [-0.03, 0, -0.04], pedal + [0.1, 0, 0.03]], [0.048, 0.038], Material.SHOE))
         shoulder = np.array([0.13, side * 0.19, 1.45])
         hand = bar + [0.01, side * 0.23, 0.03]
@@ -490,14 +448,3 @@ def _rider(step: int) -> Mesh:
     parts[-1] = Mesh(torso.vertices_m - [0.22, 0, 0], torso.normals, torso.faces, torso.part)
     parts += _head(np.array([0.25, 0.0, 1.68]))
     return merged(parts)
-
-
-def _knee(hip: Array, ankle: Array, thigh_m: float, shin_m: float) -> Array:
-    """Position of a knee that bends forward between hip and ankle."""
-    reach = ankle - hip
-    distance = min(float(np.linalg.norm(reach)), 0.999 * (thigh_m + shin_m))
-    along = (thigh_m**2 - shin_m**2 + distance**2) / (2 * distance)
-    off = np.sqrt(max(thigh_m**2 - along**2, 0.0))
-    axis = reach / np.linalg.norm(reach)
-    forward = np.array([-axis[2], 0.0, axis[0]])
-    return np.asarray(hip + axis * along + off * forward / np.linalg.norm(forward))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,7 +26,7 @@ from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, rotation_from_r
 from log2sim.synth import raycast
 from log2sim.synth.actors import Actor, ActorStates, EgoMotion, MovingScene
 from log2sim.synth.render import camera_of, frame_stamps
-from log2sim.synth.scene import LidarSpec, Scene, load_scene
+from log2sim.synth.scene import Scene, load_scene
 from log2sim.synth.truth import (
     FrameVisibility,
     LidarVisibility,
@@ -80,13 +80,18 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     streams = _image_streams(moving, cameras, seed)
     for spec in scene.lidar:
         stamps = raycast.sweep_stamps(spec, scene)
-        streams[spec.name] = Stream(spec.name, stamps, _reader(cast, spec.name))
+        streams[spec.name] = Stream(spec.name, stamps, partial(_read_sweep, cast, spec.name))
     frames: dict[str, list[FrameVisibility]] = {}
     t_s = np.arange(0, scene.duration_s + 1e-9, TRUTH_STEP_S)
     visible = None
     if observe:
         frames = visibility_by_camera(moving, cameras, _backdrop(scene, seed))
-        sweeps = {spec.name: _lidar_visibility(spec, streams[spec.name], cast, moving) for spec in scene.lidar}
+        sweeps = {}
+        for spec in scene.lidar:
+            stamps, count = streams[spec.name].t_ns, len(moving.actors)
+            hits = (cast(spec.name, i).hit for i in range(len(stamps)))
+            points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(len(stamps), count)
+            sweeps[spec.name] = LidarVisibility(stamps - round(NS_PER_S / spec.rate_hz / 2), points)
         t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
         visible = visible_at(t_ns, frames, sweeps, len(moving.actors))
     truth = _truth(moving, t_s, visible, seed)
@@ -108,6 +113,10 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
         notes=(f"synthetic, seed {seed}",),
     )
     return log, truth
+
+
+def _read_sweep(cast: Caster, name: str, i: int) -> Any:
+    return cast(name, i).sweep
 
 
 def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -> dict[str, Stream]:
@@ -133,7 +142,7 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
             raise ConfigError(
                 f"camera '{spec.name}': no frame falls within {scene.duration_s:g} s; change its offset_s"
             )
-        out[spec.name] = Stream(spec.name, stamps, _bound(read, cameras[spec.name], index, stamps))
+        out[spec.name] = Stream(spec.name, stamps, partial(read, cameras[spec.name], index, stamps))
     return out
 
 
@@ -151,15 +160,11 @@ def lamps_on(moving: MovingScene, map_T_cam: Array, t_ns: int) -> tuple[Lamp, ..
     return tuple(lamps)
 
 
-def _bound(read: Callable[..., Any], *arguments: Any) -> Callable[[int], Any]:
-    return lambda i: read(*arguments, i)
-
-
 @lru_cache(maxsize=2)
 def _backdrop(scene: Scene, seed: int) -> Any:
     from log2sim.synth.backdrop import Backdrop
 
-    return Backdrop(scene, seed)
+    return Backdrop.of(scene, seed)
 
 
 @lru_cache(maxsize=2)
@@ -184,17 +189,6 @@ def _caster(moving: MovingScene, seed: int) -> Caster:
         return raycast.cast_sweep(spec, moving, stamp, rng, _ground_reflectance(moving.scene, seed))
 
     return cast
-
-
-def _lidar_visibility(spec: LidarSpec, stream: Stream, cast: Caster, moving: MovingScene) -> LidarVisibility:
-    count = len(moving.actors)
-    hits = (cast(spec.name, i).hit for i in range(len(stream.t_ns)))
-    points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(len(stream.t_ns), count)
-    return LidarVisibility(stream.t_ns - round(NS_PER_S / spec.rate_hz / 2), points)
-
-
-def _reader(cast: Caster, name: str) -> Callable[[int], Any]:
-    return lambda i: cast(name, i).sweep
 
 
 def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> PoseTrack:
@@ -278,7 +272,6 @@ def _digest(scene: Scene, seed: int) -> str:
 
 
 TRUTH_FILE = "truth.json"
-MANIFEST = "log.json"
 
 
 def write_synthetic(
@@ -306,22 +299,13 @@ def write_synthetic(
     ConfigError
         When the folder may not be replaced or cannot be written.
     """
-    from log2sim.logs.native.writer import write_log
+    from log2sim.logs.native.writer import refuse_target, write_log
 
     target = Path(out)
-    _refuse(target, overwrite)
+    refuse_target(target, overwrite=overwrite)
     check_folder(target, overwrite=overwrite)
     log, truth = synthesize(scene, seed=seed)
     poses: Literal["gnss", "poses"] = scene.ego.poses if scene.ego is not None else "poses"
     with replaced_folder(target, overwrite=overwrite) as folder:
         write_log(log, folder, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
         truth.save(folder / TRUTH_FILE)
-
-
-def _refuse(target: Path, overwrite: bool) -> None:
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return
-    if not overwrite:
-        raise ConfigError(f"{target}: exists already; choose another name or pass --overwrite")
-    if not (target / MANIFEST).is_file():
-        raise ConfigError(f"{target}: exists and is no log folder, so it is not replaced; choose another name")

@@ -7,7 +7,7 @@ park along, across and at an angle; people, riders and what is no road user stan
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -421,7 +421,14 @@ def draw_scene(
     `weather`: by default clear, in one scene of ten rain or fog.
     """
     roads, sensor_forward = _draw_roads(mount, rng)
-    surface = _draw_surface(roads, rng)
+    steep = rng.random() < 0.4
+    tilt = rng.normal(0, 0.03 if steep else 0.008, 2)
+    bend = rng.normal(0, 4e-4 if steep else 5e-5, 3)
+    waves = np.column_stack(
+        [rng.uniform(0, 0.025, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.uniform(0, 2 * np.pi, 3)]
+    )
+    kerb = float(rng.choice([0.0, rng.uniform(0.02, 0.2), rng.normal(0, 0.2)], p=[0.3, 0.6, 0.1]))
+    surface = Surface(np.append(tilt, bend), waves, roads, kerb)
     model = lidar or _draw_lidar(mount, rng)
     objects = draw_layout(mount, roads, surface, rng)
     sensor = _draw_sensor(mount, model, surface, sensor_forward, rng)
@@ -471,17 +478,6 @@ def _draw_roads(mount: Mount, rng: np.random.Generator) -> tuple[tuple[Road, ...
         cross_yaw = yaw + float(rng.choice([-1, 1])) * float(rng.normal(np.pi / 2, 0.2))
         roads.append(Road(at, cross_yaw, 0.0, cross_half, max(1, round(2 * cross_half / 3.3)), keeps_right))
     return tuple(roads), forward
-
-
-def _draw_surface(roads: tuple[Road, ...], rng: np.random.Generator) -> Surface:
-    steep = rng.random() < 0.4
-    tilt = rng.normal(0, 0.03 if steep else 0.008, 2)
-    bend = rng.normal(0, 4e-4 if steep else 5e-5, 3)
-    waves = np.column_stack(
-        [rng.uniform(0, 0.025, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.uniform(0, 2 * np.pi, 3)]
-    )
-    kerb = float(rng.choice([0.0, rng.uniform(0.02, 0.2), rng.normal(0, 0.2)], p=[0.3, 0.6, 0.1]))
-    return Surface(np.append(tilt, bend), waves, roads, kerb)
 
 
 def _draw_lidar(mount: Mount, rng: np.random.Generator) -> LidarModel:
@@ -623,8 +619,3 @@ def draw_environment(rng: np.random.Generator, light: str | None, weather: str |
             "rain_mm_h": round(float(rain), 1),
         }
     )
-
-
-def known(field: str) -> tuple[str, ...]:
-    """Values that a field of the environment may have."""
-    return tuple(str(v) for v in get_args(Environment.model_fields[field].annotation))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, Stream, Sweep
 from log2sim.errors import ConfigError
-from log2sim.files.documents import check_folder
+from log2sim.files.documents import check_folder, refuse_folder
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth.light import light_of, weather_of
@@ -170,7 +170,10 @@ class TrafficRun:
 
     def at(self, t_s: float) -> TrafficScene:
         """Return the scene at a time since its begin."""
-        distance, speed = self._gone(t_s)
+        position = min(max(t_s / STEP_S, 0.0), len(self.distance_m) - 1.000001)
+        k = int(position)
+        step = self.distance_m[k + 1] - self.distance_m[k]
+        distance, speed = self.distance_m[k] + (position - k) * step, step / STEP_S
         objects = [_moved(o, d, v, self.scene) for o, d, v in zip(self.scene.objects, distance, speed)]
         if self.ego is None:
             return replace(self.scene, objects=tuple(objects))
@@ -186,12 +189,6 @@ class TrafficRun:
         kept = [replace(o, position_m=np.append(xy, -rise), yaw_rad=ego.yaw_rad, speed_mps=speed[-1]) if o.kind == "own car" else o
                 for o in objects]  # fmt: skip
         return replace(self.scene, objects=tuple(kept), sensor=sensor)
-
-    def _gone(self, t_s: float) -> tuple[Array, Array]:
-        position = min(max(t_s / STEP_S, 0.0), len(self.distance_m) - 1.000001)
-        k = int(position)
-        step = self.distance_m[k + 1] - self.distance_m[k]
-        return self.distance_m[k] + (position - k) * step, step / STEP_S
 
 
 def run_of(scene: TrafficScene, duration_s: float) -> TrafficRun:
@@ -281,7 +278,10 @@ def log_of(
     run = run_of(scene, duration_s)
     rig = rig_of(scene)
     mount = "map" if scene.mount == "roadside" else "ego"
-    mount_T_lidar = _ego_T_lidar(scene) if mount == "ego" else rig.map_T_lidar
+    mount_T_lidar = rig.map_T_lidar
+    if mount == "ego":
+        place = np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])])
+        mount_T_lidar = transform(np.eye(3), place)
     lidar_T_cam = mount_T_cam_of(scene.mount, rig)
     camera = replace(rig.camera, name=CAMERA, mount=mount, mount_T_cam=mount_T_lidar @ lidar_T_cam)  # type: ignore[arg-type]
     film = _Film(run, environment, camera, lidar_T_cam, seed)
@@ -310,10 +310,6 @@ def log_of(
 def _stamps(t_s: Array) -> NDArray[np.int64]:
     stamps: NDArray[np.int64] = START_NS + np.rint(t_s * NS_PER_S).astype(np.int64)
     return stamps
-
-
-def _ego_T_lidar(scene: TrafficScene) -> Array:
-    return transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
 
 
 def _map_T_lidar(scene: TrafficScene) -> Array:
@@ -425,20 +421,39 @@ def write_traffic(
     if settings.layout == "kitti" and not settings.pictures:
         raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")
     sensor_named(settings.sensor, settings.mount)
-    _refuse(out, overwrite=overwrite)
+    refuse_folder(out, overwrite=overwrite, holding=MANIFEST, kind="data of random traffic")
     check_folder(out, overwrite=overwrite)
-    write = _write_frame if settings.layout == "kitti" else _write_log
     with replaced_folder(out, overwrite=overwrite) as folder:
         scenes = []
         for index in range(settings.scenes):
             scene, environment = draw_traffic(settings, index)
-            write(settings, scene, environment, folder, index)
-            scenes.append(_description(scene, environment, index))
+            seed = int(np.random.default_rng([settings.seed, index, 2]).integers(2**31))
+            if settings.layout == "kitti":
+                frame_of(scene, environment, seed).write(folder / "training", index)
+            else:
+                _write_log(settings, scene, environment, folder / f"scene_{index:06d}", seed)
+            users = [o.category for o in scene.objects if o.category]
+            scenes.append(
+                {
+                    "name": f"{index:06d}",
+                    "environment": environment.model_dump(),
+                    "lidar": scene.lidar.name,
+                    "road_users": {category: users.count(category) for category in sorted(set(users))},
+                }
+            )
             if progress is not None:
                 progress(index + 1, settings.scenes)
         if settings.layout == "kitti":
-            _write_splits(folder, settings)
-        (folder / MANIFEST).write_text(json.dumps(_manifest(settings, scenes), indent=1) + "\n", encoding="utf-8")
+            # Lists of frames that readers of this layout look for: a random half for training, the other to validate.
+            order = np.random.default_rng([settings.seed, 3]).permutation(settings.scenes)
+            (folder / "ImageSets").mkdir()
+            half = (settings.scenes + 1) // 2
+            for name, rows in (("train", order[:half]), ("val", order[half:]), ("trainval", order)):
+                lines = "".join(f"{k:06d}\n" for k in sorted(rows.tolist()))
+                (folder / "ImageSets" / f"{name}.txt").write_text(lines, encoding="ascii")
+        manifest = {"format": FORMAT, "version": VERSION, "mount": settings.mount, "layout": settings.layout}
+        manifest |= {"seed": settings.seed, "sensor": settings.sensor, "scenes": scenes}
+        (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
 def draw_traffic(settings: TrafficSettings, index: int) -> tuple[TrafficScene, Environment]:
@@ -465,70 +480,13 @@ def frame_of(scene: TrafficScene, environment: Environment, seed: int) -> KittiF
     )
 
 
-def _write_frame(
-    settings: TrafficSettings, scene: TrafficScene, environment: Environment, root: Path, index: int
-) -> None:
-    frame_of(scene, environment, _scene_seed(settings, index)).write(root / "training", index)
-
-
 def _write_log(
-    settings: TrafficSettings, scene: TrafficScene, environment: Environment, root: Path, index: int
+    settings: TrafficSettings, scene: TrafficScene, environment: Environment, folder: Path, seed: int
 ) -> None:
     from log2sim.logs.native.writer import write_log
 
-    name = _scene_name(index)
-    seed = _scene_seed(settings, index)
-    log = log_of(scene, environment, name, settings.duration_s, seed, image_labels=settings.pictures)
+    log = log_of(scene, environment, folder.name, settings.duration_s, seed, image_labels=settings.pictures)
     if not settings.pictures:
         sweeps = {name: log.streams[name] for name in log.lidars}
         log = log.changed(cameras={}, streams=sweeps, image_labels={}, reference_camera=None)
-    write_log(log, root / name)
-
-
-def _scene_seed(settings: TrafficSettings, index: int) -> int:
-    return int(np.random.default_rng([settings.seed, index, 2]).integers(2**31))
-
-
-def _scene_name(index: int) -> str:
-    return f"scene_{index:06d}"
-
-
-def _write_splits(root: Path, settings: TrafficSettings) -> None:
-    """Write the lists of frames that readers of KITTI's layout look for: a random half for training, the other to validate."""
-    order = np.random.default_rng([settings.seed, 3]).permutation(settings.scenes)
-    folder = root / "ImageSets"
-    folder.mkdir()
-    half = (settings.scenes + 1) // 2
-    for name, rows in (("train", order[:half]), ("val", order[half:]), ("trainval", order)):
-        (folder / f"{name}.txt").write_text("".join(f"{k:06d}\n" for k in sorted(rows.tolist())), encoding="ascii")
-
-
-def _description(scene: TrafficScene, environment: Environment, index: int) -> dict[str, Any]:
-    users = [o.category for o in scene.objects if o.category]
-    return {
-        "name": f"{index:06d}",
-        "environment": environment.model_dump(),
-        "lidar": scene.lidar.name,
-        "road_users": {category: users.count(category) for category in sorted(set(users))},
-    }
-
-
-def _manifest(settings: TrafficSettings, scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "mount": settings.mount,
-        "layout": settings.layout,
-        "seed": settings.seed,
-        "sensor": settings.sensor,
-        "scenes": scenes,
-    }
-
-
-def _refuse(out: Path, *, overwrite: bool) -> None:
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return
-    if not overwrite:
-        raise ConfigError(f"{out}: exists already; choose another name or pass --overwrite")
-    if not (out / MANIFEST).is_file():
-        raise ConfigError(f"{out}: exists and is no data of random traffic, so it is not replaced; choose another name")
+    write_log(log, folder)

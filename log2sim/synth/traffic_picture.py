@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, rotation_from_rpy, transform
-from log2sim.synth.backdrop import Wall
+from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.ground import Ground, GroundPlan
 from log2sim.synth.light import Lamp, Light, headlights
 from log2sim.synth.paint import Paint, linear_bgr
-from log2sim.synth.polytope_caster import MESH_OPENNESS, Terrain
+from log2sim.synth.polytope_caster import MESH_OPENNESS
 from log2sim.synth.polytopes import Material, meshes_of
 from log2sim.synth.render import Body, Painter, SceneInstant, Values
 from log2sim.synth.scene import Road as PaintedRoad
@@ -32,21 +32,12 @@ CLOTHES: tuple[Rgb, ...] = (
     (40, 42, 50), (52, 66, 104), (150, 40, 44), (70, 96, 70), (196, 190, 180), (110, 84, 60), (208, 140, 50), (90, 92, 96),
 )  # fmt: skip
 WALLS: tuple[Rgb, ...] = (
-    (196, 182, 158),
-    (176, 158, 146),
-    (186, 186, 180),
-    (188, 168, 140),
-    (150, 120, 100),
-    (208, 204, 196),
-)
+    (196, 182, 158), (176, 158, 146), (186, 186, 180), (188, 168, 140), (150, 120, 100), (208, 204, 196),
+)  # fmt: skip
 FIXED: dict[Material, Rgb] = {
-    Material.GROUND: (120, 112, 96),
-    Material.GLASS: (62, 68, 74),
-    Material.DARK: (38, 38, 40),
-    Material.METAL: (150, 154, 158),
-    Material.MESH: (120, 126, 122),
-    Material.WOOD: (104, 82, 62),
-}
+    Material.GROUND: (120, 112, 96), Material.GLASS: (62, 68, 74), Material.DARK: (38, 38, 40),
+    Material.METAL: (150, 154, 158), Material.MESH: (120, 126, 122), Material.WOOD: (104, 82, 62),
+}  # fmt: skip
 GLOSS = {Material.GLASS: 0.34, Material.PAINT: 0.14, Material.METAL: 0.12}
 SKINS: tuple[Rgb, ...] = ((206, 162, 136), (170, 122, 92), (96, 66, 48))
 HAIRS: tuple[Rgb, ...] = ((40, 32, 26), (88, 62, 38), (150, 120, 80), (120, 118, 116))
@@ -84,7 +75,8 @@ class Look:
 
 def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
     """Draw the colors of an object."""
-    body = _choice(rng, [c for c, _ in CAR_COLORS], [s for _, s in CAR_COLORS])
+    shares = np.array([share for _, share in CAR_COLORS])
+    body = CAR_COLORS[rng.choice(len(CAR_COLORS), p=shares / np.sum(shares))][0]
     if item.category in ("truck", "bus"):
         body = LOAD_COLORS[rng.integers(len(LOAD_COLORS))]
     cloth, trousers, wall = (pool[rng.integers(len(pool))] for pool in (CLOTHES, CLOTHES[:4], WALLS))
@@ -94,21 +86,8 @@ def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
     color = np.array([green if m == Material.LEAVES else linear_bgr(drawn[Material(m)]) for m in material], np.float32)
     gloss = np.array([GLOSS.get(Material(m), 0.0) for m in material], np.float32)
     skin, hair = SKINS[rng.integers(len(SKINS))], HAIRS[rng.integers(len(HAIRS))]
-    return Look(
-        item.category,
-        item.kind,
-        item.size_m,
-        material,
-        color,
-        gloss,
-        linear_bgr(trousers),
-        linear_bgr(skin),
-        linear_bgr(hair),
-    )
-
-
-def _choice(rng: np.random.Generator, pool: list[Rgb], shares: list[float]) -> Rgb:
-    return pool[rng.choice(len(pool), p=np.array(shares) / np.sum(shares))]
+    person = (linear_bgr(rgb) for rgb in (trousers, skin, hair))
+    return Look(item.category, item.kind, item.size_m, material, color, gloss, *person)
 
 
 def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values) -> Paint:
@@ -116,42 +95,34 @@ def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values)
     z = points[:, 2] + np.float32(look.size_m[2] / 2)
     material = look.material[part]
     if look.category in VEHICLES:
-        _vehicle(look, out, material, points, z, normals)
+        # Paint lamps, plates and the sills of windows
+        length, width, height = look.size_m
+        low = min(1.1, 0.62 * height)
+        x, y = points[:, 0], np.abs(points[:, 1])
+        end = material == Material.PAINT
+        lamp = end & (y > 0.28 * width) & (z > 0.62 * low) & (z < 0.86 * low)
+        for mask, color, glow in (
+            (lamp & (normals[:, 0] > 0.5) & (x > 0.42 * length), LAMP_WHITE, 0.25),
+            (lamp & (normals[:, 0] < -0.5) & (x < -0.42 * length), LAMP_RED, 0.25),
+            (end & (np.abs(normals[:, 0]) > 0.5) & (y < 0.26) & (np.abs(z - 0.5 * low) < 0.06), PLATE, 0.0),
+        ):
+            out.albedo[mask] = color
+            out.glow[mask] = glow * np.asarray(color, np.float32)
     elif look.category in PEOPLE:
-        _person(look, out, material, z, normals)
+        # Paint trousers, hands' height, face and hair by their heights
+        cloth = material == Material.CLOTH
+        share = z / np.float32(look.size_m[2])
+        out.albedo[cloth & (share < 0.5)] = look.trousers
+        head = cloth & (share > 0.855)
+        out.albedo[head] = look.hair
+        out.albedo[head & (normals[:, 0] > 0.2) & (share < 0.965)] = look.skin
+        out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
     elif look.kind == "building":
         _front(out, material, points, z, normals)
     leaves = material == Material.LEAVES
     if leaves.any():
         out.albedo[leaves] *= _mottled(points[leaves])[:, None]
     return out
-
-
-def _vehicle(look: Look, out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
-    """Paint lamps, plates and the sills of windows."""
-    length, width, height = look.size_m
-    low = min(1.1, 0.62 * height)
-    x, y = points[:, 0], np.abs(points[:, 1])
-    end = material == Material.PAINT
-    lamp = end & (y > 0.28 * width) & (z > 0.62 * low) & (z < 0.86 * low)
-    for mask, color, glow in (
-        (lamp & (normals[:, 0] > 0.5) & (x > 0.42 * length), LAMP_WHITE, 0.25),
-        (lamp & (normals[:, 0] < -0.5) & (x < -0.42 * length), LAMP_RED, 0.25),
-        (end & (np.abs(normals[:, 0]) > 0.5) & (y < 0.26) & (np.abs(z - 0.5 * low) < 0.06), PLATE, 0.0),
-    ):
-        out.albedo[mask] = color
-        out.glow[mask] = glow * np.asarray(color, np.float32)
-
-
-def _person(look: Look, out: Paint, material: NDArray[np.int64], z: Values, normals: Values) -> None:
-    """Paint trousers, hands' height, face and hair by their heights."""
-    cloth = material == Material.CLOTH
-    share = z / np.float32(look.size_m[2])
-    out.albedo[cloth & (share < 0.5)] = look.trousers
-    head = cloth & (share > 0.855)
-    out.albedo[head] = look.hair
-    out.albedo[head & (normals[:, 0] > 0.2) & (share < 0.965)] = look.skin
-    out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
 
 
 def _front(out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
@@ -181,16 +152,6 @@ OWN_CAR = "own car"
 GRAIN_SEED = 0  # one grain for all scenes, because it takes long to make
 
 
-@dataclass(frozen=True, eq=False)
-class TrafficBackdrop:
-    """The ground of a random scene."""
-
-    ground: Ground
-    terrain: Terrain | None
-    buildings: tuple[tuple[Wall, ...], ...] = ()  # none; houses are bodies
-    shadows: tuple[Array, ...] = ()  # none; houses are bodies
-
-
 class TrafficPainter:
     """Makes the pictures' content of one random scene; shapes and colors are made once.
 
@@ -199,7 +160,7 @@ class TrafficPainter:
 
     def __init__(self, scene: TrafficScene, seed: int) -> None:
         painted = [painted_road(road, scene.surface.kerb_m > 0) for road in scene.roads]
-        self.backdrop = TrafficBackdrop(Ground(GroundPlan(painted), GRAIN_SEED), scene.surface)
+        self.backdrop = Backdrop(Ground(GroundPlan(painted), GRAIN_SEED), scene.surface)
         self._seed = seed
         self._looks: dict[int, Look] = {}
         self._meshes: dict[int, Mesh] = {}
@@ -210,7 +171,12 @@ class TrafficPainter:
         """Take the scene at one time: what a camera may see, and the index of the object that each body is."""
         seen = [k for k, item in enumerate(scene.objects) if item.kind != OWN_CAR and _in_view(item, camera, map_T_cam)]
         self._make([k for k in seen if k not in self._meshes], scene)
-        bodies = [_body(scene.objects[k], self._meshes[k], self._looks[k]) for k in seen]
+        bodies = []
+        for k in seen:
+            item = scene.objects[k]
+            center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
+            pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
+            bodies.append(Body(self._meshes[k], pose, item.size_m, self._looks[k].painter(), self._looks[k].passes()))
         lamps = lamps_of(scene) if light.lamps > 0 else ()
         return SceneInstant(self.backdrop, bodies, light, lamps), np.array(seen, np.int64)
 
@@ -264,12 +230,6 @@ def _in_view(item: TrafficObject, camera: Camera, map_T_cam: Array) -> bool:
     if distance < radius + 1.0:
         return True
     return bool(np.arccos(np.clip(p[2] / distance, -1, 1)) < half + np.arcsin(min(1.0, radius / distance)))
-
-
-def _body(item: TrafficObject, mesh: Mesh, look: Look) -> Body:
-    center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
-    pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
-    return Body(mesh, pose, item.size_m, look.painter(), passes=look.passes())
 
 
 def _rounded(mesh: Mesh, material: NDArray[np.int64]) -> Mesh:

@@ -88,7 +88,7 @@ def _car(kind: str, rng: np.random.Generator) -> Shape:
         seats,
         pillars,
         *_wheels(half * 0.62, width, rng.uniform(0.29, 0.36)),
-        _underbody(half, width, sill),
+        box((-half * 0.7, -width * 0.38, 0.14), (half * 0.7, width * 0.38, sill + 0.02), Material.DARK),
     ]
     if kind in ("van", "wagon", "large suv", "suv") and rng.random() < 0.35:
         parts.append(box((-back, -width * 0.36, belt), (-back + 0.25, width * 0.36, height - 0.1), Material.DARK))
@@ -97,32 +97,21 @@ def _car(kind: str, rng: np.random.Generator) -> Shape:
             [(-half * 0.05, sill), (half - 0.12, sill), (half, sill + 0.2), (half, hood - 0.2), (half - nose, hood), (half * 0.4, belt), (-half * 0.05, belt)],
             width, Material.PAINT, taper=0.02,
         )  # fmt: skip
-        parts += _bed(half, width, sill, belt, full=rng.random() < 0.25)
+        # The open bed.
+        low, high, w = sill + 0.1, belt - 0.08, width / 2
+        parts += [
+            box((-half, -w, low), (-half * 0.05, -w + 0.1, high), Material.PAINT),
+            box((-half, w - 0.1, low), (-half * 0.05, w, high), Material.PAINT),
+            box((-half, -w, low), (-half + 0.08, w, high), Material.PAINT),
+            box((-half, -w, low), (-half * 0.05, w, low + 0.25), Material.DARK),
+        ]
+        if rng.random() < 0.25:
+            parts.append(box((-half + 0.1, -w + 0.1, low), (-half * 0.2, w - 0.1, high + 0.2), Material.CLOTH))
     return (length, width, height), tuple(parts)
-
-
-def _bed(half: float, width: float, sill: float, belt: float, *, full: bool) -> list[Polytope]:
-    """Make the open bed of a pick-up."""
-    low, high, w = sill + 0.1, belt - 0.08, width / 2
-    walls = [
-        box((-half, -w, low), (-half * 0.05, -w + 0.1, high), Material.PAINT),
-        box((-half, w - 0.1, low), (-half * 0.05, w, high), Material.PAINT),
-        box((-half, -w, low), (-half + 0.08, w, high), Material.PAINT),
-        box((-half, -w, low), (-half * 0.05, w, low + 0.25), Material.DARK),
-    ]
-    return (
-        [*walls, box((-half + 0.1, -w + 0.1, low), (-half * 0.2, w - 0.1, high + 0.2), Material.CLOTH)]
-        if full
-        else walls
-    )
 
 
 def _wheels(x: float, width: float, radius: float) -> list[Polytope]:
     return [wheel(radius, 0.22, sx * x, sy * (width / 2 - 0.13)) for sx in (1, -1) for sy in (1, -1)]
-
-
-def _underbody(half: float, width: float, sill: float) -> Polytope:
-    return box((-half * 0.7, -width * 0.38, 0.14), (half * 0.7, width * 0.38, sill + 0.02), Material.DARK)
 
 
 def _delivery_van(rng: np.random.Generator) -> Shape:
@@ -524,28 +513,15 @@ def stand(rng: np.random.Generator) -> Parts:
 
 
 SMALL: dict[str, tuple[float, float, Callable[[np.random.Generator], Parts]]] = {
-    "tree": (0.18, 0.4, tree),
-    "bush": (0.2, 0.9, bush),
-    "grass": (0.14, 0.3, grass),
-    "pole": (0.2, 0.2, pole),
-    "stand": (0.08, 0.3, stand),
-    "bin": (0.1, 0.8, bin_),
-    "container": (0.05, 3.5, container),
-    "bench": (0.05, 1.0, bench),
-    "shelter": (0.02, 2.5, shelter),
-    "cone": (0.04, 0.5, cone),
-}
+    "tree": (0.18, 0.4, tree), "bush": (0.2, 0.9, bush), "grass": (0.14, 0.3, grass), "pole": (0.2, 0.2, pole),
+    "stand": (0.08, 0.3, stand), "bin": (0.1, 0.8, bin_), "container": (0.05, 3.5, container),
+    "bench": (0.05, 1.0, bench), "shelter": (0.02, 2.5, shelter), "cone": (0.04, 0.5, cone),
+}  # fmt: skip
 """By kind: share, radius in m that is to be free around it, and how to draw it."""
 
 
 ROAD_USERS: dict[str, Callable[[np.random.Generator], Shape]] = {
-    "car": car,
-    "truck": truck,
-    "bus": bus,
-    "motorcycle": motorcycle,
-    "cyclist": cyclist,
-    "bicycle": bicycle,
-    "pedestrian": pedestrian,
-    "other": stroller,
-}
+    "car": car, "truck": truck, "bus": bus, "motorcycle": motorcycle, "cyclist": cyclist, "bicycle": bicycle,
+    "pedestrian": pedestrian, "other": stroller,
+}  # fmt: skip
 """How to draw a road user of a category."""

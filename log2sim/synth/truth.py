@@ -142,7 +142,7 @@ def map_features_of(scene: Scene) -> MapFeatures:
         crossed = area_of([Stroke(np.array(r.line), r.width_m) for n, r in enumerate(plan.roads) if n != k])
         sides = _borders(road, crossed, k)
         borders += [piece for pieces in sides for piece in pieces]
-        lanes += _Lanes.of(road, k, plan.keeps_right, tuple(zip(lines, own)), sides).cut(crossed)
+        lanes += _lanes(road, k, plan.keeps_right, tuple(zip(lines, own)), sides, crossed)
     markings += [_crosswalk(zebra, k) for k, zebra in enumerate(plan.zebras)]
     for k, stop in enumerate(plan.stop_lines):
         markings.append(
@@ -221,103 +221,73 @@ def _crosswalk(zebra: Zebra, k: int) -> Marking:
     return Marking(f"crosswalk_{k}", "crosswalk", _on_ground(outline), zebra.width_m, "white")
 
 
-@dataclass(frozen=True, eq=False)
-class _Lanes:
-    """The lanes of a road from its right to its left, as its line runs."""
+def _lanes(
+    road: Road,
+    number: int,
+    keeps_right: bool,
+    lines: Sequence[tuple[RoadLine, list[Marking]]],
+    borders: tuple[list[RoadBorder], list[RoadBorder]],
+    crossed: BaseGeometry,
+) -> list[MapLane]:
+    """List the lanes of a road from its right to its left, in the directions in which they are driven.
 
-    road: Road
-    number: int
-    first_forward: int  # which lanes lead along the line
-    last_forward: int  # which lanes lead along the line
-    at_m: Array  # (L + 1,): how far to the left of the road's line their boundaries lie
-    # Markings, or borders, of each boundary for the lane at its right and the one at its left
-    sides: tuple[tuple[list[Marking] | list[RoadBorder], list[Marking] | list[RoadBorder]], ...]
-
-    @classmethod
-    def of(
-        cls,
-        road: Road,
-        number: int,
-        keeps_right: bool,
-        lines: Sequence[tuple[RoadLine, list[Marking]]],
-        borders: tuple[list[RoadBorder], list[RoadBorder]],
-    ) -> _Lanes:
-        """Find what lies at the boundaries."""
-        back = road.backward_lanes
-        first = 0 if keeps_right else back
-        at = (np.arange(road.lanes + 1) / road.lanes - 0.5) * road.width_m
-        sides: list[tuple[list[Marking] | list[RoadBorder], list[Marking] | list[RoadBorder]]] = []
-        for boundary in range(road.lanes + 1):
-            own = [(line, pieces) for line, pieces in lines if line.boundary == boundary]
-            if own:
-                offsets = [_offset(road, line) for line, _ in own]
-                at[boundary] = np.mean(offsets)
-                # Of a double line each lane has the one that is nearer.
-                sides.append((own[int(np.argmin(offsets))][1], own[int(np.argmax(offsets))][1]))
-            else:
-                border = borders[0] if boundary == 0 else borders[1] if boundary == road.lanes else []
-                sides.append((border, border))
-        return cls(road, number, first, first + road.lanes - back - 1, at, tuple(sides))
-
-    def cut(self, crossed: BaseGeometry) -> list[MapLane]:
-        """List the lanes in the directions in which they are driven, cut where other roads cross."""
-        parts = [self._parts(lane, crossed) for lane in range(self.road.lanes)]
-        out = []
-        for lane, pieces in enumerate(parts):
-            for n, piece in enumerate(pieces):
-                right, left = (parts[k][n] if self._alike(parts, lane, k) else None for k in (lane - 1, lane + 1))
-                forward = self._forward(lane)
-                beside = {"right": right, "left": left} if forward else {"right": left, "left": right}
-                numbers = {"right": lane - 1 if forward else lane + 1, "left": lane + 1 if forward else lane - 1}
-                same = {
-                    side: other.id
-                    for side, other in beside.items()
-                    if other is not None and self._forward(numbers[side]) == forward
-                }
-                opposite = [o.id for side, o in beside.items() if o is not None and side not in same]
-                out.append(
-                    replace(
-                        piece,
-                        left_lane=same.get("left"),
-                        right_lane=same.get("right"),
-                        opposite=opposite[0] if opposite else None,
-                    )
-                )
-        return out
-
-    def _alike(self, parts: list[list[MapLane]], lane: int, other: int) -> bool:
-        return 0 <= other < len(parts) and len(parts[other]) == len(parts[lane])
-
-    def _forward(self, lane: int) -> bool:
-        return self.first_forward <= lane <= self.last_forward
-
-    def _parts(self, lane: int, crossed: BaseGeometry) -> list[MapLane]:
-        """Cut a lane at other roads; the parts on them belong to junctions. In the order of the road's line."""
-        middle = parallel(np.array(self.road.line), float(self.at_m[lane : lane + 2].mean()))
+    They are cut at other roads; the parts on them belong to junctions.
+    """
+    at = (np.arange(road.lanes + 1) / road.lanes - 0.5) * road.width_m  # how far to the left their boundaries lie
+    # Markings, or borders, of each boundary for the lane at its right and the one at its left.
+    sides: list[tuple[Sequence[Marking | RoadBorder], Sequence[Marking | RoadBorder]]] = []
+    for boundary in range(road.lanes + 1):
+        own = [(line, pieces) for line, pieces in lines if line.boundary == boundary]
+        if own:
+            offsets = [_offset(road, line) for line, _ in own]
+            at[boundary] = np.mean(offsets)
+            # Of a double line each lane has the one that is nearer.
+            sides.append((own[int(np.argmin(offsets))][1], own[int(np.argmax(offsets))][1]))
+        else:
+            border = borders[0] if boundary == 0 else borders[1] if boundary == road.lanes else []
+            sides.append((border, border))
+    first = 0 if keeps_right else road.backward_lanes
+    forward = [first <= lane < first + road.lanes - road.backward_lanes for lane in range(road.lanes)]
+    parts: list[list[MapLane]] = []
+    for lane in range(road.lanes):
+        middle = parallel(np.array(road.line), float(at[lane : lane + 2].mean()))
         whole = LineString(middle)
         free = [(interval, False) for interval in _along(whole, whole.difference(crossed))]
-        parts = sorted([*free, *((interval, True) for interval in _along(whole, whole.intersection(crossed)))])
-        names = [f"lane_{self.number}_{lane}_{n}" for n in range(len(parts))]
-        forward = self._forward(lane)
-        out = []
-        for n, ((begin, end), inside) in enumerate(parts):
+        pieces = sorted([*free, *((interval, True) for interval in _along(whole, whole.intersection(crossed)))])
+        names = [f"lane_{number}_{lane}_{n}" for n in range(len(pieces))]
+        parts.append([])
+        for n, ((begin, end), inside) in enumerate(pieces):
             points = stretch(middle, begin, end)
-            before, after = names[max(n - 1, 0) : n], names[n + 1 : n + 2]
-            right = None if inside else _beside(points, self.sides[lane][1])
-            left = None if inside else _beside(points, self.sides[lane + 1][0])
-            out.append(
+            ends = names[max(n - 1, 0) : n], names[n + 1 : n + 2]
+            right, left = (
+                (None, None) if inside else (_beside(points, sides[lane][1]), _beside(points, sides[lane + 1][0]))
+            )
+            if not forward[lane]:
+                points, ends, right, left = points[::-1], ends[::-1], left, right
+            parts[-1].append(
                 MapLane(
                     id=names[n],
-                    points_m=_on_ground(points if forward else points[::-1]),
-                    width_m=np.full(len(points), float(np.diff(self.at_m)[lane])),
-                    left=left if forward else right,
-                    right=right if forward else left,
-                    predecessors=tuple(before if forward else after),
-                    successors=tuple(after if forward else before),
-                    junction=f"junction_{self.number}_{n}" if inside else None,
+                    points_m=_on_ground(points),
+                    width_m=np.full(len(points), float(np.diff(at)[lane])),
+                    left=left,
+                    right=right,
+                    predecessors=tuple(ends[0]),
+                    successors=tuple(ends[1]),
+                    junction=f"junction_{number}_{n}" if inside else None,
                 )
             )
-        return out
+    out = []
+    for lane, own_parts in enumerate(parts):
+        for n, piece in enumerate(own_parts):
+            beside: dict[str, Any] = {}
+            # To the left as it is driven, then to the right; of lanes that lead against it the last one counts.
+            for field, step in (("left_lane", 1), ("right_lane", -1)):
+                other = lane + (step if forward[lane] else -step)
+                if 0 <= other < road.lanes and len(parts[other]) == len(own_parts):
+                    same = forward[other] == forward[lane]
+                    beside[field if same else "opposite"] = parts[other][n].id
+            out.append(replace(piece, **beside))
+    return out
 
 
 def _offset(road: Road, line: RoadLine) -> float:

@@ -7,7 +7,6 @@ frame by frame (sequence 0000 is drive 2011_09_26_0005).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,7 +77,12 @@ class _Drive:
         streams: dict[str, Stream] = {}
         cameras: dict[str, Camera] = {}
         for number in rig.projections:
-            self._add_camera(rig, number, cameras, streams, notes)
+            file = self.path.parent / CALIBRATION[0]
+            width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+            camera = rig.camera(number, round(width), round(height))
+            t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
+            cameras[camera.name] = camera
+            streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
         if (self.path / "velodyne_points").is_dir():
             streams["velodyne"] = self._sweeps(notes)
         ego_t_ns, poses, map_frame = self._poses(notes)
@@ -108,25 +112,10 @@ class _Drive:
     def _rig(self) -> drive.Rig:
         cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
         c = drive.read_calibration(cam)
-        rect = drive.checked_rotation(drive.calibration_entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
-        projections = {}
-        for k in range(4):
-            if (self.path / f"image_{k:02d}").is_dir():
-                key = f"P_rect_{k:02d}"
-                projections[k] = drive.checked_projection(
-                    drive.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
-                )
+        numbers = [k for k in range(4) if (self.path / f"image_{k:02d}").is_dir()]
+        rect = drive.rotation_entry(c, cam, "R_rect_00")
+        projections = {k: drive.projection_entry(c, cam, f"P_rect_{k:02d}") for k in numbers}
         return drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
-
-    def _add_camera(
-        self, rig: drive.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
-    ) -> None:
-        file = self.path.parent / CALIBRATION[0]
-        width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
-        camera = rig.camera(number, round(width), round(height))
-        t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
-        cameras[camera.name] = camera
-        streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
 
     def _sweeps(self, notes: list[str]) -> Stream:
         folder = self.path / "velodyne_points"
@@ -193,16 +182,16 @@ class _Drive:
         if missing:
             first = np.setdiff1d(np.arange(len(stamps)), numbers)[0]
             notes.append(f"{name}: {missing} of {len(stamps)} records are missing, first at stamp {stamps[first]}")
-        keep, problems = strictly_increasing(stamps[numbers], name)
-        notes += problems
+        keep = strictly_increasing(stamps[numbers], name, notes)
         numbers = numbers[keep]
         return stamps[numbers], [files[n] for n in numbers.tolist()], numbers
 
 
 def _rigid(path: Path) -> Array:
     calibration = drive.read_calibration(path)
-    rotation = drive.checked_rotation(drive.calibration_entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
-    return transform(rotation, drive.calibration_entry(calibration, path, (3,), "T"))
+    return transform(
+        drive.rotation_entry(calibration, path, "R"), drive.calibration_entry(calibration, path, (3,), "T")
+    )
 
 
 def _stamps(path: Path) -> NDArray[np.int64]:
@@ -277,7 +266,13 @@ class _Sequence:
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
         poses, map_frame = drive.poses_from_oxts(rows)
         track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
-        notes = [NO_STAMPS, *_missing_records(streams, len(rows))]
+        notes = [NO_STAMPS]
+        for name, stream in streams.items():
+            missing = np.setdiff1d(np.arange(len(rows)), stream.t_ns // PERIOD_NS)
+            if len(missing):
+                notes.append(
+                    f"{name}: {len(missing)} of {len(rows)} records are missing, first number {missing[0]:06d}"
+                )
         labels = self._labels(rig, track, notes)
         records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
         calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
@@ -302,20 +297,12 @@ class _Sequence:
     def _rig(self) -> drive.Rig:
         path = self.base / "calib" / f"{self.name}.txt"
         c = drive.read_calibration(path)
-        projections = {}
-        for k in CAMERA_NUMBERS:
-            if (self.base / f"image_{k:02d}" / self.name).is_dir():
-                projections[k] = drive.checked_projection(
-                    drive.calibration_entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
-                )
-        rect = drive.checked_rotation(
-            drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
-        )
-        links = []
-        for keys in (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam")):
-            m = drive.calibration_entry(c, path, (3, 4), *keys)
-            links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
-        return drive.rig_of(links[0], links[1], rect, projections)
+        numbers = [k for k in CAMERA_NUMBERS if (self.base / f"image_{k:02d}" / self.name).is_dir()]
+        projections = {k: drive.projection_entry(c, path, f"P{k}") for k in numbers}
+        rect = drive.rotation_entry(c, path, "R0_rect", "R_rect")
+        keys = (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam"))
+        velo_T_imu, cam_T_velo = (drive.rigid_entry(c, path, *names) for names in keys)
+        return drive.rig_of(velo_T_imu, cam_T_velo, rect, projections)
 
     def _cameras(self, rig: drive.Rig) -> tuple[dict[str, Camera], dict[str, Stream]]:
         cameras, streams = {}, {}
@@ -340,14 +327,6 @@ class _Sequence:
         if not is_present(path):
             return DriveLabels()
         return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS, notes)
-
-
-def _missing_records(streams: Mapping[str, Stream], count: int) -> Iterator[str]:
-    """Say which streams lack records of the frames that the IMU counts."""
-    for name, stream in streams.items():
-        missing = np.setdiff1d(np.arange(count), stream.t_ns // PERIOD_NS)
-        if len(missing):
-            yield f"{name}: {len(missing)} of {count} records are missing, first number {missing[0]:06d}"
 
 
 def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:

@@ -123,10 +123,24 @@ def checked_rotation(rotation: Array, where: str) -> Array:
     return nearest_rotation(rotation)
 
 
-def checked_projection(P: Array, where: str) -> Array:
-    """Return P (3, 4) of a rectified camera; `LogError` when it is none."""
+def rotation_entry(calibration: Mapping[str, Array], path: Path, *keys: str) -> Array:
+    """Entry of a calibration that is a rotation (3, 3)."""
+    return checked_rotation(calibration_entry(calibration, path, (3, 3), *keys), f"{path}, entry '{keys[0]}'")
+
+
+def rigid_entry(calibration: Mapping[str, Array], path: Path, *keys: str) -> Array:
+    """Entry of a calibration that is a rotation and a translation, as (4, 4)."""
+    m = calibration_entry(calibration, path, (3, 4), *keys)
+    return transform(checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3])
+
+
+def projection_entry(calibration: Mapping[str, Array], path: Path, key: str) -> Array:
+    """Entry of a calibration that is the P (3, 4) of a rectified camera."""
+    P = calibration_entry(calibration, path, (3, 4), key)
     if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] == 1 and P[1, 0] == 0 and not P[2, :2].any()):
-        raise LogError(f"{where}: K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1")
+        raise LogError(
+            f"{path}, entry '{key}': K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1"
+        )
     return P
 
 
@@ -194,16 +208,9 @@ def spin_offset_ns(xyz_m: NDArray[np.floating], begin_ns: int, end_ns: int) -> N
 
 
 CATEGORY_OF = {
-    "Car": "car",
-    "Van": "car",
-    "Truck": "truck",
-    "Pedestrian": "pedestrian",
-    "Person": "pedestrian",
-    "Person_sitting": "pedestrian",
-    "Cyclist": "cyclist",
-    "Tram": "other",
-    "Misc": "other",
-}
+    "Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Person": "pedestrian",
+    "Person_sitting": "pedestrian", "Cyclist": "cyclist", "Tram": "other", "Misc": "other",
+}  # fmt: skip
 NOT_LABELED = "DontCare"
 NEVER_LABELED = ("bicycle",)
 """No class is for bicycles without riders (Geiger et al., "Vision meets robotics", 2013, section III)."""
@@ -310,7 +317,19 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
         if not words:
             continue
         try:
-            frame, row = _parse_words(words)
+            if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or (
+                words[2] not in CATEGORY_OF and words[2] != NOT_LABELED
+            ):
+                known = ", ".join([*CATEGORY_OF, NOT_LABELED])
+                raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
+            try:
+                frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
+            except ValueError:
+                raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
+            if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
+                raise ValueError(f"a number is not finite, or larger than {MAX_POSITION_M:g}")
+            if not 0 <= frame <= MAX_FRAME:
+                raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
         except ValueError as problem:
             message = f"{path}, line {k}: {problem}"
             if damaged is None:
@@ -325,22 +344,6 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
     return LabelRows(
         np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table
     )
-
-
-def _parse_words(words: list[str]) -> tuple[int, list[float]]:
-    """Return the number of the frame and the numbers after the type of a line; `ValueError` says what is wrong with it."""
-    if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or (words[2] not in CATEGORY_OF and words[2] != NOT_LABELED):
-        known = ", ".join([*CATEGORY_OF, NOT_LABELED])
-        raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
-    try:
-        frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
-    except ValueError:
-        raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
-    if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
-        raise ValueError(f"a number is not finite, or larger than {MAX_POSITION_M:g}")
-    if not 0 <= frame <= MAX_FRAME:
-        raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
-    return frame, row
 
 
 def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:

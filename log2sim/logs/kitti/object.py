@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Labels, Log, Stream, Sweep
+from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.files.inputs import is_present, require_links_inside
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
@@ -80,23 +80,18 @@ class _Calibration:
     def read(cls, path: Path) -> _Calibration:
         """Read a calibration file."""
         c = drive.read_calibration(path)
-
-        def rigid(key: str) -> Array:
-            m = drive.calibration_entry(c, path, (3, 4), key)
-            return transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{key}'"), m[:, 3])
-
         rect = drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect")
         P = drive.calibration_entry(c, path, (3, 4), "P2")
         if not np.linalg.det(P[:, :3]) > 0:
             raise LogError(
                 f"{path}, entry 'P2': {P.tolist()} is singular or mirrors the image; expected intrinsics, or these and a rotation"
             )
-        velo_T_imu = rigid("Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
+        velo_T_imu = drive.rigid_entry(c, path, "Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
         knows_ground = not np.array_equal(velo_T_imu, np.eye(4))
         if not knows_ground:
             velo_T_imu = transform(np.eye(3), [0.0, 0.0, drive.EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
         rect_R_cam = drive.checked_rotation(rect, f"{path}, entry 'R0_rect'")
-        rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ rigid("Tr_velo_to_cam")
+        rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ drive.rigid_entry(c, path, "Tr_velo_to_cam")
         velo_ego = (drive.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
         ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
         return cls(ego_T_rect, rect_T_velo, P, knows_ground, "Tr_imu_to_velo" in c)
@@ -130,7 +125,14 @@ class _Split:
         return list_numbered_files(self.base / "velodyne", (".bin",))
 
     def log(self) -> Log:
-        calibrations, texts = self._calibrations()
+        known: dict[str, _Calibration] = {}  # by the text of their files; most frames share one
+        calibrations = {}
+        for number, file in self.sweeps.items():
+            path = self.base / "calib" / f"{file.stem}.txt"
+            text = drive.read_text(path)
+            if text not in known:
+                known[text] = _Calibration.read(path)
+            calibrations[number] = known[text]
         first = next(iter(calibrations.values()))
         t_ns = _stamps(self.sweeps)
         streams = {"velodyne": self._velodyne(t_ns, [calibrations[n] for n in self.sweeps], first)}
@@ -152,7 +154,10 @@ class _Split:
                 "the ego is put below the LiDAR there"
             )
         labels = self._labels(first, ego, notes)
-        ground_z_m = 0.0 if first.knows_ground else _ground_under(labels.boxes_3d)
+        ground_z_m, boxes = 0.0, labels.boxes_3d
+        if not first.knows_ground and boxes is not None and len(boxes.t_ns):
+            # The median of the lower faces of labels.
+            ground_z_m = float(np.median(boxes.center_m[:, 2] - boxes.size_m[:, 2] / 2))
         others = sum(not np.allclose(c.P, first.P, rtol=1e-2, atol=1e-3) for c in calibrations.values())
         if others:
             notes.append(f"{others} of {len(t_ns)} frames have another P2 by more than 1 %; that of the first is used")
@@ -169,24 +174,12 @@ class _Split:
             ignored_regions=labels.ignored,
             ground_z_ego_m=ground_z_m,
             reference_camera=CAMERA if cameras else None,
-            digest=digest_of([*texts, labels.text], self.sweeps.values()),
+            digest=digest_of([*known, labels.text], self.sweeps.values()),
             notes=tuple(notes),
             calibrations=dict.fromkeys(
                 streams, str(self.base / "calib" / f"{next(iter(self.sweeps.values())).stem}.txt")
             ),
         )
-
-    def _calibrations(self) -> tuple[dict[int, _Calibration], list[str]]:
-        """Return calibrations by number of frame, and the different texts of their files; most frames share one."""
-        known: dict[str, _Calibration] = {}
-        found = {}
-        for number, file in self.sweeps.items():
-            path = self.base / "calib" / f"{file.stem}.txt"
-            text = drive.read_text(path)
-            if text not in known:
-                known[text] = _Calibration.read(path)
-            found[number] = known[text]
-        return found, list(known)
 
     def _velodyne(self, t_ns: NDArray[np.int64], calibrations: list[_Calibration], first: _Calibration) -> Stream:
         """Stream of the sweeps in the map frame, each by its own calibration, so that labels fit them."""
@@ -221,13 +214,6 @@ class _Split:
         found = labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
         assert found.boxes_3d is not None
         return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=np.array(labeled, dtype=np.int64)))
-
-
-def _ground_under(labels: Labels | None) -> float:
-    """Return the median height of the lower faces of labels, ego frame; 0 without labels."""
-    if labels is None or not len(labels.t_ns):
-        return 0.0
-    return float(np.median(labels.center_m[:, 2] - labels.size_m[:, 2] / 2))
 
 
 def _stamps(files: Mapping[int, Path]) -> NDArray[np.int64]:

@@ -104,7 +104,15 @@ def read_csv_table(
     if not rows:
         raise LogError(f"{path}: is empty; expected the header {','.join(columns)}")
     header = [name.strip() for name in rows[0][1]]
-    _check_header(path, header, columns, kinds)
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise LogError(f"{path}, line 1: column '{missing[0]}' is missing; expected the header {','.join(columns)}")
+    for name in header:
+        if name not in kinds:
+            hint = nearest(name, list(kinds))
+            raise LogError(f"{path}, line 1: unknown column '{name}'{hint}; known: {', '.join(kinds)}")
+        if header.count(name) > 1:
+            raise LogError(f"{path}, line 1: column '{name}' occurs twice")
     wrong = [
         f"{path}, line {n}: {len(row)} fields, the header has {len(header)}"
         for n, row in rows[1:]
@@ -119,18 +127,6 @@ def read_csv_table(
     cells = {name: [row[k].strip() for _, row in whole] for k, name in enumerate(header)}
     values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
     return CsvTable(path, values, line, hashlib.sha256(data).hexdigest())
-
-
-def _check_header(path: Path, header: list[str], columns: Mapping[str, str], kinds: Mapping[str, str]) -> None:
-    missing = [name for name in columns if name not in header]
-    if missing:
-        raise LogError(f"{path}, line 1: column '{missing[0]}' is missing; expected the header {','.join(columns)}")
-    for name in header:
-        if name not in kinds:
-            hint = nearest(name, list(kinds))
-            raise LogError(f"{path}, line 1: unknown column '{name}'{hint}; known: {', '.join(kinds)}")
-        if header.count(name) > 1:
-            raise LogError(f"{path}, line 1: column '{name}' occurs twice")
 
 
 def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind: str) -> NDArray[Any]:
@@ -250,13 +246,9 @@ def offset_of(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: La
         first = track.map_T_ego[0, :3, 3]
     else:
         positions = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
-        first = (
-            positions[0]
-            if positions
-            else labels.center_m[0]
-            if labels is not None and len(labels.t_ns)
-            else np.zeros(3)
-        )
+        if not positions and labels is not None and len(labels.t_ns):
+            positions = [labels.center_m[0]]
+        first = positions[0] if positions else np.zeros(3)
     return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
 
 
@@ -272,11 +264,6 @@ def shifted_camera(camera: Camera, offset: Array) -> Camera:
 def shifted_lidar(lidar: Lidar, offset: Array) -> Lidar:
     """Shift a LiDAR that is fixed in the map."""
     return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, shift_poses(lidar.mount_T_lidar, offset))
-
-
-def shifted_labels(labels: Labels, offset: Array) -> Labels:
-    """Shift labels."""
-    return replace(labels, center_m=labels.center_m - offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,7 +376,7 @@ class _Folder:
                 (length, width, height), float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))
             ),
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
-            labels=None if labels is None else shifted_labels(labels, offset),
+            labels=None if labels is None else replace(labels, center_m=labels.center_m - offset),
             image_labels={} if boxes is None else boxes_2d(boxes, set(cameras)),
             ignored_regions={} if regions is None else regions_2d(regions, set(cameras)),
             ground_z_ego_m=float(ego.get("ground_z_m", 0.0)) - (float(offset[2]) if roadside else 0.0),
@@ -422,14 +409,22 @@ class _Folder:
         if "poses" in ego:
             table = self.table(ego["poses"], "ego.poses", POSE_COLUMNS)
             self._not_empty(table)
-            rotation = self._rotations(table)
-            poses = transform(rotation, table.stack("x_m", "y_m", "z_m"))
+            q = table.stack("qw", "qx", "qy", "qz")
+            bad = find_not_unit(q)
+            if len(bad):
+                norm = float(np.linalg.norm(q[bad[0]]))
+                raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm:.6g}, expected a unit quaternion")
+            poses = transform(rotation_from_quaternion(q), table.stack("x_m", "y_m", "z_m"))
         else:
             table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
             self._not_empty(table)
             from log2sim.logs.stamps import map_frame_of, poses_from_geodetic
 
-            _check_geodetic(table)
+            for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
+                bad = np.flatnonzero(np.abs(table[field]) > limit)
+                if len(bad):
+                    value = f"{table[field][bad[0]]:g}"
+                    raise LogError(f"{table.where(bad[0], field)}: {value}, expected at most {limit:g} degrees")
             map_frame = map_frame_of(map_frame, *(float(table[f][0]) for f in GNSS_FIELDS[:3]))
             poses = poses_from_geodetic(
                 map_frame,
@@ -437,17 +432,8 @@ class _Folder:
                 table.stack(*GNSS_FIELDS[3:]),
                 where=f"{self.file}, field 'map.projection'",
             )
-        keep, notes = strictly_increasing(table["t_ns"], "ego")
-        self.notes += notes
+        keep = strictly_increasing(table["t_ns"], "ego", self.notes)
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
-
-    def _rotations(self, table: CsvTable) -> Array:
-        q = table.stack("qw", "qx", "qy", "qz")
-        bad = find_not_unit(q)
-        if len(bad):
-            norm = float(np.linalg.norm(q[bad[0]]))
-            raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm:.6g}, expected a unit quaternion")
-        return rotation_from_quaternion(q)
 
     def _not_empty(self, table: CsvTable) -> None:
         if not len(table):
@@ -497,8 +483,7 @@ class _Folder:
         compensable = COMPENSATED if entry["kind"] == "lidar" and frame == "lidar" else None
         table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS, compensable)
         self._not_empty(table)
-        keep, notes = strictly_increasing(table["t_ns"], entry["name"])
-        self.notes += notes
+        keep = strictly_increasing(table["t_ns"], entry["name"], self.notes)
         files = [inside(self.root, str(table["file"][row]), table.where(row, "file")) for row in keep]
         t_ns = table["t_ns"][keep]
         for file in files:
@@ -540,12 +525,3 @@ class _Folder:
         table = self.table(relative, f"labels.{key}", columns, optional, damaged)
         note_damaged_rows(damaged, len(table) + len(damaged), self.notes)
         return table
-
-
-def _check_geodetic(table: CsvTable) -> None:
-    for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
-        bad = np.flatnonzero(np.abs(table[field]) > limit)
-        if len(bad):
-            raise LogError(
-                f"{table.where(bad[0], field)}: {table[field][bad[0]]:g}, expected at most {limit:g} degrees"
-            )

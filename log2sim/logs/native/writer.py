@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Lidar, Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.files.documents import check
+from log2sim.files.documents import check, refuse_folder
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
 from log2sim.logs.native.reader import (
@@ -30,7 +30,7 @@ from log2sim.logs.native.reader import (
     POSE_COLUMNS,
     REGION_COLUMNS,
 )
-from log2sim.logs.records import image_size
+from log2sim.logs.records import JPEG_MAGIC, image_size
 
 
 def write_ego(log: Log, root: Path, manifest: dict[str, Any], kind: str) -> None:
@@ -126,8 +126,6 @@ POINT_RESOLUTION_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.
 MAX_FLOAT32_M = 8000.0
 
-JPEG_MAGIC = b"\xff\xd8"
-
 Progress = Callable[[int, int], None]
 
 
@@ -173,27 +171,12 @@ def write_log(
     target = Path(path)
     refuse_target(target, overwrite=overwrite)
     with replaced_folder(target, overwrite=overwrite) as temporary:
-        _Writer(log, temporary, _Encoding(jpeg_quality, ego, sweep), progress, problems).write()
+        _Writer(log, temporary, jpeg_quality, ego, sweep, progress, problems).write()
 
 
 def refuse_target(target: Path, *, overwrite: bool) -> None:
     """Raise `ConfigError` where no log folder may be written."""
-    if not target.exists():
-        return
-    empty = target.is_dir() and not any(target.iterdir())
-    if not (empty or overwrite):
-        raise ConfigError(f"{target}: exists already; choose another name or pass --overwrite")
-    if not (empty or (target / MANIFEST).is_file()):
-        raise ConfigError(f"{target}: exists and is no log folder, so it is not replaced; choose another name")
-
-
-@dataclass(frozen=True)
-class _Encoding:
-    """How images, ego poses and sweeps are stored: JPEG quality, "poses" or "gnss", suffix of the sweep files."""
-
-    jpeg_quality: int
-    ego: str
-    sweep: str
+    refuse_folder(target, overwrite=overwrite, holding=MANIFEST, kind="log folder")
 
 
 @dataclass(eq=False)
@@ -223,7 +206,9 @@ class _Writer:
 
     log: Log
     root: Path
-    encoding: _Encoding
+    jpeg_quality: int
+    ego: str
+    sweep: str
     progress: Progress | None
     problems: list[str] | None
 
@@ -247,7 +232,7 @@ class _Writer:
             if "map" in index.frames:
                 entry["points_frame"] = "map"
             index.write(stream.name, self.root / entry["index"])
-        write_ego(self.log, self.root, manifest, self.encoding.ego)
+        write_ego(self.log, self.root, manifest, self.ego)
         write_labels(self.log, self.root, manifest, offset)
         check(manifest, "log-1", ConfigError)
         (self.root / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -260,12 +245,19 @@ class _Writer:
             else:
                 record = stream.read(i)
                 if isinstance(record, Sweep):
-                    file = _write_sweep(record, folder, i, self.encoding.sweep, offset)
+                    file = _write_sweep(record, folder, i, self.sweep, offset)
                     index.frames.add(record.frame)
                     if record.compensated_ns is not None:
                         index.compensated_ns.append(int(record.compensated_ns))
                 else:
-                    file = _write_image(record, folder, i, self.encoding.jpeg_quality)
+                    import simplejpeg
+
+                    name = f"{i:06d}.jpg"
+                    data = simplejpeg.encode_jpeg(
+                        np.ascontiguousarray(record), quality=self.jpeg_quality, colorspace="BGR"
+                    )
+                    (folder / name).write_bytes(data)
+                    file = f"{folder.name}/{name}"
         except RecordError as error:
             if self.problems is None:
                 raise
@@ -325,15 +317,6 @@ def _sensor(sensor: Camera | Lidar, offset: Array) -> dict[str, Any]:
 def _copy_image(data: bytes, folder: Path, i: int, t_ns: int) -> str:
     image_size(data, f"{folder.name}, stamp {t_ns}")  # an image, or a RecordError
     name = f"{i:06d}.{'jpg' if data[:2] == JPEG_MAGIC else 'png'}"
-    (folder / name).write_bytes(data)
-    return f"{folder.name}/{name}"
-
-
-def _write_image(image: NDArray[np.uint8], folder: Path, i: int, jpeg_quality: int) -> str:
-    import simplejpeg
-
-    name = f"{i:06d}.jpg"
-    data = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=jpeg_quality, colorspace="BGR")
     (folder / name).write_bytes(data)
     return f"{folder.name}/{name}"
 

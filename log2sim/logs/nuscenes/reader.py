@@ -19,7 +19,7 @@ from log2sim.errors import LogError
 from log2sim.files.documents import read_json
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.excerpt import digest_of
-from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, sweep_stream
+from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, read_sweep
 from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, text_of
 from log2sim.logs.records import MAX_IMAGE_PX, first_image_size, image_stream, list_folders
 from log2sim.logs.stamps import defer_notes
@@ -116,8 +116,22 @@ class _SceneReader:
         map_T_ego = shift_poses(ego.map_T_ego, offset_m)
         track = PoseTrack(ego.t_ns, map_T_ego)
         cameras, lidars, streams = self._sensors(track)
-        self._note_flat(map_T_ego)
-        self._note_span(streams)
+        climb = float(np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max()))
+        if np.ptp(map_T_ego[:, 2, 3]) < MAX_FLAT_M:
+            self.notes.append(
+                f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees: "
+                "the map is as flat as the log states it"
+            )
+        # The records with files may last much shorter than the scene.
+        of_scene = [c.t_ns for c in self.scene.channels.values() if c.modality in ("camera", "lidar")]
+        whole_s = float(max(t[-1] for t in of_scene) - min(t[0] for t in of_scene)) / NS_PER_S
+        stamps = [stream.t_ns for stream in streams.values()]
+        there_s = float(max(t[-1] for t in stamps) - min(t[0] for t in stamps)) / NS_PER_S
+        if there_s < whole_s - 1.0:
+            self.notes.append(
+                f"images and sweeps that are there last {there_s:.1f} s of the {whole_s:.1f} s of the scene; "
+                "labels and ego poses cover all of it, a scenario only that part"
+            )
 
         @cache
         def labels() -> Labels | None:
@@ -196,27 +210,7 @@ class _SceneReader:
             map_T_ego, known = track.at(stamps)
             return map_T_ego @ channel.ego_T_sensor, known
 
-        return sweep_stream(channel.name, t_ns, files, poses)
-
-    def _note_flat(self, map_T_ego: Array) -> None:
-        climb = float(np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max()))
-        if np.ptp(map_T_ego[:, 2, 3]) < MAX_FLAT_M:
-            self.notes.append(
-                f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees: "
-                "the map is as flat as the log states it"
-            )
-
-    def _note_span(self, streams: dict[str, Stream]) -> None:
-        """Note that records with files last much shorter than the scene."""
-        of_scene = [c.t_ns for c in self.scene.channels.values() if c.modality in ("camera", "lidar")]
-        whole_s = float(max(t[-1] for t in of_scene) - min(t[0] for t in of_scene)) / NS_PER_S
-        stamps = [stream.t_ns for stream in streams.values()]
-        there_s = float(max(t[-1] for t in stamps) - min(t[0] for t in stamps)) / NS_PER_S
-        if there_s < whole_s - 1.0:
-            self.notes.append(
-                f"images and sweeps that are there last {there_s:.1f} s of the {whole_s:.1f} s of the scene; "
-                "labels and ego poses cover all of it, a scenario only that part"
-            )
+        return Stream(channel.name, t_ns, lambda i: read_sweep(files[i], int(t_ns[i]), poses))
 
     def _map_frame(self, offset_m: Array) -> MapFrame:
         place = MAP_ORIGIN_DEG.get(self.scene.location)

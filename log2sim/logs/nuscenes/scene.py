@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Labels, Stream, Sweep
+from log2sim.datatypes import Labels, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.inputs import inside
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_quaternion, transform, wrap_angle, yaw_of
@@ -39,19 +39,6 @@ BYTES_PER_POINT = 20
 
 # Takes stamps (N,) int64 to the poses (N, 4, 4) of the LiDAR in the map, and whether each is known.
 Poses = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
-
-
-def sweep_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], poses: Poses) -> Stream:
-    """Stream of .pcd.bin files.
-
-    `t_ns` (F,) int64: ends of the turns. `files`: F files. `poses`: returns the poses (N, 4, 4) of the LiDAR in the map
-    at stamps (N,), and whether each is known.
-    """
-
-    def read(i: int) -> Sweep:
-        return read_sweep(files[i], int(t_ns[i]), poses)
-
-    return Stream(name, t_ns, read)
 
 
 def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
@@ -188,13 +175,15 @@ class Scene:
             self.notes.append(f"{name}: {len(rows) - len(same)} records of another calibration left out")
         stamps = np.array([stamp_ns_of(r, self.tables.path(DATA)) for r in same], dtype=np.int64)
         order = np.argsort(stamps, kind="stable")  # tables have no order
-        keep, problems = strictly_increasing(stamps[order], name)
-        self.notes.extend(problems)
+        keep = strictly_increasing(stamps[order], name, self.notes)
+        path = self.tables.path("calibrated_sensor")
+        rotation = rotation_from_quaternion(quaternions_of([calibration], path)[0])
+        ego_T_sensor = transform(rotation, numbers_of([calibration], "translation", (3,), path)[0])
         return Channel(
             name,
             str(calibration["modality"]),
             calibration,
-            _pose_of(calibration, self.tables.path("calibrated_sensor")),
+            ego_T_sensor,
             [same[k] for k in order[keep]],
             stamps[order[keep]],
         )
@@ -219,32 +208,16 @@ class Scene:
         return str(logs.get(str(self.record.get("log_token")), {}).get("location", ""))
 
 
-def _pose_of(record: Record, path: Path) -> Array:
-    """Pose (4, 4) of a record with rotation and translation."""
-    rotation = rotation_from_quaternion(quaternions_of([record], path)[0])
-    return transform(rotation, numbers_of([record], "translation", (3,), path)[0])
-
-
 ANNOTATIONS = "sample_annotation"
 CATEGORY_OF = {
-    "vehicle.car": "car",
-    "vehicle.truck": "truck",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.construction": "other",
-    "vehicle.emergency.ambulance": "other",
-    "vehicle.emergency.police": "other",
-    "vehicle.trailer": "other",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.wheelchair": "pedestrian",
-    "human.pedestrian.personal_mobility": "other",
+    "vehicle.car": "car", "vehicle.truck": "truck", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus",
+    "vehicle.motorcycle": "motorcycle", "vehicle.bicycle": "bicycle", "vehicle.construction": "other",
+    "vehicle.emergency.ambulance": "other", "vehicle.emergency.police": "other", "vehicle.trailer": "other",
+    "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.police_officer": "pedestrian",
+    "human.pedestrian.wheelchair": "pedestrian", "human.pedestrian.personal_mobility": "other",
     "human.pedestrian.stroller": "other",
-}
+}  # fmt: skip
 NO_ROAD_USERS = {
     "animal", "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
     "movable_object.trafficcone", "static_object.bicycle_rack",

@@ -9,7 +9,7 @@ times of the PandarGT: they are those of its points, so its stamps are read from
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
@@ -88,8 +88,7 @@ class SweepFiles:
             if lidar not in self._indexes:
                 t_ns = self._t_ns if lidar == "pandar64" else self.gt_stamps
                 numbers = np.array(list(self.files))
-                keep, problems = strictly_increasing(t_ns[numbers], lidar)
-                self._notes += problems
+                keep = strictly_increasing(t_ns[numbers], lidar, self._notes)
                 self._indexes[lidar] = t_ns[numbers[keep]], [self.files[int(n)] for n in numbers[keep]]
             return self._indexes[lidar]
 
@@ -184,24 +183,13 @@ PERIOD_NS = 100_000_000
 MIN_STEP_NS = 20_000_000
 
 CATEGORY_OF = {
-    "Car": "car",
-    "Pickup Truck": "truck",
-    "Medium-sized Truck": "truck",
-    "Semi-truck": "truck",
-    "Bus": "bus",
-    "Motorcycle": "motorcycle",
-    "Motorized Scooter": "motorcycle",
-    "Pedestrian": "pedestrian",
-    "Pedestrian with Object": "pedestrian",
-    "Emergency Vehicle": "other",
-    "Other Vehicle - Construction Vehicle": "other",
-    "Other Vehicle - Pedicab": "other",
-    "Other Vehicle - Uncommon": "other",
-    "Personal Mobility Device": "other",
-    "Towed Object": "other",
-    "Train": "other",
-    "Tram / Subway": "other",
-}
+    "Car": "car", "Pickup Truck": "truck", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Bus": "bus",
+    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian", "Emergency Vehicle": "other",
+    "Other Vehicle - Construction Vehicle": "other", "Other Vehicle - Pedicab": "other",
+    "Other Vehicle - Uncommon": "other", "Personal Mobility Device": "other", "Towed Object": "other",
+    "Train": "other", "Tram / Subway": "other",
+}  # fmt: skip
 # Things that are no road users.
 NO_ROAD_USERS = {
     "Animals - Bird", "Animals - Other", "Cones", "Construction Signs", "Pylons", "Road Barriers", "Rolling Containers",
@@ -245,21 +233,26 @@ def read_labels(
     if flat:
         notes.append(f"{flat} cuboids left out: a side of them is 0 or less")
     note_left_out(left_out, NO_ROAD_USERS, notes)
-    _note_missing(files, len(t_ns), notes)
+    missing = sorted(set(range(len(t_ns))) - set(files))
+    if missing:
+        note = f"annotations/cuboids: {len(missing)} of {len(t_ns)} files are missing"
+        notes.append(f"{note}, first number {missing[0]:02d}")
     columns = [np.concatenate([p[k] for p in parts]) for k in range(6)] if parts else None
     if columns is None:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
     keep = select_spaced(columns[0], columns[1], MIN_STEP_NS)
     t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
-    category = _settle_riders(track_id, category, notes)
+    # A bicycle of unknown rider is what it is in most other sweeps.
+    alone = 0
+    for track in np.unique(track_id[category == UNKNOWN_RIDER]):
+        rows = track_id == track
+        words, counts = np.unique(category[rows & (category != UNKNOWN_RIDER)], return_counts=True)
+        category[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
+        alone += not len(words)
+    if alone:
+        plural = "s" * (alone != 1)
+        notes.append(f"{alone} bicycle{plural} taken as unridden: no sweep states whether somebody rides them")
     return Labels(t_ns, track_id, category, center, size, yaw)
-
-
-def _note_missing(files: Collection[int], count: int, notes: list[str]) -> None:
-    """Note the sweeps without a file of cuboids, where others have one."""
-    missing = sorted(set(range(count)) - set(files))
-    if missing:
-        notes.append(f"annotations/cuboids: {len(missing)} of {count} files are missing, first number {missing[0]:02d}")
 
 
 def _checked(table: Columns, path: Path) -> Columns:
@@ -303,22 +296,6 @@ def _category(label: str, rider: str) -> str:
     if label == "Bicycle":
         return RIDER.get(rider, UNKNOWN_RIDER)
     return CATEGORY_OF.get(label, "")
-
-
-def _settle_riders(track_id: NDArray[np.str_], category: NDArray[np.str_], notes: list[str]) -> NDArray[np.str_]:
-    """Categories in which a bicycle of unknown rider is what it is in most other sweeps; without any, a bicycle."""
-    settled = category.copy()
-    alone = 0
-    for track in np.unique(track_id[category == UNKNOWN_RIDER]):
-        rows = track_id == track
-        words, counts = np.unique(category[rows & (category != UNKNOWN_RIDER)], return_counts=True)
-        settled[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
-        alone += not len(words)
-    if alone:
-        notes.append(
-            f"{alone} bicycle{'s' * (alone != 1)} taken as unridden: no sweep states whether somebody rides them"
-        )
-    return settled
 
 
 TABLE = ".pkl.gz"
@@ -376,8 +353,7 @@ class _Sequence:
         notes: list[str] = []
         lidar_t_ns, map_T_pose = _poses(self.path / "lidar")
         map_T_ego = map_T_pose @ POSE_T_EGO
-        keep, problems = strictly_increasing(lidar_t_ns, "lidar/timestamps.json")
-        notes += problems
+        keep = strictly_increasing(lidar_t_ns, "lidar/timestamps.json", notes)
         track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
         cameras, streams = self._cameras(track, notes)
         kept = set(keep.tolist())  # records whose stamp is far off have no place among the others
@@ -442,12 +418,10 @@ class _Sequence:
             if not files:
                 continue
             width, height = first_image_size(list(files.values()))
-            camera = Camera(
-                folder.name, width, height, _intrinsics(folder), "ego", _mount(track, t_ns, map_T_cam, folder, notes)
-            )
+            mount = _mount(track, t_ns, map_T_cam, folder, notes)
+            camera = Camera(folder.name, width, height, _intrinsics(folder / "intrinsics.json"), "ego", mount)
             numbers = np.array(list(files))
-            keep, problems = strictly_increasing(t_ns[numbers], folder.name)
-            notes += problems
+            keep = strictly_increasing(t_ns[numbers], folder.name, notes)
             t_ns = t_ns[numbers[keep]]
             cameras[camera.name] = camera
             chosen = [files[int(n)] for n in numbers[keep]]
@@ -536,8 +510,7 @@ def _stamps_ns(stamps: list[Any], path: Path) -> NDArray[np.int64]:
     return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64)
 
 
-def _intrinsics(folder: Path) -> Array:
-    path = folder / "intrinsics.json"
+def _intrinsics(path: Path) -> Array:
     try:
         fx, fy, cx, cy = (float(read_json(path)[k]) for k in ("fx", "fy", "cx", "cy"))
     except (TypeError, KeyError, ValueError):

@@ -53,17 +53,14 @@ def decode_text(kind: str, length: int, start: int, buffers: Sequence[bytes | by
     if ends[0] < 0 or ends[-1] > len(text) or (np.diff(ends) < 0).any():
         raise ValueError("offsets of an ArrowStringArray leave its text")
     cells = np.full(length, np.nan, dtype=object)
-    for row in np.flatnonzero(_presence(there, start, length)):
+    present = np.ones(length, dtype=bool)
+    if there is not None:
+        if len(there) * 8 < start + length:
+            raise ValueError("an ArrowStringArray does not say of each text whether it is there")
+        present = np.unpackbits(there, bitorder="little")[start : start + length].astype(bool)
+    for row in np.flatnonzero(present):
         cells[row] = text[ends[row] : ends[row + 1]].decode()
     return cells
-
-
-def _presence(bits: NDArray[np.uint8] | None, start: int, length: int) -> NDArray[np.bool_]:
-    if bits is None:
-        return np.ones(length, dtype=bool)
-    if len(bits) * 8 < start + length:
-        raise ValueError("an ArrowStringArray does not say of each text whether it is there")
-    return np.unpackbits(bits, bitorder="little")[start : start + length].astype(bool)
 
 
 decompressobj: Callable[..., Any] = zlib.decompressobj
@@ -88,7 +85,14 @@ def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_by
     """
     packed = read_file(path, limit_bytes, error, missing="cannot be read: No such file or directory")
     try:
-        data = _gunzip(packed, limit_bytes) if packed[:2] == b"\x1f\x8b" else packed
+        data = packed
+        if packed[:2] == b"\x1f\x8b":
+            unpacker = decompressobj(wbits=31)
+            data = unpacker.decompress(packed, limit_bytes)
+            if unpacker.unconsumed_tail:
+                raise ValueError(f"unpacks to more than the {limit_bytes} bytes that a table may have")
+            if not unpacker.eof:
+                raise ValueError("the file is truncated")
         table = _TableUnpickler(io.BytesIO(data)).load()
         return _columns(table)
     except (
@@ -96,16 +100,6 @@ def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_by
         AttributeError, AssertionError, OverflowError, RecursionError,
     ) as problem:  # fmt: skip
         raise error(f"{path}: not a pickled table: {problem or type(problem).__name__}") from None
-
-
-def _gunzip(packed: bytes, limit_bytes: int) -> bytes:
-    unpacker = decompressobj(wbits=31)
-    data: bytes = unpacker.decompress(packed, limit_bytes)
-    if unpacker.unconsumed_tail:
-        raise ValueError(f"unpacks to more than the {limit_bytes} bytes that a table may have")
-    if not unpacker.eof:
-        raise ValueError("the file is truncated")
-    return data
 
 
 class _Part:
@@ -231,17 +225,8 @@ class _TableUnpickler(pickle._Unpickler):
     dispatch[pickle.BUILD[0]] = load_state
     dispatch[pickle.BYTEARRAY8[0]] = load_bounded_bytearray
     for _code in (
-        "INST",
-        "OBJ",
-        "NEWOBJ_EX",
-        "EXT1",
-        "EXT2",
-        "EXT4",
-        "PERSID",
-        "BINPERSID",
-        "NEXT_BUFFER",
-        "READONLY_BUFFER",
-    ):
+        "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER",
+    ):  # fmt: skip
         dispatch[getattr(pickle, _code)[0]] = load_refused
 
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +67,18 @@ def recorded_files(recording: Recording, notes: list[str]) -> tuple[list[Path], 
         _note_missing_parts(recording, notes)
         return list(recording.files), ""
     require_link_inside(metadata, recording.place)
-    document = _read_metadata(metadata)
+    try:
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
+    except ImportError:
+        raise MissingExtra("reading rosbag2 folders", "ros") from None
+    text = read_text(metadata, MAX_METADATA_BYTES, LogError)
+    try:
+        document = YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
+        if not isinstance(document, dict):
+            raise TypeError("no table")
+    except (YAMLError, ValueError, TypeError, KeyError, RecursionError) as problem:
+        raise LogError(f"{metadata}: not the metadata of a rosbag2 recording: {one_line(problem)}") from None
     mode, method = (str(document.get(key) or "").lower() for key in ("compression_mode", "compression_format"))
     if mode == "file":
         raise LogError(f"{metadata}: its files are compressed whole ({method}); unpack them with `ros2 bag convert`")
@@ -131,22 +141,6 @@ def _note_missing_parts(recording: Recording, notes: list[str]) -> None:
             notes.append(
                 f"{len(missing)} of {numbers[-1] + 1} files of the recording are missing, first part {missing[0]}"
             )
-
-
-def _read_metadata(path: Path) -> dict[str, Any]:
-    try:
-        from ruamel.yaml import YAML
-        from ruamel.yaml.error import YAMLError
-    except ImportError:
-        raise MissingExtra("reading rosbag2 folders", "ros") from None
-    text = read_text(path, MAX_METADATA_BYTES, LogError)
-    try:
-        document = YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
-        if not isinstance(document, dict):
-            raise TypeError("no table")
-    except (YAMLError, ValueError, TypeError, KeyError, RecursionError) as problem:
-        raise LogError(f"{path}: not the metadata of a rosbag2 recording: {one_line(problem)}") from None
-    return document
 
 
 ENCODINGS = ("ros1", "cdr")

@@ -263,19 +263,14 @@ def place_ego(base: str | None, settings: EgoSettings, tree: FrameTree, camera_f
         notes.append("the size of the ego is not known; that of a usual car is taken (ego.size_m)")
     ground_m = settings.ground_z_m
     if ground_m is None:
-        ground_m = _known_ground_m(base, base_T_ego, tree, given, notes)
+        footprint = tree.mount(base, GROUND_FRAME) if GROUND_FRAME in tree.frames and base != GROUND_FRAME else None
+        if footprint is not None:
+            ground_m = float((inverse(base_T_ego) @ footprint)[2, 3])
+        elif base in BASE_FRAMES or "origin_m" in given:
+            where = "ego.origin_m" if "origin_m" in given else f"'{base}'"
+            notes.append(f"{where} is taken to be at the height of the road (ego.ground_z_m)")
+            ground_m = 0.0
     return EgoFrame(base, base_T_ego, ground_m, vehicle, tuple(notes))
-
-
-def _known_ground_m(base: str, base_T_ego: Array, tree: FrameTree, given: set[str], notes: list[str]) -> float | None:
-    footprint = tree.mount(base, GROUND_FRAME) if GROUND_FRAME in tree.frames and base != GROUND_FRAME else None
-    if footprint is not None:
-        return float((inverse(base_T_ego) @ footprint)[2, 3])
-    if base in BASE_FRAMES or "origin_m" in given:
-        where = "ego.origin_m" if "origin_m" in given else f"'{base}'"
-        notes.append(f"{where} is taken to be at the height of the road (ego.ground_z_m)")
-        return 0.0
-    return None
 
 
 def measure_ground_m(sweep: Sweep, ego_T_lidar: Array) -> float:

@@ -231,8 +231,7 @@ def stamp_messages(topic: Topic, heads: Sequence[bytes | None], notes: list[str]
     lost = int((~known).sum())
     if lost:
         notes.append(f"{topic.name}: {lost} of {len(topic)} messages are damaged, first at stamp {t_ns[~known][0]}")
-    row, problems = strictly_increasing(t_ns, topic.name)
-    notes += problems
+    row = strictly_increasing(t_ns, topic.name, notes)
     return Stamped(t_ns[row], row, delay_s)
 
 

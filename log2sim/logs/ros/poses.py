@@ -75,20 +75,22 @@ class PoseSources:
                 poses = read(topic)
                 if problem := say_uncovered(poses.t_ns, *self.span_ns):
                     raise NoPoses(problem)
-                found = _near_origin(self._with_damage(poses))
+                damaged = self.damaged.get(poses.topic, 0)
+                if damaged:
+                    note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
+                    poses = replace(poses, notes=(*poses.notes, note))
+                offset = whole_kilometers(poses.map_T_base[:, :3, 3])
+                if offset.any():
+                    shifted = shift_poses(poses.map_T_base, offset)
+                    x, y, z = offset.tolist()
+                    poses = replace(poses, map_T_base=shifted, map=replace(poses.map, offset_m=(x, y, z)))
+                found = poses
                 reason = f"{len(poses.t_ns)} poses, the first source of the order that has some"
                 reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, by the settings"
                 considered.append({"source": source, "topic": topic, "used": True, "reason": reason})
             except NoPoses as reason_against:
                 considered.append({"source": source, "topic": topic, "used": False, "reason": str(reason_against)})
         return found, considered
-
-    def _with_damage(self, poses: FoundPoses) -> FoundPoses:
-        damaged = self.damaged.get(poses.topic, 0)
-        if not damaged:
-            return poses
-        note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
-        return replace(poses, notes=(*poses.notes, note))
 
     def _candidates(self) -> list[tuple[str, str, Callable[[str], FoundPoses]]]:
         wanted = self.settings
@@ -168,7 +170,8 @@ class PoseSources:
         if not valid.any():
             raise NoPoses("none of its orientations is a rotation")
         map_T_child = np.array([p for p in poses if p is not None])
-        keep, problems = strictly_increasing(stamps[valid], name)
+        problems = list[str]()
+        keep = strictly_increasing(stamps[valid], name, problems)
         if not valid.all():
             problems.append(
                 f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or no rotations; dropped"
@@ -185,7 +188,8 @@ class PoseSources:
         rows = np.array([[m.latitude, m.longitude, m.altitude] for m in fixes]).reshape(-1, 3)
         good = np.isfinite(rows).all(axis=1) & np.array([int(m.status.status) >= 0 for m in fixes], dtype=bool)
         good &= (np.abs(rows[:, 0]) < MAX_LATITUDE_DEG) & (np.abs(rows[:, 1]) <= MAX_LONGITUDE_DEG)
-        keep, problems = strictly_increasing(stamps[good], name)
+        problems = list[str]()
+        keep = strictly_increasing(stamps[good], name, problems)
         rows, stamps = rows[good][keep], stamps[good][keep]
         rotation, valid = PoseTrack(t_ns, transform(base_R, np.zeros(3))).at(stamps)
         if not (good.all() and valid.all()):
@@ -219,7 +223,7 @@ class PoseSources:
             valid = np.array([p is not None for p in poses], dtype=bool)
             if valid.sum() >= MIN_POSES:
                 rotations = np.array([p for p in poses if p is not None])[:, :3, :3]
-                keep, _ = strictly_increasing(stamps[valid], name)
+                keep = strictly_increasing(stamps[valid], name, [])
                 return name, stamps[valid][keep], rotations[keep] @ imu_T_base[:3, :3]
             reasons.append(f"{name} gives no orientation")
         raise NoPoses("; ".join(reasons) or "there is no Imu that gives the orientation")
@@ -236,15 +240,6 @@ class PoseSources:
 
 class _Zero:
     x = y = z = 0.0
-
-
-def _near_origin(poses: FoundPoses) -> FoundPoses:
-    """Take whole kilometers off large coordinates."""
-    offset = whole_kilometers(poses.map_T_base[:, :3, 3])
-    if not offset.any():
-        return poses
-    x, y, z = offset.tolist()
-    return replace(poses, map_T_base=shift_poses(poses.map_T_base, offset), map=replace(poses.map, offset_m=(x, y, z)))
 
 
 def _roll_pitch_yaw(map_T_base: Array) -> Array:

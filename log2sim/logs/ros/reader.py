@@ -81,9 +81,10 @@ class _Opening:
     def log(self) -> Log:
         sensors = list(self._sensors().values())
         if not sensors:
-            raise LogError(
-                f"{self.bag.place}: no images with CameraInfo and no point clouds in it; {self._list_topics()}"
-            )
+            topics = [f"{t.name} ({t.msgtype}, {len(t)})" for t in self.bag.topics.values()]
+            more = f" and {len(topics) - MAX_LISTED} more" if len(topics) > MAX_LISTED else ""
+            there = f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"
+            raise LogError(f"{self.bag.place}: no images with CameraInfo and no point clouds in it; {there}")
         base, why = ego.choose_base(
             self.tree, [s.frame for s in sensors], self._pose_frames(), FIXED_FRAMES, self.settings.ego.base_frame
         )
@@ -94,7 +95,10 @@ class _Opening:
         mounts = self._mounts(frame)
         cameras = self._cameras(mounts)
         lidars = {n: Lidar(n, *mounts[n]) for n in self.roles.lidars if n in mounts}
-        streams = self._streams(cameras, lidars, stamped)
+        streams = {n: camera_stream(self.bag, self.roles.cameras[n], stamped[n], c) for n, c in cameras.items()}
+        streams |= {n: lidar_stream(self.bag, n, self.roles.lidars[n], stamped[n]) for n in lidars}
+        if not streams:
+            raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
         self._note_poses(found, considered, base)
         self.notes += frame.notes
 
@@ -117,17 +121,15 @@ class _Opening:
             digest=self.bag.digest,
             notes=(lambda: (*self.notes, *measured()[1])) if known_m is None else tuple(self.notes),
             calibrations={n: self._calibration_place(n) for n in streams},
-            details=self._details(base, why, considered),
+            details={
+                "settings": None if self.file is None else self.file.name,
+                "files": [container.path.name for container in self.bag.files],
+                "topics": self.roles.table(self.bag),
+                "base_frame": {"name": base, "reason": why},
+                "poses": considered,
+                "frames": self.tree.describe(),
+            },
         )
-
-    def _streams(
-        self, cameras: dict[str, Camera], lidars: dict[str, Lidar], stamped: dict[str, Stamped]
-    ) -> dict[str, Stream]:
-        streams = {n: camera_stream(self.bag, self.roles.cameras[n], stamped[n], c) for n, c in cameras.items()}
-        streams |= {n: lidar_stream(self.bag, n, self.roles.lidars[n], stamped[n]) for n in lidars}
-        if not streams:
-            raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
-        return streams
 
     def _calibration_place(self, name: str) -> str:
         """Say where the calibration of a sensor is."""
@@ -135,16 +137,6 @@ class _Opening:
         if camera is None:
             return f"{self.bag.place}, transforms"
         return f"{self.file}" if camera.intrinsics is not None else f"{self.bag.place}, {camera.info}"
-
-    def _details(self, base: str | None, why: str, considered: list[dict[str, Any]]) -> dict[str, Any]:
-        return {
-            "settings": None if self.file is None else self.file.name,
-            "files": [container.path.name for container in self.bag.files],
-            "topics": self.roles.table(self.bag),
-            "base_frame": {"name": base, "reason": why},
-            "poses": considered,
-            "frames": self.tree.describe(),
-        }
 
     def _sensors(self) -> dict[str, CameraTopic | LidarTopic]:
         return {**self.roles.lidars, **self.roles.cameras}
@@ -226,7 +218,8 @@ class _Opening:
         mounts: dict[str, tuple[Mount, Array]] = {}
         for name, sensor in self._sensors().items():
             if frame.base is None:
-                mounts[name] = ("map", self._in_map(sensor))
+                in_map = self.tree.mount(self.tree.rigid_root(sensor.frame), sensor.frame)
+                mounts[name] = ("map", np.eye(4) if in_map is None else in_map)
                 continue
             base_T_sensor = self.tree.mount(frame.base, sensor.frame)
             if base_T_sensor is None:
@@ -237,11 +230,6 @@ class _Opening:
                 continue
             mounts[name] = ("ego", inverse(frame.base_T_ego) @ base_T_sensor)
         return mounts
-
-    def _in_map(self, sensor: CameraTopic | LidarTopic) -> Array:
-        root = self.tree.rigid_root(sensor.frame)
-        mount = self.tree.mount(root, sensor.frame)
-        return np.eye(4) if mount is None else mount
 
     def _cameras(self, mounts: dict[str, tuple[Mount, Array]]) -> dict[str, Camera]:
         cameras = {}
@@ -298,8 +286,3 @@ class _Opening:
                 f"{self.file}: 'reference_camera' is '{wanted}'; there are: {', '.join(cameras) or 'none'}"
             )
         return wanted
-
-    def _list_topics(self) -> str:
-        topics = [f"{t.name} ({t.msgtype}, {len(t)})" for t in self.bag.topics.values()]
-        more = f" and {len(topics) - MAX_LISTED} more" if len(topics) > MAX_LISTED else ""
-        return f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"

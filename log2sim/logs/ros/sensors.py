@@ -171,11 +171,6 @@ def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np
     return np.asarray(image, dtype=np.uint8)
 
 
-def image_from_compressed(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """Decode a CompressedImage; its first bytes decide what it is, as drivers write any text as its format."""
-    return decode_image(encoded_from(message, where), where, size_px)
-
-
 def encoded_from(message: Any, where: str) -> bytes:
     """Return the JPEG or PNG file in a CompressedImage; `RecordError` for anything else."""
     data: bytes = np.asarray(message.data, dtype=np.uint8).tobytes()
@@ -326,8 +321,13 @@ def camera_stream(bag: Bag, chosen: CameraTopic, stamped: Stamped, camera: Camer
 
     def read(i: int) -> NDArray[np.uint8]:
         row = int(stamped.row[i])
-        convert = image_from_compressed if compressed else image_from
-        return convert(decode(bag, topic, row), bag.where(topic, row), size_px)
+        message, where = decode(bag, topic, row), bag.where(topic, row)
+        # The first bytes decide what a compressed one is, as drivers write any text as its format.
+        return (
+            decode_image(encoded_from(message, where), where, size_px)
+            if compressed
+            else image_from(message, where, size_px)
+        )
 
     def encoded(i: int) -> bytes:
         row = int(stamped.row[i])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,16 +30,6 @@ class WireError(ValueError):
     """Bytes that are no protocol buffer of the expected form."""
 
 
-class Source(Protocol):
-    """Bytes of a message, in memory or in a file."""
-
-    def peek(self, begin: int, count: int) -> bytes:
-        """Return up to `count` bytes at an offset."""
-
-    def take(self, begin: int, end: int) -> bytes:
-        """Return the bytes of a span."""
-
-
 class Memory:
     """A message in memory."""
 
@@ -49,10 +39,6 @@ class Memory:
     def peek(self, begin: int, count: int) -> bytes:
         """Return up to `count` bytes at an offset."""
         return self.data[begin : begin + count]
-
-    def take(self, begin: int, end: int) -> bytes:
-        """Return the bytes of a span."""
-        return self.data[begin:end]
 
 
 class Field(NamedTuple):
@@ -73,7 +59,7 @@ class Field(NamedTuple):
         raise WireError(f"field {self.number} is of wire type {self.kind}, expected a floating-point number")
 
 
-def fields(source: Source, begin: int, end: int) -> Iterator[Field]:
+def fields(source: Memory | RecordWindow, begin: int, end: int) -> Iterator[Field]:
     """Walk the fields of the message in a span; values of type BYTES are skipped.
 
     Raises `WireError` when a field leaves the span or is of an unknown wire type, or there are more than `MAX_FIELDS`.

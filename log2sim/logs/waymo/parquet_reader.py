@@ -26,7 +26,7 @@ from log2sim.logs.excerpt import digest_of
 from log2sim.logs.stamps import MAX_TIME_S
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.range_images import checked, shaped
-from log2sim.logs.waymo.reader import log_of
+from log2sim.logs.waymo.reader import SegmentLog
 from log2sim.logs.waymo.segment import (
     CAMERAS,
     LASERS,
@@ -48,14 +48,11 @@ STAMP, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.las
 POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 IMAGE = "[CameraImageComponent]"
 IMAGE_COLUMNS: Mapping[str, Kind] = {
-    STAMP: "int",
-    CAMERA: "text",
-    f"{IMAGE}.pose.transform": "floats",
-    f"{IMAGE}.pose_timestamp": "float",
+    STAMP: "int", CAMERA: "text", f"{IMAGE}.pose.transform": "floats", f"{IMAGE}.pose_timestamp": "float",
     f"{IMAGE}.rolling_shutter_params.shutter": "float",
     f"{IMAGE}.rolling_shutter_params.camera_trigger_time": "float",
     f"{IMAGE}.rolling_shutter_params.camera_readout_done_time": "float",
-}
+}  # fmt: skip
 CAMERA_PREFIX = "[CameraCalibrationComponent]"
 INTRINSICS = tuple(f"{CAMERA_PREFIX}.intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
 LASER_PREFIX = "[LiDARCalibrationComponent]"
@@ -65,11 +62,6 @@ PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
 LIDAR_BOXES = ("lidar_box", "[LiDARBoxComponent]")
 PROJECTED_BOXES = ("projected_lidar_box", "[ProjectedLiDARBoxComponent]")
 CAMERA_BOXES = ("camera_box", "[CameraBoxComponent]")
-
-
-def component_file(root: Path, component: str, segment: str) -> Path:
-    """Return the path of a component of a segment."""
-    return root / component / f"{segment}.parquet"
 
 
 def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
@@ -188,14 +180,6 @@ def matrix(cell: Any) -> Any:
     return None if cell is None else rigid(np.asarray(cell, dtype=np.float64))
 
 
-@dataclass(frozen=True)
-class RecordColumns:
-    """Columns that are large and read row by row."""
-
-    kinds: Mapping[str, Kind]  # what each column holds, as for `log2sim.logs.arrow.read_columns`
-    optional: Collection[str] = ()  # names that may be absent
-
-
 @dataclass(eq=False)
 class SensorRows:
     """A component with one row for each frame and sensor; without any where its file is absent.
@@ -208,7 +192,8 @@ class SensorRows:
     index: Mapping[str, Kind]
     names: Mapping[int, str]
     frame_of: Mapping[int, int]
-    records: RecordColumns
+    kinds: Mapping[str, Kind]  # what columns hold that are large and read row by row
+    optional: Collection[str] = ()  # names out of these that may be absent
     # row of a frame by index and sensor by number
     rows: dict[tuple[int, int], int] = field(default_factory=dict)
     columns: Columns = field(default_factory=dict)  # the columns of `index`
@@ -230,9 +215,9 @@ class SensorRows:
             self.note = f"{self.path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out"
         # Rows can only be read on: a file with one sensor after the other is read from several places at once.
         by_sensor = bool(np.any(np.diff(frame[known]) < 0))
-        shared = ParquetRows(self.path, self.records.kinds, optional=self.records.optional)
+        shared = ParquetRows(self.path, self.kinds, optional=self.optional)
         for number in {number for _, number in self.rows}:
-            own = ParquetRows(self.path, self.records.kinds, optional=self.records.optional) if by_sensor else shared
+            own = ParquetRows(self.path, self.kinds, optional=self.optional) if by_sensor else shared
             self._files[number] = own
 
     def read(self, frame: int, sensor: int) -> Row | None:
@@ -296,11 +281,9 @@ class _SegmentFolder:
         self.frame_of = {t: k for k, t in enumerate(self.stamps_us)}
         of_lidars: dict[str, Kind] = {STAMP: "int", LASER: "text"}
         second = [f"{LIDAR_RETURNS[1]}.{part}" for part in ("values", "shape")]
-        ranges = RecordColumns(_matrices(*LIDAR_RETURNS), second)
-        self.sweeps = self._rows("lidar", of_lidars, LASERS, ranges)
-        self.pixel_poses = self._rows("lidar_pose", of_lidars, LASERS, RecordColumns(_matrices(PIXEL_POSES)))
-        jpeg = RecordColumns({f"{IMAGE}.image": "bytes"})
-        self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, jpeg)
+        self.sweeps = self._rows("lidar", of_lidars, LASERS, _matrices(*LIDAR_RETURNS), second)
+        self.pixel_poses = self._rows("lidar_pose", of_lidars, LASERS, _matrices(PIXEL_POSES))
+        self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, {f"{IMAGE}.image": "bytes"})
 
     def log(self) -> Log:
         boxes = self._path_of(LIDAR_BOXES[0])
@@ -323,7 +306,7 @@ class _SegmentFolder:
             details={**self._statistics(), "frames": len(self.poses)},
             notes=self.notes,
         )
-        return log_of(segment, READER.name, self._digest())
+        return SegmentLog(segment).log(READER.name, self._digest())
 
     def _frames(self) -> list[FrameRow]:
         """Return the frames in the order of the poses."""
@@ -341,15 +324,17 @@ class _SegmentFolder:
         return digest_of([self.name, repr(self.stamps_us), np.stack(self.poses).tobytes().hex(), *sizes], [])
 
     def _file(self, component: str) -> Path:
-        return component_file(self.root, component, self.name)
+        return self.root / component / f"{self.name}.parquet"
 
     def _path_of(self, component: str) -> Path | None:
         """Path of a component; None where it was not downloaded."""
         path = self._file(component)
         return path if is_present(path) else None
 
-    def _rows(self, component: str, index: Any, names: dict[int, str], records: RecordColumns) -> SensorRows:
-        rows = SensorRows(self._file(component), index, names, self.frame_of, records)
+    def _rows(
+        self, component: str, index: Any, names: dict[int, str], kinds: Any, optional: Collection[str] = ()
+    ) -> SensorRows:
+        rows = SensorRows(self._file(component), index, names, self.frame_of, kinds, optional)
         self.notes += [rows.note] if rows.note else []
         return rows
 

@@ -57,9 +57,18 @@ def read_matrix(compressed: bytes) -> NDArray[np.float32]:
         if f.kind != BYTES:
             continue
         if f.number == 1:
-            parts.append(_floats(data[f.begin : f.end]))
+            if (f.end - f.begin) % 4:
+                raise WireError(f"a range image has {f.end - f.begin} bytes of values, expected floats of 4")
+            parts.append(np.frombuffer(data[f.begin : f.end], "<f4"))
         elif f.number == 2:
-            dims = _dims(data[f.begin : f.end])
+            # A MatrixShape: its dimensions packed, or one field each.
+            shape = data[f.begin : f.end]
+            found = (
+                varints(shape[g.begin : g.end]) if g.kind == BYTES else [g.value]
+                for g in fields_of(shape)
+                if g.number == 1
+            )
+            dims = [n for numbers in found for n in numbers]
     return shaped(np.concatenate(parts) if parts else np.zeros(0, np.float32), dims)
 
 
@@ -105,7 +114,16 @@ def points_of(
             [np.cos(azimuth)[column] * level, np.sin(azimuth)[column] * level, np.sin(inclination)[row] * reach], axis=1
         )
         if images.poses is not None:
-            xyz = _compensated(xyz, images.poses[row, column], laser.vehicle_T_lidar, world_T_vehicle)
+            # Points (N, 3) of the lidar's frame at their own times, in its frame at `world_T_vehicle`
+            pixel_poses = images.poses[row, column]
+            usable = np.asarray(np.isfinite(pixel_poses).all(axis=1))
+            if not usable.all():
+                raise WireError(f"{np.sum(~usable)} of {len(usable)} pixels with a range have no finite pose")
+            roll, pitch, yaw, *position = pixel_poses.astype(np.float64).T
+            # The difference of the large positions is taken first, so that it keeps its digits.
+            from_pose = np.stack(position, axis=1) - world_T_vehicle[:3, 3]
+            turned = np.einsum("nij,nj->ni", rotation_from_rpy(roll, pitch, yaw), apply(laser.vehicle_T_lidar, xyz))
+            xyz = apply(inverse(laser.vehicle_T_lidar), (turned + from_pose) @ world_T_vehicle[:3, :3])
         parts.append(xyz.astype(np.float32))
         turns.append((column + 0.5) / width)
     return np.concatenate(parts), np.concatenate(turns)
@@ -146,33 +164,6 @@ def column_azimuths(laser: LaserCalibration, width: int) -> Array:
 def turn_of(xyz_vehicle: Array, laser: LaserCalibration) -> Array:
     """Share (N,) of the turn, 0 to 1, after which a LiDAR scans points (N, 3), m, of the vehicle's frame."""
     return compute_turn_share(xyz_vehicle - laser.vehicle_T_lidar[:3, 3])
-
-
-def _compensated(xyz: Array, pixel_poses: NDArray[np.float32], vehicle_T_lidar: Array, world_T_vehicle: Array) -> Array:
-    """Points (N, 3) of the lidar's frame at their own times, in its frame at `world_T_vehicle`."""
-    usable = np.asarray(np.isfinite(pixel_poses).all(axis=1))
-    if not usable.all():
-        raise WireError(f"{np.sum(~usable)} of {len(usable)} pixels with a range have no finite pose")
-    roll, pitch, yaw, *position = pixel_poses.astype(np.float64).T
-    # The difference of the large positions is taken first, so that it keeps its digits.
-    from_pose = np.stack(position, axis=1) - world_T_vehicle[:3, 3]
-    turned = np.einsum("nij,nj->ni", rotation_from_rpy(roll, pitch, yaw), apply(vehicle_T_lidar, xyz))
-    return apply(inverse(vehicle_T_lidar), (turned + from_pose) @ world_T_vehicle[:3, :3])
-
-
-def _floats(data: bytes) -> NDArray[np.float32]:
-    if len(data) % 4:
-        raise WireError(f"a range image has {len(data)} bytes of values, expected floats of 4")
-    return np.frombuffer(data, "<f4")
-
-
-def _dims(data: bytes) -> list[int]:
-    """Read the dimensions of a MatrixShape, packed or one field each."""
-    out: list[int] = []
-    for f in fields_of(data):
-        if f.number == 1:
-            out += varints(data[f.begin : f.end]) if f.kind == BYTES else [f.value]
-    return out
 
 
 # Vehicles are cars, trucks, buses and motorcycles.

@@ -74,19 +74,13 @@ MAX_POSE_MISMATCH_M = 0.05
 Stamps = NDArray[np.int64]
 
 
-def log_of(segment: Segment, format: str, digest: str) -> Log:
-    """Make a log of a segment; `LogError` when it has neither images nor points."""
-    return _Assembly(segment).log(format, digest)
-
-
-class _Assembly:
+class SegmentLog:
     """A segment with its frames in order; frames are counted in this order from here on."""
 
     def __init__(self, segment: Segment) -> None:
         self.segment, self.notes = segment, list(segment.notes)
         stamps = np.array([frame.stamp_ns for frame in segment.frames], dtype=np.int64)
-        self.order, problems = strictly_increasing(stamps, "frames")
-        self.notes += problems
+        self.order = strictly_increasing(stamps, "frames", self.notes)
         self.frames = [segment.frames[k] for k in self.order]
         self.times = FrameTimes.of(self.frames, self.notes)
         world_T_vehicle = np.stack([frame.world_T_vehicle for frame in self.frames])
@@ -94,6 +88,7 @@ class _Assembly:
         self.map_T_vehicle = shift_poses(world_T_vehicle, self.offset_m)
 
     def log(self, format: str, digest: str) -> Log:
+        """Make a log of the segment; `LogError` when it has neither images nor points."""
         cameras, streams, image_ns = self._cameras()
         lidars, sweeps = self._lidars()
         if not cameras and not lidars:
@@ -139,8 +134,7 @@ class _Assembly:
                     f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
                 )
             t_ns = np.array([self._image_ns(k, number) for k in rows], dtype=np.int64)
-            keep, problems = strictly_increasing(t_ns, name)
-            self.notes += problems
+            keep = strictly_increasing(t_ns, name, self.notes)
             rows, t_ns = rows[keep], t_ns[keep]
             cameras[name], image_ns[number] = camera, np.full(len(self.frames), -1, dtype=np.int64)
             image_ns[number][rows] = t_ns
@@ -172,8 +166,7 @@ class _Assembly:
                 self.notes.append(f"{name}: {len(rows)} sweeps left out: no calibration of this LiDAR")
             if not len(rows) or calibration is None:
                 continue
-            keep, problems = strictly_increasing(self.times.pose_ns[rows], name)
-            self.notes += problems
+            keep = strictly_increasing(self.times.pose_ns[rows], name, self.notes)
             lidars[name] = Lidar(name, "ego", calibration.vehicle_T_lidar)
             streams[name] = self._sweep_stream(name, number, rows[keep])
         if not lidars:
@@ -412,7 +405,7 @@ class _SegmentFile:
             notes=notes,
         )
         records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(frames.record, index)]
-        return log_of(segment, READER.name, digest_of([frames.name, frames.context.hex(), *records], []))
+        return SegmentLog(segment).log(READER.name, digest_of([frames.name, frames.context.hex(), *records], []))
 
     def _read_frames(self) -> _Frames:
         """Read the index of every frame of the segment to which the first one belongs."""

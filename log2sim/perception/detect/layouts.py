@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,40 +232,21 @@ class Candidates(NamedTuple):
     category: NDArray[np.str_]  # (M,)
 
 
-class Layout(Protocol):
-    """Output layout of one family of models; `size` is (width, height) of the input in px."""
+Size = tuple[int, int]
 
-    @property
-    def name(self) -> str:
-        """Name by which a user chooses it."""
-        ...
 
-    @property
-    def preprocessing(self) -> Preprocessing:
-        """Preprocessing that the models were trained with."""
-        ...
+@dataclass(frozen=True)
+class Layout:
+    """Output layout of one family of models; sizes are (width, height) of the input in px."""
 
-    @property
-    def default_min_score(self) -> float:
-        """Score in [0, 1] below which boxes are more often wrong than useful."""
-        ...
-
-    @property
-    def default_classes(self) -> Classes:
-        """Classes of a model whose output holds class ids without names."""
-        ...
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        ...
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        ...
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        ...
+    name: str  # by which a user chooses it
+    preprocessing: Preprocessing  # that the models were trained with
+    matches: Callable[[Outputs, Size], bool] = field(repr=False)  # whether outputs of a gray image have this layout
+    class_count: Callable[[Outputs], int | None] = field(repr=False)  # None where the output holds class ids
+    # Boxes of a score and higher.
+    decode: Callable[[Outputs, Size, Classes, float], Candidates] = field(repr=False)
+    default_classes: Classes = COCO_80  # of a model whose output holds class ids without names
+    default_min_score: float = 0.4  # in [0, 1], below which boxes are more often wrong than useful
 
 
 def corners_from_centers(center_and_size: Array) -> Array:
@@ -318,43 +299,30 @@ def cell_count(size: tuple[int, int]) -> int:
     return sum((size[0] // s) * (size[1] // s) for s in STRIDES)
 
 
-@dataclass(frozen=True)
-class Yolox:
-    """YOLOX before decoding: (1, cells, 5 + C), offsets in cells, logarithms of sizes, objectness, class scores."""
-
-    name: str = "yolox"
-    preprocessing: Preprocessing = Preprocessing("corner", rgb=False, unit=False, default_px=416)
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_80
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        shape = single_output_shape(outputs)
-        if shape is None or shape[0] != cell_count(size) or shape[1] < 6:
-            return False
-        return bool(np.median(np.abs(largest_output(outputs)[0, :, :2])) < MAX_OFFSET_CELLS)
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return int(largest_output(outputs).shape[2]) - 5
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        raw = largest_output(outputs)[0]
-        if len(raw) != cell_count(size):
-            raise ConfigError(
-                f"layout yolox: expected {cell_count(size)} rows for an input of {size}; found {len(raw)}"
-            )
-        row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
-        cell, stride = cell_grid(size)
-        picked = raw[row].astype(np.float64)
-        with np.errstate(over="ignore"):  # an infinite size is dropped with the other boxes that are not finite
-            extent = np.exp(picked[:, 2:4]) * stride[row, None]
-        center = (picked[:, :2] + cell[row]) * stride[row, None]
-        return Candidates(corners_from_centers(np.concatenate([center, extent], axis=1)), score, category)
+# YOLOX before decoding: (1, cells, 5 + C), offsets in cells, logarithms of sizes, objectness, class scores.
 
 
-def cell_grid(size: tuple[int, int]) -> tuple[Array, Array]:
+def _is_yolox(outputs: Outputs, size: Size) -> bool:
+    shape = single_output_shape(outputs)
+    if shape is None or shape[0] != cell_count(size) or shape[1] < 6:
+        return False
+    return bool(np.median(np.abs(largest_output(outputs)[0, :, :2])) < MAX_OFFSET_CELLS)
+
+
+def _from_yolox(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    raw = largest_output(outputs)[0]
+    if len(raw) != cell_count(size):
+        raise ConfigError(f"layout yolox: expected {cell_count(size)} rows for an input of {size}; found {len(raw)}")
+    row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
+    cell, stride = cell_grid(size)
+    picked = raw[row].astype(np.float64)
+    with np.errstate(over="ignore"):  # an infinite size is dropped with the other boxes that are not finite
+        extent = np.exp(picked[:, 2:4]) * stride[row, None]
+    center = (picked[:, :2] + cell[row]) * stride[row, None]
+    return Candidates(corners_from_centers(np.concatenate([center, extent], axis=1)), score, category)
+
+
+def cell_grid(size: Size) -> tuple[Array, Array]:
     """Build cell indices (N, 2) u, v and strides (N,) in px, row by row, fine strides first."""
     cell, stride = [], []
     for s in STRIDES:
@@ -364,195 +332,142 @@ def cell_grid(size: tuple[int, int]) -> tuple[Array, Array]:
     return np.concatenate(cell).astype(np.float64), np.concatenate(stride)
 
 
-@dataclass(frozen=True)
-class YoloRows:
-    """Decoded rows (1, N, 5 + C): center, size in px of the input, objectness, class scores (YOLOv5, v6, v7, YOLOX)."""
-
-    name: str
-    preprocessing: Preprocessing
-    # Boxes a cell by which the layout is recognized; 0: only a layout given by name.
-    anchors: int = 0
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_80
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        shape = single_output_shape(outputs)
-        return shape is not None and self.anchors > 0 and shape[0] == self.anchors * cell_count(size) and shape[1] > 5
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return int(largest_output(outputs).shape[2]) - 5
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        raw = largest_output(outputs)[0]
-        row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
-        return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
+# Decoded rows (1, N, 5 + C): center, size in px of the input, objectness, class scores (YOLOv5, v6, v7, YOLOX).
 
 
-@dataclass(frozen=True)
-class Yolov8:
-    """YOLOv8, v9, 11, 12: columns (1, 4 + C, N) of center, size in px of the input, and class scores."""
-
-    name: str = "yolov8"
-    preprocessing: Preprocessing = Preprocessing("center", rgb=True, unit=True)
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_80
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        shape = single_output_shape(outputs)
-        return shape is not None and shape[1] == cell_count(size) and shape[0] > 4
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return int(largest_output(outputs).shape[1]) - 4
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        raw = largest_output(outputs)[0].T
-        row, score, category = classes.best(raw[:, 4:], min_score)
-        return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
+def _is_yolov5(outputs: Outputs, size: Size) -> bool:
+    shape = single_output_shape(outputs)
+    return shape is not None and shape[0] == 3 * cell_count(size) and shape[1] > 5
 
 
-@dataclass(frozen=True)
-class Yolov10:
-    """YOLOv10 and other end-to-end exports: rows (1, N, 6) of u0, v0, u1, v1 in px of the input, score, class id."""
-
-    name: str = "yolov10"
-    preprocessing: Preprocessing = Preprocessing("center", rgb=True, unit=True)
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_80
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        shape = single_output_shape(outputs)
-        return shape is not None and shape[1] == 6 and shape[0] not in (cell_count(size), 3 * cell_count(size))
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return None
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        raw = largest_output(outputs)[0].astype(np.float64)
-        category = classes.categories_of(raw[:, 5])
-        keep = (raw[:, 4] >= min_score) & (category != "")
-        return Candidates(raw[keep, :4], raw[keep, 4], category[keep])
+def _from_rows(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    raw = largest_output(outputs)[0]
+    row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
+    return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
 
 
-@dataclass(frozen=True)
-class TfOd:
-    """TensorFlow object detection API: boxes v0, u0, v1, u1 in 0-1, classes as COCO ids from 1, already suppressed."""
-
-    name: str = "tf-od"
-    preprocessing: Preprocessing = Preprocessing("stretch", rgb=True, unit=False, default_px=None)
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_91
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        return all(find_output(outputs, f"detection_{part}") is not None for part in ("boxes", "scores", "classes"))
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return None
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        score = required_output(outputs, "detection_scores")[0].astype(np.float64)
-        number = find_output(outputs, "num_detections")
-        count = len(score) if number is None else min(len(score), int(number.ravel()[0]))
-        box = required_output(outputs, "detection_boxes")[0, :count].astype(np.float64)
-        category = classes.categories_of(required_output(outputs, "detection_classes")[0, :count])
-        keep = (score[:count] >= min_score) & (category != "")
-        return Candidates(from_normalized(box[keep], size), score[:count][keep], category[keep])
+def _count_in_rows(outputs: Outputs) -> int:
+    return int(largest_output(outputs).shape[2]) - 5
 
 
-@dataclass(frozen=True)
-class TfOdRaw:
-    """The same family before its suppression: `boxes` (1, N, 4) as above and `scores` (1, N, C) after the sigmoid."""
-
-    name: str = "tf-od-raw"
-    preprocessing: Preprocessing = Preprocessing("tf1", rgb=True, unit=False, default_px=300)
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_91
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        box, score = find_output(outputs, "boxes"), find_output(outputs, "scores")
-        if box is None or score is None or box.ndim != 3 or score.ndim != 3:
-            return False
-        return box.shape[2] == 4 and box.shape[:2] == score.shape[:2]
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return int(required_output(outputs, "scores").shape[2])
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        row, score, category = classes.best(required_output(outputs, "scores")[0], min_score)
-        return Candidates(
-            from_normalized(required_output(outputs, "boxes")[0][row].astype(np.float64), size), score, category
-        )
+# YOLOv8, v9, 11, 12: columns (1, 4 + C, N) of center, size in px of the input, and class scores.
 
 
-def from_normalized(box_vuvu: Array, size: tuple[int, int]) -> Array:
+def _is_yolov8(outputs: Outputs, size: Size) -> bool:
+    shape = single_output_shape(outputs)
+    return shape is not None and shape[1] == cell_count(size) and shape[0] > 4
+
+
+def _from_yolov8(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    raw = largest_output(outputs)[0].T
+    row, score, category = classes.best(raw[:, 4:], min_score)
+    return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
+
+
+# YOLOv10 and other end-to-end exports: rows (1, N, 6) of u0, v0, u1, v1 in px of the input, score, class id.
+
+
+def _is_yolov10(outputs: Outputs, size: Size) -> bool:
+    shape = single_output_shape(outputs)
+    return shape is not None and shape[1] == 6 and shape[0] not in (cell_count(size), 3 * cell_count(size))
+
+
+def _from_yolov10(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    raw = largest_output(outputs)[0].astype(np.float64)
+    category = classes.categories_of(raw[:, 5])
+    keep = (raw[:, 4] >= min_score) & (category != "")
+    return Candidates(raw[keep, :4], raw[keep, 4], category[keep])
+
+
+# TensorFlow object detection API: boxes v0, u0, v1, u1 in 0-1, classes as COCO ids from 1, already suppressed.
+
+
+def _is_tf_od(outputs: Outputs, size: Size) -> bool:
+    return all(find_output(outputs, f"detection_{part}") is not None for part in ("boxes", "scores", "classes"))
+
+
+def _from_tf_od(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    score = required_output(outputs, "detection_scores")[0].astype(np.float64)
+    number = find_output(outputs, "num_detections")
+    count = len(score) if number is None else min(len(score), int(number.ravel()[0]))
+    box = required_output(outputs, "detection_boxes")[0, :count].astype(np.float64)
+    category = classes.categories_of(required_output(outputs, "detection_classes")[0, :count])
+    keep = (score[:count] >= min_score) & (category != "")
+    return Candidates(from_normalized(box[keep], size), score[:count][keep], category[keep])
+
+
+# The same family before its suppression: `boxes` (1, N, 4) as above and `scores` (1, N, C) after the sigmoid.
+
+
+def _is_tf_od_raw(outputs: Outputs, size: Size) -> bool:
+    box, score = find_output(outputs, "boxes"), find_output(outputs, "scores")
+    if box is None or score is None or box.ndim != 3 or score.ndim != 3:
+        return False
+    return box.shape[2] == 4 and box.shape[:2] == score.shape[:2]
+
+
+def _from_tf_od_raw(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    row, score, category = classes.best(required_output(outputs, "scores")[0], min_score)
+    box = required_output(outputs, "boxes")[0][row].astype(np.float64)
+    return Candidates(from_normalized(box, size), score, category)
+
+
+def from_normalized(box_vuvu: Array, size: Size) -> Array:
     """Convert boxes from v0, u0, v1, u1 in 0-1 to u0, v0, u1, v1 in px."""
     return box_vuvu.reshape(-1, 4)[:, [1, 0, 3, 2]] * np.array([*size, *size], dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class RtDetr:
-    """RT-DETR: boxes as center and size in 0-1; (1, 300, 4 + C) with scores, or `pred_boxes` and `logits` apart."""
-
-    name: str = "rt-detr"
-    preprocessing: Preprocessing = Preprocessing("stretch", rgb=True, unit=True)
-    default_min_score: float = 0.4
-    default_classes: Classes = COCO_80
-
-    def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
-        """Return whether outputs of a gray image have this layout."""
-        if find_output(outputs, "pred_boxes") is not None and find_output(outputs, "logits") is not None:
-            return True
-        shape = single_output_shape(outputs)
-        return shape is not None and shape[0] == 300 and shape[1] > 6
-
-    def class_count(self, outputs: Outputs) -> int | None:
-        """Return the number of classes; None where the output holds class ids."""
-        return int(self._parts(outputs)[1].shape[1])
-
-    def decode(self, outputs: Outputs, size: tuple[int, int], classes: Classes, min_score: float) -> Candidates:
-        """Decode the boxes of score `min_score` and higher."""
-        box, class_scores = self._parts(outputs)
-        row, score, category = classes.best(class_scores, min_score)
-        scaled = corners_from_centers(box[row].astype(np.float64)) * np.array([*size, *size], dtype=np.float64)
-        return Candidates(scaled, score, category)
-
-    @staticmethod
-    def _parts(outputs: Outputs) -> tuple[NDArray[Any], NDArray[Any]]:
-        box, logits = find_output(outputs, "pred_boxes"), find_output(outputs, "logits")
-        if box is not None and logits is not None:
-            return box[0], 0.5 * (1 + np.tanh(0.5 * logits[0]))  # sigmoid without overflow
-        return largest_output(outputs)[0, :, :4], largest_output(outputs)[0, :, 4:]
+# RT-DETR: boxes as center and size in 0-1; (1, 300, 4 + C) with scores, or `pred_boxes` and `logits` apart.
 
 
-YOLOV5_PREPROCESSING = Preprocessing("center", rgb=True, unit=True)
+def _is_rt_detr(outputs: Outputs, size: Size) -> bool:
+    if find_output(outputs, "pred_boxes") is not None and find_output(outputs, "logits") is not None:
+        return True
+    shape = single_output_shape(outputs)
+    return shape is not None and shape[0] == 300 and shape[1] > 6
+
+
+def _from_rt_detr(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    box, class_scores = _rt_detr_parts(outputs)
+    row, score, category = classes.best(class_scores, min_score)
+    scaled = corners_from_centers(box[row].astype(np.float64)) * np.array([*size, *size], dtype=np.float64)
+    return Candidates(scaled, score, category)
+
+
+def _rt_detr_parts(outputs: Outputs) -> tuple[NDArray[Any], NDArray[Any]]:
+    box, logits = find_output(outputs, "pred_boxes"), find_output(outputs, "logits")
+    if box is not None and logits is not None:
+        return box[0], 0.5 * (1 + np.tanh(0.5 * logits[0]))  # sigmoid without overflow
+    return largest_output(outputs)[0, :, :4], largest_output(outputs)[0, :, 4:]
+
+
+_CENTERED = Preprocessing("center", rgb=True, unit=True)
+_CORNER = Preprocessing("corner", rgb=False, unit=False, default_px=416)
+_STRETCHED = Preprocessing("stretch", rgb=True, unit=False, default_px=None)
+_AS_TF1 = Preprocessing("tf1", rgb=True, unit=False, default_px=300)
 LAYOUTS: Mapping[str, Layout] = {
     layout.name: layout
     for layout in (
-        TfOd(),
-        TfOdRaw(),
-        Yolox(),
-        YoloRows("yolov5", YOLOV5_PREPROCESSING, anchors=3),
-        YoloRows("yolov6", YOLOV5_PREPROCESSING),
-        YoloRows("yolox-decoded", Preprocessing("corner", rgb=False, unit=False, default_px=416)),
-        Yolov8(),
-        Yolov10(),
-        RtDetr(),
+        Layout("tf-od", _STRETCHED, _is_tf_od, lambda outputs: None, _from_tf_od, COCO_91),
+        Layout(
+            "tf-od-raw", _AS_TF1, _is_tf_od_raw, lambda outputs: int(required_output(outputs, "scores").shape[2]),
+            _from_tf_od_raw, COCO_91,
+        ),
+        Layout("yolox", _CORNER, _is_yolox, _count_in_rows, _from_yolox),
+        Layout("yolov5", _CENTERED, _is_yolov5, _count_in_rows, _from_rows),
+        # Only where they are given by name.
+        Layout("yolov6", _CENTERED, lambda outputs, size: False, _count_in_rows, _from_rows),
+        Layout("yolox-decoded", _CORNER, lambda outputs, size: False, _count_in_rows, _from_rows),
+        Layout(
+            "yolov8", _CENTERED, _is_yolov8, lambda outputs: int(largest_output(outputs).shape[1]) - 4, _from_yolov8
+        ),
+        Layout("yolov10", _CENTERED, _is_yolov10, lambda outputs: None, _from_yolov10),
+        Layout(
+            "rt-detr", Preprocessing("stretch", rgb=True, unit=True), _is_rt_detr,
+            lambda outputs: int(_rt_detr_parts(outputs)[1].shape[1]), _from_rt_detr,
+        ),
     )
-}
+}  # fmt: skip
 
 
 def named_layout(name: str) -> Layout:

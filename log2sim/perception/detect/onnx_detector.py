@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ def load_model(path: Path) -> OnnxModel:
     """
     import onnxruntime
 
-    check_file(path)
+    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX model")
     options = onnxruntime.SessionOptions()
     # Threads that share a run wait for each other; runs side by side do not.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -85,11 +85,6 @@ def load_model(path: Path) -> OnnxModel:
         raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
     metadata = dict(session.get_modelmeta().custom_metadata_map)
     return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session)
-
-
-def check_file(path: Path) -> None:
-    """Raise `ConfigError` for a file that cannot be a model, before it is read."""
-    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX model")
 
 
 def input_spec(inputs: list[Any], path: Path) -> InputSpec:
@@ -131,18 +126,12 @@ def suppress(detections: Detections, max_overlap: float) -> Detections:
     a person in front of a car is kept. O(M^2) time.
     """
     ordered = strongest_first(detections).take(slice(MAX_CANDIDATES))
-    keep = suppressed_mask(ordered.box_px, groups_of(ordered.category), max_overlap)
-    return ordered.take(keep)
-
-
-def suppressed_mask(box_px: NDArray[np.float64], group: NDArray[np.str_], max_overlap: float) -> NDArray[np.bool_]:
-    """Compute the mask (M,) of the boxes that are kept, for boxes (M, 4) sorted by descending score."""
-    keep = np.ones(len(box_px), dtype=bool)
-    for i in range(len(box_px)):
+    box, group, keep = ordered.box_px, groups_of(ordered.category), np.ones(len(ordered), dtype=bool)
+    for i in range(len(box)):
         if keep[i]:
             later = np.flatnonzero(keep[i + 1 :] & (group[i + 1 :] == group[i])) + i + 1
-            keep[later] = box_iou(box_px[i], box_px[later])[0] <= max_overlap
-    return keep
+            keep[later] = box_iou(box[i], box[later])[0] <= max_overlap
+    return ordered.take(keep)
 
 
 # Overlap of neighboring tiles as a share of a tile's width; wider objects are detected in the whole image.
@@ -275,7 +264,11 @@ def rider_fit(person_px: Array, wheeler_px: Array) -> Array:
     shared = np.minimum(p[..., 2], w[..., 2]) - np.maximum(p[..., 0], w[..., 0])
     narrow = np.minimum(p[..., 2] - p[..., 0], w[..., 2] - w[..., 0])
     share = np.divide(shared, narrow, out=np.zeros_like(shared), where=narrow > 0)
-    return np.where((share >= MIN_HORIZONTAL_SHARE) & _is_rider_height(p, w), np.clip(share, 0, 1), 0.0)
+    height = w[..., 3] - w[..., 1]
+    rises_above = p[..., 1] < w[..., 1] - MIN_RISE * height
+    # Of a person nearer or farther than the two-wheeler the lower edge is elsewhere.
+    same_depth = np.abs(p[..., 3] - w[..., 3]) < MAX_FEET_OFFSET * height
+    return np.where((share >= MIN_HORIZONTAL_SHARE) & rises_above & same_depth, np.clip(share, 0, 1), 0.0)
 
 
 def inside_share(box_px: Array, outer_px: Array) -> Array:
@@ -283,15 +276,6 @@ def inside_share(box_px: Array, outer_px: Array) -> Array:
     shared = np.minimum(box_px[:, 2:], outer_px[2:]) - np.maximum(box_px[:, :2], outer_px[:2])
     area = np.prod(box_px[:, 2:] - box_px[:, :2], axis=1)
     return np.asarray(np.divide(np.clip(shared, 0, None).prod(axis=1), area, out=np.zeros(len(area)), where=area > 0))
-
-
-def _is_rider_height(p: Array, w: Array) -> NDArray[np.bool_]:
-    """Return whether persons end and rise where riders of the two-wheelers do."""
-    height = w[..., 3] - w[..., 1]
-    rises_above = p[..., 1] < w[..., 1] - MIN_RISE * height
-    # Of a person nearer or farther than the two-wheeler the lower edge is elsewhere.
-    same_depth = np.abs(p[..., 3] - w[..., 3]) < MAX_FEET_OFFSET * height
-    return np.asarray(rises_above & same_depth)
 
 
 # Smaller boxes are rounding of the decoder.
@@ -454,9 +438,9 @@ def with_input_size(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
             f"{model.path}: input_px {input_px}: the model takes {model.spec.width_px} x {model.spec.height_px} px and "
             "nothing else; leave input_px out"
         )
-    changed: Any = replace(cast(Any, layout), preprocessing=replace(layout.preprocessing, default_px=input_px))
+    changed = replace(layout, preprocessing=replace(layout.preprocessing, default_px=input_px))
     model.run(changed.preprocessing(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)[0])
-    return cast(Layout, changed)
+    return changed
 
 
 def probe_size(model: OnnxModel, layout: Layout) -> tuple[int, int]:

@@ -1,7 +1,5 @@
 """Detector `ssd-mobilenet-v2`: converted from the frozen graph to integers of 8 bits.
 
-Field numbers are those of TensorFlow's graph.proto, node_def.proto, attr_value.proto and tensor.proto.
-
 Nodes between the preprocessed picture and the two concatenated outputs are translated one by one, constants folded.
 
 Weights have a scale for each channel, values one for each tensor (Jacob et al., "Quantization and Training of Neural Networks
@@ -17,9 +15,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -37,8 +35,40 @@ if TYPE_CHECKING:
     import onnx
 
 
-VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+# Numbers, names and types of the fields that are read of messages, those with a "*" repeated, by TensorFlow's graph.proto,
+# node_def.proto, attr_value.proto and tensor.proto. A map is a list of entries.
+MESSAGES: dict[str, str] = {
+    "Graph": "1 node *Node",
+    "Node": "1 name string, 2 op string, 3 input *string, 5 attr *Entry",
+    "Entry": "1 key string, 2 value Value",
+    "Value": "1 list List, 2 s bytes, 8 tensor Tensor",
+    "List": "3 i *int64",
+    "Tensor": "1 dtype int32, 2 shape Shape, 4 content bytes, 5 floats *float, 7 ints *int32, 10 longs *int64, 11 flags *bool",
+    "Shape": "2 dim *Dimension",
+    "Dimension": "1 size int64",
+}
 TENSOR_DTYPES: dict[int, type] = {1: np.float32, 2: np.float64, 3: np.int32, 4: np.uint8, 9: np.int64, 10: np.bool_}
+
+
+@cache
+def message_class(name: str) -> Any:
+    """Return the class of one of `MESSAGES`."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # comes with onnx
+
+    field_type = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name="log2sim_graph.proto", package="log2sim", syntax="proto3")
+    for message, fields in MESSAGES.items():
+        declared = file.message_type.add(name=message)
+        for number, field, kind in (entry.split() for entry in fields.split(",")):
+            label = field_type.LABEL_REPEATED if kind.startswith("*") else field_type.LABEL_OPTIONAL
+            added = declared.field.add(name=field, number=int(number), label=label)
+            if kind.lstrip("*") in MESSAGES:
+                added.type, added.type_name = field_type.TYPE_MESSAGE, f".log2sim.{kind.lstrip('*')}"
+            else:
+                added.type = field_type.Type.Value(f"TYPE_{kind.lstrip('*').upper()}")
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"log2sim.{name}"))
 
 
 @dataclass(frozen=True)
@@ -48,129 +78,45 @@ class Node:
     name: str
     op: str
     inputs: tuple[str, ...]  # names of nodes, without output numbers
-    attributes: dict[str, bytes]  # undecoded AttrValue messages
+    attributes: dict[str, Any]  # AttrValue messages
 
     def integers(self, key: str) -> list[int]:
-        """Read a list of integers, such as strides; empty when the attribute is absent."""
-        for number, _, value in fields(self.attributes.get(key, b"")):
-            if number == 1:
-                return [i for n, wire, v in fields(value) if n == 3 for i in packed_integers(wire, v)]
-        return []
-
-    def text(self, key: str) -> str:
-        """Read a string, such as the kind of padding; "" when the attribute is absent."""
-        return next((bytes(v).decode() for n, _, v in fields(self.attributes.get(key, b"")) if n == 2), "")
-
-    def tensor(self, key: str) -> NDArray[Any] | None:
-        """Read a constant; None when the attribute is absent or holds no numbers."""
-        return next((read_tensor(v) for n, _, v in fields(self.attributes.get(key, b"")) if n == 8), None)
+        """Return a list of integers, such as strides; empty when the attribute is absent."""
+        return list(self.attributes[key].list.i) if key in self.attributes else []
 
 
 def read_graph(data: bytes) -> dict[str, Node]:
-    """Read all nodes of a GraphDef by name.
+    """Read all nodes of a GraphDef by name; `ValueError` when the bytes are no such message."""
+    from google.protobuf.message import DecodeError
 
-    Raises `ValueError` when the bytes are no such message.
-    """
-    nodes = [read_node(value) for number, wire, value in fields(data) if number == 1 and wire == BYTES]
-    return {node.name: node for node in nodes}
-
-
-def read_node(data: bytes) -> Node:
-    """Read one NodeDef."""
-    name, op, inputs, attributes = "", "", [], {}
-    for number, _, value in fields(data):
-        if number == 1:
-            name = bytes(value).decode()
-        elif number == 2:
-            op = bytes(value).decode()
-        elif number == 3:
-            inputs.append(bytes(value).decode().lstrip("^").split(":")[0])
-        elif number == 5:
-            entry = {n: bytes(v) for n, _, v in fields(value)}
-            attributes[entry[1].decode()] = entry.get(2, b"")
-    return Node(name, op, tuple(inputs), attributes)
+    try:
+        graph = message_class("Graph").FromString(data)
+    except DecodeError as problem:
+        raise ValueError(f"not a graph: {problem}") from None
+    return {
+        node.name: Node(
+            node.name,
+            node.op,
+            tuple(name.lstrip("^").split(":")[0] for name in node.input),
+            {entry.key: entry.value for entry in node.attr},
+        )
+        for node in graph.node
+    }
 
 
-def fields(data: bytes) -> Iterator[tuple[int, int, Any]]:
-    """Yield field number, wire type and value (int or bytes) of each field of one message."""
-    at, end = 0, len(data)
-    while at < end:
-        key, at = varint(data, at)
-        wire = key & 7
-        if wire == VARINT:
-            value, at = varint(data, at)
-            yield key >> 3, wire, value
-            continue
-        if wire == BYTES:
-            length, at = varint(data, at)
-        elif wire in (FIXED64, FIXED32):
-            length = 8 if wire == FIXED64 else 4
-        else:
-            raise ValueError(f"wire type {wire} at byte {at}: not a protobuf message")
-        if at + length > end:
-            raise ValueError(f"field {key >> 3} at byte {at} ends behind its message")
-        yield key >> 3, wire, data[at : at + length]
-        at += length
-
-
-def varint(data: bytes, at: int) -> tuple[int, int]:
-    """Read an unsigned integer of seven bits a byte, lowest first, and return it and where it ends."""
-    value = shift = 0
-    while at < len(data) and shift < 70:
-        byte = data[at]
-        value |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-        if byte < 0x80:
-            return value, at
-    raise ValueError(f"integer at byte {at} does not end")
-
-
-def packed_integers(wire: int, value: Any) -> list[int]:
-    """Read the signed integers of a repeated field, packed or single."""
-    if wire == VARINT:
-        return [signed(value)]
-    out, at = [], 0
-    while at < len(value):
-        number, at = varint(value, at)
-        out.append(signed(number))
-    return out
-
-
-def signed(value: int) -> int:
-    """Convert an unsigned 64-bit integer to the signed one of the same bits (two's complement)."""
-    return value - (1 << 64) if value >> 63 else value
-
-
-def read_tensor(data: bytes) -> NDArray[Any] | None:
-    """Read a TensorProto as an array; None for types that hold no numbers (strings)."""
-    kind, shape, content, values = 0, [], b"", []
-    for number, wire, value in fields(data):
-        if number == 1:
-            kind = value
-        elif number == 2:
-            shape = [read_dimension(v) for n, _, v in fields(value) if n == 2]
-        elif number == 4:
-            content = value
-        elif number == 5:
-            values += list(struct.unpack(f"<{len(value) // 4}f", value))
-        elif number in (7, 10, 11):
-            values += packed_integers(wire, value)
-    dtype = TENSOR_DTYPES.get(kind)
+def read_tensor(tensor: Any) -> NDArray[Any] | None:
+    """Return a TensorProto as an array; None for types that hold no numbers (strings)."""
+    dtype, shape = TENSOR_DTYPES.get(tensor.dtype), [dimension.size for dimension in tensor.shape.dim]
     if dtype is None:
         return None
-    if len(content):
-        return np.frombuffer(content, dtype).reshape(shape)
+    if tensor.content:
+        return np.frombuffer(tensor.content, dtype).reshape(shape)
+    values = [*tensor.floats, *tensor.ints, *tensor.longs, *tensor.flags]
     # The format leaves out repeats of the last value.
     count = int(np.prod(shape, dtype=np.int64))
     if len(values) > count:
         raise ValueError(f"{len(values)} values for a tensor of shape {shape}")
-    padded = values + (values[-1:] or [0]) * (count - len(values))
-    return np.array(padded, dtype).reshape(shape)
-
-
-def read_dimension(data: bytes) -> int:
-    """Read the size of one dimension."""
-    return next((signed(value) for number, _, value in fields(data) if number == 1), 0)
+    return np.array(values + (values[-1:] or [0]) * (count - len(values)), dtype).reshape(shape)
 
 
 OPSET = 13
@@ -231,7 +177,7 @@ class Converter:
 
     def _fold(self, node: Node) -> NDArray[Any] | None:
         if node.op == "Const":
-            return node.tensor("value")
+            return read_tensor(node.attributes["value"].tensor)
         if node.op == "Identity":
             return self.constant(node.inputs[0])
         if node.op not in ("Mul", "Add", "Sub", "Rsqrt") or PICTURE in (node.name, *node.inputs):
@@ -296,7 +242,7 @@ class Converter:
             dilations=(node.integers("dilations") or [1] * 4)[1:3],
             kernel_shape=list(kernel.shape[2:]),
             group=groups,
-            auto_pad="SAME_UPPER" if node.text("padding") == "SAME" else "VALID",
+            auto_pad="SAME_UPPER" if node.attributes["padding"].s == b"SAME" else "VALID",
         )
 
 
@@ -419,8 +365,13 @@ class Convolution:
     node: Any
     weights: NDArray[np.float32]  # (M, C, kH, kW)
     bias: NDArray[np.float32]  # (M,)
-    output: str  # name of the last value that is folded in
+    folded: list[str]  # names of the values that are folded in; the last one is what it gives
     clipped: bool  # whether a ReLU6 is among what is folded in
+
+    @property
+    def output(self) -> str:
+        """Name of what it gives."""
+        return self.folded[-1] if self.folded else str(self.node.output[0])
 
 
 def known_ranges() -> dict[str, tuple[float, float]]:
@@ -468,7 +419,7 @@ def fold_convolutions(model: onnx.ModelProto) -> dict[str, Convolution]:
         if node.op_type != "Conv":
             continue
         weights, output, clipped = constants[node.input[1]].astype(np.float32), node.output[0], False
-        bias = np.zeros(len(weights), np.float32)
+        bias, folded = np.zeros(len(weights), np.float32), list[str]()
         while len(users.get(output, ())) == 1 and not clipped:
             (after,) = users[output]
             known = [constants[name] for name in after.input if name in constants]
@@ -481,7 +432,8 @@ def fold_convolutions(model: onnx.ModelProto) -> dict[str, Convolution]:
             else:
                 break
             output = after.output[0]
-        found[node.output[0]] = Convolution(node, weights, bias, output, clipped)
+            folded.append(output)
+        found[node.output[0]] = Convolution(node, weights, bias, folded, clipped)
     return found
 
 
@@ -493,7 +445,7 @@ class Quantizer:
 
     def __init__(self, model: onnx.ModelProto, ranges: Mapping[str, tuple[float, float]]) -> None:
         self._ranges, self._convolutions = ranges, fold_convolutions(model)
-        self._folded = {name for c in self._convolutions.values() for name in _folded_names(model, c)}
+        self._folded = {name for c in self._convolutions.values() for name in c.folded}
         self._constants = {i.name: i for i in model.graph.initializer}
         self._scales: dict[str, float] = {}
         # What is missing from the products of scales and levels, the same everywhere.
@@ -546,7 +498,9 @@ class Quantizer:
             self._restore(f"{name}/bias_int32", np.rint(bias / step).astype(np.int32), step),
         ]
         self._make("Conv", inputs, folded.output, **_attributes(folded.node))
-        self._quantize(folded.output, RELU6_RANGE if folded.clipped else self._range_of(folded.output))
+        if not folded.clipped and folded.output not in self._ranges:
+            raise ValueError(f"value '{folded.output}' has no range")
+        self._quantize(folded.output, RELU6_RANGE if folded.clipped else self._ranges[folded.output])
 
     def _add_head(
         self, folded: Convolution, whole: NDArray[np.int8], step: NDArray[np.float32], bias: NDArray[np.float32]
@@ -581,11 +535,6 @@ class Quantizer:
         inputs = [self._store(name, whole), self._store(f"{name}/scale", scale), self._store(f"{name}/zero", zero)]
         return self._make("DequantizeLinear", inputs, f"{name}/float", axis=0)
 
-    def _range_of(self, name: str) -> tuple[float, float]:
-        if name not in self._ranges:
-            raise ValueError(f"value '{name}' has no range")
-        return self._ranges[name]
-
     def _quantize(self, name: str, limits: tuple[float, float]) -> None:
         """Round a value to levels between limits, under its own name for all that use it."""
         low, high = min(limits[0], 0.0), max(limits[1], 0.0)
@@ -608,16 +557,6 @@ class Quantizer:
 
         self.initializers.append(numpy_helper.from_array(np.asarray(value), name))
         return name
-
-
-def _folded_names(model: onnx.ModelProto, folded: Convolution) -> list[str]:
-    """Names of the values between a convolution and the last one that is folded into it, that one included."""
-    by_input = {name: node for node in model.graph.node for name in node.input}
-    names, output = [], folded.node.output[0]
-    while output != folded.output:
-        output = by_input[output].output[0]
-        names.append(output)
-    return names
 
 
 def _attributes(node: Any) -> dict[str, Any]:
@@ -664,8 +603,6 @@ def converted_model() -> Path:
     graph = graph_bytes()
     if importlib.util.find_spec("onnx") is None:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
-    pass  # HOUSE
-
     try:
         converted = convert(graph)
         content = (quantize(converted, known_ranges()) if in_bytes else converted).SerializeToString(deterministic=True)
