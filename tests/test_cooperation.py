@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
+from benchmarks.registration import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
 
 from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log, Stream, Sweep

@@ -11,20 +11,14 @@ from hypothesis import strategies as st
 from plain_settings import AGENTS_ALONE
 from worlds import rows_at, tiny_log, tiny_table
 
-from log2sim.config import Config, TrackConfig
+from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.evaluation.detection.detect_log import without_ego
-from log2sim.geometry import rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import wrap_angle
 from log2sim.perception.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative import (
-    METHODS,
     BoxErrors,
-    EndsDetector,
     SeenBoxes,
-    create_for_ends,
-    detector_by_mounting,
-    estimate_errors,
-    fuse_boxes,
     match_by_covariance,
     merge_by_covariance,
     take_off_offset,
@@ -36,10 +30,10 @@ from log2sim.perception.lidar.cloud import (
     assemble_views,
     join_parts,
 )
-from log2sim.perception.lidar.measure import follow_box, measure_boxes
+from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
-from log2sim.tracking.tracker import merge_tracks, track_ends
+from log2sim.tracking.tracker import merge_tracks
 
 POST = {
     "name": "post",
@@ -232,7 +226,7 @@ def test_the_road_joins_two_tracks_of_a_hidden_object() -> None:
 
 def test_a_row_keeps_the_view_of_the_other_end(both_ends) -> None:
     cloud = assemble_views(both_ends, sweeps_at(both_ends), origin=np.zeros(3), ground_z=0.0, max_range_m=80.0)
-    rows = measure_boxes(boxes_at((14.0, -4.0, 0.75, 4.2, 1.8, 1.5, np.deg2rad(10))), cloud)
+    rows = measure([], boxes_at((14.0, -4.0, 0.75, 4.2, 1.8, 1.5, np.deg2rad(10))), cloud)
     (other,) = rows.others
     assert rows.seen_by.tolist() == [[True, True]]
     places = [view.sensor + view.origin for view in cloud.views]
@@ -275,7 +269,7 @@ def test_boxes_are_sought_where_the_other_end_sees_them_later() -> None:
     nothing = view_of(outline_points(30.0, 0.0), [20, 5, 3], end="road", stamp_ns=50_000_000)
     assert np.array_equal(follow_box(box, nothing).center_m, box.center_m)
     cloud = join_parts([view_of(outline_points(0.0, 0.0), [-15, -5, 2]), later])
-    rows = measure_boxes(box, cloud)
+    rows = measure([], box, cloud)
     assert rows.points[0] == len(cloud.xyz)
 
 
@@ -374,54 +368,3 @@ def test_the_ego_that_the_road_sees_is_no_detection(both_ends) -> None:
     assert without_ego(both_ends, found).center_m.tolist() == found.center_m[1:].tolist()
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
     assert without_ego(vehicle, found) is found
-
-
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-def test_what_one_end_alone_sees_stays(method) -> None:
-    a = seen(boxes_at(CAR, (20, 0, 0.8, 4.5, 1.8, 1.6, 0.3)))
-    b = seen(boxes_at((0.1, 0, 0.8, 4.5, 1.8, 1.6, 0), (0, 30, 0.8, 4.5, 1.8, 1.6, 0.3)))
-    fused = fuse_boxes(a, b, method).boxes
-    assert len(fused) == 3
-    alone = fused.take(fused.points == 50)
-    assert sorted(map(tuple, alone.center_m[:, :2].tolist())) == [(0, 30), (20, 0)]
-    nothing = seen(Boxes3D.empty())
-    assert fuse_boxes(a, nothing, method) is a
-    assert fuse_boxes(nothing, b, method) is b
-
-
-def test_near_sides_are_better_known_than_far_ones() -> None:
-    errors = estimate_errors(boxes_at(CAR), np.array([-10.0, 4.0, 2.0]))
-    (rear, front), (right, left) = errors.side_m[0]
-    assert rear < front
-    assert left < right
-    assert errors.yaw_rad[0] < 0.2
-    few = estimate_errors(boxes_at(CAR, points=5), np.array([-10.0, 4.0, 2.0]))
-    assert (few.side_m > errors.side_m).all()
-
-
-def test_the_road_has_a_detector_that_fits_its_mounting(both_ends) -> None:
-    assert detector_by_mounting(both_ends, "lidar:vehicle") == "lidar:vehicle"
-    assert detector_by_mounting(both_ends, "lidar:mine.onnx") == "lidar:mine.onnx"
-    post = both_ends.lidars["post"]
-    down = post.mount_T_lidar @ transform(rotation_from_rpy(0.0, np.deg2rad(31.0), 0.0), np.zeros(3))
-    tilted = both_ends.changed(lidars={**both_ends.lidars, "post": replace(post, mount_T_lidar=down)})
-    assert detector_by_mounting(tilted, "lidar:vehicle") == "lidar:roadside"
-    config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
-    detector = create_for_ends(tilted, config)
-    assert isinstance(detector, EndsDetector)
-    assert detector.name == "lidar:vehicle|lidar:roadside"
-    points = config.changed(cooperation={"fusion": "points"})
-    assert create_for_ends(tilted, points).name == "lidar:vehicle"
-
-
-def test_both_ends_share_the_life_of_a_short_track() -> None:
-    ticks = np.arange(12)
-    empty = rows_at(np.zeros((0, 2)))
-
-    def by_tick(track):
-        return [track.measurements.take(track.tick == k) if k in track.tick else empty for k in ticks]
-
-    a, b = track_of([2, 3, 4], line([2, 3, 4], 5.0)), track_of([5, 6, 7], line([5, 6, 7], 5.0), end=1)
-    config = TrackConfig(birth_score=0.4, max_gap_s=1.0, min_life_s=0.5)
-    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), config)
-    assert found.tick.tolist() == [2, 3, 4, 5, 6, 7]

@@ -17,7 +17,7 @@ from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import observe
-from log2sim.perception.frames import AHEAD, KeepingReader, RecordReader, look_again, work_ahead
+from log2sim.perception.frames import AHEAD, RecordReader, look_again, work_ahead
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, sample_rays
 from log2sim.perception.observe_tick import base_pose
@@ -317,33 +317,6 @@ def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
     assert second.got == [("left", 3, 3), ("left", 4, 4)]
     assert sorted(reads) == [("left", 1), ("left", 3), ("left", 4), ("right2", 1)]
     assert steps == [(k + 1, 4) for k in range(4)]
-
-
-def test_kept_sweeps_are_read_once_and_stay_as_they_are() -> None:
-    reads: list[int] = []
-
-    def read(i: int) -> Sweep:
-        reads.append(i)
-        return Sweep(
-            i, np.full((4, 3), i, np.float32), t_ns=np.arange(4) + i, intensity=None if i else np.ones(4, np.float32)
-        )
-
-    lidar = Lidar("top", "map", np.eye(4))
-    log = Log("l", "synthetic", {}, {"top": lidar}, {"top": Stream("top", np.arange(5, dtype=np.int64), read)})
-    reader = KeepingReader(log, 2)
-    for _ in range(2):
-        for i in (0, 1, 2):
-            sweep = reader.get("top", i)
-            assert (sweep.stamp_ns, sweep.xyz_m.tolist(), sweep.t_ns.tolist()) == (
-                i,
-                [[i] * 3] * 4,
-                [i, i + 1, i + 2, i + 3],
-            )
-            assert (sweep.intensity is None) == (i > 0)
-    assert reads == [0, 1, 2, 2]
-    reader.forget()
-    reader.get("top", 0)
-    assert reads[-1] == 0
 
 
 PATIENCE_S = 20.0

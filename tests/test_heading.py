@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
-import fit_outline
 import numpy as np
 import pytest
+from fits import outline as fit_outline
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_size import bare

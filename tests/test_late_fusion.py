@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
-from worlds import camera_ahead, outline_px, rows_at, standing
+from numpy.typing import NDArray
+from worlds import camera_ahead, outline_px, scan, standing
 
-from log2sim.datatypes import Boxes3D, Measurements
+from log2sim.datatypes import Boxes3D, Detections, Measurements
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.fusion import PAIR_WEIGHTS, join_with_images, match_boxes
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, match_boxes, measure
 from log2sim.perception.lidar.projection import View
 
 CAMERA = camera_ahead()
@@ -19,31 +18,39 @@ VIEW = View(CAMERA, NS_PER_S, CAMERA.mount_T_cam)
 CAR = (4.4, 1.85, 1.6)
 
 
-def in_sweep(
-    *places: tuple[float, float], category: str = "car", score: float = 0.8, yaw_deg: float = 0.0
-) -> Measurements:
-    """Rows of boxes of a sweep on the ground, without points."""
+def in_sweep(*places: tuple[float, float], category: str = "car", score: float = 0.8, yaw_deg: float = 0.0) -> Boxes3D:
+    """Boxes of a sweep on the ground."""
     m = len(places)
     center = np.array([(x, y, CAR[2] / 2) for x, y in places]).reshape(-1, 3)
-    boxes = Boxes3D(
+    return Boxes3D(
         np.full(m, NS_PER_S), center, np.tile(CAR, (m, 1)), np.full(m, np.deg2rad(yaw_deg)), np.full(m, 0.9),
         np.full(m, category, dtype="<U16"), np.full(m, score), np.full(m, 50),
     )  # fmt: skip
-    rows = Measurements.of_boxes(boxes, np.array([0.0, 0.0, 1.9]))
-    return replace(rows, center_m=center, covariance=np.tile(np.eye(2) * 0.04, (m, 1, 1)), source=np.full(m, "lidar"))
 
 
-def in_image(*places: tuple[float, float], category: str = "car", score: float = 0.7, **columns: Any) -> Measurements:
-    """Rows of exact image boxes of cars at places, measured there."""
+def in_image(*places: tuple[float, float], category: str = "car", score: float = 0.7) -> Detections:
+    """Exact image boxes of cars at places."""
     box = np.array([outline_px(CAMERA, CAMERA.mount_T_cam, standing(x, y, size_m=CAR)) for x, y in places])
-    known = {"box_px": box.reshape(-1, 4), "sensor_m": np.tile([0.0, 0.0, 1.9], (len(places), 1))}
-    return rows_at(
-        np.array(places).reshape(-1, 2), category, camera="front", score=score, source="lidar", **known | columns
-    )
+    return Detections(box.reshape(-1, 4), np.full(len(places), score), np.full(len(places), category))
 
 
-def joined(boxes: Measurements, rows: Measurements) -> Measurements:
-    return join_with_images(boxes, [match_boxes(boxes, rows, VIEW)])
+def cloud_of(world: NDArray[np.float64] | None = None) -> Cloud:
+    """The cloud of points (N, 3) on flat ground; none by default."""
+    world = np.zeros((0, 3)) if world is None else world
+    height = world[:, 2].astype(np.float32)
+    t_s, sensor = np.zeros(len(world), np.float32), np.array([0.0, 0.0, 1.9], np.float32)
+    return Cloud(NS_PER_S, np.zeros(3), world.astype(np.float32), t_s, sensor, height < 0.1, height)
+
+
+def joined(
+    boxes: Boxes3D, found: Detections, view: View = VIEW, world: NDArray[np.float64] | None = None
+) -> Measurements:
+    return measure([(view, found, cloud_of(world))], boxes, cloud_of(world))
+
+
+def matched(boxes: Boxes3D, found: Detections) -> Pairs:
+    rows = measure([(VIEW, found, None)])
+    return match_boxes(boxes, rows, np.zeros(len(rows), np.intp), [VIEW])
 
 
 def test_a_box_in_both_is_one_row_with_what_both_know() -> None:
@@ -58,37 +65,45 @@ def test_a_box_in_both_is_one_row_with_what_both_know() -> None:
 
 def test_every_box_gets_its_own_partner_and_the_best_pair_is_matched_first() -> None:
     places = [(15.0, 3.0), (15.6, 0.5), (30.0, -4.0)]
-    found = match_boxes(in_sweep(*places), in_image(*places[::-1]), VIEW)
-    assert found.partner.tolist() == [2, 1, 0]
+    found = matched(in_sweep(*places), in_image(*places[::-1]))
+    assert sorted(zip(found.box.tolist(), found.image.tolist())) == [(0, 2), (1, 1), (2, 0)]
     assert (found.iou > 0.9).all()
-    twice = match_boxes(in_sweep((20, 2), (20.3, 2.1)), in_image((20, 2)), VIEW)
-    assert twice.partner.tolist() == [0, -1]
+    twice = matched(in_sweep((20.3, 2.1), (20, 2)), in_image((20, 2)))
+    assert (twice.box.tolist(), twice.image.tolist()) == ([1], [0])
 
 
 def test_the_category_of_the_image_counts_only_where_the_boxes_agree() -> None:
     loose = in_image((20, 3.2), category="truck")
-    match = match_boxes(in_sweep((20, 2)), loose, VIEW)
-    assert 0.3 <= match.iou[0] < 0.5
+    assert 0.3 <= matched(in_sweep((20, 2)), loose).iou[0] < 0.5
     assert joined(in_sweep((20, 2)), loose).category.tolist() == ["car"]
 
 
 def test_an_object_in_view_that_the_image_misses_is_doubted_and_one_outside_is_not() -> None:
     boxes = in_sweep((20, 2), (-20, 2), (20, 60), score=0.6)
-    assert match_boxes(boxes, in_image(), VIEW).height_px.tolist()[1:] == [0, 0]
+    assert matched(boxes, in_image()).height_px.tolist()[1:] == [0, 0]
     score = joined(boxes, in_image()).score
     assert score[0] < 0.5
     assert score[1:].tolist() == [0.6, 0.6]
 
 
+def test_a_box_in_both_takes_its_points_from_the_image_boxes_of_others() -> None:
+    cars = [standing(14, 0, 20), standing(21, 3, 20)]
+    world, owner = scan(cars, azimuth_deg=(-40, 40), steps=(400, 60))
+    found = in_image((14, 0), (21, 3))
+    found.box_px[:] = [outline_px(CAMERA, CAMERA.mount_T_cam, car) for car in cars]
+    rows = joined(in_sweep((14, 0), yaw_deg=20), found, world=world)
+    assert rows.camera.tolist() == ["front", "front"]
+    assert np.isfinite(rows.box_yaw_rad).tolist() == [True, False]
+    for car, cluster in zip((0, 1), rows.cluster):
+        nearest = np.linalg.norm(world[:, None] - cluster[None, :, :3], axis=2).argmin(axis=0)
+        assert (owner[nearest] == car).mean() > 0.9
+
+
 def test_two_even_chances_that_agree_are_three_to_one() -> None:
-    half, iou, near = np.array([0.5]), np.array([0.7]), np.array([0.0])
-    assert PAIR_WEIGHTS.score(half, half, iou, near)[0] == pytest.approx(0.75, abs=0.01)
-    better = [
-        PAIR_WEIGHTS.score(half + 0.1, half, iou, near), PAIR_WEIGHTS.score(half, half + 0.1, iou, near),
-        PAIR_WEIGHTS.score(half, half, iou + 0.1, near),
-    ]  # fmt: skip
+    assert PAIR_WEIGHTS.score(0.5, 0.5, 0.7) == pytest.approx(0.75, abs=0.01)
+    better = [PAIR_WEIGHTS.score(0.6, 0.5, 0.7), PAIR_WEIGHTS.score(0.5, 0.6, 0.7), PAIR_WEIGHTS.score(0.5, 0.5, 0.8)]
     assert min(better) > 0.75
-    assert PAIR_WEIGHTS.score(np.ones(1), np.ones(1), np.ones(1), near)[0] < 1
+    assert PAIR_WEIGHTS.score(1.0, 1.0, 1.0) < 1
 
 
 @pytest.mark.parametrize("turn_deg", [37.0, 90.0, 180.0])
@@ -100,8 +115,6 @@ def test_turning_the_world_changes_no_match_and_no_score(turn_deg: float) -> Non
     camera = camera_ahead(yaw_rad=turn)
     view = View(camera, NS_PER_S, camera.mount_T_cam)
     rows = in_image(*places[:2])
-    here = join_with_images(in_sweep(*places), [match_boxes(in_sweep(*places), rows, VIEW)])
-    boxes = in_sweep(*turned, yaw_deg=turn_deg)
-    there = join_with_images(boxes, [match_boxes(boxes, rows, view)])
+    here, there = joined(in_sweep(*places), rows), joined(in_sweep(*turned, yaw_deg=turn_deg), rows, view)
     np.testing.assert_allclose(there.score, here.score, atol=1e-9)
     assert there.camera.tolist() == here.camera.tolist()

@@ -213,7 +213,7 @@ def assert_same_rows(a: Measurements, b: Measurements) -> None:
 
 def doubled_rows(log: Log) -> Measurements:
     """What one camera measured in a tick, each object twice, a little apart and with another score."""
-    from log2sim.perception.lidar.measure import measure_view
+    from log2sim.perception.lidar.measure import measure
     from log2sim.perception.lidar.projection import View
 
     t_ns = int(log.streams["front"].t_ns[4])
@@ -224,7 +224,7 @@ def doubled_rows(log: Log) -> Measurements:
     boxes = create_detector("labels", log).detect(Frame(view.camera, t_ns, lambda: np.zeros((1, 1, 3), np.uint8)))
     again = Detections(boxes.box_px + 2.0, boxes.score * 0.7, boxes.category)
     driver = Detections(boxes.box_px[:1] * 1.0, np.array([0.5]), np.array(["pedestrian"]))
-    return Measurements.join([measure_view(view, d, cloud) for d in (boxes, again, driver)])
+    return Measurements.join([measure([(view, d, cloud)]) for d in (boxes, again, driver)])
 
 
 def test_for_one_camera_dropping_doubles_is_all_of_fusion(tiny: Log) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from log2sim.config import Config
-from log2sim.datatypes import Lidar, Log, Stream, Sweep
+from log2sim.datatypes import Fault, Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.localization.choice import localize, localize_like
+from log2sim.localization.choice import localize, localize_like, refine
 from log2sim.localization.pose_refinement import Keyframe, refine_poses, solve_twists
 from log2sim.localization.surfaces import Registration, exp_of, log_of
 
@@ -79,7 +79,7 @@ def test_drift_is_taken_out(frame: str) -> None:
 def test_a_run_takes_refined_poses_where_those_of_the_log_drift_and_finds_them_again() -> None:
     """A sweep in the map, as some logs have it, lies where its refined pose puts it."""
     log = street_log(drifted(), "map")
-    found, choice = localize(log, Config())
+    found, choice = refine(*localize(log, Config()))
     assert found.ego is not None
     assert choice.refined
     local = apply(inverse(drifted()[30]), log.streams["top"].read(30).xyz_m)
@@ -88,6 +88,8 @@ def test_a_run_takes_refined_poses_where_those_of_the_log_drift_and_finds_them_a
     assert again.ego is not None
     np.testing.assert_array_equal(again.ego.map_T_ego, found.ego.map_T_ego)
     assert localize_like(log, {"poses": {"source": "given"}}) is log  # as of earlier versions
+    late = Fault("time_offset", "top", "", "kept")
+    assert refine(*localize(log, Config()), [late])[0] is log  # the sweeps of such a LiDAR show another motion
 
 
 def test_one_false_registration_changes_little() -> None:

@@ -12,7 +12,7 @@ from log2sim.geometry import Camera, apply, inverse, transform
 from log2sim.perception.boxes import rotate
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
 from log2sim.perception.lidar.clusters import continued_sides
-from log2sim.perception.lidar.measure import measure_view, project_cloud
+from log2sim.perception.lidar.measure import measure, project_cloud
 from log2sim.perception.lidar.projection import View
 
 T0_NS = 1_700_000_000_000_000_000
@@ -44,6 +44,11 @@ def cloud_of(world, *, far=(0.0, 0.0, 0.0), height=None, t_s=None):
         np.abs(height) <= ON_GROUND_M,
         height.astype(np.float32),
     )
+
+
+def measure_view(view, found, cloud, mode="robust"):
+    """Rows of the boxes of one frame."""
+    return measure([(view, found, cloud)], mode=mode)
 
 
 def boxes(view, solids, categories=None, score=None):

@@ -19,7 +19,7 @@ from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.geometry import NS_PER_S, rotation_from_rpy, wrap_angle
 from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure import measure_boxes
+from log2sim.perception.lidar.measure import measure
 from log2sim.tracking.tracker import mark_unrecorded
 
 ORIGIN = np.array([500.0, -200.0, 3.0])
@@ -54,7 +54,7 @@ CARS = [standing(12.0, 5.0, 20.0), standing(-15.0, 3.0, 170.0), standing(4.0, -1
 
 
 def test_boxes_have_their_points_and_places_all_around() -> None:
-    rows = measure_boxes(boxes_of(CARS), cloud_of(CARS))
+    rows = measure([], boxes_of(CARS), cloud_of(CARS))
     assert (rows.source == "lidar").all()
     assert (rows.camera == "").all()
     for k, car in enumerate(CARS):
@@ -65,7 +65,7 @@ def test_boxes_have_their_points_and_places_all_around() -> None:
 
 
 def test_points_correct_a_yaw_that_is_somewhat_wrong_and_keep_its_direction() -> None:
-    rows = measure_boxes(boxes_of(CARS, yaw_error_rad=np.deg2rad(6)), cloud_of(CARS))
+    rows = measure([], boxes_of(CARS, yaw_error_rad=np.deg2rad(6)), cloud_of(CARS))
     for k, car in enumerate(CARS):
         assert abs(wrap_angle(rows.yaw_rad[k] - car.yaw_rad)) < np.deg2rad(2)
 
@@ -73,8 +73,8 @@ def test_points_correct_a_yaw_that_is_somewhat_wrong_and_keep_its_direction() ->
 @pytest.mark.parametrize(("turn_deg", "flip"), [(73.0, 1.0), (180.0, 1.0), (0.0, -1.0), (-140.0, -1.0)])
 def test_turning_and_mirroring_the_world_turns_and_mirrors_the_rows(turn_deg: float, flip: float) -> None:
     turn = float(np.deg2rad(turn_deg))
-    here = measure_boxes(boxes_of(CARS), cloud_of(CARS))
-    there = measure_boxes(boxes_of(CARS, turn_rad=turn, flip=flip), cloud_of(CARS, turn_rad=turn, flip=flip))
+    here = measure([], boxes_of(CARS), cloud_of(CARS))
+    there = measure([], boxes_of(CARS, turn_rad=turn, flip=flip), cloud_of(CARS, turn_rad=turn, flip=flip))
     expected = ((here.center_m - ORIGIN) * [1.0, flip, 1.0]) @ rotation_from_rpy(0, 0, turn).T + ORIGIN
     np.testing.assert_allclose(there.center_m, expected, atol=0.03)
     np.testing.assert_allclose(wrap_angle(there.yaw_rad - (flip * here.yaw_rad + turn)), 0.0, atol=0.01)
@@ -96,7 +96,7 @@ def track_of(
     ticks: int, score: float | np.ndarray = 0.8, *, heading: float = 0.9, camera: str = "", **moved: float
 ) -> Track:
     """A track of one car by boxes of sweeps, which turns by `flip` radians at a share `flipped` of its ticks."""
-    rows = Measurements.join([measure_boxes(boxes_of(CARS[:1]), cloud_of(CARS[:1]))] * ticks)
+    rows = Measurements.join([measure([], boxes_of(CARS[:1]), cloud_of(CARS[:1]))] * ticks)
     yaw = rows.box_yaw_rad.copy()
     yaw[: round(ticks * moved.get("flipped", 0.0))] += np.pi
     t_ns = NS_PER_S + np.arange(ticks) * NS_PER_S // 10

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check, write_json
 from log2sim.pipeline import Result
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.memory import loop_log
 from extremes import CASES, Case, outcome_of
-from looped_log import loop_log
 from plain_settings import AGENTS_ALONE
 from worlds import tiny_log
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -320,14 +320,8 @@ def test_impossible_motion_is_flagged() -> None:
 @pytest.fixture(scope="module")
 def maneuvers() -> ModuleType:
     """The module of maneuvers with known truth that the benchmark uses as well."""
-    path = Path(__file__).resolve().parent.parent / "tools" / "smoothing_worlds.py"
-    spec = importlib.util.spec_from_file_location("smoothing_worlds", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["smoothing_worlds"] = module
-    spec.loader.exec_module(module)
-    return module
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+    return importlib.import_module("benchmarks.smoothing")
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])

@@ -1,13 +1,12 @@
 """Vehicle and road together: the three tests of Chen, "Intelligent Perception System for Vehicle-Road Cooperation", in random variants.
 
-python tools/cooperation.py --test blind_area --variants 50 --seed 0 --json blind_area.json --plot plots
+python tools/cooperation.py --test blind_area --variants 50 --seed 0 --json blind_area.json
 
 Tests: range (A), blind_area (B), overlap (C), ap (random traffic, AP BEV .5), registration (pose and clock of the pole).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -22,45 +21,23 @@ from cooperation_worlds import (
     overlap_measures,
     range_measures,
     registration_measures,
-    tables,
 )
 from cooperation_worlds.draw_blind_area import draw_blind_area
 from cooperation_worlds.draw_overlap import draw_overlap
 from cooperation_worlds.draw_range import draw_range
-from cooperation_worlds.perturb import RoadError, disturb, draw_error
-from cooperation_worlds.plots import plot_world
-from cooperation_worlds.rows import Rows
-from cooperation_worlds.runs import ALONE, WAYS, Found, detect, perceive, prepared
-from cooperation_worlds.world import World, log_of
+from cooperation_worlds.runs import ALONE, TABLE, WAYS, Found, Rows, detect, perceive, prepared
+from cooperation_worlds.world import RoadError, World, disturb, draw_error, log_of
+from entry import parser_of
 
 from log2sim.datatypes import Log
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
 TESTS = (*DRAW, "ap", "registration")
-PLOTTED = 10
-PLOT_AT_S = {"range": (0.5, 2.5), "blind_area": (1.0, 4.2), "overlap": (1.0,)}
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What to run.
-
-    Attributes
-    ----------
-    ways : tuple of str
-        The ends alone and the levels of fusion.
-    noise : float
-        Share of 0.5 m, 2 degrees and 0.3 s by which the road's end is off at most.
-    delayed : bool
-        Whether the clock of the road's end is off, too.
-    register : bool
-        Whether the road's end is registered.
-    every : int
-        One in so many sweeps is used.
-    rows : Rows
-        What is measured already.
-    plots : Path or None
-    """
+    """What to run; `noise` is the share of 0.5 m, 2 degrees and 0.3 s by which the road's end is off at most."""
 
     ways: tuple[str, ...]
     noise: float
@@ -68,7 +45,6 @@ class Choices:
     register: bool
     every: int
     rows: Rows
-    plots: Path | None
 
     def key(self, test: str, seed: int, way: str) -> tuple[Any, ...]:
         """Name a row."""
@@ -82,7 +58,7 @@ class Choices:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run tests and print their tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--test", action="append", choices=TESTS, help="May be given several times; all without.")
     parser.add_argument("--variants", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0, help="Variants are drawn from this seed and those that follow.")
@@ -91,21 +67,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--no-delay", action="store_true", help="Noise in the pose alone.")
     parser.add_argument("--no-register", action="store_true", help="Take the road's pose and clock as they are.")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="Use one in N sweeps, which saves time.")
-    parser.add_argument("--plot", type=Path, metavar="DIR", help="Draw the first ten variants of each test from above.")
     parser.add_argument("--json", type=Path, metavar="FILE", help="Write the figures.")
     parser.add_argument(
         "--rows", type=Path, metavar="FILE", help="Keep rows here, and go on from those that are there."
     )
     a = parser.parse_args(arguments)
-    choices = Choices(
-        tuple(a.ways.split(",")), a.noise, not a.no_delay, not a.no_register, a.every, Rows(a.rows), a.plot
-    )
-    if a.plot is not None:
-        a.plot.mkdir(parents=True, exist_ok=True)
+    choices = Choices(tuple(a.ways.split(",")), a.noise, not a.no_delay, not a.no_register, a.every, Rows(a.rows))
     out = {}
     for test in a.test or TESTS:
         out[test] = RUN[test](choices, range(a.seed, a.seed + a.variants))
-        print("\n" + tables.TABLE[test](out[test]) + "\n", flush=True)
+        print("\n" + TABLE[test](out[test]) + "\n", flush=True)
     if a.json is not None:
         a.json.write_text(json.dumps(out, indent=1) + "\n")
 
@@ -120,13 +91,10 @@ def measured(
         if missing:
             log, _ = choices.disturbed(log_of(world)[0], seed)
             both = prepared(log, register=choices.register) if set(missing) - set(ALONE) else log
-            found = {}
             for way in missing:
                 used = log if way in ALONE else both
-                found[way] = perceive(used, way, world.scene.start_ns)
-                choices.rows[choices.key(test, seed, way)] = measure(world, used, way, found[way])
-            if choices.plots is not None and count <= PLOTTED:
-                plot_world(world, log, found, choices.plots / f"{test}_{seed}.png", PLOT_AT_S[test])
+                found = perceive(used, way, world.scene.start_ns)
+                choices.rows[choices.key(test, seed, way)] = measure(world, used, way, found)
         say(test, count, len(seeds))
         yield world, {way: choices.rows[choices.key(test, seed, way)] for way in choices.ways}
 

@@ -20,8 +20,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from kitti_boxes import Boxes, read_tracks
-from kitti_scene import Index, Matcher, Scene, make_scene
+from kitti.boxes import Boxes, read_tracks
+from kitti.map import Index, Matcher, Scene, make_scene
 
 from log2sim.errors import Log2SimError
 from log2sim.evaluation.metrics.comparison import Pairs

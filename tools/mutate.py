@@ -21,9 +21,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from mutation.bases import KINDS
+from mutation.running import BAD, CLASSES, MEANING, temporary_folder
 from mutation.supervising import Harness, Row, indices, kind_of, run_many
-from mutation.verdict import BAD, CLASSES, MEANING
-from mutation.watch import temporary_folder
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -28,7 +28,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from bench_table import markdown
+from benchmarks.table import markdown
 
 import log2sim
 from log2sim.config import Config

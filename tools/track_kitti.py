@@ -17,12 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from kitti_boxes import Boxes, read_detections, write_tracks
-from kitti_choice import choose
-from kitti_confidence import Described, describe
-from kitti_map import View, read_view, to_measurements
-from kitti_people import decide_people, find_pairs
-from kitti_rows import rows_offline, rows_online
+from kitti.boxes import Boxes, read_detections, rows_offline, rows_online, write_tracks
+from kitti.choice import Described, choose, decide_people, describe, find_pairs
+from kitti.map import View, read_view, to_measurements
 
 from log2sim.datatypes import Measurements
 from log2sim.errors import Log2SimError, LogError

@@ -5,12 +5,13 @@ python tools/train_lidar.py vehicle --out DIR             # everything, with the
 python tools/train_lidar.py vehicle --out DIR --scenes 200 --steps 300     # a toy
 python tools/train_lidar.py vehicle --out DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
 python tools/train_lidar.py vehicle --out DIR --data LOGS --scenes 0 --steps 2000          # from these alone
+python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
+import importlib
 import json
 import math
 import sys
@@ -21,20 +22,24 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-
-sys.path.insert(0, str(Path(__file__).parent))
-
+from entry import parser_of
 from lidar_training import fitting
-from lidar_training.clouds import Example, draw_example
-from lidar_training.export import calibrate, describe, description, export_onnx, quantize
+from lidar_training.clouds import (
+    Example,
+    Sample,
+    Shard,
+    augmented,
+    draw_example,
+    draw_sample,
+    grid_of,
+    window_of,
+    write_shard,
+)
+from lidar_training.export import calibrate, describe, description, export_onnx, quantize, report
 from lidar_training.fitting import FitPlan
-from lidar_training.losses import loss_of
-from lidar_training.network import BevNetwork
+from lidar_training.network import BevNetwork, loss_of, targets_of
 from lidar_training.real_logs import example_of, read_sweeps, sample_of
-from lidar_training.report import report
-from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_of, window_of, write_shard
-from lidar_training.targets import targets_of
+from torch import Tensor, nn
 
 from log2sim.batch.discovery import find_logs
 from log2sim.config import LidarConfig
@@ -43,6 +48,7 @@ from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.detectors import open_network
 from log2sim.perception.detect3d.network import load_network
 
+PAPERS = ("zou2021", "two_stream")
 PER_SHARD = 100
 # Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.
 HELD_OUT_SHARE = 0.2
@@ -241,9 +247,13 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
     (out / f"{mount}.json").write_text(json.dumps(card, indent=1) + "\n")
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the steps that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] and arguments[0] in PAPERS:
+        importlib.import_module(f"{arguments[0]}.train").main(arguments[1:])
+        return
+    parser = parser_of(__doc__)
     parser.add_argument("mount", choices=("vehicle", "roadside"))
     parser.add_argument("--out", type=Path, required=True, help="folder of shards, checkpoints and results")
     parser.add_argument("--scenes", type=int, help="a single round with as many scenes; 0 with --data alone")
@@ -255,7 +265,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="of the sweeps of --data take every n-th")
     parser.add_argument("--only", choices=("generate", "fit", "finish"))
     parser.add_argument("--examples", type=int, default=150, help="scenes to calibrate with, and as many to test with")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     rounds = ROUNDS[options.mount]
     if options.steps or options.scenes is not None:

@@ -13,7 +13,7 @@ from log2sim.agents.size import TrackGeometry, independent, independent_along
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Doubt, Track, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.fusion import logit
+from log2sim.perception.lidar.measure import logit
 
 
 def spans_of(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
@@ -71,7 +71,7 @@ class Support:
 
 
 # Limits of `image_confidence`. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes and
-# signs look like: on the logs of `tools/confidence_logs.py --seed 3` those below 0.6 are right at 0.30 of their ticks, above at
+# signs look like: on the logs of `tools/fit.py confidence_logs --seed 3` those below 0.6 are right at 0.30 of their ticks, above at
 # 0.95; vehicles and two-wheelers below at 0.85.
 MIN_TRACK_CONFIDENCE = 0.3
 MIN_SURE_TRACK_CONFIDENCE = 0.6

@@ -1,6 +1,6 @@
 """How far an agent can be trusted: the probability that it is right, and its standard deviations.
 
-Printed by `tools/fit_confidence.py` on the logs of `tools/confidence_logs.py`: `WITHOUT_LIDAR` with `--seed 3` and `--seed 4`, 1066
+Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs`: `WITHOUT_LIDAR` with `--seed 3` and `--seed 4`, 1066
 agents of 120 synthetic logs; all else with `--seed 3`, 1369 agents of 70.
 """
 
@@ -15,7 +15,7 @@ from log2sim.agents.candidate import AgentCandidate, Timeline, image_confidence,
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import Array
-from log2sim.perception.fusion import logit
+from log2sim.perception.lidar.measure import logit
 
 WITH_LIDAR = {
     "image": 0.1081,
@@ -245,7 +245,7 @@ def with_systematic_errors(
     Notes
     -----
     A variance is a sum of terms, each a reason for an error, times weights that fit synthetic logs
-    (`tools/fit_confidence.py`). Smoothing and fits take the errors of ticks as independent; but a box that is laid against the
+    (`tools/fit.py confidence`). Smoothing and fits take the errors of ticks as independent; but a box that is laid against the
     wrong end, or has a wrong length, is off by as much at every tick.
     """
     w, size_m = candidate.agent.waypoints, candidate.agent.size_m

@@ -134,31 +134,10 @@ class Ending(IntEnum):
     ELSEWHERE = 3
 
 
-@dataclass(frozen=True, eq=False)
-class RayCounts:
-    """Rays toward A agents at T ticks.
+def count_rays(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline) -> NDArray[np.int64]:
+    """Count the rays toward the solid part and the whole of A agents in T clouds by their ending, (2, 3, A, T).
 
-    Attributes
-    ----------
-    inside : (A, T) int64
-        Those that end at the agent.
-    through : (A, T) int64
-        Those that go on behind it.
-    before : (A, T) int64
-        Those that end before it.
-    """
-
-    inside: NDArray[np.int64]
-    through: NDArray[np.int64]
-    before: NDArray[np.int64]
-
-
-def count_rays(
-    agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline
-) -> tuple[RayCounts, RayCounts]:
-    """Count the rays toward the solid part and the whole of A agents in T clouds.
-
-    They are 0 at ticks without a cloud or outside of an agent's life.
+    They end at the agent, go on behind it, or end before it. They are 0 at ticks without a cloud or outside of an agent's life.
 
     Notes
     -----
@@ -174,7 +153,7 @@ def count_rays(
             cloud = clouds[tick]
             if cloud is not None and cloud.free is not None and len(cloud.free):
                 counts[..., tick] = count_at(boxes, tick, cloud.origin, cloud.free)
-    return RayCounts(*counts[0]), RayCounts(*counts[1])
+    return counts
 
 
 def count_at(boxes: AgentTable, tick: int, origin: Array, rays: Rays) -> NDArray[np.int64]:
@@ -447,22 +426,18 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
 def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) -> list[AgentCandidate]:
     """Weigh candidates of which there are not too many."""
     agents, clouds, timeline = [c.agent for c in candidates], recording.clouds, recording.timeline
-    solid, whole = count_rays(agents, clouds, timeline)
+    solid, (inside, through, before) = count_rays(agents, clouds, timeline)
     in_structure, beside = structure_shares(agents, clouds, timeline)
-    met = whole.inside + whole.through
-    shown = (
-        shown_in_images(AgentTable.of(agents, recording.t_s), recording)
-        & (met >= whole.before)
-        & (met >= MIN_TICK_RAYS)
-    )
+    met = inside + through
+    shown = shown_in_images(AgentTable.of(agents, recording.t_s), recording) & (met >= before) & (met >= MIN_TICK_RAYS)
     weighed = []
     for k, candidate in enumerate(candidates):
-        rays = int(whole.before[k].sum() + met[k].sum())
+        rays = int(before[k].sum() + met[k].sum())
         pointless = bool(rays >= MIN_LOOKING_RAYS and not (candidate.track.measurements.points > 0).any())
         # Where points of it went to something beside it, rays still end in it.
-        unreached = pointless and whole.inside[k].sum() <= rays / 2
+        unreached = pointless and inside[k].sum() <= rays / 2
         support = replace(
-            _support(solid, k),
+            _support(*solid[:, k]),
             in_structure=float(in_structure[k]),
             beside_structure=float(beside[k]),
             pointless=pointless,
@@ -472,22 +447,16 @@ def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) 
             image_ticks=int(shown[k, candidate.track.tick[candidate.track.measurements.camera != ""]].sum()),
             image_height_share=image_height_share(candidate.track.measurements),
         )
-        weighed.append(
-            replace(candidate, support=support, evidence=_nats(candidate, solid.inside[k], solid.through[k]))
-        )
+        weighed.append(replace(candidate, support=support, evidence=_nats(candidate, *solid[:2, k])))
     return weighed
 
 
-def _support(rays: RayCounts, k: int) -> Support:
-    """Sum the rays of one agent over its ticks, without those at which only the border of what hides it shows."""
-    met = rays.inside[k] + rays.through[k]
-    seen = (met > 0) & (met >= rays.before[k])
-    return Support(
-        inside=int(rays.inside[k, seen].sum()),
-        through=int(rays.through[k, seen].sum()),
-        before=int(rays.before[k].sum()),
-        seen_ticks=int(seen.sum()),
-    )
+def _support(inside: NDArray[np.int64], through: NDArray[np.int64], before: NDArray[np.int64]) -> Support:
+    """Sum the rays of one agent over ticks (T,), without those at which only the border of what hides it shows."""
+    met = inside + through
+    seen = (met > 0) & (met >= before)
+    counts = inside[seen].sum(), through[seen].sum(), before.sum(), seen.sum()
+    return Support(*(int(count) for count in counts))
 
 
 def image_height_share(m: Measurements) -> float | None:

@@ -120,7 +120,7 @@ def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tup
     Notes
     -----
     A logistic regression on which cells of the outline have points, less the same with front and back swapped, so the
-    log-odds of a vehicle that is turned round are exactly the opposite. `tools/fit_outline.py` fits the weights to random
+    log-odds of a vehicle that is turned round are exactly the opposite. `tools/fit.py outline` fits the weights to random
     vehicles seen by simulated LiDARs.
     """
     m = track.measurements

@@ -30,8 +30,9 @@ from log2sim.tracking.forward import ACCELERATION_MPS2, CENTER_SIGMA_M, CHI2_2DO
 
 # Error of an observed end: rounded corners, gaps between rays.
 END_SIGMA_M = 0.25
-# More measurements of a track are not looked at one by one; fewer of an end show no motion.
-MAX_START_ROWS, MIN_START_ROWS = 60, 5
+# More measurements of a track are not looked at one by one: in 10 s at 10 Hz errors repeat for twice their distance. Fewer of an
+# end show no motion.
+MAX_ROWS, MIN_START_ROWS = 40, 5
 # Times at which a vehicle may start or stop; a shorter motion may be a neighbor that joins its points for some ticks.
 TIMES, MIN_MOTION_S = 24, 1.0
 # One vehicle in fifty that seems to stand starts or stops.
@@ -53,7 +54,7 @@ def motion_of_ends(track: Track) -> tuple[float, float]:
     rows = np.flatnonzero(np.isfinite(m.yaw_rad) & [len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
     if GROUP_OF[track.category] != "vehicle" or len(rows) < MIN_START_ROWS:
         return 0.0, -np.inf
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_START_ROWS)).round().astype(np.intp))]
+    rows = rows[_spread(len(rows))]
     yaw, yaw_sigma = _axis(m.yaw_rad[rows])
     turned_m = TYPICAL_SIZE_M[track.category][1] * yaw_sigma
     ends = ends_of(track, rows, np.full(len(rows), yaw), np.zeros((len(rows), 2)))
@@ -131,8 +132,6 @@ def _log_odds(ends: list[Positions]) -> tuple[float, float]:
     return drives, float(np.logaddexp.reduce(accelerates) - np.log(count)) if count else -np.inf
 
 
-# More measurements of a track are not looked at one by one.
-MAX_ROWS = 80
 # Fewer measurements show no object, and fewer show no motion: two more than place, velocity and acceleration need.
 MIN_ROWS, MIN_MOVING_ROWS = 3, 5
 # Two positions are at one place within the 99 % quantile of chi-square with two degrees of freedom, in standard deviations of
@@ -212,9 +211,12 @@ def _expected_motion(track: Track) -> MotionPriorSigmas:
 
 def _positions(track: Track) -> tuple[Positions, NDArray[np.intp]]:
     """Return the positions of at most `MAX_ROWS` measurements, and the rows of these."""
-    m = track.measurements
-    rows = np.unique(np.linspace(0, len(m) - 1, min(len(m), MAX_ROWS)).round().astype(np.intp))
+    rows = _spread(len(track))
     return _positions_of(track, rows), rows
+
+
+def _spread(count: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_ROWS)).round().astype(np.intp))
 
 
 def _positions_of(track: Track, rows: NDArray[np.intp]) -> Positions:

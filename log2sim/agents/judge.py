@@ -12,7 +12,7 @@ from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
 from log2sim.agents.evidence import Recording, doubt_size, weigh
 from log2sim.agents.size import independent
 from log2sim.datatypes import GROUP_OF, Agent, AgentTable, Doubt
-from log2sim.geometry import Array, overlap_of_smaller
+from log2sim.geometry import overlap_of_smaller
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
 # by distance, since the boxes of two people who stand close together overlap.
@@ -25,47 +25,21 @@ SAMPLES = 12
 
 def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
     """Keep, of the candidates that overlap, the one with the most evidence, and none that overlaps the ego."""
-    taken = [ego] if ego is not None else []
-    extents = _Extents(taken)
-    kept: list[AgentCandidate] = []
-    for candidate in sorted(built, key=lambda b: -b.evidence):
-        if not any(_are_duplicates(candidate.agent, taken[k]) for k in extents.near(candidate.agent)):
-            kept.append(candidate)
-            taken.append(candidate.agent)
-            extents.add(candidate.agent)
-    return kept
-
-
-class _Extents:
-    """Extents in time and space of agents, by which most pairs are told apart at once."""
-
-    def __init__(self, agents: Sequence[Agent]) -> None:
-        self._rows: Array = np.zeros((max(len(agents), 64), 7))
-        self._count = 0
-        for agent in agents:
-            self.add(agent)
-
-    def add(self, agent: Agent) -> None:
-        """Add an agent."""
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._rows[self._count] = self._row(agent)
-        self._count += 1
-
-    def near(self, agent: Agent) -> list[int]:
-        """Return the numbers of the agents that are there at the same time, and near enough for the boxes to touch."""
-        t0, t1, x0, x1, y0, y1, radius = self._row(agent)
-        rows = self._rows[: self._count].T
-        reach = rows[6] + radius
-        apart = (rows[0] > t1) | (rows[1] < t0)
-        apart |= (rows[2] - x1 > reach) | (x0 - rows[3] > reach) | (rows[4] - y1 > reach) | (y0 - rows[5] > reach)
-        return [int(k) for k in np.flatnonzero(~apart)]
-
-    @staticmethod
-    def _row(agent: Agent) -> tuple[float, ...]:
-        w = agent.waypoints
-        ends = (w.t_s[0], w.t_s[-1], w.x_m.min(), w.x_m.max(), w.y_m.min(), w.y_m.max())
-        return *map(float, ends), float(np.hypot(*agent.size_m[:2])) / 2
+    ordered = sorted(built, key=lambda b: -b.evidence)
+    agents = [*([] if ego is None else [ego]), *(c.agent for c in ordered)]
+    ways = [a.waypoints for a in agents]
+    # First and last time and place: agents that are not there at the same time and near enough are no duplicates.
+    low = np.array([(w.t_s[0], w.x_m.min(), w.y_m.min()) for w in ways]).reshape(-1, 3)
+    high = np.array([(w.t_s[-1], w.x_m.max(), w.y_m.max()) for w in ways]).reshape(-1, 3)
+    reach = np.array([np.hypot(*a.size_m[:2]) / 2 for a in agents])[:, None] * [0.0, 1.0, 1.0]
+    taken: list[int] = [] if ego is None else [0]
+    for k in range(len(taken), len(agents)):
+        apart = np.maximum(low[taken] - high[k], low[k] - high[taken]) > reach[taken] + reach[k]
+        near = np.array(taken, dtype=np.intp)[~apart.any(axis=1)]
+        if not any(_are_duplicates(agents[k], agents[other]) for other in near):
+            taken.append(k)
+    first = len(agents) - len(ordered)
+    return [ordered[k - first] for k in taken if k >= first]
 
 
 def _are_duplicates(a: Agent, b: Agent) -> bool:

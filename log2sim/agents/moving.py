@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -284,24 +284,6 @@ MAX_YAW_OFF_RAD = np.pi / 4
 HEIGHT_MEDIAN_HALF = 4
 
 
-@dataclass(frozen=True, eq=False)
-class _Positions:
-    """Positions of an object in rising time.
-
-    Attributes
-    ----------
-    t_s : (n,) float64
-    xy_m : (n, 2) float64
-    covariance : (n, 2, 2) float64
-    tick : (n,) int64
-    """
-
-    t_s: Array
-    xy_m: Array
-    covariance: Array
-    tick: NDArray[np.int64]
-
-
 def moving_candidate(
     track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool
 ) -> AgentCandidate:
@@ -328,13 +310,13 @@ def moving_candidate(
         geometry = moving_geometry(track, headings, rough.velocity_mps)
         xy, covariance = geometry.xy_m, geometry.covariance
     matches = _lidar_matches(track, rough, headings, geometry, obstacles, timeline)
-    positions = _all_positions(track, geometry, matches, timeline)
-    life = np.arange(positions.tick.min(), positions.tick.max() + 1)
+    positions_s, xy, covariance, ticks = _all_positions(track, geometry, matches, timeline)
+    life = np.arange(ticks.min(), ticks.max() + 1)
     at = timeline.seconds(timeline.t_ns[life])
     if not smooth:
         motion = replace(motion, jerk_density=UNSMOOTHED_JERK_DENSITY)
-    path = smooth_track(positions.t_s, positions.xy_m, covariance=positions.covariance + noise, at_s=at, motion=motion)
-    observed = np.isin(life, positions.tick)
+    path = smooth_track(positions_s, xy, covariance=covariance + noise, at_s=at, motion=motion)
+    observed = np.isin(life, ticks)
     residual = path.residual_m[path.inlier]
     quality = {
         "lidar_only": len(matches),
@@ -343,8 +325,8 @@ def moving_candidate(
     }
     z = np.interp(at, t, _running_median(geometry.z_m))
     waypoints = _waypoints(path, _headings(path, group), z, observed)
-    sigma_m = np.sqrt(np.trace(positions.covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
-    doubts = limit_doubts(path.broken) + jump_doubts(positions.t_s, path.residual_m, sigma_m)
+    sigma_m = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
+    doubts = limit_doubts(path.broken) + jump_doubts(positions_s, path.residual_m, sigma_m)
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
@@ -424,8 +406,8 @@ def _lidar_matches(
 
 def _all_positions(
     track: Track, geometry: TrackGeometry, matches: Sequence[LidarMatch], timeline: Timeline
-) -> _Positions:
-    """Merge the positions of measurements and LiDAR matches, one at a moment."""
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Merge measurements and LiDAR matches, one at a moment: times (n,), positions, covariances, and the ticks of all."""
     t_ns = np.concatenate([track.measurements.t_ns, np.array([m.t_ns for m in matches], dtype=np.int64)])
     t_s = timeline.seconds(t_ns)
     xy = np.concatenate([geometry.xy_m, np.array([m.xy_m for m in matches]).reshape(-1, 2)])
@@ -433,7 +415,7 @@ def _all_positions(
     tick = np.concatenate([track.tick, np.array([m.tick for m in matches], dtype=np.int64)])
     rows = np.argsort(t_s, kind="stable")
     rows = rows[np.r_[True, np.diff(t_s[rows]) > SAME_MOMENT_S]]
-    return _Positions(t_s[rows], xy[rows], covariance[rows], tick)
+    return t_s[rows], xy[rows], covariance[rows], tick
 
 
 def _waypoints(path: SmoothedTrack, yaw: Array, z_m: Array, observed: NDArray[np.bool_]) -> Waypoints:

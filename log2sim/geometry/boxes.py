@@ -69,7 +69,7 @@ def points_in_box(
     return np.asarray((np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(d[:, 2]) <= half[2]))
 
 
-def cross_slab(origin: Array, along: Array, low: ArrayLike, high: ArrayLike) -> tuple[Array, Array]:
+def cross_slab(origin: Array, along: Array, low: Array | float, high: Array | float) -> tuple[Array, Array]:
     """Return where lines enter and leave the slabs between two planes, along one axis, in units of their directions (N,).
 
     Lines are in a box between the latest entry and the earliest exit over its axes (Kay and Kajiya, SIGGRAPH 1986). A line in
@@ -146,19 +146,28 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
         return ProjectedBoxes(valid, box, range_m)
     planes = view_planes(camera)
     limit = np.array([camera.width_px, camera.height_px], dtype=np.float64)
-    camera_map = inverse(cam_T_map)[None, :3, 3]
     corners_cam = box_corners(center_m, size_m, yaw_rad) @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
     inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0  # (L, 8, 5)
-    for i in np.flatnonzero(np.all(inside.any(axis=1), axis=1)):
-        if points_in_box(camera_map, center_m[i], size_m[i], float(yaw_rad[i]))[0]:
-            continue
-        vertices = corners_cam[i] if inside[i].all() else clip_box(corners_cam[i], planes)
-        uv = project(camera, vertices)[0] if len(vertices) else np.zeros((0, 2))
-        uv = np.clip(uv[np.isfinite(uv).all(axis=1)], 0, limit)
-        if len(uv) >= 3 and np.all(np.ptp(uv, axis=0) > 0):
-            valid[i] = True
-            box[i] = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
-            range_m[i] = np.linalg.norm(corners_cam[i], axis=1).min()
+    offset = inverse(cam_T_map)[:3, 3] - center_m
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    along, across = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
+    around_camera = (np.abs(np.stack([along, across, offset[:, 2]], axis=1)) <= size_m / 2).all(axis=1)
+    shown = np.flatnonzero(inside.any(axis=1).all(axis=1) & ~around_camera)
+    vertices = [corners_cam[i] if inside[i].all() else clip_box(corners_cam[i], planes) for i in shown]
+    shown = shown[[len(of_box) > 0 for of_box in vertices]]
+    if not len(shown):
+        return ProjectedBoxes(valid, box, range_m)
+    uv, _ = project(camera, np.concatenate(vertices))
+    known = np.isfinite(uv).all(axis=1)
+    uv = np.clip(uv, 0, limit)
+    count = np.array([len(of_box) for of_box in vertices if len(of_box)])
+    first = np.cumsum(count) - count
+    low = np.minimum.reduceat(np.where(known[:, None], uv, np.inf), first)
+    high = np.maximum.reduceat(np.where(known[:, None], uv, -np.inf), first)
+    large = (np.add.reduceat(known.astype(np.intp), first) >= 3) & (high > low).all(axis=1)
+    shown = shown[large]
+    valid[shown], box[shown] = True, np.concatenate([low, high], axis=1)[large]
+    range_m[shown] = np.linalg.norm(corners_cam[shown], axis=2).min(axis=1)
     return ProjectedBoxes(valid, box, range_m)
 
 

@@ -129,6 +129,7 @@ MAX_UNSURE_SHARE_ALONE = 0.5
 # Given poses are replaced by refined ones where they drift by more, RMS; less changes agents by no more than chance does, in
 # simulated streets and recorded drives, and markings alone need better.
 MIN_DRIFT_M = 0.1
+LIDAR_FAULTS = ("time_offset", "lidar_rotation", "lidar_translation")
 # Sweeps this long before and after the time that is used are registered too.
 MARGIN_S = 1.0
 
@@ -165,22 +166,20 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
     window = None
     if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
         window = (int(during[0]), int(during[1]))
-    check, refined = entry.get("check") is not False, entry.get("refined") is True
-    report = progress or (lambda *_: None)
-    return _localize(_Request(log, source, window, report, check=check, refine=refined, again=refined))[0]
+    check = entry.get("check") is not False
+    log, choice = _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))
+    return refine(log, replace(choice, during_ns=window), again=True)[0] if entry.get("refined") is True else log
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """What to localize, how, from which part, and whether poses of the log are checked first and refined, `again` as before."""
+    """What to localize, how, from which part, and whether poses of the log are checked first."""
 
     log: Log
     requested: str
     during_ns: tuple[int, int] | None
     progress: Progress
     check: bool = True
-    refine: bool = True
-    again: bool = False
 
     def answer(self, source: str, reason: str, **found: Any) -> PoseChoice:
         """Return the choice of a source."""
@@ -205,18 +204,26 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     else:
         mended = request.log.changed(ego=checked.track)
     log, choice = _choose(replace(request, log=mended))
-    choice = replace(choice, faults=faults) if faults else choice
-    if choice.source != "given" or not request.refine:
-        return log, choice
-    refined = refine_poses(log, request.during_ns)
+    return log, replace(choice, faults=faults) if faults else choice
+
+
+def refine(
+    log: Log, choice: PoseChoice, faults: Sequence[Fault] = (), *, again: bool = False
+) -> tuple[Log, PoseChoice]:
+    """Replace given poses that drift by those that the sweeps of a LiDAR show.
+
+    `faults`: of its clock and mount, by which its sweeps show a wrong motion; then nothing is replaced, nor where poses are not
+    to be checked. `again`: poses were replaced before, so that they are whatever they drift by.
+    """
+    wrong = any(fault.treatment == "kept" and fault.kind in LIDAR_FAULTS for fault in faults)
+    refined = None if choice.source != "given" or not choice.checked or wrong else refine_poses(log, choice.during_ns)
     if refined is None or log.ego is None:
         return log, choice
     moved_m = np.linalg.norm(refined.map_T_ego[:, :3, 3] - log.ego.map_T_ego[:, :3, 3], axis=1)
-    if np.sqrt(np.mean(moved_m**2)) < MIN_DRIFT_M and not request.again:
+    if np.sqrt(np.mean(moved_m**2)) < MIN_DRIFT_M and not again:
         return log, replace(choice, for_map=refined)
     note = f"poses of the log are moved by up to {moved_m.max():.2f} m, by which surfaces in sweeps lie on each other"
-    choice = replace(choice, refined=True, notes=(*choice.notes, note), during_ns=request.during_ns)
-    return replace_poses(log, refined), choice
+    return replace_poses(log, refined), replace(choice, refined=True, notes=(*choice.notes, note))
 
 
 def _choose(request: _Request) -> tuple[Log, PoseChoice]:
@@ -225,7 +232,7 @@ def _choose(request: _Request) -> tuple[Log, PoseChoice]:
     if log.ego is None and "ego" not in mounts:
         return log, PoseChoice(requested, "none", "all sensors are fixed in the map")
     if log.ego is not None and requested == "given":
-        return log, GIVEN
+        return log, replace(GIVEN, during_ns=request.during_ns)
     if log.ego is None and "map" in mounts:
         reason = "the log has no poses that relate the ego's sensors to those fixed in the map"
         return log, PoseChoice(requested, "none", reason)

@@ -79,8 +79,8 @@ class PoseNoise:
         of_ego = velocity @ back.T
         by_offset = of_ego[second] - np.einsum("pij,pj->pi", second_T_first, of_ego[first])
         by_values = np.concatenate([by_offset[:, :, None], mount - second_T_first @ mount], axis=2)
-        both = np.concatenate([by_values, log_of(inverse(predicted) @ found)[:, :, None]], axis=2)
-        by_poses = np.zeros((pairs, len(t_ns), 6, 6))
+        both: Array = np.concatenate([by_values, log_of(inverse(predicted) @ found)[:, :, None]], axis=2)
+        by_poses: Array = np.zeros((pairs, len(t_ns), 6, 6))
         by_poses[row, second], by_poses[row, first] = back, -second_T_first @ back
         by_poses = by_poses.transpose(0, 2, 1, 3).reshape(pairs, 6, -1)
         information = np.linalg.inv(np.array([pair.found.covariance for pair in seen.pairs]))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, transform
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
 from log2sim.localization.replaced import shift_stream
@@ -458,18 +458,18 @@ class Findings:
             "treatment": "left_out" if self.contradicted else "corrected" if self.applied.any() else "kept",
             "verified": self.verified,
             **self._values(),
-            "structure": {n: None if s is None else _structure_figures(s) for n, s in zip(names, self.found.structure)},
-            "objects": {n: None if o is None else _object_figures(o) for n, o in zip(names, self.found.objects)},
+            "structure": {
+                n: None
+                if s is None
+                else {"points": s.points, "on_surface": s.on_surface / s.points, "residual_m": s.rms_m}
+                for n, s in zip(names, self.found.structure)
+            },
+            "objects": {
+                n: None if o is None else {"pairs": o.pairs, "moving": o.moving, "residual_m": o.rms_m}
+                for n, o in zip(names, self.found.objects)
+            },
             "seen_through": {n: None if v is None else v.contradicting for n, v in zip(names, self.visibility)},
         }
-
-
-def _structure_figures(part: Any) -> dict[str, float]:
-    return {"points": part.points, "on_surface": part.on_surface / part.points, "residual_m": part.rms_m}
-
-
-def _object_figures(part: Any) -> dict[str, float]:
-    return {"pairs": part.pairs, "moving": part.moving, "residual_m": part.rms_m}
 
 
 Progress = Callable[[str, int, int], None]
@@ -501,36 +501,23 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
     at_road = [n for n, lidar in used.lidars.items() if lidar.mount == "map" and len(log.streams[n].t_ns)]
     if not config.cooperation.register_road or log.ego is None or not at_road or not lidars_on_ego(used):
         return RoadRegistration(log)
+    ego, figures = log.ego, []
     faults: list[Fault] = []
-    figures = []
     for unit in units_of(used, at_road):
-        findings = _check_unit(used, config, unit, progress)
-        log = (
-            correct_unit(log, unit, findings.correction, float(findings.applied[-1])) if findings.applied.any() else log
+        stage = f"register {unit.lidars[0]}"
+        sight = look_around(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]
+        found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
+        before, after = (
+            None if sight.view is None else look_through(sight.view, apply(correction, upright))
+            for correction in (np.eye(4), found.correction)
         )
+        findings = Findings(unit, found, (before, after))
+        shift_m, turn_rad = np.linalg.norm(found.values[:3]), np.linalg.norm(found.values[3:DELAY])
+        if findings.moved and shift_m < MAX_POSE_ERROR_M and turn_rad < MAX_POSE_ERROR_RAD:
+            # It may be an error of the ego's poses.
+            findings = replace(findings, found=add_pose_errors(sight, found, ego))
+        if findings.applied.any():
+            log = correct_unit(log, unit, findings.correction, float(findings.applied[-1]))
         faults += findings.faults()
         figures.append(findings.to_dict())
     return RoadRegistration(log, tuple(faults), figures)
-
-
-def _check_unit(log: Log, config: Config, unit: Unit, progress: Progress) -> Findings:
-    """Estimate what a unit lacks, and look whether what it sees can be there."""
-    sight = look_around(log, config, unit, lambda done, total: progress(f"register {unit.lidars[0]}", done, total))
-    found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
-    visibility = (_visibility(sight, upright, np.eye(4)), _visibility(sight, upright, found.correction))
-    findings = Findings(unit, found, visibility)
-    if log.ego is None or not findings.moved or not _may_be_of_ego(found):
-        return findings
-    return replace(findings, found=add_pose_errors(sight, found, log.ego))
-
-
-def _may_be_of_ego(found: Estimate) -> bool:
-    """Whether errors of the ego's poses can be as large as what a unit's pose is off by."""
-    shift_m, turn_rad = np.linalg.norm(found.values[:3]), np.linalg.norm(found.values[3:DELAY])
-    return bool(shift_m < MAX_POSE_ERROR_M and turn_rad < MAX_POSE_ERROR_RAD)
-
-
-def _visibility(sight: Sight, upright_m: Array, correction: Array) -> Visibility | None:
-    if sight.view is None:
-        return None
-    return look_through(sight.view, upright_m @ correction[:3, :3].T + correction[:3, 3])

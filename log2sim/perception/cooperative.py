@@ -27,12 +27,12 @@ from log2sim.perception.boxes import oriented_covariance, rotate
 from log2sim.perception.detect3d.boxes import Rectangles, suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure import measure_boxes
+from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
 from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
-# Fitted by `tools/fit_box_errors.py` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
+# Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
 SIDE_WEIGHTS: dict[str, Array] = {
     "vehicle": np.array([-1.9, -0.12, -0.05, -0.33, 1.42, -0.51, 0.47]),
     "two_wheeler": np.array([-1.21, -0.21, -0.13, -0.13, 1.09, -0.1, 0.47]),
@@ -111,7 +111,7 @@ MIN_REFINED_POINTS = 20
 def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     """Move and turn boxes (M,) to the sides that points of a viewpoint show; they grow to hold them."""
     mine = np.flatnonzero(boxes.points >= MIN_REFINED_POINTS)
-    rows = measure_boxes(boxes.take(mine), view)
+    rows = measure([], boxes.take(mine), view)
     size, yaw, center = boxes.size_m.copy(), boxes.yaw_rad.copy(), boxes.center_m.copy()
     # The yaw of points is known up to half turns.
     turned = np.cos(rows.yaw_rad - yaw[mine]) < 0

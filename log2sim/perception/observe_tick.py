@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +12,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes import ENDS, Boxes3D, Detections, Log, Measurements, end_of
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detection_cache import LightBox, with_ranges
-from log2sim.perception.fusion import join_with_images, match_boxes
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin, join_parts
-from log2sim.perception.lidar.clusters import measure_few_points
-from log2sim.perception.lidar.measure import measure_boxes, measure_view, outside_ego, project_cloud
+from log2sim.perception.lidar.measure import Frame, measure, outside_ego, project_cloud
 from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.sync import Schedule
 from log2sim.plan import FusionLevel, Plan, Stage
@@ -23,7 +22,7 @@ from log2sim.plan import FusionLevel, Plan, Stage
 MAX_GROUND_POINTS_PER_FRAME = 40
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Observed:
     """What is measured at one tick.
 
@@ -54,30 +53,30 @@ class TickObserver:
         self, tick: int, found: dict[str, Detections], clouds: Sequence[Cloud | None], boxes: Boxes3D | None
     ) -> Observed:
         """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
-        out = Observed()
-        views = {name: view for name in found if (view := self._view(name, tick)) is not None}
-        own = clouds if boxes is None else [_of_end(c, self._end(n)) for n, c in zip(self.schedule.frames, clouds)]
-        measured = {
-            camera: self._measure_camera(views[camera], tick, found[camera], cloud, out)
-            for camera, cloud in zip(self.schedule.frames, own)
-            if camera in views
-        }
         reference = clouds[self.schedule.reference_row]
-        if boxes is None or reference is None:
-            joined = Measurements.join(list(measured.values()))
-        elif self.plan.fusion is FusionLevel.TRACKS and boxes.seen_by is not None:
-            joined = Measurements.join([
-                self._join_sensors(
-                    boxes.take(seen),
-                    _of_end(reference, end),
-                    {camera: rows for camera, rows in measured.items() if self._end(camera) == end},
-                    views,
-                )
-                for end, seen in zip(ENDS, boxes.seen_by.T)
-            ])  # fmt: skip
-        else:
-            joined = self._join_sensors(boxes, reference, measured, views)
-        out.measurements = joined.take(self._in_range(tick, joined))
+        # Where clouds were searched, a camera's objects are sought in what its own end sees.
+        parts = {(id(c), end): c if boxes is None else _of_end(c, end) for c in clouds for end in ENDS}
+        frames: dict[str, list[Frame]] = {end: [] for end in ENDS}
+        for camera, cloud in zip(self.schedule.frames, clouds):
+            if camera in found and (view := self._view(camera, tick)) is not None:
+                end = end_of(view.camera)
+                frames[end].append((view, found[camera], parts[id(cloud), end]))
+        groups = [(list(chain(*frames.values())), boxes, reference)]
+        if self.plan.fusion is FusionLevel.TRACKS and boxes is not None and boxes.seen_by is not None:
+            groups = [
+                (frames[end], boxes.take(seen), parts[id(reference), end]) for end, seen in zip(ENDS, boxes.seen_by.T)
+            ]
+        joined = Measurements.join([
+            measure(shown, None if of is None else outside_ego(self.log, of), cloud, mode=self.mode)
+            for shown, of, cloud in groups
+        ])  # fmt: skip
+        out = Observed(joined.take(self._in_range(tick, joined)))
+        if self.plan.keeps(Stage.HOMOGRAPHY):
+            for view, _, cloud in chain(*frames.values()):
+                ego_T_map, name = inverse(base_pose(self.log, view.t_ns)), view.camera.name
+                out.feet[name] = foot_points(view.camera, joined, ego_T_map, tick)
+                if cloud is not None:
+                    out.ground[name] = _ground_points(view, cloud, ego_T_map, tick)
         return out
 
     def range_lights(self, tick: int, lights: list[LightBox], clouds: Sequence[Cloud | None]) -> list[LightBox]:
@@ -89,38 +88,10 @@ class TickObserver:
             out += of_camera if view is None or cloud is None else with_ranges(of_camera, view, cloud)
         return out
 
-    def _end(self, camera: str) -> str:
-        return end_of(self.log.cameras[camera])
-
-    def _join_sensors(
-        self, boxes: Boxes3D, cloud: Cloud | None, measured: dict[str, Measurements], views: dict[str, View]
-    ) -> Measurements:
-        """Measure boxes found in a cloud and join them with the measured detections of cameras."""
-        if cloud is None:
-            return Measurements.join(list(measured.values()))
-        in_sweep = measure_boxes(outside_ego(self.log, boxes), cloud)
-        return join_with_images(
-            in_sweep, [match_boxes(in_sweep, rows, views[camera]) for camera, rows in measured.items()]
-        )
-
     def _view(self, camera: str, tick: int) -> View | None:
         """Return a camera's frame of a tick; None where its pose is not known."""
         t_ns = int(self.log.streams[camera].t_ns[self.schedule.frames[camera][tick]])
         return view_of(self.log, camera, t_ns)
-
-    def _measure_camera(
-        self, view: View, tick: int, detections: Detections, cloud: Cloud | None, out: Observed
-    ) -> Measurements:
-        measured = measure_view(view, detections, cloud, mode=self.mode)
-        if cloud is not None and self.mode == "robust":
-            measured = measure_few_points(measured, view, cloud)
-        if not self.plan.keeps(Stage.HOMOGRAPHY):
-            return measured
-        ego_T_map, camera = inverse(base_pose(self.log, view.t_ns)), view.camera.name
-        out.feet[camera] = foot_points(view.camera, measured, ego_T_map, tick)
-        if cloud is not None:
-            out.ground[camera] = _ground_points(view, cloud, ego_T_map, tick)
-        return measured
 
     def _in_range(self, tick: int, rows: Measurements) -> NDArray[np.bool_]:
         """Mark the rows within range of the ego, and those without a position, which a homography may still place."""

@@ -97,11 +97,8 @@ def _named(lane: MapLane, lines: Sequence[Polyline], names: Sequence[str]) -> Ma
     points, heading = own.at(s)[:, :2], own.heading_at(s)
     half = np.interp(s, own.s_m, lane.width_m) / 2
     best: dict[str, tuple[float, str | None]] = {}
-    low, high = own.bounds_m
     for line, name in zip(lines, names):
-        if np.any(line.bounds_m[0] - half.max() - NEAR_M > high) or np.any(
-            line.bounds_m[1] + half.max() + NEAR_M < low
-        ):
+        if not own.is_near(line, half.max() + NEAR_M):
             continue
         for turned in (0.0, np.pi):
             at = line.project(points, heading + turned)
@@ -168,8 +165,7 @@ def find_side_of_traffic(paths: Sequence[DrivenPath]) -> int:
     votes = 0.0
     for k, one in enumerate(paths):
         for two in paths[k + 1 :]:
-            low, high = one.line.bounds_m
-            if np.any(two.line.bounds_m[0] - ONCOMING_M > high) or np.any(two.line.bounds_m[1] + ONCOMING_M < low):
+            if not one.line.is_near(two.line, ONCOMING_M):
                 continue
             at = one.line.project(two.line.points_m[:, :2], two.line.heading_rad + np.pi)
             meets = at.inside & (np.abs(at.aside_m) <= ONCOMING_M) & (np.abs(at.turn_rad) <= MAX_TURN_RAD / 2)

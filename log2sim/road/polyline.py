@@ -110,6 +110,11 @@ class Polyline:
         """Least and greatest x, y."""
         return self.points_m[:, :2].min(axis=0), self.points_m[:, :2].max(axis=0)
 
+    def is_near(self, other: Polyline, reach_m: float) -> bool:
+        """Return whether another may be within a distance: the boxes around both are."""
+        (low, high), (from_m, to_m) = self.bounds_m, other.bounds_m
+        return not (np.any(from_m - reach_m > high) or np.any(to_m + reach_m < low))
+
     def project(self, xy_m: Array, heading_rad: Array) -> Projection:
         """Project points (N, 2) with headings (N,): of the parts nearby, on the one that leads their way."""
         near = self._tree.query(_features(xy_m, heading_rad))[1]
@@ -357,9 +362,8 @@ def match(routes: Sequence[Polyline], line: Polyline, enter_m: float = ENTER_M, 
     shape = (len(routes), n)
     s, aside, turn = np.full(shape, np.nan), np.full(shape, np.inf), np.full(shape, np.inf)
     stay = np.zeros(shape, dtype=bool)
-    low, high = line.bounds_m
     for r, route in enumerate(routes):
-        if np.any(route.bounds_m[0] - stay_m > high) or np.any(route.bounds_m[1] + stay_m < low):
+        if not line.is_near(route, stay_m):
             continue
         at = route.project(line.points_m[:, :2], line.heading_rad)
         s[r], aside[r], turn[r] = at.s_m, at.aside_m, at.turn_rad

@@ -53,10 +53,7 @@ def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
         points, heading = line.at(s)[:, :2], line.heading_at(s)
         candidates = []
         for j, other in enumerate(lines):
-            apart = np.any(other.bounds_m[0] - MAX_APART_M > line.bounds_m[1]) or np.any(
-                other.bounds_m[1] + MAX_APART_M < line.bounds_m[0]
-            )
-            if i != j and not apart:
+            if i != j and line.is_near(other, MAX_APART_M):
                 candidates += [(j, same, *_next_to(points, heading, other, same)) for same in (True, False)]
         for sign in (1, -1):
             found += _nearest(i, s, [c for c in candidates if np.any(sign * c[3] > 0)], sign)
@@ -160,8 +157,7 @@ def _find_change(path: DrivenPath, others: Sequence[DrivenPath]) -> _Change | No
     for k, other in enumerate(others):
         if other.agent == path.agent or other.rank == 2 or path.rank == 2:
             continue
-        low, high = path.line.bounds_m
-        if np.any(other.line.bounds_m[0] - MAX_APART_M > high) or np.any(other.line.bounds_m[1] + MAX_APART_M < low):
+        if not path.line.is_near(other.line, MAX_APART_M):
             continue
         change = _change_beside(path, other, k)
         found += [change] if change is not None else []

@@ -89,12 +89,7 @@ class _Sides:
         nearest = {sign: np.full(len(s), np.inf) for sign in (1, -1)}
         which = {sign: np.full(len(s), -1) for sign in (1, -1)}
         for j, other in enumerate(lines):
-            low, high = line.bounds_m
-            if (
-                j == k
-                or np.any(other.bounds_m[0] - MAX_WIDTH_M > high)
-                or np.any(other.bounds_m[1] + MAX_WIDTH_M < low)
-            ):
+            if j == k or not line.is_near(other, MAX_WIDTH_M):
                 continue
             for turned in (0.0, np.pi):
                 at = other.project(points, heading + turned)

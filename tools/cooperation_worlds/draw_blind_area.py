@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cooperation_worlds.builder import MAX_TRIES, Builder
-from cooperation_worlds.line_of_sight import visible_share
-from cooperation_worlds.spacing import agents_touch
-from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World
+from cooperation_worlds.sight import agents_touch, visible_share
+from cooperation_worlds.world import MAX_TRIES, ROAD_LIDAR, VEHICLE_LIDAR, Builder, World
 from log2sim.synth.polytopes import Shape
 
 SPEED_MPS = 30 / 3.6

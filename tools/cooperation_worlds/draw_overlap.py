@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cooperation_worlds.builder import MAX_TRIES, Builder
 from cooperation_worlds.draw_range import distances_m
-from cooperation_worlds.line_of_sight import visible_share
-from cooperation_worlds.spacing import agents_touch, things_touch
-from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World
+from cooperation_worlds.sight import agents_touch, things_touch, visible_share
+from cooperation_worlds.world import MAX_TRIES, ROAD_LIDAR, VEHICLE_LIDAR, Builder, World
 
 DURATION_S, STEP_S = 2.0, 0.1
 GAP_M = 1.0

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cooperation_worlds.builder import MAX_TRIES, ROAD_RANGE_M, Builder
-from cooperation_worlds.line_of_sight import visible_share
-from cooperation_worlds.spacing import agents_touch
-from cooperation_worlds.world import ROAD_LIDAR, Array, World
+from cooperation_worlds.sight import agents_touch, visible_share
+from cooperation_worlds.world import MAX_TRIES, ROAD_LIDAR, ROAD_RANGE_M, Array, Builder, World
 
 MAX_DURATION_S, STEP_S = 5.0, 0.1
 GAP_M = 0.05  # between all at least

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cooperation_worlds.builder import ROAD_LINES
-from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, Array, Parts
+from cooperation_worlds.world import ROAD_LIDAR, ROAD_LINES, VEHICLE_LIDAR, Array, Parts
 from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision

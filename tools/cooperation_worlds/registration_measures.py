@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cooperation_worlds.perturb import RoadError, disturb
 from cooperation_worlds.runs import settings
-from cooperation_worlds.world import ROAD_LIDAR
+from cooperation_worlds.world import ROAD_LIDAR, RoadError, disturb
 from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, inverse
 from log2sim.pipeline import start

@@ -7,8 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from extremes.small_log import LABELS, Row, folder_of, known_and_finite, result_of, rows_changed, same, small_log, sound
-from extremes.table import FAR_M, Outcome, case
+from extremes.table import (
+    FAR_M,
+    LABELS,
+    Outcome,
+    Row,
+    case,
+    folder_of,
+    known_and_finite,
+    result_of,
+    rows_changed,
+    same,
+    small_log,
+    sound,
+)
 from log2sim import open_log, reconstruct
 from log2sim.errors import LogError
 from log2sim.pipeline import Result

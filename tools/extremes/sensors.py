@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from extremes.small_log import LABELS, folder_of, known_and_finite, refused, refused_log, small_log, sound
-from extremes.table import Outcome, case
-from log2sim import open_log, reconstruct
-from log2sim.datatypes import Log
+from extremes.table import (
+    LABELS,
+    Outcome,
+    RunBy,
+    case,
+    folder_of,
+    known_and_finite,
+    refused,
+    refused_log,
+    small_log,
+    sound,
+)
+from log2sim import Config, Scenario, evaluate, open_log, reconstruct
+from log2sim.datatypes import CATEGORIES, Log, Stream, Sweep
 from log2sim.errors import MissingExtra
+from log2sim.evaluation.metrics.comparison import Selection
+from log2sim.evaluation.metrics.evaluator import compare_scenarios
+from log2sim.geometry import NS_PER_S, Array, rotation_from_rpy, transform
 
 
 @case("log: one camera", "all agents, no fusion")
@@ -126,3 +141,237 @@ def skew_lidar() -> Outcome:
     log = small_log()
     lidar = log.lidars["top"]
     return refused_log(replace(log, lidars={"top": replace(lidar, mount_T_lidar=lidar.mount_T_lidar * 1.1)}), "'top'")
+
+
+SAMPLE = Path(__file__).resolve().parents[2] / "samples/crossing"
+LIDAR = "lidar_top"
+START_S, STOP_S = 2.0, 3.0
+RANGE_M = 40.0
+
+Change = Callable[[Log], Log]
+
+
+@dataclass(frozen=True)
+class Required:
+    """What a run must reach: kinds of faults of which one is told (none: nothing; None: either), and limits of its figures."""
+
+    told: tuple[str, ...] | None = ()
+    recall: float = 0.0
+    precision: float = 0.0
+    position_m: float = np.inf
+    speed_mps: float = np.inf
+    ego_m: float = np.inf
+    nees: float = np.inf
+    fixes: dict[str, bool] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        names = {"recall": "recall >= {:g}", "precision": "precision >= {:g}", "position_m": "<= {:g} m"}
+        names |= {"speed_mps": "<= {:g} m/s", "ego_m": "ego <= {:g} m", "nees": "NEES <= {:g}"}
+        limits = [
+            words.format(value) for name, words in names.items() if (value := getattr(self, name)) not in (0.0, np.inf)
+        ]
+        told = [] if self.told is None else ["told"] if self.told else ["nothing told"]
+        return ", ".join([*told, *limits])
+
+
+@lru_cache
+def sample() -> Log:
+    return open_log(SAMPLE)
+
+
+def seconds(log: Log, t_ns: Any) -> Array:
+    """Seconds (N,) after the first frame of the front camera."""
+    return np.asarray((np.asarray(t_ns) - log.streams["front"].t_ns[0]) / NS_PER_S)
+
+
+def with_stream(log: Log, stream: Stream) -> Log:
+    return log.changed(streams={**log.streams, stream.name: stream})
+
+
+def reading(log: Log, name: str, source: Callable[[int], int], change: Callable[[int, Any], Any]) -> Log:
+    """The log with a stream that gives `change(i, record)` of the record `source(i)` at stamp i."""
+    old = log.streams[name]
+    return with_stream(log, Stream(name, old.t_ns, lambda i: change(i, old.read(source(i)))))
+
+
+def frozen_camera(log: Log) -> Log:
+    t = seconds(log, log.streams["front"].t_ns)
+    last = int(np.flatnonzero(t <= START_S)[-1])
+    return reading(log, "front", lambda i: min(i, last), lambda i, image: image)
+
+
+def black_camera(log: Log) -> Log:
+    half = len(log.streams["front"].t_ns) // 2
+    return reading(log, "front", lambda i: i, lambda i, image: image * np.uint8(i < half))
+
+
+def moved_in_time(sweep: Sweep, shift_ns: int) -> Sweep:
+    times = None if sweep.t_ns is None else sweep.t_ns + shift_ns
+    return replace(sweep, stamp_ns=sweep.stamp_ns + shift_ns, t_ns=times)
+
+
+def repeated_sweep(log: Log) -> Log:
+    stamps = log.streams[LIDAR].t_ns
+    t = seconds(log, stamps)
+    first = int(np.flatnonzero(t >= START_S)[0])
+
+    def source(i: int) -> int:
+        return first if START_S <= t[i] <= STOP_S else i
+
+    return reading(log, LIDAR, source, lambda i, sweep: moved_in_time(sweep, int(stamps[i] - stamps[source(i)])))
+
+
+def no_sweeps(log: Log) -> Log:
+    old = log.streams[LIDAR]
+    t = seconds(log, old.t_ns)
+    kept = np.flatnonzero((t < START_S) | (t > STOP_S))
+    return with_stream(log, Stream(LIDAR, old.t_ns[kept], lambda i: old.read(int(kept[i]))))
+
+
+def late_sweeps(log: Log) -> Log:
+    old, shift_ns = log.streams[LIDAR], 100_000_000
+    return with_stream(log, Stream(LIDAR, old.t_ns + shift_ns, lambda i: moved_in_time(old.read(i), shift_ns)))
+
+
+def yawed(mount_T_sensor: Array, degrees: float) -> Array:
+    """The mount turned about the vertical axis of the ego through the sensor."""
+    turn = transform(rotation_from_rpy(0.0, 0.0, np.radians(degrees)) @ mount_T_sensor[:3, :3], mount_T_sensor[:3, 3])
+    return np.asarray(turn)
+
+
+def yawed_lidar(log: Log) -> Log:
+    lidar = log.lidars[LIDAR]
+    return log.changed(lidars={LIDAR: replace(lidar, mount_T_lidar=yawed(lidar.mount_T_lidar, 1.0))})
+
+
+def yawed_camera(log: Log) -> Log:
+    camera = log.cameras["front"]
+    return log.changed(cameras={**log.cameras, "front": replace(camera, mount_T_cam=yawed(camera.mount_T_cam, 1.0))})
+
+
+def swapped_cameras(log: Log) -> Log:
+    left, right = log.cameras["front_left"], log.cameras["front_right"]
+    swapped = {
+        "front_left": replace(left, mount_T_cam=right.mount_T_cam),
+        "front_right": replace(right, mount_T_cam=left.mount_T_cam),
+    }
+    return log.changed(cameras={**log.cameras, **swapped})
+
+
+def with_poses(log: Log, change: Callable[[Array, Array], Array], kept: NDArray[np.bool_] | None = None) -> Log:
+    """The log with changed poses: `change(seconds, map_T_ego)` of those that are kept."""
+    assert log.ego is not None
+    k = np.flatnonzero(np.ones(len(log.ego.t_ns), dtype=bool) if kept is None else kept)
+    t_ns = log.ego.t_ns[k]
+    return log.changed(ego=replace(log.ego, t_ns=t_ns, map_T_ego=change(seconds(log, t_ns), log.ego.map_T_ego[k])))
+
+
+def jumping_poses(log: Log) -> Log:
+    def jump(t: Array, poses: Array) -> Array:
+        poses = poses.copy()
+        poses[(t >= START_S) & (t <= STOP_S), :2, 3] += [3.0, 4.0]
+        return poses
+
+    return with_poses(log, jump)
+
+
+def frozen_poses(log: Log) -> Log:
+    def freeze(t: Array, poses: Array) -> Array:
+        poses = poses.copy()
+        during = np.flatnonzero((t >= START_S) & (t <= STOP_S))
+        poses[during] = poses[during[0]]
+        return poses
+
+    return with_poses(log, freeze)
+
+
+def every_s(interval_s: float) -> Change:
+    def thin(log: Log) -> Log:
+        assert log.ego is not None
+        step = round(interval_s / 0.02)  # poses of the sample are 20 ms apart
+        kept = np.arange(len(log.ego.t_ns)) % step == 0
+        return with_poses(log, lambda t, poses: poses, kept)
+
+    return thin
+
+
+@lru_cache
+def truth() -> Scenario:
+    return Scenario.load(SAMPLE / "truth.json")
+
+
+def nees_during(scenario: Scenario) -> float:
+    """Mean squared position error over squared sigma, a half for each axis, of the ticks while the fault lasts."""
+    compared, t_s, _ = compare_scenarios(scenario, truth(), Selection(RANGE_M, frozenset(CATEGORIES)))
+    ratios: list[float] = []
+    for a, row in enumerate(compared.match):
+        for k in np.flatnonzero((row >= 0) & compared.counted[a] & (t_s >= START_S) & (t_s <= STOP_S)):
+            w = scenario.others[row[k]].waypoints
+            error = compared.truth.xy_m[a, k] - compared.other.xy_m[row[k], k]
+            sigma = np.interp(t_s[k], w.t_s, w.sigma_xy_m)
+            ratios.append(float(error @ error / (2 * sigma**2)))
+    return float(np.mean(ratios)) if ratios else float("nan")
+
+
+def run(change: Change, required: Required) -> Outcome:
+    """Reconstruct and evaluate the log with a fault."""
+    # What is required concerns agents and the ego: the ground and colors only take time.
+    config = Config.load(
+        calibration=required.fixes, map={"lanes": False}, appearance={"colors": False, "signals": False}
+    )
+    result = reconstruct(change(sample()), config)
+    told = {fault["kind"] for fault in result.report["faults"]}
+    figures = evaluate(result.scenario, truth(), max_range_m=RANGE_M)
+    found = {
+        "recall": figures["recall"],
+        "precision": figures["precision"],
+        "position_m": figures["position_rmse_m"],
+        "speed_mps": figures["speed_rmse_mps"],
+        "ego_m": figures["ego"]["position_rmse_m"],
+        "nees": nees_during(result.scenario),
+    }
+    enough = all(found[name] >= getattr(required, name) for name in ("recall", "precision"))
+    small = all(found[name] <= getattr(required, name) for name in ("position_m", "speed_mps", "ego_m", "nees"))
+    right = required.told is None or (bool(told & set(required.told)) if required.told else not told)
+    words = "told " + "+".join(sorted(told)) if told else "nothing told"
+    numbers = "{recall:.2f} / {precision:.2f} / {speed_mps:.2f} m/s / ego {ego_m:.2f} m / NEES {nees:.1f}".format(
+        **found
+    )
+    return Outcome(enough and small and right, f"{words}; {numbers}", None, found["position_m"])
+
+
+FAULTS: dict[str, tuple[Change, Required]] = {
+    "none": (lambda log: log, Required((), 0.98, 0.98, 0.2, 0.15, 0.1)),
+    "front camera frozen from 2 s": (frozen_camera, Required(("frozen_images",), speed_mps=0.2)),
+    "front camera black for half the time": (black_camera, Required(("black_images",))),
+    "one LiDAR sweep repeated for 1 s": (repeated_sweep, Required(("repeated_sweeps",), 0.98, 0.97, 0.3, 0.3)),
+    "LiDAR stamps + 100 ms": (late_sweeps, Required(("time_offset",))),
+    "LiDAR stamps + 100 ms, --fix-time": (
+        late_sweeps, Required(("time_offset",), position_m=0.2, fixes={"fix_time": True}),
+    ),
+    "LiDAR mount yawed by 1 degree": (yawed_lidar, Required(("lidar_rotation",))),
+    "LiDAR mount yawed by 1 degree, --fix-calibration": (
+        yawed_lidar, Required(("lidar_rotation",), position_m=0.22, fixes={"fix_mounts": True}),
+    ),
+    "camera yawed by 1 degree": (yawed_camera, Required(("camera_rotation",))),
+    "left and right extrinsics swapped": (swapped_cameras, Required(("swapped_cameras",))),
+    "GNSS jump of 5 m for 1 s": (jumping_poses, Required(("pose_jump",), 0.98, 0.97, 0.22)),
+    "GNSS frozen for 1 s": (frozen_poses, Required(("frozen_poses",), 0.97, 0.97, 0.25, ego_m=0.15)),
+    "poses at 1 Hz": (every_s(1.0), Required(None, 0.98, 0.97)),
+    "poses at 0.8 Hz": (every_s(1.25), Required(None, 0.98, 0.97)),
+    "no LiDAR for 1 s": (no_sweeps, Required(("missing_sweeps",), nees=2.0)),
+}  # fmt: skip
+"""What is done to the sample, and what is required of its reconstruction."""
+
+SLOW_TESTS = {
+    "front camera frozen from 2 s",
+    "one LiDAR sweep repeated for 1 s",
+    "LiDAR stamps + 100 ms, --fix-time",
+    "left and right extrinsics swapped",
+    "GNSS frozen for 1 s",
+}
+"""One of each kind of fault; a run takes 20 s."""
+
+for _name, (_change, _required) in FAULTS.items():
+    _by: RunBy = "slow tests" if _name in SLOW_TESTS else "tool"
+    case(f"sensor: {_name}", str(_required), run_by=_by)(lambda c=_change, r=_required: run(c, r))

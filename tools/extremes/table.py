@@ -5,11 +5,25 @@ A case says what it found and whether that is what is required; it never raises 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import csv
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+
+from log2sim import Config, Scenario, open_log, reconstruct
+from log2sim.datatypes import Log
+from log2sim.errors import Log2SimError, LogError
+from log2sim.logs.native.writer import write_log
+from log2sim.pipeline import Result, infer_scenario, observe_log, start
+from log2sim.plan import Decision, Stage
+from log2sim.synth.scene import scene_from_table
+from log2sim.synth.synthesis import synthesize
 
 RunBy = Literal["tests", "slow tests", "tool"]
 FAR_M = np.array([691_000.0, 5_334_000.0])
@@ -57,3 +71,125 @@ def case(
         return run
 
     return add
+
+
+LABELS = Config.load(detect={"name": "labels"})
+Row = dict[str, str]
+
+
+@lru_cache
+def small_log() -> Log:
+    """Six ticks of a street with a car, a parked car and a pedestrian."""
+    agents = [
+        {"id": "car", "category": "car", "size_m": [4.4, 1.8, 1.5], "waypoints": [[16.0, 2.0, 4.0], [40.0, 2.0, 4.0]]},
+        {"id": "parked", "category": "car", "size_m": [4.2, 1.8, 1.5], "pose": [14.0, -4.0, 10.0]},
+        {"id": "walker", "category": "pedestrian", "waypoints": [[12.0, 5.0, 1.4], [12.0, -5.0, 1.4]]},
+    ]
+    lidar = {
+        "name": "top",
+        "position_m": [1.2, 0.0, 1.9],
+        "channels": 20,
+        "elevation_deg": [-18.0, 3.0],
+        "range_m": 60.0,
+    }
+    table = {
+        "name": "extreme", "duration_s": 0.6, "agent": agents,
+        "ego": {"waypoints": [[0.0, 0.0, 3.0], [20.0, 0.0, 3.0]], "poses": "poses"},
+        "road": [{"line": [[-10.0, 0.0], [50.0, 0.0]], "width_m": 10.0}],
+        "camera": [{"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [320, 200], "offset_s": 0.03}],
+        "lidar": [lidar | {"azimuth_deg": [-60.0, 60.0], "azimuth_step_deg": 0.6}],
+        "gnss": {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0},
+    }  # fmt: skip
+    return synthesize(scene_from_table(table), seed=0)[0]
+
+
+@lru_cache
+def files_of_small_log() -> dict[str, bytes]:
+    """Everything in the folder of the small log."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "log"
+        write_log(small_log(), folder)
+        return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+@contextmanager
+def folder_of(change: Callable[[Path], object]) -> Iterator[Path]:
+    """A folder with the small log, changed."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "log"
+        for name, content in files_of_small_log().items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        change(folder)
+        yield folder
+
+
+def result_of(change: Callable[[Path], object], *, decode_images: bool = False) -> Result:
+    """Reconstruct the changed log, whose images are decoded only where asked for: boxes come from its labels."""
+    with folder_of(change) as folder:
+        run = start(open_log(folder), LABELS)
+        if decode_images:
+            run = replace(run, plan=run.plan.variant(Decision(Stage.IMAGE_DECODING, True, "images are asked for")))
+        return infer_scenario(replace(run, plan=run.plan.only_agents()), observe_log(run))
+
+
+@lru_cache
+def sound() -> Result:
+    """What the small log gives when nothing is done to it."""
+    return result_of(lambda folder: None)
+
+
+def rows_changed(folder: Path, change: Callable[[Row], object]) -> None:
+    """Change every row of every table."""
+    for file in folder.rglob("*.csv"):
+        with file.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        for row in rows:
+            change(row)
+        with file.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def farthest_m(a: Scenario, b: Scenario, shift_m: tuple[float, ...] = (0.0, 0.0)) -> float:
+    """Largest distance of the waypoints of two scenarios in the world; infinite where they do not hold the same agents."""
+    if [(x.id, len(x.waypoints)) for x in a.agents] != [(x.id, len(x.waypoints)) for x in b.agents]:
+        return float("inf")
+    move = np.array(b.map.offset_m[:2]) - np.array(a.map.offset_m[:2]) - np.array(shift_m[:2])
+    apart = [
+        np.hypot(x.waypoints.x_m - (y.waypoints.x_m + move[0]), x.waypoints.y_m - (y.waypoints.y_m + move[1])).max()
+        for x, y in zip(a.agents, b.agents)
+    ]
+    return float(max(apart))
+
+
+def same(result: Result, within_m: float, shift_m: tuple[float, ...] = (0.0, 0.0), found: str = "") -> Outcome:
+    error = farthest_m(sound().scenario, result.scenario, shift_m)
+    return Outcome(error <= within_m, found or ("the same" if error <= within_m else "another scenario"), None, error)
+
+
+def refused(change: Callable[[Path], object], words: str, kind: type[Log2SimError] = LogError) -> Outcome:
+    """The log is refused with a message of ours that holds the words."""
+    try:
+        result_of(change)
+    except kind as error:
+        return Outcome(words in str(error), f"refused: {str(error).split('/')[-1][:90]}")
+    return Outcome(False, "accepted")
+
+
+def refused_log(log: Log, words: str, kind: type[Log2SimError] = LogError) -> Outcome:
+    """The same for a log in memory, as a reader of others may make it."""
+    try:
+        reconstruct(log, LABELS)
+    except kind as error:
+        return Outcome(words in str(error), f"refused: {str(error)[:90]}")
+    return Outcome(False, "accepted")
+
+
+def known_and_finite(result: Result, least_agents: int) -> tuple[bool, str]:
+    agents = result.scenario.others
+    finite = all(
+        np.isfinite(getattr(a.waypoints, k)).all() for a in result.scenario.agents for k in ("x_m", "y_m", "yaw_rad")
+    )
+    return finite and len(agents) >= least_agents, f"{len(agents)} agents"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
+from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M, rasterize
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, estimate_ground
 from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
 
@@ -41,3 +44,113 @@ def draw_example(mount: Mount, seed: tuple[int, ...]) -> Example:
     ignored = (labeled.points < MIN_POINTS) | np.isin(labeled.category, ("bicycle", "other"))
     truth = SceneBoxes.of(labeled.boxes, labeled.category, points=labeled.points, ignored=ignored).take(seen)
     return Example(cloud, truth)
+
+
+STEP_M = 0.005  # of stored coordinates
+KEPT_RANGE_M = 55.0
+CATEGORIES = ("car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "bicycle", "other")
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A leveled cloud and its road users.
+
+    Attributes
+    ----------
+    xyz_m : (N, 3) float32, m
+        z is the height above the estimated ground; the sensor is at x = y = 0.
+    boxes : (M, 7) float32
+        x, y, z, length, width, height, heading.
+    category : (M,) int64
+        Index into CATEGORIES.
+    points : (M,) int64
+    """
+
+    xyz_m: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+    category: NDArray[np.int64]
+    points: NDArray[np.int64]
+
+
+def draw_sample(mount: Mount, seed: tuple[int, ...]) -> Sample:
+    """Draw a scene, cast it and level its cloud."""
+    rng = np.random.default_rng(seed)
+    cloud = labeled_cloud(draw_scene(mount, rng), rng)
+    xyz = cloud.xyz_m
+    ground = estimate_ground(xyz, np.zeros(2), 0.0)
+    leveled = xyz.copy()
+    leveled[:, 2] -= ground.at(xyz[:, :2])
+    near = (np.abs(xyz[:, :2]) < KEPT_RANGE_M).all(axis=1)
+    near &= (leveled[:, 2] > MIN_HEIGHT_M) & (leveled[:, 2] < MAX_HEIGHT_M)
+    boxes = cloud.boxes.astype(np.float32)
+    boxes[:, 2] -= ground.at(boxes[:, :2])
+    seen = cloud.points > 0
+    category = np.array([CATEGORIES.index(c) for c in cloud.category], np.int64)
+    return Sample(leveled[near], boxes[seen], category[seen], cloud.points[seen])
+
+
+def write_shard(path: Path, samples: list[Sample]) -> None:
+    """Write samples to a file, under a temporary name first."""
+    temporary = path.with_suffix(".part")
+    with temporary.open("wb") as file:
+        np.savez(
+            file,
+            xyz=np.concatenate([np.rint(s.xyz_m / STEP_M).astype(np.int16) for s in samples]),
+            counts=np.array([len(s.xyz_m) for s in samples]),
+            boxes=np.concatenate([s.boxes for s in samples]),
+            category=np.concatenate([s.category for s in samples]),
+            points=np.concatenate([s.points for s in samples]),
+            users=np.array([len(s.boxes) for s in samples]),
+        )
+    os.replace(temporary, path)
+
+
+class Shard:
+    """Samples of a file, decoded one by one."""
+
+    def __init__(self, path: Path) -> None:
+        with np.load(path) as data:
+            self._columns = {name: data[name] for name in data.files}
+        self._ends = np.cumsum(self._columns["counts"]), np.cumsum(self._columns["users"])
+
+    def __len__(self) -> int:
+        return len(self._columns["counts"])
+
+    def __getitem__(self, k: int) -> Sample:
+        c = self._columns
+        p = slice(self._ends[0][k] - c["counts"][k], self._ends[0][k])
+        u = slice(self._ends[1][k] - c["users"][k], self._ends[1][k])
+        return Sample(
+            c["xyz"][p].astype(np.float32) * np.float32(STEP_M), c["boxes"][u], c["category"][u], c["points"][u]
+        )
+
+
+def augmented(sample: Sample, rng: np.random.Generator) -> Sample:
+    """Turn, mirror, thin out and tilt a sample a little."""
+    angle, mirror = rng.uniform(-np.pi, np.pi), rng.random() < 0.5
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, s], [-s, c]], np.float32)
+    xyz, boxes = sample.xyz_m.copy(), sample.boxes.copy()
+    if mirror:
+        xyz[:, 1] *= -1
+        boxes[:, 1] *= -1
+        boxes[:, 6] *= -1
+    xyz[:, :2] = xyz[:, :2] @ turn
+    boxes[:, :2] = boxes[:, :2] @ turn
+    boxes[:, 6] += angle
+    share = rng.choice([0.0, rng.uniform(0, 0.5)])
+    if share:
+        xyz = xyz[rng.random(len(xyz)) >= share]
+    # The estimate of the ground errs on real roads by a little more than on simulated ones.
+    xyz[:, 2] += np.float32(rng.normal(0, 0.01)) + xyz[:, :2] @ rng.normal(0, 0.0005, 2).astype(np.float32)
+    return Sample(xyz, boxes, sample.category, np.rint(sample.points * (1 - share)).astype(np.int64))
+
+
+def window_of(rng: np.random.Generator, cells: int, cell_m: float, shift_m: float = 10.0) -> np.ndarray:
+    """Draw the lower corner (2,) of a square grid around the sensor, m."""
+    return np.asarray(rng.uniform(-shift_m, shift_m, 2) - cells * cell_m / 2)
+
+
+def grid_of(sample: Sample, low: np.ndarray, cells: int, cell_m: float) -> NDArray[np.float32]:
+    """Rasterize a sample in a square window."""
+    return rasterize(sample.xyz_m, cell_m=cell_m, low=low, shape=(cells, cells))

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_training.clouds import Example
-from lidar_training.samples import CATEGORIES, KEPT_RANGE_M, Sample
+from lidar_training.clouds import CATEGORIES, KEPT_RANGE_M, Example, Sample
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import LogError

@@ -19,18 +19,22 @@ import numpy as np
 
 import log2sim
 from mutation.bases import KINDS, LOGS, SCENARIO, XOSC, write_base
-from mutation.containers import CONTAINERS
+from mutation.binaries import CONTAINERS, FILES, MESSAGES, RAW, STORED
 from mutation.damage import Damage, Mutation, Place, damage
-from mutation.json_trees import TREES
-from mutation.messages import MESSAGES
-from mutation.raw_bytes import RAW
-from mutation.record_files import FILES
-from mutation.running import Outcome, Ran, Watched, commands_for, measured, prepare_process, run_commands, variant_of
-from mutation.stored_tables import STORED
-from mutation.text_lines import LINES
-from mutation.verdict import judge
-from mutation.watch import Canaries, Watch
-from mutation.xml_files import XML
+from mutation.running import (
+    Canaries,
+    Outcome,
+    Ran,
+    Watch,
+    Watched,
+    commands_for,
+    judge,
+    measured,
+    prepare_process,
+    run_commands,
+    variant_of,
+)
+from mutation.texts import LINES, TREES, XML
 
 ALL: tuple[Mutation, ...] = (*RAW, *LINES, *TREES, *FILES, *CONTAINERS, *STORED, *MESSAGES, *XML)
 # Of 48 inputs four are scenarios and two OpenSCENARIO files, the rest logs in turn.

@@ -6,16 +6,17 @@ A sensor with 32 layers has 2 to 6 points on a person at 20 to 30 m.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, TYPICAL_SIZE_M
 from log2sim.geometry import NS_PER_S, Array, apply, box_iou, undistort
 from log2sim.perception.boxes import azimuth_step_rad, fit_yaw, oriented_covariance, rotate, subsample, upper_median
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.projection import ProjectedPoints, View, project_points
+from log2sim.perception.lidar.projection import ProjectedPoints, View
 
 Index = NDArray[np.intp]
 
@@ -272,51 +273,79 @@ BESIDE_SHARE, ABOVE_SHARE = 1.0, 0.25
 OWNED_MARGIN_M = 0.1
 
 
-def measure_few_points(rows: Measurements, view: View, cloud: Cloud) -> Measurements:
-    """Place the people and riders among the rows (M,) of a camera frame who have no points of their own yet.
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Points above the ground that a frame shows and no 3D box owns.
+
+    Attributes
+    ----------
+    points : (n,) int
+        Rows of the cloud that may be image boxes' objects.
+    columns_m : (3, n) float32
+        The same as rows x, y, z, relative to the cloud's origin.
+    visible : ProjectedPoints
+        Which of them are in the image.
+    """
+
+    view: View
+    cloud: Cloud
+    points: Index
+    columns_m: NDArray[np.float32]
+    visible: ProjectedPoints
+
+
+def place_few_points(seen: Shown, columns: dict[str, Any], rows: Index, boxes_px: Array) -> None:
+    """Place the people and riders among the rows (R,) of a frame who have no points of their own yet.
+
+    Parameters
+    ----------
+    columns : dict
+        Of `Measurements`, written to.
+    boxes_px : (N, 4) float64
+        All image boxes of the frame, which hide what is behind them.
 
     Notes
     -----
     A body is where two or more points inside its box have a depth at which the box is as high as a person. Points that go
     on at that depth on both sides of the box or above it belong to a wall, a fence or a pole.
     """
-    small = np.array([GROUP_OF[c] in GROUPS_OF_FEW_POINTS for c in rows.category.tolist()], dtype=bool)
-    wanted = np.flatnonzero(small & (rows.source == "") & ~rows.truncated)
-    if len(wanted) == 0:
-        return rows
-    visible = project_points(view, cloud.origin, cloud.obstacle_columns)
+    small = np.array([GROUP_OF[c] in GROUPS_OF_FEW_POINTS for c in columns["category"][rows].tolist()], dtype=bool)
+    wanted = rows[small & (columns["source"][rows] == "") & ~columns["truncated"][rows]]
+    extended = rows[np.isfinite(columns["low_m"][rows, 0])]
+    visible, index = seen.visible, seen.points[seen.visible.index]
 
-    def is_free(chosen: NDArray[np.intp]) -> NDArray[np.bool_]:
-        return ~_owned(cloud.xyz[cloud.obstacles[visible.index[chosen]], :2] + cloud.origin[:2], rows)
+    def is_free(chosen: Index) -> NDArray[np.bool_]:
+        return ~_owned(seen.cloud.xyz[index[chosen], :2] + seen.cloud.origin[:2], columns, extended)
 
-    columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(rows).items()}
     for k in wanted.tolist():
-        chosen = _body_points(visible, rows, k, is_free, float(view.camera.K[1, 1]))
+        tall_m = TYPICAL_SIZE_M[str(columns["category"][k])][2]
+        chosen = _body_points(visible, columns["box_px"][k], boxes_px, tall_m, is_free, float(seen.view.camera.K[1, 1]))
         if len(chosen):
-            _write(columns, k, view, cloud, cloud.obstacles[visible.index[chosen]], visible.depth[chosen])
-    return Measurements(**columns)
+            _write(columns, k, seen.view, seen.cloud, index[chosen], visible.depth[chosen])
 
 
 def _body_points(
     visible: ProjectedPoints,
-    rows: Measurements,
-    k: int,
+    box_px: Array,
+    boxes_px: Array,
+    tall_m: float,
     is_free: Callable[[NDArray[np.intp]], NDArray[np.bool_]],
     focal_px: float,
 ) -> NDArray[np.intp]:
-    """Choose the points of the body in the box of row `k` among the n points of an image; none where nothing fits.
+    """Choose the points of the body in a box (4,) among the n points of an image; none where nothing fits.
 
     Parameters
     ----------
-    rows : Measurements
-        Of the frame.
+    boxes_px : (N, 4) float64
+        All boxes of the frame.
+    tall_m : float
+        Typical height of a body.
     is_free : callable
         Marks those of some of the points that are no other object's.
     focal_px : float
         Vertical.
     """
-    boxes_px, tall_m = rows.box_px, TYPICAL_SIZE_M[str(rows.category[k])][2]
-    u0, v0, u1, v1 = boxes_px[k].tolist()
+    u0, v0, u1, v1 = box_px.tolist()
     width, height = u1 - u0, v1 - v0
     u, v, depth = visible.u, visible.v, visible.depth
     inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * width
@@ -327,8 +356,8 @@ def _body_points(
         return inside[:0]
     inside = inside[np.argsort(depth[inside], kind="stable")]
     bodies = np.split(inside, np.flatnonzero(np.diff(depth[inside]) > MAX_DEPTH_GAP_M) + 1)
-    around = _around(visible, boxes_px, k)
-    bodies = [b for b in bodies if len(b) >= MIN_POINTS and not _goes_on(visible, b, around, boxes_px[k])]
+    around = _around(visible, box_px, boxes_px)
+    bodies = [b for b in bodies if len(b) >= MIN_POINTS and not _goes_on(visible, b, around, box_px)]
 
     def likelihood(body: NDArray[np.intp]) -> float:
         off = _off_height(depth[body], height, focal_px, tall_m)
@@ -342,26 +371,26 @@ def _off_height(depth_m: NDArray[np.float32], height_px: float, focal_px: float,
     return np.asarray((height_px * depth_m / focal_px / tall_m - 1) / HEIGHT_SIGMA_SHARE)
 
 
-def _owned(xy: Array, rows: Measurements) -> NDArray[np.bool_]:
-    """Mark the points (n, 2) of the map within the extents of the points of any row."""
+def _owned(xy: Array, columns: dict[str, Any], rows: Index) -> NDArray[np.bool_]:
+    """Mark the points (n, 2) of the map within the extents of the points of any of the rows."""
     owned = np.zeros(len(xy), dtype=bool)
-    for j in np.flatnonzero(np.isfinite(rows.low_m[:, 0])):
-        local = rotate(xy - rows.sensor_m[j, :2], -float(rows.yaw_rad[j]))
-        low, high = rows.low_m[j] - OWNED_MARGIN_M, rows.high_m[j] + OWNED_MARGIN_M
+    for j in rows:
+        local = rotate(xy - columns["sensor_m"][j, :2], -float(columns["yaw_rad"][j]))
+        low, high = columns["low_m"][j] - OWNED_MARGIN_M, columns["high_m"][j] + OWNED_MARGIN_M
         owned |= ((local >= low) & (local <= high)).all(axis=1)
     return owned
 
 
-def _around(visible: ProjectedPoints, boxes_px: Array, k: int) -> NDArray[np.intp]:
-    """Find the points left, right and above box `k` that no other box shows but one that surrounds it."""
-    u0, v0, u1, v1 = boxes_px[k].tolist()
+def _around(visible: ProjectedPoints, box_px: Array, boxes_px: Array) -> NDArray[np.intp]:
+    """Find the points left, right and above a box that no other box shows but one as wide."""
+    u0, v0, u1, v1 = box_px.tolist()
     beside, above = BESIDE_SHARE * (u1 - u0), ABOVE_SHARE * (v1 - v0)
     u, v = visible.u, visible.v
     near = np.flatnonzero((u >= u0 - beside) & (u <= u1 + beside) & (v >= v0 - above) & (v <= v1))
     u, v = u[near], v[near]
     found = (u < u0) | (u > u1) | (v < v0)
-    for j, (a0, b0, a1, b1) in enumerate(boxes_px.tolist()):
-        if j != k and not (a0 <= u0 and a1 >= u1):
+    for a0, b0, a1, b1 in boxes_px.tolist():
+        if not (a0 <= u0 and a1 >= u1):
             found &= ~((u >= a0) & (u <= a1) & (v >= b0) & (v <= b1))
     return np.asarray(near[found])
 

@@ -1,22 +1,39 @@
-"""Measurement: LiDAR points inside boxes of images and of clouds are the evidence for objects.
+"""Measurement: the LiDAR points inside the 3D boxes and the image boxes of one tick are the evidence for objects.
 
-Mode "paper" follows Bhardwaj & Kalra: depth of the point nearest to the box center, extents of all points in the box.
-Mode "robust" removes the ground, assigns a cluster to every box, and measures the cluster's oriented extents and which of
+3D boxes come first. Those that an image box shows, too, take their points; only image boxes without a partner are clustered, in
+the points that are left. A pair is judged by the score in the image, the score in the sweep and the IoU of the image box with
+the projected 3D box, as in Pang, Morris & Radha, "CLOCs: Camera-LiDAR Object Candidates Fusion for 3D Object Detection" (IROS
+2020); in place of their network a logistic function is fitted to these three (`tools/fit.py late_fusion`).
+
+Mode "paper" follows Bhardwaj & Kalra in image boxes: depth of the point nearest to the box center, extents of all points in the
+box. Mode "robust" removes the ground, assigns a cluster to every box, and measures the cluster's oriented extents and which of
 their ends are ends of the object.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Boxes3D, Detections, Log, Measurements, OtherView, end_of
-from log2sim.geometry import NS_PER_S, Array, Camera
+from log2sim.datatypes import (
+    GROUP_OF,
+    MAX_SIZE_M,
+    TYPICAL_SIZE_M,
+    Boxes3D,
+    Detections,
+    Log,
+    Measurements,
+    OtherView,
+    end_of,
+    seen_from,
+)
+from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.geometry import NS_PER_S, Array, Camera, box_iou
 from log2sim.perception.boxes import (
     TOP_QUANTILE,
     fit_extents_of_clusters,
@@ -32,14 +49,335 @@ from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
     MIN_CLUSTER_POINTS,
+    Shown,
     assign_clusters,
     candidate_clusters,
     continued_sides,
+    place_few_points,
     region_grow,
 )
-from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
+from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_boxes_in_view, project_points
 
 Index = NDArray[np.intp]
+Frame = tuple[View, Detections, "Cloud | None"]
+"""A frame with its image boxes, and the cloud nearest in time, None without one."""
+
+
+def measure(
+    frames: Sequence[Frame], boxes: Boxes3D | None = None, sweep: Cloud | None = None, *, mode: str = "robust"
+) -> Measurements:
+    """Measure the image boxes and the 3D boxes of one tick: one row for each object, also where both show it.
+
+    Parameters
+    ----------
+    boxes : Boxes3D, optional
+        What a detector found in `sweep`; None where none searched it.
+    mode : str
+        Of image boxes: "robust" or "paper".
+
+    Returns
+    -------
+    Measurements
+        Rows of the 3D boxes, then those of the image boxes without a partner in the order of the frames; without LiDAR points
+        these have no position.
+    """
+    searched = boxes is not None and sweep is not None
+    boxes = boxes if boxes is not None and sweep is not None else Boxes3D.empty()
+    images, frame = _rows_of_images(frames)
+    pairs = match_boxes(boxes, images, frame, [view for view, _, _ in frames])
+    alone = np.setdiff1d(np.arange(len(images)), pairs.image)
+    rows, own = images.take(alone), list[Index]()
+    frame = np.concatenate([np.full(len(boxes), -1), frame[alone]])
+    if sweep is not None and len(boxes):
+        own = _members_of_all(boxes, sweep)
+        rows = Measurements.join([_rows_of_boxes(boxes, sweep, own), rows])
+    columns: dict[str, Any] = vars(rows) | {"cluster": list(rows.cluster), "others": [None] * len(rows)}
+    # The points of rows, by the cloud in which these were sought.
+    found: dict[int, tuple[Cloud, dict[int, Index]]] = {}
+    if sweep is not None:
+        found[id(sweep)] = sweep, {k: members for k, members in enumerate(own) if len(members) >= MIN_CLUSTER_POINTS}
+    free = _free_points(frames, sweep, [own[k] for k in np.unique(pairs.box)])
+    shown = list[tuple[Shown, Index, Array]]()
+    for k, (view, detections, cloud) in enumerate(frames):
+        of_frame = np.flatnonzero(frame == k)
+        if cloud is not None and len(of_frame) and mode == "robust":
+            points, columns_m = free[id(cloud)]
+            seen = Shown(view, cloud, points, columns_m, project_points(view, cloud.origin, columns_m))
+            found.setdefault(id(cloud), (cloud, {}))[1].update(_cluster_boxes(seen, of_frame, columns))
+            shown.append((seen, of_frame, detections.box_px))
+    for cloud, members in found.values():
+        write_evidence(columns, list(members), list(members.values()), cloud)
+    columns |= vars(place_boxes(Measurements(**columns)))
+    for seen, of_frame, boxes_px in shown:
+        place_few_points(seen, columns, of_frame, boxes_px)
+    if mode == "paper":
+        for k, (view, _, cloud) in enumerate(frames):
+            if cloud is not None:
+                _measure_as_paper(view, cloud, columns, np.flatnonzero(frame == k))
+    if searched:
+        _join_pairs(columns, images, pairs, [view for view, _, _ in frames])
+        _doubt_images(columns, len(boxes))
+    others = tuple(columns["others"]) if any(view is not None for view in columns["others"]) else ()
+    return Measurements(**columns | {"cluster": tuple(columns["cluster"]), "others": others})
+
+
+def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
+    """Return a row without a position for each image box (N,), and the number (N,) of its frame."""
+    frame = np.repeat(np.arange(len(frames)), [len(found) for _, found, _ in frames])
+    if not len(frame):
+        return Measurements.empty(), frame
+    found = Detections(
+        *(np.concatenate([getattr(d, k) for _, d, _ in frames]) for k in ("box_px", "score", "category"))
+    )
+    views = [view for view, _, _ in frames]
+    rows = Measurements.unplaced(found, t_ns=0, camera="", sensor_m=np.zeros(3))
+    return replace(
+        rows,
+        t_ns=np.array([view.t_ns for view in views])[frame],
+        camera=np.array([view.camera.name for view in views])[frame],
+        truncated=np.concatenate([_cut_by_border(view.camera, detections.box_px) for view, detections, _ in frames]),
+        sensor_m=np.array([view.map_T_cam[:3, 3] for view in views])[frame],
+        seen_by=np.concatenate([seen_from(end_of(view.camera), 1) for view in views])[frame],
+    ), frame
+
+
+def _rows_of_boxes(boxes: Boxes3D, cloud: Cloud, members: Sequence[Index]) -> Measurements:
+    """Return a row for each box (M,) with points of a cloud; with too few of its own it keeps the position of its box."""
+    rows = Measurements.of_boxes(boxes, cloud.sensor + cloud.origin)
+    seen_by = np.array([cloud.ends_of(index) for index in members], dtype=bool)
+    half_m = boxes.size_m[:, 2] / 2
+    return replace(
+        rows,
+        yaw_rad=boxes.yaw_rad,
+        points=boxes.points,
+        bottom_m=boxes.center_m[:, 2] - half_m,
+        top_m=boxes.center_m[:, 2] + half_m,
+        sensor_m=_nearest_viewpoints(boxes, cloud) if cloud.parts else rows.sensor_m,
+        seen_by=seen_by if boxes.seen_by is None else seen_by | boxes.seen_by,
+    )
+
+
+# Boxes that overlap less are different objects.
+MIN_IOU = 0.3
+# The category of the image counts where the boxes overlap by this.
+MIN_CATEGORY_IOU = 0.5
+# A rider is taken for a pedestrian now and then and the other way round.
+RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
+# Scores nearer to 0 or 1 are not believed.
+MIN_SCORE, MAX_SCORE = 0.01, 0.99
+# Recall of a detector in images for objects of at least this height in px, and the height at which it finds none.
+IMAGE_RECALL, IMAGE_RECALL_PX, NO_IMAGE_RECALL_PX = 0.6, 40.0, 12.0
+# Recall of a detector in sweeps for objects with many points, within its range, by group; half of it is reached at so many
+# points.
+SWEEP_RECALL = {"vehicle": 0.75, "two_wheeler": 0.6, "pedestrian": 0.5}
+SWEEP_RECALL_POINTS, SWEEP_RANGE_M = 15.0, 40.0
+
+
+@dataclass(frozen=True)
+class PairWeights:
+    """Weights of the logistic function that scores an object found in an image and in a sweep.
+
+    Attributes
+    ----------
+    image, sweep : float
+        Of the log-odds of the scores.
+    """
+
+    bias: float
+    image: float
+    sweep: float
+    iou: float
+
+    def score(self, image: Array, sweep: Array, iou: Array) -> Array:
+        """Return the probability (M,) that pairs are objects."""
+        return probability_of(self.bias + self.image * logit(image) + self.sweep * logit(sweep) + self.iou * iou)
+
+
+# Independent evidence: two scores of 0.5 with an IoU of 0.7 are one of 0.75, as by 1 - (1 - a) (1 - b).
+PAIR_WEIGHTS = PairWeights(bias=-1.7, image=1.0, sweep=1.0, iou=4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Which image boxes show which of M 3D boxes, the best of P pairs first.
+
+    Attributes
+    ----------
+    box, image : (P,) int
+    iou : (P,) float64
+        Of the projected box with the image box.
+    height_px : (M,) float64
+        Height of the projected box in the image where it is highest; 0 for a box outside all images.
+    """
+
+    box: Index
+    image: Index
+    iou: Array
+    height_px: Array
+
+
+def match_boxes(boxes: Boxes3D, images: Measurements, frame: Index, views: Sequence[View]) -> Pairs:
+    """Match 3D boxes (M,) with image boxes (N,) of frames numbered (N,), the best pairs first; one of a box in each frame."""
+    iou, height_px = np.zeros((len(boxes), len(images))), np.zeros(len(boxes))
+    for k, view in enumerate(views):
+        projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
+        box_px, of_frame = np.nan_to_num(projected.box_px), np.flatnonzero(frame == k)
+        height_px = np.maximum(height_px, box_px[:, 3] - box_px[:, 1])
+        iou[:, of_frame] = box_iou(box_px, images.box_px[of_frame])
+    iou[~_may_be_same(boxes.category, images.category)] = 0.0
+    pairs = np.argwhere(iou >= MIN_IOU)
+    pairs = pairs[np.argsort(-iou[*pairs.T], kind="stable")]
+    free_images, free_boxes, kept = set(pairs[:, 1].tolist()), {(i, int(frame[j])) for i, j in pairs.tolist()}, []
+    for n, (i, j) in enumerate(pairs.tolist()):
+        if j in free_images and (i, int(frame[j])) in free_boxes:
+            free_images.remove(j)
+            free_boxes.remove((i, int(frame[j])))
+            kept.append(n)
+    box, image = pairs[kept].T
+    return Pairs(box, image, iou[box, image], height_px)
+
+
+def _may_be_same(boxes: NDArray[np.str_], images: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Mark the pairs (M, N) whose categories are of one group or confused with each other."""
+    a, b = (np.array([GROUP_OF[str(c)] for c in category], dtype="<U16") for category in (boxes, images))
+    same = a[:, None] == b
+    for one, other in RELATED:
+        same |= (a[:, None] == one) & (b == other)
+    return np.asarray(same)
+
+
+def _join_pairs(columns: dict[str, Any], images: Measurements, pairs: Pairs, views: Sequence[View]) -> None:
+    """Write what image boxes say into the first rows, of 3D boxes; doubt those that an image should show and does not."""
+    score = columns["score"][: len(pairs.height_px)].copy()
+    tall = (pairs.height_px - NO_IMAGE_RECALL_PX) / (IMAGE_RECALL_PX - NO_IMAGE_RECALL_PX)
+    columns["score"][: len(score)] = if_missed(score, IMAGE_RECALL * np.clip(tall, 0, 1))
+    view_of = {view.camera.name: view for view in views}
+    # Of several images the best one is written last.
+    for n in np.argsort(pairs.iou * images.score[pairs.image], kind="stable").tolist():
+        row, image, iou = int(pairs.box[n]), int(pairs.image[n]), pairs.iou[n]
+        for name in ("camera", "box_px", "truncated", "category")[: 4 if iou >= MIN_CATEGORY_IOU else 3]:
+            columns[name][row] = getattr(images, name)[image]
+        columns["seen_by"][row] |= images.seen_by[image]
+        columns["score"][row] = PAIR_WEIGHTS.score(images.score[image], score[row], iou)
+        view, cluster = view_of[str(images.camera[image])], columns["cluster"][row]
+        places = cluster[:, :3] if len(cluster) else columns["center_m"][row][None]
+        depth_m = (places - view.map_T_cam[:3, 3]) @ view.map_T_cam[:3, 2]
+        category = str(columns["category"][row])
+        columns["height_px_m"][row] = _height_m(images.box_px[image], depth_m, category, view.camera)
+
+
+def _doubt_images(columns: dict[str, Any], first: int) -> None:
+    """Lower the scores of rows from the `first` on, of images alone, that the detector in sweeps should have found by their points."""
+    found = np.array([SWEEP_RECALL.get(GROUP_OF[str(c)], 0.0) for c in columns["category"][first:]], dtype=np.float64)
+    points = columns["points"][first:]
+    with np.errstate(invalid="ignore"):
+        covered = np.hypot(*(columns["center_m"] - columns["sensor_m"])[first:, :2].T) <= SWEEP_RANGE_M
+    recall = np.where(covered, found * points / (points + SWEEP_RECALL_POINTS), 0.0)
+    columns["score"][first:] = if_missed(columns["score"][first:], recall)
+
+
+def if_missed(score: Array, recall: Array) -> Array:
+    """Return the probability (M,) of objects that another detector missed: the odds of the score times 1 - recall."""
+    return np.where(recall > 0, probability_of(logit(score) + np.log1p(-recall)), score)
+
+
+def logit(p: Array) -> Array:
+    """Return the log-odds (M,) of scores, limited to those that are believed."""
+    return log_odds_of(np.clip(p, MIN_SCORE, MAX_SCORE))
+
+
+# A box that ends nearer to the image border may be cut by it.
+BORDER_PX = 3.0
+# Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
+MIN_LONG_M = 10.0
+NEAR_END_QUANTILE = 0.05
+# Smallest extent in mode "paper", m.
+MIN_EXTENT_M = 0.1
+
+
+def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
+    border = np.array([camera.width_px, camera.height_px]) - BORDER_PX
+    return np.asarray((box_px[:, :2] < BORDER_PX).any(axis=1) | (box_px[:, 2:] > border).any(axis=1))
+
+
+def _free_points(
+    frames: Sequence[Frame], sweep: Cloud | None, owned: Sequence[Index]
+) -> dict[int, tuple[Index, NDArray[np.float32]]]:
+    """Return the obstacles (n,) of each cloud but those that boxes in the sweep own, and the same as rows x, y, z (3, n)."""
+    own: dict[int, NDArray[np.bool_]] = {}
+    if sweep is not None and len(owned):
+        mask = np.zeros(len(sweep.xyz), dtype=bool)
+        mask[np.concatenate(owned)] = True
+        edges = np.cumsum([len(part.xyz) for part in sweep.views])[:-1]
+        own = {id(part): of_part for part, of_part in zip(sweep.views, np.split(mask, edges))}
+    out = {}
+    for cloud in {id(cloud): cloud for _, _, cloud in frames if cloud is not None}.values():
+        out[id(cloud)] = cloud.obstacles, cloud.obstacle_columns
+        if any(id(part) in own for part in cloud.views):
+            masks = [own.get(id(part), np.zeros(len(part.xyz), dtype=bool)) for part in cloud.views]
+            free = ~np.concatenate(masks)[cloud.obstacles]
+            out[id(cloud)] = cloud.obstacles[free], cloud.obstacle_columns.compress(free, axis=1)
+    return out
+
+
+def _cluster_boxes(seen: Shown, rows: Index, columns: dict[str, Any]) -> dict[int, Index]:
+    """Assign a cluster to each of the rows (R,) of a frame, as indices in its cloud, and write how high the image box is there."""
+    cloud, points, visible, columns_m = seen.cloud, seen.points, seen.visible, seen.columns_m
+    index, boxes_px = points[visible.index], columns["box_px"][rows]
+    category = [str(c) for c in columns["category"][rows]]
+    options, inside = [], points_in_image_boxes(visible, boxes_px, MARGIN)
+    xyz, uv = columns_m.take(visible.index, axis=1).T, np.stack([visible.u, visible.v], axis=1)
+    range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
+    for k, i in enumerate(inside):
+        found = candidate_clusters(xyz[i], uv[i], range_m[i], boxes_px[k], category[k])
+        options.append([(i[members], score) for members, score in found])
+    assigned = assign_clusters(options, boxes_px, len(index))
+    taken = np.bincount(np.concatenate([*assigned, index[:0]]), minlength=len(index)) > 0
+    out = {}
+    for k, chosen in enumerate(assigned):
+        if len(chosen) < MIN_CLUSTER_POINTS:
+            continue
+        members, truncated = index[chosen], columns["truncated"][rows[k]]
+        if truncated:
+            grown = points[region_grow(columns_m[:2].T, cloud.xyz[members, :2], category[k])]
+            members = np.union1d(members, grown)
+        if MAX_SIZE_M[category[k]][0] >= MIN_LONG_M:
+            rest = points if truncated else index[inside[k]]
+            other = np.ones(len(cloud.xyz), dtype=bool)
+            other[members] = other[index[taken]] = False
+            rest = rest[other[rest]]
+            seed, more = (cloud.xyz[part, :2].astype(np.float64) - cloud.sensor[:2] for part in (members, rest))
+            members = np.union1d(members, rest[continued_sides(seed, more, MAX_SIZE_M[category[k]][0])])
+        columns["height_px_m"][rows[k]] = _height_m(boxes_px[k], visible.depth[chosen], category[k], seen.view.camera)
+        out[int(rows[k])] = members
+    return out
+
+
+def _height_m(box_px: Array, depth_m: NDArray[np.floating[Any]], category: str, camera: Camera) -> float:
+    """Return how high an image box is at the depths (n,) of its object; that of a long vehicle is as high as its near end looks."""
+    is_long = MAX_SIZE_M[category][0] >= MIN_LONG_M
+    at_m = float(np.quantile(depth_m, NEAR_END_QUANTILE)) if is_long else upper_median(depth_m)
+    return float((box_px[3] - box_px[1]) * at_m / camera.K[1, 1])
+
+
+def _measure_as_paper(view: View, cloud: Cloud, columns: dict[str, Any], rows: Index) -> None:
+    """Take the depth of the point nearest to the box center, and the extents of all points in the box, for rows (R,) of a frame."""
+    visible = project_points(view, cloud.origin, cloud.columns)
+    uv, xyz = np.stack([visible.u, visible.v], axis=1), cloud.xyz[visible.index]
+    for k, inside in zip(rows.tolist(), points_in_image_boxes(visible, columns["box_px"][rows])):
+        if len(inside) == 0:
+            continue
+        box = columns["box_px"][k]
+        nearest = inside[np.argmin(np.hypot(*(uv[inside] - (box[:2] + box[2:]) / 2).T))]
+        center = xyz[nearest] + cloud.origin
+        half = np.maximum(np.ptp(xyz[inside], axis=0), MIN_EXTENT_M) / 2
+        offset = (center - columns["sensor_m"][k])[:2]
+        columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = 0.0, offset - half[:2], offset + half[:2]
+        columns["bottom_m"][k], columns["top_m"][k] = center[2] - half[2], center[2] + half[2]
+        columns["center_m"][k], columns["covariance"][k], columns["source"][k] = center, np.eye(2), "lidar"
+        columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
+        columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
+
 
 # Points of a cluster that are kept as evidence.
 MAX_KEPT_POINTS = 400
@@ -53,7 +391,7 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
     Parameters
     ----------
     columns : dict
-        From `writable`.
+        Of `Measurements`, written to; those that are no arrays are lists.
     rows : R ints
     members : R arrays (n,) of int
         The points of each row in the cloud.
@@ -109,114 +447,6 @@ def _other_view(cloud: Cloud, members: Index, t_ns: int) -> OtherView:
     )
 
 
-# A box that ends nearer to the image border may be cut by it.
-BORDER_PX = 3.0
-# Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
-MIN_LONG_M = 10.0
-NEAR_END_QUANTILE = 0.05
-# Smallest extent in mode "paper", m.
-MIN_EXTENT_M = 0.1
-
-
-def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mode: str = "robust") -> Measurements:
-    """Measure every detection (M,) of one camera frame; rows without LiDAR points have no position."""
-    rows = Measurements.unplaced(
-        detections,
-        t_ns=view.t_ns,
-        camera=view.camera.name,
-        sensor_m=view.map_T_cam[:3, 3],
-        end=end_of(view.camera),
-    )
-    rows = replace(rows, truncated=_cut_by_border(view.camera, detections.box_px))
-    if cloud is None or not len(detections):
-        return rows
-    return _measure_as_paper(rows, view, cloud) if mode == "paper" else _measure_robustly(rows, view, cloud)
-
-
-def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
-    border = np.array([camera.width_px, camera.height_px]) - BORDER_PX
-    return np.asarray((box_px[:, :2] < BORDER_PX).any(axis=1) | (box_px[:, 2:] > border).any(axis=1))
-
-
-def writable(rows: Measurements) -> dict[str, Any]:
-    """Copy the columns of rows, so that they can be written."""
-    columns = {k: list(v) if isinstance(v, tuple) else v.copy() for k, v in vars(rows).items()}
-    return columns | {"others": columns["others"] or [None] * len(rows)}
-
-
-def with_tuples(columns: dict[str, Any]) -> dict[str, Any]:
-    """Return columns from `writable` as rows have them."""
-    others = columns["others"] if any(v is not None for v in columns["others"]) else ()
-    return columns | {"cluster": tuple(columns["cluster"]), "others": tuple(others)}
-
-
-def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measurements:
-    """Assign a cluster to every row and measure its extents."""
-    points, columns_m = cloud.obstacles, cloud.obstacle_columns
-    visible = project_points(view, cloud.origin, columns_m)
-    index = points[visible.index]
-    options, inside = [], points_in_image_boxes(visible, rows.box_px, MARGIN)
-    xyz, uv = columns_m.take(visible.index, axis=1).T, np.stack([visible.u, visible.v], axis=1)
-    range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
-    for k, i in enumerate(inside):
-        found = candidate_clusters(xyz[i], uv[i], range_m[i], rows.box_px[k], str(rows.category[k]))
-        options.append([(i[members], score) for members, score in found])
-    columns, assigned = writable(rows), assign_clusters(options, rows.box_px, len(index))
-    taken = np.bincount(np.concatenate([*assigned, index[:0]]), minlength=len(index)) > 0
-    rows_seen, members_seen = list[int](), list[NDArray[np.intp]]()
-    for k, chosen in enumerate(assigned):
-        if len(chosen) < MIN_CLUSTER_POINTS:
-            continue
-        members, category = index[chosen], str(rows.category[k])
-        if rows.truncated[k]:
-            grown = points[region_grow(columns_m[:2].T, cloud.xyz[members, :2], category)]
-            members = np.union1d(members, grown)
-        if MAX_SIZE_M[category][0] >= MIN_LONG_M:
-            rest = points if rows.truncated[k] else index[inside[k]]
-            other = np.ones(len(cloud.xyz), dtype=bool)
-            other[members] = other[index[taken]] = False
-            rest = rest[other[rest]]
-            members = np.union1d(members, rest[_continuation(cloud, members, rest, MAX_SIZE_M[category][0])])
-        box = rows.box_px[k]
-        # The image box of a long vehicle is as high as its near end looks.
-        is_long, depth = MAX_SIZE_M[category][0] >= MIN_LONG_M, visible.depth[chosen]
-        depth_m = float(np.quantile(depth, NEAR_END_QUANTILE)) if is_long else upper_median(depth)
-        columns["height_px_m"][k] = (box[3] - box[1]) * depth_m / view.camera.K[1, 1]
-        rows_seen.append(k)
-        members_seen.append(members)
-    write_evidence(columns, rows_seen, members_seen, cloud)
-    return place_boxes(Measurements(**with_tuples(columns)))
-
-
-def _continuation(
-    cloud: Cloud, members: NDArray[np.intp], rest: NDArray[np.intp], max_length_m: float
-) -> NDArray[np.intp]:
-    """Find those of the points `rest` that continue the sides of the points `members`, see `continued_sides`."""
-    seed, others = (cloud.xyz[rows, :2].astype(np.float64) - cloud.sensor[:2] for rows in (members, rest))
-    return continued_sides(seed, others, max_length_m)
-
-
-def _measure_as_paper(rows: Measurements, view: View, cloud: Cloud) -> Measurements:
-    """Take the depth of the point nearest to the box center, and the extents of all points in the box."""
-    visible = project_points(view, cloud.origin, cloud.columns)
-    uv, xyz = np.stack([visible.u, visible.v], axis=1), cloud.xyz[visible.index]
-    columns = writable(rows)
-    for k, inside in enumerate(points_in_image_boxes(visible, rows.box_px)):
-        if len(inside) == 0:
-            continue
-        box = rows.box_px[k]
-        nearest = inside[np.argmin(np.hypot(*(uv[inside] - (box[:2] + box[2:]) / 2).T))]
-        center = xyz[nearest] + cloud.origin
-        half = np.maximum(np.ptp(xyz[inside], axis=0), MIN_EXTENT_M) / 2
-        offset = (center - rows.sensor_m[k])[:2]
-        columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = 0.0, offset - half[:2], offset + half[:2]
-        columns["bottom_m"][k], columns["top_m"][k] = center[2] - half[2], center[2] + half[2]
-        columns["center_m"][k], columns["covariance"][k], columns["source"][k] = center, np.eye(2), "lidar"
-        columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
-        columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
-    return Measurements(**with_tuples(columns))
-
-
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
     """Project the cloud's points at `index`: which of them the camera sees (n,), pixels (n, 2) and depths (n,)."""
     visible = project_points(view, cloud.origin, np.ascontiguousarray(cloud.xyz[index].T))
@@ -231,25 +461,6 @@ EGO_MARGIN_M = 0.4
 # A box is sought at the times of another viewpoint's points up to this speed and distance, in steps of a LiDAR's noise and
 # the spacing of its rays.
 MAX_FOLLOWED_MPS, MAX_FOLLOWED_M, FOLLOW_STEP_M = 30.0, 2.0, 0.1
-
-
-def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
-    """Measure boxes (M,) found in a cloud; a row with too few points of its own keeps the position of its box."""
-    columns = writable(Measurements.of_boxes(boxes, cloud.sensor + cloud.origin))
-    columns["yaw_rad"][:] = boxes.yaw_rad
-    columns["points"][:] = boxes.points
-    for end, sign in (("bottom_m", -0.5), ("top_m", 0.5)):
-        columns[end][:] = boxes.center_m[:, 2] + sign * boxes.size_m[:, 2]
-    if cloud.parts:
-        columns["sensor_m"][:] = _nearest_viewpoints(boxes, cloud)
-    found = _members_of_all(boxes, cloud)
-    for k, members in enumerate(found):
-        columns["seen_by"][k] = cloud.ends_of(members)
-    if boxes.seen_by is not None:
-        columns["seen_by"] |= boxes.seen_by
-    enough = [k for k, members in enumerate(found) if len(members) >= MIN_CLUSTER_POINTS]
-    write_evidence(columns, enough, [found[k] for k in enough], cloud)
-    return place_boxes(Measurements(**with_tuples(columns)))
 
 
 def outside_ego(log: Log, boxes: Boxes3D) -> Boxes3D:

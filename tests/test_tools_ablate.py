@@ -1,0 +1,136 @@
+"""The ablation finds what can be changed by itself, changes it everywhere, and tells what matters from what does not."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+import ablate  # noqa: E402
+
+from log2sim import pipeline  # noqa: E402
+from log2sim.config import Config  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+TOY = """
+from __future__ import annotations
+from dataclasses import dataclass
+import numpy as np
+GATE_M = 2.0
+UNUSED_S, BOTH_MPS = 1.0, {"car": 3.0, "truck": 4.0}
+MIN_COUNT: int = 2
+names = 3.0
+@dataclass(frozen=True)
+class Row:
+    label: str
+    length_m: float
+TABLE = {"car": Row("c", 4.0), "truck": Row("t", 8.0)}
+def is_long(row: Row) -> bool:
+    return row.length_m > 3.0
+def is_never_asked(row: Row) -> bool:
+    return False
+"""
+USER = """
+from __future__ import annotations
+from toy.numbers import GATE_M, TABLE, Row, is_long
+HALF_GATE_M = 0.5 * GATE_M
+def wide(value, gate_m=GATE_M):
+    return value + gate_m
+def turned(row: Row) -> Row:
+    return Row(row.label, -row.length_m)
+def answer():
+    return HALF_GATE_M + wide(0.0) + (turned(TABLE["car"]).length_m if is_long(TABLE["car"]) else 0.0)
+"""
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """Modules whose answer depends on one constant, through a derived one and a default elsewhere, on one column, and on two rules."""
+    (tmp_path / "toy").mkdir()
+    for name, text in (("__init__", ""), ("numbers", TOY), ("user", USER)):
+        (tmp_path / "toy" / f"{name}.py").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield [importlib.import_module(f"toy.{name}") for name in ("numbers", "user")]
+    for name in [n for n in sys.modules if n.split(".")[0] == "toy"]:
+        del sys.modules[name]
+
+
+def test_changes_reach_all_that_is_derived_from_what_is_changed(toy):
+    found = {v.label: v for module in toy for v in (*ablate.constants_in(module, ""), *ablate.rules_in(module, ""))}
+    assert set(found) == {
+        "toy.numbers.GATE_M", "toy.numbers.UNUSED_S", "toy.numbers.BOTH_MPS", "toy.numbers.MIN_COUNT", "toy.numbers.TABLE.length_m",
+        "toy.user.HALF_GATE_M", "toy.numbers.is_long", "toy.numbers.is_never_asked", "toy.user.turned",
+    }  # fmt: skip
+    answer = toy[1].answer
+    assert answer() == -1.0
+    for label, expected in (
+        ("toy.numbers.GATE_M", 0.5), ("toy.user.HALF_GATE_M", -0.5), ("toy.numbers.TABLE.length_m", -3.0), ("toy.numbers.UNUSED_S", -1.0),
+    ):  # fmt: skip
+        one = found[label]
+        graph, usual = ablate.Imports(toy), one.value
+        graph.put(one.module, one.name, ablate.mapped(usual, lambda v: 1.5 * v, one.column))
+        assert answer() == expected, label
+        graph.put(one.module, one.name, usual)
+        assert answer() == -1.0
+    ablate.Imports(toy).put("toy.user", "turned", found["toy.user.turned"].value)
+    assert answer() == 7.0
+
+
+def test_what_nothing_calls_is_told_without_a_run(toy):
+    called = {toy[1].answer.__code__, toy[1].wide.__code__, toy[0].is_long.__code__}
+    graph = ablate.Imports(toy)
+    names = ("GATE_M", "UNUSED_S", "MIN_COUNT", "TABLE", "is_long", "is_never_asked")
+    assert [n for n in names if graph.is_called("toy.numbers", n, called)] == ["GATE_M", "TABLE", "is_long"]
+
+
+def test_whole_numbers_change_by_one_and_shares_stay_below_one():
+    assert [ablate.scaled(2, f) for f in (0.7, 1.3)] == [1, 3]
+    assert ablate.scaled(10, 1.3) == 13
+    assert [ablate.scaled(v, 1.3, share=True) for v in (0.9, 0.2)] == pytest.approx([0.95, 0.26])
+    doubled = ablate.mapped({"a": (0.9, True, "x"), "b": np.array([1.0, 2.0])}, lambda v: 2 * v)
+    assert doubled["a"] == (1.8, True, "x")
+    np.testing.assert_array_equal(doubled["b"], [2.0, 4.0])
+    changes = {v.change: v.value for v in ablate.scalings(ablate.Variation("constants", "", "m", "MAX_GAP_M", "", 2.0))}
+    assert changes == {"x0.7": pytest.approx(1.4), "x1.3": pytest.approx(2.6), "off": np.inf}
+
+
+def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
+    assert all(hasattr(pipeline, name) for functions, _, _ in ablate.STAGES.values() for name in functions)
+    found = list(ablate.variations(Config()))
+    assert {v.stage for v in found} == set(ablate.STAGES)
+    labels = {v.label for v in found}
+    assert {"track.max_gap_s", "agents.conflicts.TOUCHING", "datatypes.categories.CATEGORY.max_size_m"} <= labels
+
+
+def test_rows_are_worse_better_or_equal_beyond_the_noise_of_seeds():
+    def row(label: str, change: str, outcome: str, **figures: float) -> dict:
+        figures = dict.fromkeys(ablate.FIGURES, 1.0) | figures
+        return {
+            "case": "log",
+            "label": label,
+            "change": change,
+            "stage": "tracking",
+            "unit": "",
+            "value": "2",
+            "figures": figures,
+            "outcome": outcome,
+        }
+
+    rows = [row("seed", str(k), "abc", recall=1.0 + 0.01 * k) for k in range(3)]
+    rows += [
+        row("A", "x0.7", "d", recall=0.9), row("B", "x0.7", "d", recall=1.01), row("C", "off", "ab"), row("D", "x1.3", "d", invented=0.5),
+        {**row("E", "off", ""), "case": "", "outcome": "not called"},
+    ]  # fmt: skip
+    usual, noise = ablate.usual_and_noise(rows)
+    told = {r["label"]: ablate.effect({"log": r}, usual, noise)[1].split()[0] for r in rows[3:7]}
+    assert told == {"A": "worse", "B": "equal", "C": "same", "D": "better"}
+    assert ablate.matters(rows) == {"A", "D"}
+    text = ablate.tables(rows)
+    assert "The same scenarios without: C." in text
+    assert "Not called in these logs: E." in text

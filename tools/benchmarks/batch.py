@@ -1,0 +1,157 @@
+"""Rate, failures, memory and overhead of `log2sim batch` on many small logs that are written for it.
+
+    python tools/bench.py batch FOLDER [--logs 10000] [--jobs 2] [--damaged 10] [--detector lidar:labels]
+
+One short drive is synthesized; each log is a copy of it at another time and place, with records that are links to the same files, so that
+10,000 logs take seconds to write. All of them must give the same number of agents, but for those that are damaged on purpose.
+FOLDER/logs is written once; FOLDER/out goes on where an earlier call was stopped, so remove it for a new measurement.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from entry import parser_of
+
+from log2sim.batch import plan_batch, run_batch
+from log2sim.batch.folder import Row, sum_up
+from log2sim.batch.run import local_workers
+from log2sim.cli.progress import progress
+from log2sim.config import Config
+from log2sim.logs.native.writer import write_log
+from log2sim.synth.scene import scene_from_table
+from log2sim.synth.synthesis import synthesize
+
+SCENE = {
+    "name": "short",
+    "duration_s": 0.5,
+    "ego": {"waypoints": [[0.0, 0.0, 5.0], [20.0, 0.0, 5.0]], "poses": "poses"},
+    "road": [{"line": [[-10.0, 0.0], [50.0, 0.0]], "width_m": 10.0}],
+    "agent": [
+        {"id": "car", "category": "car", "size_m": [4.4, 1.8, 1.5], "waypoints": [[16.0, 2.0, 6.0], [40.0, 2.0, 6.0]]}
+    ],
+    "camera": [{"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [320, 200]}],
+    "lidar": [
+        {
+            "name": "top", "position_m": [1.2, 0.0, 1.9], "channels": 16, "elevation_deg": [-15.0, 3.0], "azimuth_deg": [-40.0, 40.0],
+            "azimuth_step_deg": 0.5, "range_m": 60.0,
+        }
+    ],
+    "gnss": {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0},
+}  # fmt: skip
+SETTINGS = ("map.lanes=false", "appearance.colors=false", "appearance.signals=false")
+STEP_NS, STEP_M = 10**12, 7.0
+"""Between a log and the next one."""
+SHIFTED = {"t_ns": STEP_NS, "x_m": STEP_M, "y_m": -STEP_M}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write the logs, run them and print a table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--logs", type=int, default=10_000)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--damaged", type=int, default=10, help="logs whose index is cut off")
+    parser.add_argument("--detector", default="lidar:labels")
+    asked = parser.parse_args(arguments)
+    root = asked.folder / "logs"
+    if not root.exists():
+        write_logs(root, asked.logs, asked.damaged)
+    for line in measure(root, asked.folder / "out", asked.jobs, asked.detector):
+        print(line)
+
+
+def write_logs(root: Path, count: int, damaged: int) -> None:
+    """Write so many logs, of which some are damaged."""
+    began, unfinished, base = time.perf_counter(), root.with_name(f"{root.name}.part"), root.with_name("drive")
+    for left in (unfinished, base):
+        shutil.rmtree(left, ignore_errors=True)
+    log, _ = synthesize(scene_from_table(SCENE))
+    write_log(log, base)
+    tables = {path.relative_to(base): path.read_text() for path in base.rglob("*.csv")}
+    records = [path.relative_to(base) for path in base.rglob("*") if path.suffix in (".npz", ".jpg")]
+    spoiled = set(range(count - 1, -1, -max(count // damaged, 1))[:damaged]) if damaged else set[int]()
+    for k in range(count):
+        target = unfinished / f"drive-{k:06d}"
+        for name, text in tables.items():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            (target / name).write_text(shifted(text, k))
+        for name in records:
+            os.link(base / name, target / name)
+        manifest = (base / "log.json").read_text()
+        (target / "log.json").write_text(manifest[: len(manifest) // 2] if k in spoiled else manifest)
+    unfinished.rename(root)
+    print(f"{count} logs written in {time.perf_counter() - began:.1f} s, {len(spoiled)} of them damaged")
+
+
+def shifted(table: str, steps: int) -> str:
+    """Return a table of CSV with stamps and places that are so many steps later and farther."""
+    head, *lines = table.splitlines()
+    names = head.split(",")
+    rows = [
+        ",".join(_moved(name, text, steps) for name, text in zip(names, line.split(","), strict=True)) for line in lines
+    ]
+    return "\n".join([head, *rows]) + "\n"
+
+
+def _moved(name: str, text: str, steps: int) -> str:
+    if name not in SHIFTED:
+        return text
+    return str(int(text) + steps * STEP_NS) if name == "t_ns" else repr(float(text) + steps * SHIFTED[name])
+
+
+def measure(root: Path, out: Path, jobs: int, detector: str) -> Iterable[str]:
+    """Run the batch and return the lines of a table."""
+    began = time.perf_counter()
+    batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": detector}))
+    found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
+    wall, own, workers = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
+    with progress(quiet=False) as report_progress:
+        rows = run_batch(
+            batch, lambda: local_workers(jobs), progress=lambda done, total: report_progress("logs", done, total)
+        )
+    wall = time.perf_counter() - wall
+    own, workers = _cpu(resource.RUSAGE_SELF) - own, _cpu(resource.RUSAGE_CHILDREN) - workers
+    ran = [row for row in rows if row.name in missing]
+    return table(ran, {"found": found_s, "wall": wall, "own": own, "workers": workers}, jobs)
+
+
+def table(rows: Sequence[Row], spent: dict[str, float], jobs: int) -> Iterable[str]:
+    """Yield the lines: what ran, how fast, and what it cost beside the logs themselves."""
+    count, sums = len(rows), sum_up(rows)
+    agents = sorted({row.agents for row in rows if row.agents is not None})
+    in_logs = sum(row.cpu_s or 0.0 for row in rows)
+    peaks = [row.peak_memory_mib for row in rows if row.peak_memory_mib is not None]
+    tenth = max(len(peaks) // 10, 1)
+    figures = {
+        "logs run": f"{count}, {sums['done']:.0f} done, {sums['failed']:.0f} failed ({_kinds(rows)})",
+        "run twice": str(sum(row.attempts > 1 for row in rows)),
+        "agents a log": ", ".join(map(str, agents)),
+        "finding the logs": f"{spent['found']:.1f} s",
+        "wall time": f"{spent['wall']:.1f} s, {count / spent['wall']:.1f} logs/s with {jobs} workers",
+        "CPU time": f"{spent['own'] + spent['workers']:.1f} s",
+        "of a log": f"{1000 * in_logs / count:.1f} ms",
+        "of a worker beside the logs": f"{1000 * (spent['workers'] - in_logs) / count:.1f} ms a log, its start among them",
+        "of client and scheduler": f"{1000 * spent['own'] / count:.2f} ms a log",
+        "memory of client and scheduler": f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB",
+        "memory of a worker": f"{max(peaks[:tenth]):.0f} MiB in the first tenth, {max(peaks):.0f} MiB in all",
+    }
+    width = max(map(len, figures))
+    yield from (f"{name:{width}}  {value}" for name, value in figures.items())
+    yield json.dumps({"rows": count, **{k: round(v, 3) for k, v in spent.items()}, "in_logs": round(in_logs, 3)})
+
+
+def _kinds(rows: Sequence[Row]) -> str:
+    kinds = [row.error_kind for row in rows if not row.is_done]
+    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds))) or "none"
+
+
+def _cpu(who: int) -> float:
+    used = resource.getrusage(who)
+    return used.ru_utime + used.ru_stime

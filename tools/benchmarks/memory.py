@@ -1,0 +1,181 @@
+"""Peak memory of a reconstruction against the length of its log, which is driven several times in a row.
+
+    python tools/bench.py memory LOG [--times 1 4 16] [--detector NAME]
+
+Each length runs in a process of its own. The table has the peak by stage and what a tick more adds to it.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from entry import parser_of
+from numpy.typing import NDArray
+
+from benchmarks.table import markdown
+from log2sim.datatypes import ImageLabels, Labels, Log, Stream, Sweep
+from log2sim.geometry import Array, PoseTrack
+
+RUN = """
+import json, sys
+from entry import parser_of
+from log2sim import Config, open_log, reconstruct
+from benchmarks.memory import loop_log
+path, times, settings = json.loads(sys.argv[1])
+result = reconstruct(loop_log(open_log(path), times), Config.load(**settings))
+print(json.dumps({"ticks": result.report["ticks"], "stages": result.report["stages"], "agents": len(result.scenario.agents)}))
+"""
+
+
+def measure(path: str, times: int, settings: dict[str, Any]) -> dict[str, Any]:
+    """Reconstruct a log that is driven several times in a row; returns ticks, agents and the report's stages."""
+    job = json.dumps([path, times, settings])
+    ran = subprocess.run(
+        [sys.executable, "-c", RUN, job], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
+    )
+    if ran.returncode:
+        raise SystemExit(ran.stderr)
+    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    return found
+
+
+def peak_of(measured: dict[str, Any]) -> float:
+    """Peak of all stages, MiB."""
+    return max(float(stage["peak_memory_mib"]) for stage in measured["stages"])
+
+
+def growth_kib(one: dict[str, Any], other: dict[str, Any]) -> float:
+    """What each tick more of the second run adds to the peak of the first, KiB."""
+    return 1024 * (peak_of(other) - peak_of(one)) / (other["ticks"] - one["ticks"])
+
+
+def rows_of(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """One row a stage and one for what a tick adds, one column a run."""
+    names = list(dict.fromkeys(stage["stage"] for run in runs for stage in run["stages"]))
+    by_name = [{stage["stage"]: stage["peak_memory_mib"] for stage in run["stages"]} for run in runs]
+    rows = [[name, *(f"{peaks[name]:.0f} MiB" if name in peaks else "-" for peaks in by_name)] for name in names]
+    rows.append(["agents", *(str(run["agents"]) for run in runs)])
+    added = ["-", *(f"{growth_kib(runs[0], run):.1f} KiB" for run in runs[1:])]
+    return [*rows, ["each tick more", *added]]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("log")
+    parser.add_argument("--times", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--detector", default="lidar:vehicle")
+    options = parser.parse_args(arguments)
+    settings = {"detect": {"name": options.detector}}
+    runs = [measure(str(Path(options.log).resolve()), times, settings) for times in options.times]
+    print(markdown(["peak at the end of", *(f"{run['ticks']} ticks" for run in runs)], rows_of(runs)))
+    return 0
+
+
+def loop_log(log: Log, times: int) -> Log:
+    """Return a log in which the recording of an ego is followed by copies of itself, moved on by its way.
+
+    The world moves with the ego: agents, labels and sweeps of each turn are new ones at new places, as on a long drive.
+
+    Raises
+    ------
+    ValueError
+        For a log without an ego, or with sensors at the road.
+    """
+    if log.ego is None or any(s.mount == "map" for s in (*log.cameras.values(), *log.lidars.values())):
+        raise ValueError("only the sensors of an ego can drive on")
+    ego = log.ego
+    first_ns, last_ns = int(ego.t_ns[0]), int(ego.t_ns[-1])
+    steps = [_power(_way(ego), k) for k in range(times)]
+    late_ns = [k * (last_ns - first_ns) for k in range(times)]
+    streams = {name: _looped(stream, first_ns, last_ns, late_ns, steps) for name, stream in log.streams.items()}
+    poses = PoseTrack(
+        np.concatenate([ego.t_ns[:-1] + late for late in late_ns]),
+        np.concatenate([step @ ego.map_T_ego[:-1] for step in steps]),
+        ego.max_gap_s,
+        ego.extrapolate_s,
+    )
+    return log.changed(
+        name=f"{log.name} x {times}",
+        streams=streams,
+        ego=poses,
+        labels=None if log.labels is None else _labels(log.labels, late_ns, steps),
+        image_labels={name: _image_labels(found, late_ns) for name, found in log.image_labels.items()},
+        ignored_regions={},
+        digest=f"{log.digest} x {times}",
+    )
+
+
+def _way(ego: PoseTrack) -> Array:
+    """The transform (4, 4) of the map that takes the first pose to the last: a turn about the vertical and a shift."""
+    first, last = ego.map_T_ego[0], ego.map_T_ego[-1]
+    turn = np.arctan2(last[1, 0], last[0, 0]) - np.arctan2(first[1, 0], first[0, 0])
+    out = np.eye(4)
+    out[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    out[:3, 3] = last[:3, 3] - out[:3, :3] @ first[:3, 3]
+    return out
+
+
+def _power(step: Array, times: int) -> Array:
+    return np.linalg.matrix_power(step, times)
+
+
+def _looped(stream: Stream, first_ns: int, last_ns: int, late_ns: list[int], steps: list[Array]) -> Stream:
+    kept = np.flatnonzero((stream.t_ns >= first_ns) & (stream.t_ns < last_ns))
+
+    def read(index: int) -> Any:
+        turn, row = divmod(index, len(kept))
+        record = stream.read(int(kept[row]))
+        return _moved(record, late_ns[turn], steps[turn]) if isinstance(record, Sweep) else record
+
+    return Stream(stream.name, np.concatenate([stream.t_ns[kept] + late for late in late_ns]), read)
+
+
+def _moved(sweep: Sweep, late_ns: int, step: Array) -> Sweep:
+    xyz = sweep.xyz_m if sweep.frame == "lidar" else sweep.xyz_m @ step[:3, :3].T + step[:3, 3]
+    return replace(
+        sweep,
+        stamp_ns=sweep.stamp_ns + late_ns,
+        xyz_m=xyz,
+        t_ns=None if sweep.t_ns is None else sweep.t_ns + late_ns,
+        compensated_ns=None if sweep.compensated_ns is None else sweep.compensated_ns + late_ns,
+    )
+
+
+def _labels(labels: Labels, late_ns: list[int], steps: list[Array]) -> Labels:
+    times = len(late_ns)
+
+    def again(column: NDArray[Any] | None) -> NDArray[Any] | None:
+        return None if column is None else np.concatenate([column] * times)
+
+    return replace(
+        labels,
+        t_ns=np.concatenate([labels.t_ns + late for late in late_ns]),
+        track_id=np.concatenate([np.char.add(labels.track_id.astype(str), f"/{k}") for k in range(times)]),
+        category=np.concatenate([labels.category] * times),
+        center_m=np.concatenate([labels.center_m @ step[:3, :3].T + step[:3, 3] for step in steps]),
+        size_m=np.concatenate([labels.size_m] * times),
+        yaw_rad=np.concatenate([labels.yaw_rad + np.arctan2(step[1, 0], step[0, 0]) for step in steps]),
+        visible=again(labels.visible),
+        kind=again(labels.kind),
+        occlusion=again(labels.occlusion),
+        labeled_ns=None
+        if labels.labeled_ns is None
+        else np.unique(np.concatenate([labels.labeled_ns + late for late in late_ns])),
+    )
+
+
+def _image_labels(labels: ImageLabels, late_ns: list[int]) -> ImageLabels:
+    times = len(late_ns)
+    return ImageLabels(
+        np.concatenate([labels.t_ns + late for late in late_ns]),
+        np.concatenate([labels.box_px] * times),
+        np.concatenate([labels.category] * times),
+    )

@@ -1,0 +1,364 @@
+"""Measure how well roadside units are registered: random worlds, errors of poses and delays of stamps, by kind of world.
+
+python tools/bench.py registration --seeds 10
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from entry import parser_of
+from numpy.typing import NDArray
+
+from log2sim.config import Config
+from log2sim.datatypes import EgoVehicle, Lidar, Log, Stream, Sweep
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.localization.replaced import shift_stream
+from log2sim.localization.roadside import RoadRegistration, register_road
+from log2sim.localization.surfaces import exp_of
+from log2sim.plan import choose_detector, select_sensors
+from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
+from log2sim.synth.returns import LIDAR_MODELS, LidarModel
+from log2sim.synth.traffic import Road, TrafficObject, TrafficScene, draw_scene
+from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS, TrafficRun, run_of
+from log2sim.synth.traffic_shapes import ROAD_USERS
+
+TARGET_M, TARGET_DEG, TARGET_S = 0.1, 0.3, 0.02
+RATES_HZ = (10.0, 5.0, 2.0, 20.0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One registration of one disturbed log."""
+
+    world: str
+    noise: tuple[float, float]
+    delay_s: float
+    error: tuple[float, float, float]
+    kinds: tuple[str, ...]
+    verified: bool
+    moving: int
+    took_s: float
+    seen_through: float
+
+
+def register(log: Log) -> tuple[RoadRegistration, float]:
+    config = choose_detector(log, Config())
+    start = time.perf_counter()
+    found = register_road(log, config, select_sensors(log, config), progress=lambda *_: None)
+    return found, time.perf_counter() - start
+
+
+def measure(world: World, noise: tuple[float, float], delay_s: float) -> list[Outcome]:
+    """Disturb every pole of a world in its own way and register them."""
+    log = world.log
+    for k, pole in enumerate(world.poles):
+        rng = np.random.default_rng([world.spec.seed, k, round(100 * noise[0]), round(100 * noise[1])])
+        log = disturbed(log, pole, *noise, delay_s, rng)
+    found, took_s = register(log)
+    outcomes = []
+    for pole, figures in zip(world.poles, found.figures):
+        objects = figures["objects"]["after"]
+        kinds = tuple(fault.kind for fault in found.faults if fault.sensor == pole)
+        outcomes.append(
+            Outcome(
+                f"{world.spec.kind} {world.spec.road_lidar}", noise, delay_s, errors_of(found.log, world.log, pole),
+                kinds, figures["verified"], 0 if objects is None else objects["moving"], took_s / len(world.poles),
+                figures["seen_through"]["before"] or 0.0,
+            )
+        )  # fmt: skip
+    return outcomes
+
+
+def row(name: str, outcomes: list[Outcome]) -> str:
+    """Put a row of the table together."""
+    away, turned, late = np.abs([o.error for o in outcomes]).T
+    seen = np.array([o.moving > 0 for o in outcomes])
+    wrong = sum("wrong_road_pose" in o.kinds for o in outcomes)
+    unknown = sum("unknown_road_pose" in o.kinds for o in outcomes)
+    told = sum("road_pose" in o.kinds or "road_clock" in o.kinds for o in outcomes)
+    late_ms = late[seen] * 1e3 if seen.any() else np.array([np.nan])
+    cells = [
+        name, f"{len(outcomes)}", f"{np.median(away):.3f}", f"{np.quantile(away, 0.9):.2f}", f"{np.median(turned):.2f}",
+        f"{np.quantile(turned, 0.9):.2f}", f"{np.mean((away <= TARGET_M) & (turned <= TARGET_DEG)):.2f}",
+        f"{np.median(late_ms):.0f}", f"{np.quantile(late_ms, 0.9):.0f}", f"{np.mean(late_ms <= TARGET_S * 1e3):.2f}",
+        f"{told}", f"{unknown}", f"{wrong}", f"{np.median([o.took_s for o in outcomes]):.1f}",
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--worlds", nargs="+", default=["street", "open"], choices=["street", "open"])
+    parser.add_argument("--lidars", nargs="+", default=["tilted16", "level32", "level64"])
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--first", type=int, default=100, help="first seed")
+    parser.add_argument("--noise", nargs="+", default=["0/0", "0.25/1", "0.5/2"], help="m/degrees")
+    parser.add_argument("--delays-ms", nargs="+", type=float, default=[0.0, 100.0, 300.0])
+    parser.add_argument("--poles", type=int, default=1)
+    parser.add_argument("--verbose", action="store_true")
+    asked = parser.parse_args(arguments)
+    noises = [tuple(float(v) for v in text.split("/")) for text in asked.noise]
+    outcomes: list[Outcome] = []
+    for kind, lidar, k in itertools.product(asked.worlds, asked.lidars, range(asked.seeds)):
+        rates = RATES_HZ[k % 4], RATES_HZ[(k + k // 4 + 1) % 4]
+        spec = WorldSpec(kind, asked.first + k, lidar, asked.poles, *rates)
+        world = draw_world(spec)
+        for noise, delay_ms in itertools.product(noises, asked.delays_ms):
+            found = measure(world, noise, delay_ms / 1e3)  # type: ignore[arg-type]
+            outcomes += found
+            if asked.verbose:
+                for o in found:
+                    print(
+                        spec.seed,
+                        o.world,
+                        rates,
+                        noise,
+                        delay_ms,
+                        *(f"{v:.3f}" for v in o.error),
+                        o.kinds,
+                        o.moving,
+                        flush=True,
+                    )
+    print("| world | registrations | error m | 90 % | degrees | 90 % | within 0.1 m, 0.3 deg | clock ms | 90 % | within 20 ms "
+          "| corrected | unverified | left out | s |")  # fmt: skip
+    print("|" + "---|" * 14)
+    for noise, delay_ms in itertools.product(noises, asked.delays_ms):
+        part = [o for o in outcomes if o.noise == noise and o.delay_s == delay_ms / 1e3]
+        print(row(f"**{noise[0]:g} m, {noise[1]:g} degrees, {delay_ms:g} ms**", part))
+        for world_name in dict.fromkeys(o.world for o in part):
+            print(row(world_name, [o for o in part if o.world == world_name]))
+
+
+Kind = Literal["street", "open"]
+VEHICLE = "vehicle"
+POSE_RATE_HZ = 20.0
+# What stays in a world with next to no structure.
+TRAFFIC_SPEED_MPS = 1.0
+ALONG, STANDING_SHARE = 0.9, 0.1
+
+
+@dataclass(frozen=True)
+class WorldSpec:
+    """What a world is like.
+
+    Attributes
+    ----------
+    kind : {"street", "open"}
+        With houses, fences, trees and parked vehicles as they are drawn; or a road with nothing but moving traffic.
+    seed : int
+    road_lidar : str
+        "tilted16", "level32" or "level64".
+    poles : int
+    vehicle_rate_hz, road_rate_hz : float
+    duration_s : float
+    azimuth_step_deg : float
+        Of all LiDARs; coarse ones are cast faster.
+    """
+
+    kind: Kind = "street"
+    seed: int = 0
+    road_lidar: str = "tilted16"
+    poles: int = 1
+    vehicle_rate_hz: float = 10.0
+    road_rate_hz: float = 10.0
+    duration_s: float = 4.5
+    azimuth_step_deg: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A log without errors, and what the names of the LiDARs of its poles are."""
+
+    log: Log
+    spec: WorldSpec
+    poles: tuple[str, ...]
+
+
+def draw_world(spec: WorldSpec) -> World:
+    """Draw a world; every sweep depends on the seed and its index alone."""
+    rng = np.random.default_rng([spec.seed, 15])
+    lidar = LIDAR_MODELS["hdl32e"].model_copy(
+        update={"azimuth_step_deg": spec.azimuth_step_deg, "rate_hz": spec.vehicle_rate_hz}
+    )
+    scene = _draw_drive(lidar, rng)
+    if spec.kind == "open":
+        kept = tuple(
+            o for o in scene.objects if (o.category and o.speed_mps > TRAFFIC_SPEED_MPS) or o.kind == "own car"
+        )
+        scene = replace(scene, objects=kept)
+    run = run_of(scene, spec.duration_s + 0.5)
+    size, parts = _car(rng)
+    ego_body = (size, parts)
+    ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
+    lidars = {VEHICLE: Lidar(VEHICLE, "ego", ego_T_lidar)}
+    streams = {
+        VEHICLE: _stream(VEHICLE, spec.vehicle_rate_hz, spec.duration_s, 0.0, _ego_reader(run, lidar, spec.seed))
+    }
+    names = tuple(f"pole{k}" for k in range(spec.poles))
+    for k, name in enumerate(names):
+        model, map_T_lidar = _pole(spec, scene, k, rng)
+        lidars[name] = Lidar(name, "map", map_T_lidar)
+        phase_s = float(rng.uniform(0, 1 / spec.road_rate_hz))
+        reader = _road_reader(run, ego_body, model, map_T_lidar, spec.seed + 1000 * (k + 1))
+        streams[name] = _stream(name, spec.road_rate_hz, spec.duration_s, phase_s, reader)
+    log = Log(
+        name=f"{spec.kind}-{spec.seed}", format="synthetic", cameras={}, lidars=lidars, streams=streams,
+        ego=_poses(run, ego_T_lidar, spec.duration_s), ego_vehicle=EgoVehicle(size, REAR_AXLE_OFFSET_M),
+    )  # fmt: skip
+    return World(log, spec, names)
+
+
+def _draw_drive(lidar: LidarModel, rng: np.random.Generator) -> TrafficScene:
+    """Draw a scene whose vehicle follows the road at up to 16 m/s; one in ten stands."""
+    while True:
+        scene = draw_scene("vehicle", rng, lidar=lidar)
+        forward = scene.sensor.rotation[:2, 0] / np.linalg.norm(scene.sensor.rotation[:2, 0])
+        road = scene.roads[0].yaw_rad
+        if abs(forward @ [np.cos(road), np.sin(road)]) < ALONG:
+            continue
+        speed = 0.0 if rng.random() < STANDING_SHARE else rng.uniform(3.0, 16.0)
+        own = [replace(o, speed_mps=speed) if o.kind == "own car" else o for o in scene.objects]
+        return replace(scene, objects=tuple(own), sensor=replace(scene.sensor, velocity_mps=speed * forward))
+
+
+def _car(rng: np.random.Generator) -> tuple[tuple[float, float, float], tuple]:
+    while True:
+        size, parts = ROAD_USERS["car"](rng)
+        if 4.0 < size[0] < 5.0:
+            return size, parts
+
+
+def _pole(spec: WorldSpec, scene: TrafficScene, k: int, rng: np.random.Generator) -> tuple[LidarModel, Array]:
+    """Place a LiDAR beside the main road, ahead of the vehicle."""
+    road: Road = scene.roads[0]
+    heading = np.arctan2(*scene.sensor.rotation[1::-1, 0])
+    ahead = float(np.sign(np.cos(heading - road.yaw_rad)) or 1.0)
+    side = float(rng.choice([-1, 1]))
+    for _ in range(50):
+        s, d = ahead * rng.uniform(5.0, 25.0) + 25.0 * ahead * k, side * (road.half_width_m + rng.uniform(0.5, 2.0))
+        xy, direction = road.at(s, d)
+        if all(np.hypot(*(o.position_m[:2] - xy)) > 1.5 for o in scene.objects):
+            break
+    towards = direction - side * np.pi / 2 + rng.uniform(-0.6, 0.6)
+    step = {"azimuth_step_deg": spec.azimuth_step_deg, "rate_hz": spec.road_rate_hz}
+    if spec.road_lidar == "tilted16":
+        model = LIDAR_MODELS["rslidar16-roadside"].model_copy(update=step)
+        height, pitch = 3.6 + rng.normal(0, 0.1), np.deg2rad(model.pitch_deg + rng.normal(0, 0.6))
+    else:
+        lines = int(spec.road_lidar.removeprefix("level"))
+        elevation = tuple(np.linspace(-25, 10, lines).tolist())
+        model = LIDAR_MODELS["vlp16"].model_copy(update={**step, "elevation_deg": elevation, "noise_m": 0.02})
+        height, pitch = 3.0 + rng.normal(0, 0.1), np.deg2rad(rng.normal(0, 0.6))
+    z = scene.surface.elevation(xy) + height
+    rotation = rotation_from_rpy(np.deg2rad(rng.normal(0, 0.6)), pitch, towards)
+    return model, transform(rotation, np.array([*xy, z]))
+
+
+def _stream(
+    name: str, rate_hz: float, duration_s: float, phase_s: float, cast: Callable[[int, float], Sweep]
+) -> Stream:
+    """Make a stream whose stamps are the ends of sweeps."""
+    period = 1.0 / rate_hz
+    middle = np.arange(period / 2 + phase_s, duration_s - period / 2, period)
+    t_ns = _stamps(middle + period / 2)
+
+    @lru_cache(maxsize=256)
+    def read(i: int) -> Sweep:
+        return cast(i, float(middle[i]))
+
+    return Stream(name, t_ns, read)
+
+
+def _stamps(t_s: Array) -> NDArray[np.int64]:
+    stamps: NDArray[np.int64] = START_NS + np.rint(t_s * NS_PER_S).astype(np.int64)
+    return stamps
+
+
+def _solids(objects: tuple[TrafficObject, ...], seed: int) -> list[Solid]:
+    rng = np.random.default_rng([seed, 3])
+    passes = rng.uniform(0.3, 0.9, len(objects))
+    return [
+        Solid(o.parts, o.position_m, o.yaw_rad, o.speed_mps * np.array([np.cos(o.yaw_rad), np.sin(o.yaw_rad)]), glass_passes=float(p))
+        for o, p in zip(objects, passes)
+    ]  # fmt: skip
+
+
+def _ego_reader(run: TrafficRun, model: LidarModel, seed: int) -> Callable[[int, float], Sweep]:
+    period = 1 / model.rate_hz
+
+    def cast(i: int, t_s: float) -> Sweep:
+        now = run.at(t_s)
+        rng = np.random.default_rng([seed, 4, i])
+        returns = cast_polytopes(model, now.sensor, _solids(now.objects, seed), now.surface, rng, now.returns)
+        t_ns = _stamps(t_s + returns.t_s.astype(np.float64))
+        return Sweep(int(_stamps(np.array([t_s + period / 2]))[0]), returns.xyz_m, "map", t_ns)
+
+    return cast
+
+
+def _road_reader(
+    run: TrafficRun, body: tuple[tuple[float, float, float], tuple], model: LidarModel, map_T_lidar: Array, seed: int
+) -> Callable[[int, float], Sweep]:
+    period, lidar_T_map = 1 / model.rate_hz, inverse(map_T_lidar)
+
+    def cast(i: int, t_s: float) -> Sweep:
+        now = run.at(t_s)
+        objects = [o for o in now.objects if o.kind != "own car"]
+        R, place = now.sensor.rotation, now.sensor.position_m
+        yaw, speed = float(np.arctan2(R[1, 0], R[0, 0])), float(np.hypot(*now.sensor.velocity_mps))
+        middle = place[:2] + 0.3 * np.array([np.cos(yaw), np.sin(yaw)])
+        floor = now.surface.elevation(middle)
+        objects.append(TrafficObject("car", np.append(middle, floor), yaw, body[0], body[1], speed))
+        sensor = SensorState(map_T_lidar[:3, :3], map_T_lidar[:3, 3], np.zeros(2))
+        rng = np.random.default_rng([seed, 4, i])
+        returns = cast_polytopes(model, sensor, _solids(tuple(objects), seed), now.surface, rng, now.returns)
+        t_ns = _stamps(t_s + returns.t_s.astype(np.float64))
+        return Sweep(int(_stamps(np.array([t_s + period / 2]))[0]), apply(lidar_T_map, returns.xyz_m), "lidar", t_ns)
+
+    return cast
+
+
+def _poses(run: TrafficRun, ego_T_lidar: Array, duration_s: float) -> PoseTrack:
+    t_s = np.arange(int(np.ceil(duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
+    sensors = [run.at(float(t)).sensor for t in t_s]
+    poses = np.array([transform(s.rotation, s.position_m) @ inverse(ego_T_lidar) for s in sensors])
+    return PoseTrack(_stamps(t_s), poses)
+
+
+def misplaced(log: Log, pole: str, shift_m: float, turn_deg: float) -> Log:
+    """Put a LiDAR of the roadside elsewhere on the ground and turn it about the vertical, as by a wrong entry in a table."""
+    mount = log.lidars[pole].mount_T_lidar
+    turn = transform(rotation_from_rpy(0.0, 0.0, np.radians(turn_deg)), np.zeros(3)) @ mount
+    turn[:3, 3] = mount[:3, 3] + [shift_m, 0.0, 0.0]
+    return log.changed(lidars={**log.lidars, pole: replace(log.lidars[pole], mount_T_lidar=turn)})
+
+
+def disturbed(log: Log, pole: str, shift_m: float, turn_deg: float, delay_s: float, rng: np.random.Generator) -> Log:
+    """Move and turn a LiDAR of the roadside in a random direction, and let its stamps be late."""
+    shift, axis = rng.normal(size=3), rng.normal(size=3)
+    twist = np.concatenate(
+        [shift_m * shift / np.linalg.norm(shift), np.radians(turn_deg) * axis / np.linalg.norm(axis)]
+    )
+    mount = log.lidars[pole].mount_T_lidar
+    wrong = mount.copy()
+    error = exp_of(twist)
+    wrong[:3, :3], wrong[:3, 3] = error[:3, :3] @ mount[:3, :3], mount[:3, 3] + error[:3, 3]
+    lidars = {**log.lidars, pole: replace(log.lidars[pole], mount_T_lidar=wrong)}
+    streams = {**log.streams, pole: shift_stream(log.streams[pole], round(delay_s * NS_PER_S))}
+    return log.changed(lidars=lidars, streams=streams)
+
+
+def errors_of(log: Log, true: Log, pole: str) -> tuple[float, float, float]:
+    """Compute how far a LiDAR's pose, m and degrees, and its clock, s, are from the truth."""
+    off = log.lidars[pole].mount_T_lidar @ inverse(true.lidars[pole].mount_T_lidar)
+    turned = float(np.degrees(np.linalg.norm(off[:3, :3] - np.eye(3)) / np.sqrt(2)))
+    away = float(np.linalg.norm((log.lidars[pole].mount_T_lidar - true.lidars[pole].mount_T_lidar)[:3, 3]))
+    late_s = float(log.streams[pole].t_ns[0] - true.streams[pole].t_ns[0]) / NS_PER_S
+    return away, turned, late_s

@@ -1,0 +1,124 @@
+"""Names the colors of vehicles in photos that lie in folders named by color, and counts how often the names agree.
+
+    python tools/bench.py vehicle_colors FOLDER [--detector NAME_OR_FILE.onnx] [--sheet FILE.png]
+
+Labels that are not among the names of `log2sim.datatypes.COLOR_NAMES` are merged with the next one: silver and gray are one,
+pink is red. Nothing is learned from the photos.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from entry import parser_of
+from numpy.typing import NDArray
+
+from log2sim.datatypes import COLOR_NAMES, Frame, Log
+from log2sim.files.inputs import read_bytes
+from log2sim.geometry import Camera
+from log2sim.road.color_picture import PictureColor, color_of_picture
+
+SUFFIXES = (".jpg", ".jpeg", ".png")
+MERGED = {"silver": "gray", "grey": "gray", "pink": "red", "magenta": "red", "purple": "blue", "cyan": "blue", "beige": "brown",
+          "tan": "brown", "gold": "yellow"}  # fmt: skip
+MAX_BYTES = 20 * 1024**2
+TILE_PX = 160
+MIN_VEHICLE_SHARE = 0.1  # of the photo; a smaller box is of something in the background
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--detector", help="finds the box of the vehicle; without it the photo is the box")
+    parser.add_argument("--sheet", type=Path, help="picture of all photos with their names, wrong ones in red")
+    options = parser.parse_args(arguments)
+    detector = None
+    if options.detector:
+        from log2sim.perception.detect.detectors import create_detector
+
+        detector = create_detector(options.detector, Log("photos", "photos", {}, {}, {}), min_score=0.3)
+    confusion: Counter[tuple[str, str]] = Counter()
+    second, tiles, begin = 0, [], time.perf_counter()
+    for label, path in photos(options.folder):
+        image = cv2.imdecode(np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8), cv2.IMREAD_COLOR)
+        found = None if image is None else color_of_picture(image, box_of(image, detector))
+        order = ["none", "none"] if found is None else ranked(found)
+        confusion[label, order[0]] += 1
+        second += label in order[:2]
+        if options.sheet and found is not None:
+            tiles.append(tile(image, found, f"{label}: {order[0]}, {order[1]}", order[0] == label))
+    count = sum(confusion.values())
+    if not count:
+        print(f"{options.folder}: no photos in folders named by color", file=sys.stderr)
+        return 1
+    print_table(confusion)
+    first = sum(n for (label, name), n in confusion.items() if label == name)
+    seconds = time.perf_counter() - begin
+    print(
+        f"{count} photos, top 1 {first / count:.3f}, top 2 {second / count:.3f}, {1000 * seconds / count:.0f} ms each"
+    )
+    if options.sheet:
+        cv2.imwrite(str(options.sheet), sheet_of(tiles))
+    return 0
+
+
+def photos(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the merged label and the path of each photo."""
+    for inner in sorted(path for path in folder.iterdir() if path.is_dir()):
+        label = MERGED.get(inner.name.lower(), inner.name.lower())
+        if label in COLOR_NAMES:
+            yield from ((label, path) for path in sorted(inner.iterdir()) if path.suffix.lower() in SUFFIXES)
+
+
+def ranked(found: PictureColor) -> list[str]:
+    """Return the merged names by their probability."""
+    total: Counter[str] = Counter()
+    for name, probability in zip(COLOR_NAMES, found.probability):
+        total[MERGED.get(name, name)] += float(probability)
+    return [name for name, _ in total.most_common()]
+
+
+def box_of(image: NDArray[np.uint8], detector: object) -> NDArray[np.float64] | None:
+    """Return the box of the largest vehicle that a detector finds; None without one."""
+    if detector is None:
+        return None
+    height, width = image.shape[:2]
+    camera = Camera("photo", width, height, np.diag([width, width, 1.0]), "map", np.eye(4))
+    found = detector.detect(Frame(camera, 0, lambda: image))
+    vehicle = np.isin(found.category, ("car", "truck", "bus", "motorcycle"))
+    boxes = found.box_px[vehicle]
+    area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+    if not len(area) or area.max() < MIN_VEHICLE_SHARE * width * height:
+        return None
+    return boxes[int(np.argmax(area))]
+
+
+def print_table(confusion: Counter[tuple[str, str]]) -> None:
+    names = sorted({name for pair in confusion for name in pair}, key=lambda n: (*COLOR_NAMES, "none").index(n))
+    print("label \\ name".ljust(14) + "".join(name.rjust(8) for name in names))
+    for label in names:
+        if any(pair[0] == label for pair in confusion):
+            print(label.ljust(14) + "".join(str(confusion[label, name] or ".").rjust(8) for name in names))
+
+
+def tile(image: NDArray[np.uint8], found: PictureColor, text: str, right: bool) -> NDArray[np.uint8]:
+    """Draw a photo, what of it was used, and the color."""
+    used = cv2.resize(found.weight / found.weight.max(), (TILE_PX, TILE_PX))[..., None]
+    small = cv2.resize(image, (TILE_PX, TILE_PX), interpolation=cv2.INTER_AREA)
+    out = np.full((TILE_PX + 18, 2 * TILE_PX + 10, 3), 255, np.uint8)
+    out[18:, :TILE_PX], out[18:, TILE_PX : 2 * TILE_PX] = small, (small * (0.15 + 0.85 * used)).astype(np.uint8)
+    out[18:, 2 * TILE_PX :] = found.color["rgb"][::-1]
+    cv2.putText(out, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0) if right else (0, 0, 255), 1, cv2.LINE_AA)
+    return out
+
+
+def sheet_of(tiles: list[NDArray[np.uint8]], columns: int = 6) -> NDArray[np.uint8]:
+    blank = np.full_like(tiles[0], 255)
+    tiles = tiles + [blank] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])

@@ -1,0 +1,1 @@
+"""Fits of the method's constants, run by `tools/fit.py`."""

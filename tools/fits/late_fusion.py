@@ -1,0 +1,101 @@
+"""Fit the weights with which late fusion scores an object found in an image and in a sweep, on synthetic scenes.
+
+    python tools/fit.py late_fusion --images ssd-mobilenet-v2 --sweeps lidar:vehicle --seed 1 samples/scenes/*.toml
+
+Every scene is made with the seed and its truth; a pair of an image box and a projected box of the sweep is right where an
+agent of that group is at its place. The weights are the most likely ones of a logistic function, with those of independent
+evidence as prior, and are printed as `log2sim/perception/lidar/measure.py` holds them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from entry import parser_of
+from numpy.typing import NDArray
+
+from log2sim.config import Config
+from log2sim.datatypes import GROUP_OF, Boxes3D, Measurements, Scenario
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.perception.lidar import measure
+from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, PairWeights, logit
+from log2sim.perception.lidar.projection import View
+from log2sim.pipeline import observe_log, start
+from log2sim.synth.scene import load_scene
+from log2sim.synth.synthesis import synthesize
+
+# A box is right when its center is this near to an agent's.
+MAX_OFFSET_M = {"vehicle": 1.5, "two_wheeler": 1.0, "pedestrian": 0.7, "other": 1.0}
+# Standard deviation of the weights around those of independent evidence, before any pair is seen.
+PRIOR_SIGMA = np.array([1.0, 0.5, 0.5, 2.0])
+
+
+def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Features (P, 4) of all pairs in a scene, and whether they are right (P,)."""
+    log, truth = synthesize(load_scene(scene), seed=seed)
+    found: list[tuple[Boxes3D, Measurements, Pairs]] = []
+    original = measure.match_boxes
+
+    def match(boxes: Boxes3D, images: Measurements, frame: NDArray[np.intp], views: Sequence[View]) -> Pairs:
+        pairs = original(boxes, images, frame, views)
+        found.append((boxes, images, pairs))
+        return pairs
+
+    measure.match_boxes = match
+    try:
+        observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
+    finally:
+        measure.match_boxes = original
+    parts = [_features(*of_tick, truth) for of_tick in found]
+    return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
+
+
+def _features(boxes: Boxes3D, images: Measurements, pairs: Pairs, truth: Scenario) -> tuple[Array, NDArray[np.bool_]]:
+    scores = logit(images.score[pairs.image]), logit(boxes.score[pairs.box])
+    x = np.column_stack([np.ones(len(pairs.box)), *scores, pairs.iou])
+    right = np.zeros(len(x), dtype=bool)
+    for n, row in enumerate(pairs.box):
+        group = GROUP_OF[str(boxes.category[row])]
+        at_s = np.array([(int(boxes.t_ns[row]) - truth.t0_ns) / NS_PER_S])
+        for agent in truth.others:
+            state = agent.at(at_s)
+            near = (
+                np.hypot(state.x_m - boxes.center_m[row, 0], state.y_m - boxes.center_m[row, 1]) < MAX_OFFSET_M[group]
+            )
+            right[n] |= bool(state.valid[0] and near[0] and GROUP_OF[agent.category] == group)
+    return x, right
+
+
+def fit(x: Array, right: NDArray[np.bool_]) -> Array:
+    """Find the most likely weights (4,) for features (P, 4) of pairs that are right or wrong (P,)."""
+    from scipy.optimize import minimize
+
+    prior = np.array(list(vars(PAIR_WEIGHTS).values()))
+
+    def loss(w: Array) -> float:
+        return float(loss_of(x, right, w) + (((w - prior) / PRIOR_SIGMA) ** 2).sum() / 2)
+
+    return np.asarray(minimize(loss, prior, method="BFGS").x)
+
+
+def loss_of(x: Array, right: NDArray[np.bool_], w: Array) -> float:
+    """Negative log-likelihood of weights (4,)."""
+    return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (x @ w)).sum())
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--images", default="ssd-mobilenet-v2", help="detector in images")
+    parser.add_argument("--sweeps", default="lidar:vehicle", help="detector in sweeps")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args(arguments)
+    parts = [pairs_of(scene, options.images, options.sweeps, options.seed) for scene in options.scenes]
+    x, right = np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts])
+    before, weights = np.array(list(vars(PAIR_WEIGHTS).values())), fit(x, right)
+    print(f"{len(x)} pairs, {int(right.sum())} right; seed {options.seed}")
+    for name, w in (("independent", before), ("fitted", weights)):
+        print(f"{name:12s} loss a pair {loss_of(x, right, w) / max(len(x), 1):.4f}")
+    print(PairWeights(*(round(float(w), 2) for w in weights)))

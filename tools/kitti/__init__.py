@@ -1,0 +1,1 @@
+"""Tracking of whole boxes on the KITTI tracking benchmark."""

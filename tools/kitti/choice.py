@@ -1,0 +1,432 @@
+"""Which boxes of tracks are told on the KITTI tracking benchmark, and with which score."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitti.boxes import (
+    SCALE,
+    Boxes,
+    Index,
+    Mask,
+    Rows,
+    end_rows,
+    exact_sums,
+    first_of_run,
+    last_of_run,
+    neighbors,
+    overlap_3d,
+    smooth_shapes,
+    sum_so_far,
+)
+from kitti.map import PERIOD_NS, View, from_map, hidden_share, is_small, same_frame
+from log2sim.datatypes import Measurements
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.tracking.stitch import MAX_PEDESTRIAN_SPEED_MPS
+
+# Log-odds that a box of a car lies on a labeled one, of detected and of predicted boxes, with all frames at hand and with those
+# so far: logistic regression by tools/fit.py kitti on sequences 0000, 0002, 0004, 0005, 0007, 0009 and 0011, all of the part on
+# which the benchmark's validation does not run.
+SEEN = {"constant": -8.89, "score": 0.2, "near_score": 1.0, "near_share": 3.25, "hidden": -3.67, "height": -4.68}
+PREDICTED = {"constant": -5.5, "near_score": 0.67, "near_share": 3.59}
+SEEN_ONLINE = {"constant": -7.45, "score": 0.49, "near_score": 0.7, "near_share": 2.18, "hidden": -1.7, "height": -4.12}
+PREDICTED_ONLINE = {"constant": -5.33, "near_score": 0.98, "near_share": 1.93}
+# A box is told where it is more likely labeled than not; a detected one is left out only where that is unlikely.
+MIN_PREDICTED, MIN_SEEN = 0.5, 0.2
+# A track of which less than half is likely labeled stands or falls as a whole, by its score.
+WEAK_TRACK = 0.5
+# Boxes so small that the benchmark does not count them as errors are carried on for so many frames.
+SMALL_FRAMES = 20
+# There are too few labeled people to learn from. Tracks of at least this confidence are filled where they are missed for at
+# most so many frames, online for two.
+FILLED_CONFIDENCE, FILLED_FRAMES, FILLED_FRAMES_ONLINE = 2.0, 15, 2
+
+
+def choose(described: Described, *, online: bool) -> Boxes:
+    """The boxes that are told, by frame; their score is how much their track is believed, up to their frame if online."""
+    car = described.boxes.category == "Car"
+    keep, score = _people(described, online=online)
+    keep_car, score_car = _cars(described, online=online)
+    keep = np.where(car, keep_car, keep)
+    told = Boxes(**{**vars(described.boxes), "score": np.where(car, score_car, score)}).take(keep)
+    return told.take(np.lexsort([told.track_id, told.frame]))
+
+
+def _cars(d: Described, *, online: bool) -> tuple[Mask, Array]:
+    small = is_small(d.boxes)
+    # What cannot be an error says nothing against its track.
+    seen = np.where(small, 1.0, labeled_probability(d.features, SEEN_ONLINE if online else SEEN))
+    predicted = labeled_probability(d.features, PREDICTED_ONLINE if online else PREDICTED)
+    soon = d.distance <= SMALL_FRAMES
+    likely = ~d.doubled & (small & soon | (predicted >= MIN_PREDICTED))
+    if online:
+        # What is only predicted is believed as much as the last detection.
+        before, _ = neighbors(d.seen, d.boxes.track_id)
+        return np.where(d.seen, seen >= MIN_SEEN, likely), seen[before]
+    weak = _mean_of_track(d, seen, d.seen) < WEAK_TRACK
+    keep = np.where(d.seen, weak | (seen >= MIN_SEEN), likely)
+    return keep, _mean_of_track(d, seen, d.seen & keep & ~small)
+
+
+def _people(d: Described, *, online: bool) -> tuple[Mask, Array]:
+    few = d.distance <= FILLED_FRAMES_ONLINE if online else (d.gap > 0) & (d.gap <= FILLED_FRAMES)
+    filled = ~d.doubled & (d.confidence >= FILLED_CONFIDENCE) & few
+    keep = d.seen | filled
+    if not online:
+        return keep, d.confidence
+    # The evaluation takes the mean over the track: what is seen now counts beside all that was seen.
+    before, _ = neighbors(d.seen, d.boxes.track_id)
+    now = d.features["score"] + np.log(np.clip(d.hits, 1, FULL_HITS))
+    return keep, (now[before] + d.confidence) / 2
+
+
+def labeled_probability(features: Mapping[str, Array], weights: Mapping[str, float]) -> Array:
+    """Probability (N,) of a logistic model; `weights` are those of its features and the `constant`."""
+    log_odds = weights["constant"] + sum(w * features[name] for name, w in weights.items() if name != "constant")
+    return np.asarray(1 / (1 + np.exp(-log_odds)))
+
+
+def _mean_of_track(d: Described, values: Array, counted: Mask) -> Array:
+    """Mean (N,) over the counted rows of a track, 1 without any."""
+    track = d.boxes.track_id
+    count = np.bincount(track, weights=counted, minlength=1)
+    total = np.bincount(track, weights=values * counted, minlength=1)
+    return np.divide(total, count, out=np.ones(len(count)), where=count > 0)[track]
+
+
+# A frame without a detection counts as one with the lowest score that detectors of this benchmark report (a logit).
+MISSED_SCORE = -1.0
+# Scores of one track are alike: beyond so many detections another one tells no more.
+FULL_HITS = 20
+# What stands may be a pole; what moved this far is none.
+MOVED_M = 5.0
+# Confidences are told apart within these limits; tracks from this one on hide others.
+CONFIDENCE_LIMITS, HIDING_CONFIDENCE = (-2.0, 8.0), 2.0
+# Detections within so many frames tell how surely an object is seen at that time.
+NEAR_FRAMES = 5
+# What may stand behind: shares of image boxes that are hidden by more than this weigh.
+HIDDEN_SHARE = 0.6
+# Higher boxes than this are seen as well as these, lower ones than that are no errors.
+HEIGHTS_PX = (20.0, 60.0)
+# A predicted box that overlaps a detection of another track by this much (IoU in 3D) is no second object.
+SAME_PLACE_IOU = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """Rows of tracks as boxes of the camera with what tells whether they are labeled, by track and frame.
+
+    Attributes
+    ----------
+    boxes : Boxes
+        N rows; `track_id` is the track.
+    seen : (N,) bool
+        Whether the box was detected.
+    distance : (N,) int64
+        Frames to the nearest detection of the track, online to the last one.
+    gap : (N,) int64
+        Frames in a row without a detection between two of them, 0 where there is one and beyond the ends of the track.
+    doubled : (N,) bool
+        Predicted boxes where another track is that was seen there or nearer in time.
+    hits : (N,) float64
+        Detections of the track so far.
+    confidence : (N,) float64
+        How much the track is believed by all its detections, online by those so far.
+    features : mapping
+        (N,) float64 each, by name: `score` of the detection, `near_score` and `near_share` the mean score of the detections
+        around it and the share of the frames that have one, `hidden` the share of the image box that others hide beyond what
+        does not matter, `height` the logarithm of its height.
+    """
+
+    boxes: Boxes
+    seen: Mask
+    distance: Index
+    gap: Index
+    doubled: Mask
+    hits: Array
+    confidence: Array
+    features: Mapping[str, Array]
+
+
+def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
+    """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
+    out = _in_camera(rows, boxes, measurements, view, online=online)
+    inside = np.isfinite(out.box_px).all(axis=1)
+    out, rows = out.take(inside), rows.take(inside)
+    if not online:
+        rows, kept = join_tracks(rows, out, _distances(rows, online=online)[0])
+        order = np.flatnonzero(kept)[np.lexsort([rows.frame[kept], rows.track[kept]])]
+        rows, out = rows.take(order), replace(out, track_id=rows.track).take(order)
+    seen = rows.source >= 0
+    score = np.where(seen, boxes.score[rows.source], 0.0)
+    distance, beyond, gap = _distances(rows, online=online)
+    moved = np.clip(_moved_m(rows, measurements, online=online) / MOVED_M, 0, 1) * view.motion_known
+    evidence = _evidence(rows.track, seen, score, online | (beyond == 0), online=online)
+    confidence = np.clip(evidence + moved, *CONFIDENCE_LIMITS)
+    share, local = _near(rows, seen, score, online=online)
+    hidden = _hidden(out, seen & (confidence >= HIDING_CONFIDENCE), len(view.map_T_cam))
+    height = np.clip(out.box_px[:, 3] - out.box_px[:, 1], *HEIGHTS_PX)
+    features = {
+        "score": score,
+        "near_score": local,
+        "near_share": share,
+        "hidden": np.maximum(hidden - HIDDEN_SHARE, 0),
+        "height": np.log(height / HEIGHTS_PX[1]),
+    }
+    doubled = _from_there_on(_doubled(out, distance), beyond, out.track_id)
+    hits = sum_so_far(seen, first_of_run(out.track_id))
+    return Described(out, seen, distance, gap, doubled, hits, confidence, features)
+
+
+def _distances(rows: Rows, *, online: bool) -> tuple[Index, Index, Index]:
+    """Frames (N,) to the nearest detection of the track, beyond its end (negative before it), and of the gap a row is in.
+
+    Online no detection is known but the last one.
+    """
+    seen = rows.source >= 0
+    before, after = neighbors(seen, rows.track)
+    since, until = rows.frame - rows.frame[before], rows.frame[after] - rows.frame
+    outside = ~seen & (online | (before == after))
+    distance = np.where(outside, np.abs(since), np.minimum(since, until))
+    return distance, np.where(outside, since, 0), np.where(seen | outside, 0, since + until - 1)
+
+
+def _in_camera(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Boxes:
+    columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
+    center, size, yaw = smooth_shapes(rows, boxes, measurements, online=online)
+    in_camera = from_map(center, size, yaw, rows.frame, view)
+    # In the image the detector knows better than a box around a box.
+    in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
+    return Boxes(**(columns | in_camera))
+
+
+def _evidence(track: Index, seen: Mask, score: Array, within: Mask, *, online: bool) -> Array:
+    """Mean score (N,) of a track over the frames in which it was in view, and the logarithm of its detections.
+
+    Online it is that of the rows up to each.
+    """
+    begin = first_of_run(track)
+    counted = np.where(within, np.where(seen, score, MISSED_SCORE), 0.0)
+    sums = [sum_so_far(v, begin) for v in (counted, within, seen)]
+    if not online:
+        last = last_of_run(begin)
+        sums = [s[last] for s in sums]
+    total, frames, hits = sums
+    return np.asarray(total / np.maximum(frames, 1) + np.log(np.clip(hits, 1, FULL_HITS)))
+
+
+def _moved_m(rows: Rows, measurements: Measurements, *, online: bool) -> Array:
+    """Distance (N,) in the map from the first detection of a track to its last one, online to the last one so far."""
+    first, last = end_rows(rows, online=online)
+    xy = measurements.center_m[:, :2]
+    return np.asarray(np.hypot(*(xy[rows.source[last]] - xy[rows.source[first]]).T))
+
+
+def _near(rows: Rows, seen: Mask, score: Array, *, online: bool) -> tuple[Array, Array]:
+    """Share (N,) of the frames around each row in which its track was detected, and the mean score there."""
+    key = rows.track * (int(rows.frame.max(initial=0)) + 2 * NEAR_FRAMES + 1) + rows.frame
+    known = key[seen]
+    total = exact_sums(score[seen])
+    a = np.searchsorted(known, key - NEAR_FRAMES, "left")
+    b = np.searchsorted(known, key + (0 if online else NEAR_FRAMES), "right")
+    window = NEAR_FRAMES if online else 2 * NEAR_FRAMES
+    return (b - a - seen) / window, (total[b] - total[a]) / SCALE / np.maximum(b - a, 1)
+
+
+def _hidden(out: Boxes, hides: Mask, frames: int) -> Array:
+    """Share (N,) of every image box that nearer ones of the rows `hides` (N,) hide."""
+    order = np.argsort(out.frame, kind="stable")
+    hidden = np.empty(len(out))
+    hidden[order] = hidden_share(out.take(order), frames, hides[order])
+    return hidden
+
+
+def _doubled(out: Boxes, distance: Index) -> Mask:
+    """Which predicted boxes (N,) are where another track is that was detected there or, `distance` (N,) frames away, nearer."""
+    order = np.argsort(out.frame, kind="stable")
+    predicted = np.flatnonzero(distance > 0)
+    i, j = same_frame(out.take(predicted), out.take(order), reach_m=True)
+    i, j = predicted[i], order[j]
+    stronger = (out.track_id[i] != out.track_id[j]) & (
+        (distance[j] < distance[i]) | (distance[j] == distance[i]) & (j < i)
+    )
+    i, j = i[stronger], j[stronger]
+    doubled = np.zeros(len(out), dtype=bool)
+    doubled[i[overlap_3d(out.take(i), out.take(j)) >= SAME_PLACE_IOU]] = True
+    return doubled
+
+
+def _from_there_on(doubled: Mask, beyond: Index, track: Index) -> Mask:
+    """Doubled boxes (N,) and those farther from the end of their track, `beyond` (N,) frames after it or, negative, before it."""
+    out = doubled.copy()
+    for sign in (1, -1):
+        rows = np.flatnonzero(sign * beyond > 0)[::sign]
+        if len(rows):
+            # Rows beyond the same end follow each other; elsewhere the frame jumps back to one beside an end.
+            begin = first_of_run(track[rows] + np.cumsum(np.abs(beyond[rows]) == 1) * (int(track.max()) + 1))
+            out[rows] |= sum_so_far(doubled[rows], begin) > 0
+    return out
+
+
+# Boxes that overlap this much (IoU in 3D) are one object, as for the benchmark.
+ONE_OBJECT_IOU = 0.25
+
+
+def join_tracks(rows: Rows, boxes: Boxes, distance: Index) -> tuple[Rows, Mask]:
+    """Rows (N,) by track and frame with one number for every object, and which of them stay, one a frame.
+
+    `boxes` are the rows in the camera, `distance` (N,) the frames to the nearest detection of the track. Those that are nearer
+    in time are joined first.
+    """
+    i, j = predicted_on_detected(boxes, distance)
+    order = np.argsort(distance[i], kind="stable")
+    pairs = np.column_stack([rows.track[i], rows.track[j]])[order]
+    pairs = np.sort(pairs, axis=1)
+    pairs = pairs[np.sort(np.unique(pairs, axis=0, return_index=True)[1])]
+    seen = rows.source >= 0
+    detected = {t: rows.frame[seen & (rows.track == t)] for t in np.unique(pairs).tolist()}
+    head = {t: t for t in detected}
+    for a, b in pairs.tolist():
+        a, b = (_first(head, t) for t in (a, b))
+        if a != b and len(np.intersect1d(detected[a], detected[b])) == 0:
+            head[b] = a
+            detected[a] = np.concatenate([detected[a], detected[b]])
+    number = np.arange(int(rows.track.max(initial=-1)) + 1)
+    for t in head:
+        number[t] = _first(head, t)
+    joined = Rows(**{**vars(rows), "track": number[rows.track]})
+    return joined, _nearest_of_frame(joined, distance)
+
+
+def predicted_on_detected(boxes: Boxes, distance: Index) -> tuple[Index, Index]:
+    """Pairs of a predicted and a detected row of two tracks of one category that are one object."""
+    order = np.argsort(boxes.frame, kind="stable")
+    found = order[distance[order] == 0]
+    predicted = np.flatnonzero(distance > 0)
+    i, j = same_frame(boxes.take(predicted), boxes.take(found), reach_m=True)
+    i, j = predicted[i], found[j]
+    other = (boxes.track_id[i] != boxes.track_id[j]) & (boxes.category[i] == boxes.category[j])
+    i, j = i[other], j[other]
+    one = overlap_3d(boxes.take(i), boxes.take(j)) >= ONE_OBJECT_IOU
+    return i[one], j[one]
+
+
+def _first(head: dict[int, int], track: int) -> int:
+    while head[track] != track:
+        track = head[track]
+    return track
+
+
+def _nearest_of_frame(rows: Rows, distance: Index) -> NDArray[np.bool_]:
+    order = np.lexsort([distance, rows.frame, rows.track])
+    first = np.r_[True, (np.diff(rows.track[order]) != 0) | (np.diff(rows.frame[order]) != 0)][: len(order)]
+    keep = np.zeros(len(order), dtype=bool)
+    keep[order[first]] = True
+    return keep
+
+
+PEDESTRIAN, RIDER = "Pedestrian", "Cyclist"
+SAME_OBJECT_M = 0.6
+# Of labeled people the log-odds to be a rider are the score of the rider less that of the pedestrian and this; where a detector
+# reports one of them alone the other one counts as missed.
+RIDER_LEAD = 1.0
+# What moved this far has a speed. Log-odds to be a rider: some 0.85 of those who walk and 0.1 of those who ride do so at 0.5 to
+# 2 m/s, and 0.02 and 0.85 faster than people run.
+MOVED_ON_FOOT_M, WALKING_MPS, WALKS, RIDES = 1.0, (0.5, 2.0), -2.0, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Detections of a sequence, in places with a pedestrian and a rider only one of them first.
+
+    Attributes
+    ----------
+    boxes : Boxes
+        N detections for the tracker, sorted by frame, then the others of their pairs, sorted by frame as well.
+    count : int
+        N.
+    other : (N,) int64
+        Row of the other one of the pair, -1 for none.
+    rider : (N,) float64
+        How much rather it is a rider than a pedestrian, in units of a score.
+    """
+
+    boxes: Boxes
+    count: int
+    other: Index
+    rider: Array
+
+    @property
+    def tracked(self) -> Boxes:
+        """The detections for the tracker (N,)."""
+        return self.boxes.take(slice(0, self.count))
+
+
+def find_pairs(boxes: Boxes) -> Pairs:
+    """Pair each pedestrian with the nearest rider in its place; the likelier one is tracked."""
+    boxes = boxes.take(np.argsort(boxes.frame, kind="stable"))
+    pedestrian, rider = (np.flatnonzero(boxes.category == c) for c in (PEDESTRIAN, RIDER))
+    i, j = same_frame(boxes.take(pedestrian), boxes.take(rider), reach_m=False)
+    i, j = pedestrian[i], rider[j]
+    apart_m = np.hypot(*(boxes.bottom_m[i] - boxes.bottom_m[j])[:, [0, 2]].T)
+    order = np.flatnonzero(apart_m < SAME_OBJECT_M)
+    order = order[np.argsort(apart_m[order], kind="stable")]
+    pair = np.full(len(boxes), -1, dtype=np.int64)
+    for a, b in zip(i[order].tolist(), j[order].tolist()):
+        if pair[a] < 0 and pair[b] < 0:
+            pair[a], pair[b] = b, a
+    opposite = np.where(pair >= 0, boxes.score[pair], MISSED_SCORE)
+    lead = np.where(boxes.category == RIDER, 1, -1) * (boxes.score - opposite) - RIDER_LEAD
+    second = (pair >= 0) & np.where(boxes.category == RIDER, lead <= 0, lead > 0)
+    first, second = np.flatnonzero(~second), np.flatnonzero(second)
+    place = np.empty(len(boxes), dtype=np.int64)
+    place[np.concatenate([first, second])] = np.arange(len(boxes))
+    other = np.where(pair[first] >= 0, place[pair[first]], -1)
+    return Pairs(boxes.take(np.concatenate([first, second])), len(first), other, lead[first])
+
+
+def decide_people(rows: Rows, pairs: Pairs, places_m: Array | None, *, online: bool) -> Rows:
+    """Rows by track and frame; those of people have the category of their track, and size and heading of a box of it.
+
+    Online both are decided at every row from those up to it. `places_m` are the centers of the detections in the map, None
+    where nothing stands in it.
+    """
+    rows = rows.take(np.lexsort([rows.frame, rows.track]))
+    seen = rows.source >= 0
+    source = np.maximum(rows.source, 0)
+    begin = first_of_run(rows.track)
+    end = np.arange(len(begin)) if online else last_of_run(begin)
+    mean = sum_so_far(np.where(seen, pairs.rider[source], 0.0), begin)[end] / sum_so_far(seen, begin)[end]
+    lead = mean if places_m is None else mean + _by_speed(rows, places_m, online=online)
+    person = np.isin(pairs.boxes.category[rows.model], (PEDESTRIAN, RIDER))
+    category = np.where(person, np.where(lead > 0, RIDER, PEDESTRIAN), rows.category)
+    # A pair gives the box of the right category; where there is none, the nearest one of the track does.
+    switched = seen & (pairs.boxes.category[source] != category) & (pairs.other[source] >= 0)
+    source = np.where(switched, pairs.other[source], rows.source)
+    right = seen & (pairs.boxes.category[source] == category)
+    nearest, known = _nearest(right, rows, online=online)
+    model = np.where(person & known, source[nearest], np.where(switched, source, rows.model))
+    return replace(rows, source=source, model=model, category=category.astype("<U16"))
+
+
+def _by_speed(rows: Rows, places_m: Array, *, online: bool) -> Array:
+    """Log-odds (N,) of riders by the speed of their tracks."""
+    first, last = end_rows(rows, online=online)
+    moved_m = np.hypot(*(places_m[rows.source[last]] - places_m[rows.source[first]])[:, :2].T)
+    seconds = (rows.frame[last] - rows.frame[first]) * PERIOD_NS / NS_PER_S
+    speed = np.divide(moved_m, seconds, out=np.zeros(len(moved_m)), where=(seconds > 0) & (moved_m > MOVED_ON_FOOT_M))
+    walks = (speed >= WALKING_MPS[0]) & (speed <= WALKING_MPS[1])
+    return np.where(speed > MAX_PEDESTRIAN_SPEED_MPS, RIDES, np.where(walks, WALKS, 0.0))
+
+
+def _nearest(right: Mask, rows: Rows, *, online: bool) -> tuple[Index, Mask]:
+    """Nearest of the rows `right` (N,) of the same track, online the last one, and whether there is one."""
+    before, after = (np.clip(k, 0, len(right) - 1) for k in neighbors(right, rows.track))
+    sooner = np.abs(rows.frame - rows.frame[before]) <= np.abs(rows.frame[after] - rows.frame)
+    nearest = before if online else np.where(sooner, before, after)
+    known = right[nearest] & (rows.track[nearest] == rows.track)
+    return nearest, known & ((nearest <= np.arange(len(nearest))) | (not online))

@@ -1,0 +1,1 @@
+"""The network of Zou et al. (2021): cells and votes of a roadside sensor."""
