@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_overlap import agent, candidate
+from test_plausibility_conflicts import agent, candidate
 from worlds import rows_at
 
 from log2sim.agents.candidate import Support, Timeline
