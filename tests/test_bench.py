@@ -277,7 +277,7 @@ def test_tiles_and_input_sizes_are_those_that_change_something(
 ) -> None:
     def open_size(log: Log, config: Config) -> OnnxDetector:
         side = None if config.detect.name == "any.onnx" else 300
-        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None, 1)
+        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
         return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.4, 0.5, "auto", 0.4)
 
     monkeypatch.setattr("log2sim.evaluation.bench.settings.create_image_detector", open_size)
