@@ -18,11 +18,8 @@ from log2sim.errors import ConfigError
 from log2sim.files.documents import first_problem
 from log2sim.files.inputs import read_text
 
-LIDAR_PREFIX = "lidar:"
-"""Names of detectors in LiDAR sweeps begin with it."""
-
-GIVEN_PREFIX = "given:"
-"""Names of detectors that a program handed to `reconstruct` begin with it."""
+LIDAR_PREFIX = "lidar:"  # names of detectors in LiDAR sweeps begin with it
+GIVEN_PREFIX = "given:"  # names of detectors that a program handed to `reconstruct` begin with it
 
 
 def setting(default: Any, description: str, *, unit: str = "", ge: float | None = None, le: float | None = None) -> Any:
@@ -241,6 +238,7 @@ class AppearanceConfig(Section):
 
 
 CONFIG_LIMIT_BYTES = 1024 * 1024
+# Types of JSON Schema in plain words.
 KINDS = {
     "integer": "whole number",
     "number": "number",
@@ -248,7 +246,6 @@ KINDS = {
     "string": "text",
     "array": "names separated by commas",
 }
-"""Types of JSON Schema in plain words."""
 
 
 def _names(value: Any) -> Any:

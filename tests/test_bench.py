@@ -187,6 +187,37 @@ def test_several_cameras_are_fitted_together_and_apart(tiny: tuple[Log, Scenario
     assert not any("cameras" in s.name for s in alone.homography)
 
 
+def test_tiles_and_input_sizes_are_those_that_change_something(
+    tiny: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_size(log: Log, config: Config) -> OnnxDetector:
+        side = None if config.detect.name == "any.onnx" else 300
+        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
+        return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.4, 0.5, "auto", 0.4)
+
+    monkeypatch.setattr("log2sim.evaluation.bench.settings.create_image_detector", open_size)
+    grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
+    found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
+    # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.
+    assert found == {
+        "any auto tiles": (0, 0),
+        "any 2 tiles": (2, 0),
+        "any 3 tiles": (3, 0),
+        "any 5 tiles": (5, 0),
+        "any input 320 px": (0, 320),
+        "any input 640 px": (0, 640),
+        "any input 960 px": (0, 960),
+        "fixed auto tiles": (0, 0),
+        "fixed 2 tiles": (2, 0),
+        "fixed 3 tiles": (3, 0),
+        "fixed 5 tiles": (5, 0),
+    }
+    assert [s.present for s in grid.detect] == [True] + [False] * 10
+    assert grid.detect[-1].config.detect.name == "models/fixed.onnx"
+    alike = make_grid(tiny[0], Config.load(detect={"name": "a/m.onnx"}), ["b/m.onnx"]).detect
+    assert len({s.name for s in alike}) == len(alike) == 8
+
+
 @dataclass
 class Counting:
     """A detector that counts what it is asked for."""
@@ -251,58 +282,6 @@ def test_every_stage_has_a_panel_and_the_figures_fit_each_other(result: Benchmar
     assert panels["measure"].recommendation.supported == "robust"
 
 
-@pytest.mark.slow
-def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: Path, tmp_path: Path) -> None:
-    import cv2
-
-    options = (tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0.5")
-    ran = run("bench", *options)
-    assert ran.code == 0, ran.err
-    assert names(tmp_path / "b") == ["bench.json", "bench.png"]
-    assert "detecting: 6 of 6" in ran.err
-    assert run("validate", tmp_path / "b/bench.json").code == 0
-    picture = cv2.imread(str(tmp_path / "b/bench.png"))
-    assert picture.shape[1] > 1500
-    assert 0.01 < (picture.min(axis=2) < 200).mean() < 0.3
-    again = run("bench", *options)
-    assert again.code == 2
-    assert "--overwrite" in again.line
-    quiet = run("bench", *options, "--overwrite", "--quiet", "--stop", "0.2")
-    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
-    assert json.loads((tmp_path / "b/bench.json").read_text())["ticks"] == 3
-
-
-def test_tiles_and_input_sizes_are_those_that_change_something(
-    tiny: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def open_size(log: Log, config: Config) -> OnnxDetector:
-        side = None if config.detect.name == "any.onnx" else 300
-        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
-        return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.4, 0.5, "auto", 0.4)
-
-    monkeypatch.setattr("log2sim.evaluation.bench.settings.create_image_detector", open_size)
-    grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
-    found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
-    # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.
-    assert found == {
-        "any auto tiles": (0, 0),
-        "any 2 tiles": (2, 0),
-        "any 3 tiles": (3, 0),
-        "any 5 tiles": (5, 0),
-        "any input 320 px": (0, 320),
-        "any input 640 px": (0, 640),
-        "any input 960 px": (0, 960),
-        "fixed auto tiles": (0, 0),
-        "fixed 2 tiles": (2, 0),
-        "fixed 3 tiles": (3, 0),
-        "fixed 5 tiles": (5, 0),
-    }
-    assert [s.present for s in grid.detect] == [True] + [False] * 10
-    assert grid.detect[-1].config.detect.name == "models/fixed.onnx"
-    alike = make_grid(tiny[0], Config.load(detect={"name": "a/m.onnx"}), ["b/m.onnx"]).detect
-    assert len({s.name for s in alike}) == len(alike) == 8
-
-
 def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> None:
     out = json.loads(json.dumps(document(result), allow_nan=False))
     check(out, "bench-1", LogError)
@@ -337,6 +316,27 @@ def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) ->
         order = [next(p.ms_per_tick for p in panel.points if f" {p.setting}  " in r) for r in rows]
         assert order == sorted(order)
     assert "What the figures support:" in lines
+
+
+@pytest.mark.slow
+def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: Path, tmp_path: Path) -> None:
+    import cv2
+
+    options = (tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0.5")
+    ran = run("bench", *options)
+    assert ran.code == 0, ran.err
+    assert names(tmp_path / "b") == ["bench.json", "bench.png"]
+    assert "detecting: 6 of 6" in ran.err
+    assert run("validate", tmp_path / "b/bench.json").code == 0
+    picture = cv2.imread(str(tmp_path / "b/bench.png"))
+    assert picture.shape[1] > 1500
+    assert 0.01 < (picture.min(axis=2) < 200).mean() < 0.3
+    again = run("bench", *options)
+    assert again.code == 2
+    assert "--overwrite" in again.line
+    quiet = run("bench", *options, "--overwrite", "--quiet", "--stop", "0.2")
+    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
+    assert json.loads((tmp_path / "b/bench.json").read_text())["ticks"] == 3
 
 
 def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_path: Path) -> None:

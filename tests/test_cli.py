@@ -13,7 +13,7 @@ import pytest
 import tifffile
 from command_line import names, run
 from localization_worlds import BEND, HOUSES, LIDAR, drive
-from test_detection_cache import TICKS, Seeing, entries, folder, made
+from test_first_pass_cache import PART, TICKS, Seeing, entries, folder, made
 from typer.testing import CliRunner
 from worlds import tiny_toml
 
@@ -373,7 +373,7 @@ def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
     assert "earlier runs" not in out
     assert cached == {"found": 0, "kept": TICKS, "problem": None}
     out, cached = reconstruct(tiny_folder, tmp_path / "c.json")
-    assert f"{TICKS} pictures known from earlier runs" in out
+    assert f"{TICKS} ticks known from earlier runs" in out
     assert (tmp_path / "c.json").read_bytes() == (tmp_path / "a.json").read_bytes()
     shown = json.loads(run("cache", "--json").out)
     size = sum(path.stat().st_size for path in entries(folder))
@@ -381,12 +381,12 @@ def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
         "folder": str(folder),
         "max_mb": 2048,
         "bytes": size,
-        "pictures": TICKS,
-        "detectors": [{"name": "seeing", "pictures": TICKS, "bytes": size}],
+        "parts": TICKS // PART,
+        "detectors": [{"name": "seeing", "parts": TICKS // PART, "bytes": size}],
         "last_run": {"found": TICKS, "kept": 0},
     }
-    assert f"{TICKS} by seeing" in run("cache").out
-    assert run("cache", "--clear").out == f"{folder}: {TICKS} pictures removed\n"
+    assert f"{TICKS // PART} by seeing" in run("cache").out
+    assert run("cache", "--clear").out == f"{folder}: {TICKS // PART} parts removed\n"
     assert entries(folder) == []
 
 

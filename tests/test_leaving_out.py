@@ -114,6 +114,34 @@ def test_a_sweep_during_which_the_ego_rests_takes_one_pose(tiny: Log, monkeypatc
 # --- LiDARs
 
 
+def with_roadside_lidar(log: Log, distance_m: float, reads: Counter[int]) -> Log:
+    """The log with a LiDAR that stands in the map at a distance and sees posts around itself."""
+    points, _ = scan([standing(8.0, 0.0)])
+
+    def read(i: int) -> Sweep:
+        reads[i] += 1
+        return Sweep(int(log.streams["top"].t_ns[i]), points, "lidar", None)
+
+    post = Lidar("post", "map", transform(np.eye(3), np.array([distance_m, 0.0, 1.9])))
+    streams = {**log.streams, "post": Stream("post", log.streams["top"].t_ns, read)}
+    return replace(log, lidars={**log.lidars, "post": post}, streams=streams)
+
+
+def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: Counter[int] = Counter()
+    log = with_roadside_lidar(tiny, 2000.0, reads)
+    without = run(log)
+    step = entry(without, "use of every LiDAR")
+    assert not step["kept"]
+    assert "post" in step["reason"]
+    assert not reads
+    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
+    full = run(log)
+    assert entry(full, "use of every LiDAR")["kept"]
+    assert sum(reads.values()) > 5
+    assert_same_agents(without.scenario, full.scenario, within=0.0)  # its points are beyond the range that is measured
+
+
 # --- images and frames
 
 
@@ -280,31 +308,3 @@ def test_a_waypoint_that_departs_in_any_column_stays(column: str) -> None:
 
 
 # --- the report
-
-
-def with_roadside_lidar(log: Log, distance_m: float, reads: Counter[int]) -> Log:
-    """The log with a LiDAR that stands in the map at a distance and sees posts around itself."""
-    points, _ = scan([standing(8.0, 0.0)])
-
-    def read(i: int) -> Sweep:
-        reads[i] += 1
-        return Sweep(int(log.streams["top"].t_ns[i]), points, "lidar", None)
-
-    post = Lidar("post", "map", transform(np.eye(3), np.array([distance_m, 0.0, 1.9])))
-    streams = {**log.streams, "post": Stream("post", log.streams["top"].t_ns, read)}
-    return replace(log, lidars={**log.lidars, "post": post}, streams=streams)
-
-
-def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads: Counter[int] = Counter()
-    log = with_roadside_lidar(tiny, 2000.0, reads)
-    without = run(log)
-    step = entry(without, "use of every LiDAR")
-    assert not step["kept"]
-    assert "post" in step["reason"]
-    assert not reads
-    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
-    full = run(log)
-    assert entry(full, "use of every LiDAR")["kept"]
-    assert sum(reads.values()) > 5
-    assert_same_agents(without.scenario, full.scenario, within=0.0)  # its points are beyond the range that is measured

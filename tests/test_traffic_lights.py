@@ -10,7 +10,7 @@ import pytest
 
 from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import box_corners, inverse, project
-from log2sim.perception.detection_cache import LightBox, crop_lights, with_ranges
+from log2sim.perception.traffic_light_boxes import LightBox, crop_lights, with_ranges
 from log2sim.road.signals import (
     STATES,
     find_signals,

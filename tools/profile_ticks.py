@@ -3,7 +3,7 @@
     OPENBLAS_NUM_THREADS=1 python tools/profile_ticks.py LOG [LOG ...] [--detector NAME ...] [--ticks N] [--repeats N] [--json]
 
 Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
-with as many as there are cores. Parts are the packages whose functions a thread is in, found by looking at all threads
+with as many as there are cores. With `--parts`, parts are the packages whose functions a thread is in, found by looking at all threads
 every few milliseconds and giving the processor time that each took since then to the function it is in. Kept detections are
 not used. Linux only.
 """
@@ -130,9 +130,13 @@ def part_of(function: str) -> str:
 
 def times_of(call: Callable[[], Any]) -> tuple[Any, Times]:
     """What a call returns, and its times."""
-    wall, cpu = time.perf_counter(), time.process_time()
+
+    def spent() -> float:  # with processes that ended meanwhile
+        return time.process_time() + sum(os.times()[2:4])
+
+    wall, cpu = time.perf_counter(), spent()
     out = call()
-    return out, Times(time.perf_counter() - wall, time.process_time() - cpu)
+    return out, Times(time.perf_counter() - wall, spent() - cpu)
 
 
 def records_of(schedule: Schedule) -> list[tuple[str, int]]:
@@ -166,19 +170,26 @@ def floor_of(log: Log, records: Sequence[tuple[str, int]], threads: int) -> Time
     return times_of(read_all)[1]
 
 
-def measure(open_anew: Callable[[], Log], config: Config) -> tuple[Measured, Schedule]:
-    """Run all stages on a log that is opened anew."""
+def measure(
+    open_anew: Callable[[], Log], config: Config, *, jobs: int | None = None, sampled: bool = False
+) -> tuple[Measured, Schedule]:
+    """Run all stages on a log that is opened anew; `sampled` in one process, a fifth slower, with its parts."""
     log, kept = open_anew(), list[Run]()
 
     def reconstruct() -> None:
-        run = start(log, config, cache=False)
+        run = start(log, config, cache=False, jobs=1 if sampled else jobs)
         kept.append(run)
         observations = observe_log(run)
         infer_scenario(run, observations)
 
-    with Sampler() as sampler:
+    functions: Counter[str] = Counter()
+    if sampled:
+        with Sampler() as sampler:
+            _, times = times_of(reconstruct)
+        functions = sampler.functions
+    else:
         _, times = times_of(reconstruct)
-    run, functions = kept[0], sampler.functions
+    run = kept[0]
     cpu = run.clock.cpu_seconds
     stages = {name: Times(seconds, cpu[name]) for name, seconds in run.clock.seconds.items()}
     parts: Counter[str] = Counter()
@@ -214,7 +225,7 @@ def profile(open_anew: Callable[[], Log], options: argparse.Namespace) -> Iterat
     floors: dict[tuple[str, int], list[Times]] = {}
     for _ in range(options.repeats):
         for name, config in configs.items():
-            measured, schedule = measure(open_anew, config)
+            measured, schedule = measure(open_anew, config, jobs=options.jobs, sampled=options.parts)
             runs[name].append(measured)
             for count in sorted({1, threads}):
                 floor = floor_of(open_anew(), records_of(schedule), count)
@@ -290,6 +301,12 @@ def main() -> int:
     parser.add_argument("--detector", action="append", metavar="NAME", help=f"repeat it; by default {DETECTORS}")
     parser.add_argument("--ticks", type=int, default=0, metavar="N", help="the first ones; by default all")
     parser.add_argument("--repeats", type=int, default=3, metavar="N")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="processes that share the ticks; by default the usable cores"
+    )
+    parser.add_argument(
+        "--parts", action="store_true", help="look where one process is every few milliseconds, which costs a fifth"
+    )
     parser.add_argument("--functions", type=int, default=0, metavar="N", help="lines of functions")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of reconstruct")
     parser.add_argument("--json", action="store_true", help="all figures as JSON")

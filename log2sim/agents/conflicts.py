@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ def find_conflicts(
     return [Conflict(*pair, *map(np.concatenate, zip(*parts[pair]))) for pair in sorted(parts)], present
 
 
-def _overlaps(boxes: AgentTable, touching: float) -> tuple[NDArray[np.intp], ...]:
+def _overlaps(boxes: AgentTable, touching: float) -> tuple[NDArray[Any], ...]:
     """Return agents, agents, ticks, shares and depths (n,) of boxes that share more than `touching` of the smaller one."""
     first, second = np.triu_indices(len(boxes.present), 1)
     radius = np.hypot(boxes.size_m[:, 0], boxes.size_m[:, 1]) / 2

@@ -455,8 +455,7 @@ def _support(inside: NDArray[np.int64], through: NDArray[np.int64], before: NDAr
     """Sum the rays of one agent over ticks (T,), without those at which only the border of what hides it shows."""
     met = inside + through
     seen = (met > 0) & (met >= before)
-    counts = inside[seen].sum(), through[seen].sum(), before.sum(), seen.sum()
-    return Support(*(int(count) for count in counts))
+    return Support(int(inside[seen].sum()), int(through[seen].sum()), int(before.sum()), int(seen.sum()))
 
 
 def image_height_share(m: Measurements) -> float | None:

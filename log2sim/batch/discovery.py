@@ -12,26 +12,16 @@ from log2sim.files import plugins
 from log2sim.files.inputs import follows_links
 from log2sim.logs.opening import Reader, find_reader
 
-MAX_LEVELS = 8
-"""Below the root; data sets have up to four (split, date, drive, sensor)."""
-MAX_FOLDERS = 500_000
-"""That are looked into, so that a wrong root such as "/" ends."""
+MAX_LEVELS = 8  # below the root; data sets have up to four (split, date, drive, sensor)
+MAX_FOLDERS = 500_000  # that are looked into, so that a wrong root such as "/" ends
 
 
 @dataclass(frozen=True)
 class FoundLog:
-    """A log that can be opened.
+    """A log that can be opened."""
 
-    Attributes
-    ----------
-    id : str
-        Path of the log below the root, with the sequence where one folder holds several; unique within a format.
-    path : Path
-        What `open_log` takes.
-    """
-
-    id: str
-    path: Path
+    id: str  # path of the log below the root, with the sequence where one folder holds several; unique within a format
+    path: Path  # what `open_log` takes
     format: str
     sequence: str
 
@@ -41,26 +31,11 @@ def find_logs(
 ) -> list[FoundLog]:
     """Find all logs at and below a folder, in the order of their ids.
 
-    Parameters
-    ----------
-    root : Path
-        A folder, or the file of one log.
-    format : str
-        Name of the only format that is looked for, or "auto".
-    leave_out : Path, optional
-        Folder that is not looked into.
-    max_folders : int
-        That are looked into before the search is given up.
+    `root`: a folder, or the file of one log. `format`: name of the only format that is looked for, or "auto".
+    `leave_out`: folder that is not looked into. `max_folders`: that are looked into before the search is given up.
+    Raises `LogError` when the root is missing, or there is no log. Raises `ConfigError` for an unknown format, or more
+    folders than can be searched.
 
-    Raises
-    ------
-    LogError
-        When the root is missing, or there is no log.
-    ConfigError
-        For an unknown format, or more folders than can be searched.
-
-    Notes
-    -----
     A log is reported at the deepest folder that its reader accepts. Nothing below a folder that is a log itself is another one. Hidden
     folders are skipped, and links are followed only where that was asked for (`log2sim.files.inputs.following_links`).
     """
@@ -86,15 +61,7 @@ def _of_file(root: Path, format: str) -> list[FoundLog]:
 
 
 class _Search:
-    """A search below one root.
-
-    Attributes
-    ----------
-    root : Path
-    readers : mapping of str to Reader
-    leave_out : Path or None
-    max_folders : int
-    """
+    """A search below one root."""
 
     def __init__(self, root: Path, readers: Mapping[str, Reader], leave_out: Path | None, max_folders: int) -> None:
         self.root, self.readers, self.leave_out, self.max_folders = root, readers, leave_out, max_folders

@@ -41,12 +41,7 @@ DIGITS = 4
 
 @dataclass(frozen=True)
 class Scope:
-    """What is compared, as for one scenario.
-
-    Attributes
-    ----------
-    max_range_m : float, m, optional
-    """
+    """What is compared, as for one scenario."""
 
     max_range_m: float | None = None
     categories: Sequence[str] | None = None
@@ -124,16 +119,9 @@ def _figures(found: Figures) -> Figures:
 def pool(entries: Sequence[Figures]) -> Figures:
     """Sum up the figures of logs.
 
-    Parameters
-    ----------
-    entries : sequence of dict
-        As in `logs` of the document, without those that could not be compared.
-
-    Returns
-    -------
-    dict
-        Counts are summed, and shares and MOTA follow from the sums; squared errors are averaged over all matched ticks. Medians and HOTA
-        of logs cannot be pooled, so `median_of_logs` holds their median over the logs.
+    `entries`: as in `logs` of the document, without those that could not be compared. Counts are summed, and
+    shares and MOTA follow from the sums; squared errors are averaged over all matched ticks. Medians and HOTA of logs
+    cannot be pooled, so `median_of_logs` holds their median over the logs.
     """
     counts = {name: sum(e["counts"][name] for e in entries) for name in (entries[0]["counts"] if entries else ())}
     matched, false = counts.get("matched_ticks", 0), counts.get("false_ticks", 0)

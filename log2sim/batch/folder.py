@@ -27,8 +27,7 @@ from log2sim.files.documents import first_problem, read_json, replaced, write_js
 from log2sim.files.outputs import claim, is_left_over, is_temporary, remove, replaced_folder
 from log2sim.version import __version__
 
-MAX_NAME_CHARS = 80
-"""Of a folder; file systems take 255 bytes, and temporary names are longer."""
+MAX_NAME_CHARS = 80  # of a folder; file systems take 255 bytes, and temporary names are longer
 HASH_DIGITS = 8
 _SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 _UNSAFE_CHARS = re.compile(r"[^A-Za-z0-9._-]+")
@@ -36,35 +35,17 @@ _UNSAFE_CHARS = re.compile(r"[^A-Za-z0-9._-]+")
 
 @dataclass(frozen=True)
 class Job:
-    """One run of one log.
+    """One run of one log."""
 
-    Attributes
-    ----------
-    out : str
-        Folder of the batch, absolute.
-    token : str
-        Of the batch; a folder of that name without it is another one.
-    name : str
-        Of the folder for the log.
-    log : str
-        `FoundLog.id`.
-    path : str
-        What `open_log` takes, absolute.
-    cache : bool
-        Whether detections in pictures are kept, and taken from earlier runs.
-    attempts : int
-        1 at the first run.
-    """
-
-    out: str
-    token: str
-    name: str
-    log: str
-    path: str
+    out: str  # folder of the batch, absolute
+    token: str  # of the batch; a folder of that name without it is another one
+    name: str  # of the folder for the log
+    log: str  # `FoundLog.id`
+    path: str  # what `open_log` takes, absolute
     format: str
     sequence: str
-    cache: bool = True
-    attempts: int = 1
+    cache: bool = True  # whether detections in pictures are kept, and taken from earlier runs
+    attempts: int = 1  # 1 at the first run
 
 
 def make_jobs(logs: Sequence[FoundLog], out: Path, token: str, *, cache: bool = True) -> list[Job]:
@@ -93,62 +74,38 @@ def _hash(text: str) -> str:
     return sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:HASH_DIGITS]
 
 
-MAX_ERROR_CHARS = 2000
-"""Of a message in a table; `error.txt` has all of it."""
-
+MAX_ERROR_CHARS = 2000  # of a message in a table; `error.txt` has all of it
 Count = Annotated[int | None, Field(ge=0)]
 Amount = Annotated[float | None, Field(ge=0)]
 
 
 class Row(BaseModel):
-    """One log of a batch; figures are None where it failed.
-
-    Attributes
-    ----------
-    name : str
-        Of its folder.
-    log : str
-        Its path below the root, with the sequence where a folder holds several.
-    status : str
-        "done" or "failed".
-    error_kind : str
-        Class of the error; empty without one.
-    error : str
-        Its message.
-    attempts : int
-        How often it was run, 2 after a repetition.
-    ticks : int
-    duration_s : float, s
-    agents, static, doubtful : int
-        Agents without the ego, those of them that stand all the time, and all that the scenario doubts.
-    faults, unreadable : int
-        Faults of sensors and poses, and records that could not be read.
-    seconds, cpu_s : float, s
-        Wall time and time of the processor, from opening the log to writing its files.
-    peak_memory_mib : float, MiB
-        Largest resident memory of the worker so far.
-    """
+    """One log of a batch; figures are None where it failed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    name: str
-    log: str
+    name: str  # of its folder
+    log: str  # its path below the root, with the sequence where a folder holds several
     format: str
     sequence: str
-    status: Literal["done", "failed"]
-    error_kind: str = ""
-    error: str = ""
-    attempts: Annotated[int, Field(ge=1)] = 1
+    status: Literal["done", "failed"]  # "done" or "failed"
+    error_kind: str = ""  # class of the error; empty without one
+    error: str = ""  # its message
+    attempts: Annotated[int, Field(ge=1)] = 1  # how often it was run, 2 after a repetition
     ticks: Count = None
     duration_s: Amount = None
+    # agents, static, doubtful: agents without the ego, those of them that stand all the time, and all that the
+    # scenario doubts.
     agents: Count = None
     static: Count = None
     doubtful: Count = None
+    # faults, unreadable: faults of sensors and poses, and records that could not be read.
     faults: Count = None
     unreadable: Count = None
+    # seconds, cpu_s: wall time and time of the processor, from opening the log to writing its files.
     seconds: Amount = None
     cpu_s: Amount = None
-    peak_memory_mib: Amount = None
+    peak_memory_mib: Amount = None  # MiB, largest resident memory of the worker so far
 
     @property
     def is_done(self) -> bool:
@@ -223,29 +180,17 @@ MAX_LISTED = 5
 
 
 class BatchSettings(BaseModel):
-    """What all logs of a batch share, as `batch.json` holds it.
-
-    Attributes
-    ----------
-    token : str
-        Random, so that workers on other machines can tell whether they see the same folder.
-    root : str
-        Folder that is searched for logs, absolute.
-    format : str
-        Format that is looked for, or "auto".
-    config : dict
-        Settings of the reconstruction.
-    """
+    """What all logs of a batch share, as `batch.json` holds it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     batch_version: int = 1
-    token: str
+    token: str  # random, so that workers on other machines can tell whether they see the same folder
     log2sim_version: str
-    root: str
-    format: str
+    root: str  # folder that is searched for logs, absolute
+    format: str  # format that is looked for, or "auto"
     follow_links: bool
-    config: dict[str, Any]
+    config: dict[str, Any]  # settings of the reconstruction
 
     @classmethod
     def create(cls, root: Path, format: str, follow_links: bool, config: Config) -> BatchSettings:
@@ -292,10 +237,8 @@ class BatchFolder:
     def start(cls, path: Path, wanted: BatchSettings, *, overwrite: bool) -> BatchFolder:
         """Go on with the batch in a folder, or begin one.
 
-        Raises
-        ------
-        ConfigError
-            When the folder holds something else, a batch of other settings, or is in use by another run.
+        Raises `ConfigError` when the folder holds something else, a batch of other settings, or is in use by another
+        run.
         """
         claim(path / SETTINGS_FILE, overwrite=False)
         if not is_batch(path):
@@ -369,8 +312,7 @@ def _flat(document: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-MAX_ROWS = 5000
-"""Of each table, which browsers lay out in a second; the Parquet file has all."""
+MAX_ROWS = 5000  # of each table, which browsers lay out in a second; the Parquet file has all
 COLUMNS = (
     ("log", "log", ""),
     ("format", "format", ""),
@@ -391,10 +333,7 @@ COLUMNS = (
 def write_batch_page(path: Path, rows: Sequence[Row], settings: BatchSettings, *, total: int) -> None:
     """Write the page of a batch: sums, what failed and why, and the figures of each log.
 
-    Parameters
-    ----------
-    total : int
-        Logs of the batch; those without a row were not run yet.
+    `total`: logs of the batch; those without a row were not run yet.
     """
     with replaced(path) as temporary:
         temporary.write_text(html_of(rows, settings, total), encoding="utf-8")

@@ -48,41 +48,6 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-def run_job(job: Job) -> tuple[dict[str, Any], bool]:
-    """Reconstruct a log and write its folder.
-
-    Returns
-    -------
-    row : dict
-        Of `log2sim.batch.folder.Row`.
-    may_repeat : bool
-        Whether another run may succeed: the log failed by something else than what is wrong with it or with the settings.
-
-    Raises
-    ------
-    ConfigError
-        When the folder of the batch is not visible here, or belongs to another version of log2sim.
-    """
-    folder, config = _batch_of(job.out, job.token)
-    target, spent = folder.log_folder(job.name), _stopwatch()
-    try:
-        with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
-            log = open_log(job.path, format=job.format, sequence=job.sequence)
-            result = reconstruct(log, config, cache=job.cache, jobs=1)
-            result.scenario.save(unfinished / SCENARIO_FILE)
-            write_json(unfinished / REPORT_FILE, result.report)
-            row = done_row(job, result.report, spent())
-            write_json(unfinished / ROW_FILE, row.model_dump())
-        return row.model_dump(), False
-    except Log2SimError as error:
-        row, may_repeat, text = failed_row(job, type(error).__name__, str(error), spent()), False, str(error)
-    except Exception as error:  # whatever it is, the other logs go on
-        row = failed_row(job, type(error).__name__, f"internal error: {type(error).__name__}: {error}", spent())
-        may_repeat, text = True, traceback.format_exc()
-    folder.write_failure(row, text)
-    return row.model_dump(), may_repeat
-
-
 @lru_cache(maxsize=1)
 def _batch_of(out: str, token: str) -> tuple[BatchFolder, Config]:
     """Return the batch in a folder and its settings, once the process is set up for it."""
@@ -116,9 +81,9 @@ def _stopwatch() -> Callable[[], dict[str, float]]:
     return spent
 
 
+# Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for
+# certificates, too: other users of the machine do not get in.
 HOST = "127.0.0.1"
-"""Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for certificates, too: other users of the
-machine do not get in."""
 PROTOCOLS = ("tcp://", "tls://")
 CONNECT_TIMEOUT_S = 20
 START_TIMEOUT_S = 120
@@ -146,17 +111,10 @@ SETTINGS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Workers:
-    """Workers that a batch may use.
-
-    Attributes
-    ----------
-    client : distributed.Client
-    are_ours : bool
-        Whether they were started for this round of the batch, so that none ran a log in an earlier one.
-    """
+    """Workers that a batch may use."""
 
     client: Client
-    are_ours: bool
+    are_ours: bool  # whether they were started for this round of the batch, so that none ran a log in an earlier one
 
     def others_than(self, address: str) -> list[str]:
         """Return the addresses of all workers but one."""
@@ -172,10 +130,7 @@ def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractCo
 def local_workers(count: int) -> Iterator[Workers]:
     """Start so many worker processes on this machine, each with its share of the cores and of the memory; stop them at the end.
 
-    Raises
-    ------
-    MissingExtra
-        Without Dask.
+    Raises `MissingExtra` without Dask.
     """
     distributed, dask = import_dask()
     from distributed.system import MEMORY_LIMIT
@@ -212,12 +167,7 @@ def local_workers(count: int) -> Iterator[Workers]:
 def workers_of(address: str) -> Iterator[Workers]:
     """Use the workers of a scheduler that somebody started.
 
-    Raises
-    ------
-    MissingExtra
-        Without Dask.
-    ConfigError
-        When the address is none, or nobody answers there.
+    Raises `MissingExtra` without Dask. Raises `ConfigError` when the address is none, or nobody answers there.
     """
     if not address.startswith(PROTOCOLS):
         raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")
@@ -248,30 +198,22 @@ def import_dask() -> tuple[Any, Any]:
 Progress = Callable[[int, int], None]
 Connect = Callable[[], AbstractContextManager[Workers]]
 
+# Jobs that the scheduler knows at once: enough for 1,000 workers, and little memory for any number of logs.
 MAX_SUBMITTED = 4000
-"""Jobs that the scheduler knows at once: enough for 1,000 workers, and little memory for any number of logs."""
 MAX_ATTEMPTS = 2
 KEY_BYTES = 8
+# Of repetitions at the end; more than two come of logs that waited behind one that killed their worker.
 MAX_ROUNDS = 6
-"""Of repetitions at the end; more than two come of logs that waited behind one that killed their worker."""
 TABLE_FILE, PAGE_FILE = "table.parquet", "table.html"
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Logs to be reconstructed, and what earlier runs did of them.
-
-    Attributes
-    ----------
-    jobs : tuple of Job
-        One for each log.
-    done : mapping of str to Row
-        By the name of the log's folder.
-    """
+    """Logs to be reconstructed, and what earlier runs did of them."""
 
     folder: BatchFolder
-    jobs: tuple[Job, ...]
-    done: Mapping[str, Row]
+    jobs: tuple[Job, ...]  # one for each log
+    done: Mapping[str, Row]  # by the name of the log's folder
 
     @cached_property
     def missing(self) -> list[Job]:
@@ -281,20 +223,12 @@ class Batch:
 
 @dataclass(frozen=True)
 class Finished:
-    """A job that ended.
-
-    Attributes
-    ----------
-    repetition : Job, optional
-        To be run at the end.
-    worker : str
-        Address of the worker that is not to run that; empty where none is to be avoided.
-    """
+    """A job that ended."""
 
     job: Job
     row: Row
-    repetition: Job | None = None
-    worker: str = ""
+    repetition: Job | None = None  # to be run at the end
+    worker: str = ""  # address of the worker that is not to run that; empty where none is to be avoided
 
 
 def plan_batch(
@@ -455,8 +389,29 @@ def _run_once(
 
 
 def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
-    """Run a job; what that needs is imported by workers alone."""
-    return run_job(job)
+    """Reconstruct a log and write its folder.
+
+    Returns the row of the log, and whether another run may succeed: it failed by something else than what is wrong with it
+    or with the settings. Raises `ConfigError` where the folder of the batch is not visible, or of another version.
+    """
+    folder, config = _batch_of(job.out, job.token)
+    target, spent = folder.log_folder(job.name), _stopwatch()
+    try:
+        with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
+            log = open_log(job.path, format=job.format, sequence=job.sequence)
+            result = reconstruct(log, config, cache=job.cache, jobs=1)
+            result.scenario.save(unfinished / SCENARIO_FILE)
+            write_json(unfinished / REPORT_FILE, result.report)
+            row = done_row(job, result.report, spent())
+            write_json(unfinished / ROW_FILE, row.model_dump())
+        return row.model_dump(), False
+    except Log2SimError as error:
+        row, may_repeat, text = failed_row(job, type(error).__name__, str(error), spent()), False, str(error)
+    except Exception as error:  # whatever it is, the other logs go on
+        row = failed_row(job, type(error).__name__, f"internal error: {type(error).__name__}: {error}", spent())
+        may_repeat, text = True, traceback.format_exc()
+    folder.write_failure(row, text)
+    return row.model_dump(), may_repeat
 
 
 def _submit(workers: Workers, job: Job, avoided: Mapping[str, str]) -> Future:

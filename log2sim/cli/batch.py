@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import ConfigFile, Format, NoCache, Poses, Quiet, Settings, counted, say, write_to
+from log2sim.cli.options import ConfigFile, Format, NoCache, Poses, Quiet, Settings, counted, option, say, write_to
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,26 +22,20 @@ def batch(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder with logs of any formats below it.")],
     out: Annotated[Path, write_to("DIR", "Folder for the results; the same command goes on there.")],
     jobs: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="Worker processes on this machine.", show_default="one for each core"),
+        int | None, option("Worker processes on this machine.", "N", min=1, default="one for each core")
     ] = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler, which see the same folders."
-        ),
+        str | None, option("Use the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")
     ] = None,
     format: Format = "auto",
-    detector: Annotated[
-        str | None, typer.Option(metavar="NAME|MODEL.onnx|labels|lidar:NAME", help="Detector, see reconstruct.")
-    ] = None,
+    detector: Annotated[str | None, option("Detector, see reconstruct.", "NAME|MODEL.onnx|labels|lidar:NAME")] = None,
     poses: Poses = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    seed: Annotated[int | None, option("Seed of all random numbers.")] = None,
     no_cache: NoCache = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", "-f", help="Start over: first remove the results that DIR holds.")
+        bool, option("Start over: first remove the results that DIR holds.", None, "--overwrite", "-f")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -74,9 +69,7 @@ def batch(
     say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
 
     with progress(quiet=quiet) as report_progress:
-        rows = run_batch(
-            planned, lambda: connect(jobs, scheduler), progress=lambda done, total: report_progress("logs", done, total)
-        )
+        rows = run_batch(planned, lambda: connect(jobs, scheduler), progress=partial(report_progress, "logs"))
     for line in _failure_lines(rows):
         say(line, quiet=quiet)
     say(f"{out / 'table.html'}: {_summary(rows)}", quiet=quiet)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from log2sim.cli.options import (
     ConfigFile,
     Format,
@@ -18,37 +16,33 @@ from log2sim.cli.options import (
     Start,
     Stop,
     complete_detectors,
+    option,
     say,
     say_written,
+    write_to,
 )
 
 
 def bench(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for bench.json and bench.png.")],
+    out: Annotated[Path, write_to("DIR", "Folder for bench.json and bench.png.")],
     truth: Annotated[
         Path | None,
-        typer.Option(
-            metavar="TRUTH", help="Ground truth: a scenario file or a log with labels; default: LOG, if it has labels."
-        ),
+        option("Ground truth: a scenario file or a log with labels; default: LOG, if it has labels.", "TRUTH"),
     ] = None,
     detector: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME|MODEL.onnx|labels",
-            help="Detector, see reconstruct; repeat the option to compare several.",
-            autocompletion=complete_detectors,
+        option(
+            "Detector, see reconstruct; repeat the option to compare several.",
+            "NAME|MODEL.onnx|labels",
+            completes=complete_detectors,
         ),
     ] = None,
     format: Format = "auto",
     sequence: SequenceName = None,
-    cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
-    range: Annotated[
-        float | None, typer.Option(metavar="M", help="Compare agents up to this distance from the ego, in m.")
-    ] = None,
-    categories: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Compare only these categories or groups, e.g. vehicle.")
-    ] = None,
+    cameras: Annotated[str | None, option("Use only these cameras.", "A,B")] = None,
+    range: Annotated[float | None, option("Compare agents up to this distance from the ego, in m.", "M")] = None,
+    categories: Annotated[str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B")] = None,
     start: Start = None,
     stop: Stop = None,
     config: ConfigFile = None,

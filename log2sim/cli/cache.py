@@ -1,4 +1,4 @@
-"""Show, limit and clear the cache of detections."""
+"""Show, limit and clear the cache of first passes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all kept detections.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all that is kept.")] = False,
     max_mb: Annotated[
         int | None,
         typer.Option(
@@ -27,7 +27,7 @@ def cache(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what is kept of earlier runs, so that no picture is searched twice; limit it or remove it.
+    """Show what is kept of earlier runs, so that nothing is detected and measured twice; limit it or remove it.
 
     The environment variable LOG2SIM_CACHE moves the folder.
 
@@ -47,16 +47,16 @@ def cache(
     if as_json:
         say(json.dumps(summarize(store), indent=2))
     elif removed is not None:
-        say(f"{store.folder}: {counted(removed, 'picture')} removed")
+        say(f"{store.folder}: {counted(removed, 'part')} removed")
     else:
         say("\n".join(describe(summarize(store))))
 
 
 def summarize(store: DiskCache) -> dict[str, Any]:
-    """Return the folder and the size of a cache, the pictures by detector, and what the last run took from it."""
+    """Return the folder and the size of a cache, the parts of logs by detector, and what the last run took from it."""
     usage, last = store.usage(), store.last_run
     detectors = [
-        {"name": group.rpartition(".")[0], "pictures": count, "bytes": usage.bytes[group]}
+        {"name": group.rpartition(".")[0], "parts": count, "bytes": usage.bytes[group]}
         for group, count in sorted(usage.entries.items(), key=lambda item: (-item[1], item[0]))
     ]
     found, kept = last.get("found"), last.get("kept")
@@ -64,7 +64,7 @@ def summarize(store: DiskCache) -> dict[str, Any]:
         "folder": str(store.folder),
         "max_mb": store.max_mb,
         "bytes": sum(usage.bytes.values()),
-        "pictures": sum(usage.entries.values()),
+        "parts": sum(usage.entries.values()),
         "detectors": detectors,
         "last_run": {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None,
     }
@@ -77,12 +77,12 @@ def describe(found: dict[str, Any]) -> list[str]:
     rows = [
         ("folder", found["folder"]),
         ("size", f"{_megabytes(found)} of at most {found['max_mb']} MB"),
-        ("pictures", str(found["pictures"])),
-        *(("", f"{d['pictures']} by {d['name']}, {_megabytes(d)} MB") for d in found["detectors"]),
+        ("parts of logs", str(found["parts"])),
+        *(("", f"{d['parts']} by {d['name']}, {_megabytes(d)} MB") for d in found["detectors"]),
     ]
     last = found["last_run"]
     if last is not None:
-        rows.append(("last run", f"{counted(last['found'], 'picture')} known, {last['kept']} searched and kept"))
+        rows.append(("last run", f"{counted(last['found'], 'tick')} known, {last['kept']} kept"))
     return list(format_rows(rows))
 
 

@@ -5,10 +5,7 @@ from __future__ import annotations
 from log2sim.cli.options import ConfigFile, Settings, say
 
 
-def config(
-    file: ConfigFile = None,
-    settings: Settings = None,
-) -> None:
+def config(file: ConfigFile = None, settings: Settings = None) -> None:
     """Print all settings as TOML.
 
     Each with its meaning, unit, choices and default; with --config or --set, the values that these give.

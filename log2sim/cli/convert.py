@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
-
-import typer
 
 from log2sim.cli.options import (
     Cameras,
@@ -19,13 +18,14 @@ from log2sim.cli.options import (
     camera_names,
     counted,
     say,
+    write_to,
 )
 from log2sim.errors import ConfigError
 
 
 def convert(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
+    out: Annotated[Path, write_to("DIR", "Folder to write.")],
     format: Format = "auto",
     sequence: SequenceName = None,
     start: Start = None,
@@ -61,7 +61,7 @@ def convert(
             out,
             overwrite=overwrite,
             jpeg_quality=95,
-            progress=lambda done, total: report_progress("convert", done, total),
+            progress=partial(report_progress, "convert"),
             problems=problems,
         )
     for problem in problems:

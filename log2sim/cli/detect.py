@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
-
-import typer
 
 from log2sim.cli.options import (
     ConfigFile,
@@ -20,20 +19,22 @@ from log2sim.cli.options import (
     Stop,
     complete_plugins,
     counted,
+    option,
     say,
+    write_to,
 )
 
 
 def detect(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Boxes file to write.")],
+    out: Annotated[Path, write_to("FILE", "Boxes file to write.")],
     detector: Annotated[
         str,
-        typer.Option(
-            metavar="lidar:NAME|lidar:MODEL.onnx",
-            help="Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
+        option(
+            "Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
             "the log).",
-            autocompletion=complete_plugins("lidar_detector", prefix="lidar:"),
+            "lidar:NAME|lidar:MODEL.onnx",
+            completes=complete_plugins("lidar_detector", prefix="lidar:"),
         ),
     ] = "lidar:vehicle",
     format: Format = "auto",
@@ -72,7 +73,7 @@ def detect(
     if weakness := describe_weakness(detector):
         say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        result = detect_log(opened, chosen, progress=lambda done, total: report_progress("detect", done, total))
+        result = detect_log(opened, chosen, progress=partial(report_progress, "detect"))
     result.found.save(out)
     for line in pose_notes(result.poses.to_dict()):
         say(line, quiet=quiet)

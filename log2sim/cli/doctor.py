@@ -22,12 +22,10 @@ from log2sim.version import __version__
 OK, MISSING, OUTDATED, BROKEN = "ok", "missing", "outdated", "broken"
 MIN_PYTHON = (3, 11)
 
-MODULES = {
-    "opencv-contrib-python-headless": "cv2",
-    "scikit-image": "skimage",
-}
-"""Modules of packages whose names differ by more than a hyphen."""
+# Modules of packages whose names differ by more than a hyphen.
+MODULES = {"opencv-contrib-python-headless": "cv2", "scikit-image": "skimage"}
 
+# Extras for users, and what for; others are for development.
 PURPOSES = {
     "coco": "the default detector in images",
     "video": ".mp4 as H.264",
@@ -44,7 +42,6 @@ PURPOSES = {
     "rerun": "export --to rerun",
     "carla": "replay --simulator carla",
 }
-"""Extras for users, and what for; others are for development."""
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -52,86 +49,44 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 @dataclass(frozen=True)
 class Package:
-    """A package that log2sim needs.
-
-    Attributes
-    ----------
-    version : str or None
-        None where it is missing.
-    state : {"ok", "missing", "outdated", "broken"}
-        Broken: it is there and cannot be imported.
-    problem : str
-        What is wrong, for people; empty without a problem.
-    """
+    """A package that log2sim needs."""
 
     name: str
-    version: str | None
-    state: str
-    problem: str = ""
+    version: str | None  # none where it is missing
+    state: str  # {"ok", "missing", "outdated", "broken"}, broken: it is there and cannot be imported
+    problem: str = ""  # what is wrong, for people; empty without a problem
 
 
 @dataclass(frozen=True)
 class Extra:
-    """An optional part of log2sim.
-
-    Attributes
-    ----------
-    missing : tuple of str
-        Packages of it that are missing or too old.
-    purpose : str
-        Empty for extras that are for development.
-    install : str
-        A line for the shell that adds it.
-    """
+    """An optional part of log2sim."""
 
     name: str
-    missing: tuple[str, ...]
-    purpose: str
-    install: str
+    missing: tuple[str, ...]  # packages of it that are missing or too old
+    purpose: str  # empty for extras that are for development
+    install: str  # A line for the shell that adds it
 
 
 @dataclass(frozen=True)
 class Installation:
-    """What `log2sim doctor` shows.
+    """What `log2sim doctor` shows."""
 
-    Attributes
-    ----------
-    log2sim, python, system : str
-        Versions; the system with its processor.
-    program : str
-        The Python that runs.
-    packages : tuple of Package
-        Those that are needed.
-    models : mapping of str to str
-        By detector: "ready", or what it needs.
-    cache : str
-        Folder of the cache.
-    cache_bytes : int
-        Size of what is in it.
-    cores, usable_cores : int
-        Processors of the machine, and those that this process may use.
-    threads : mapping of str to str
-        Variables of the environment that limit threads.
-    browser : str or None
-        A browser that shows the pages of `log2sim view`.
-    broken : tuple of str
-        What is needed and does not work, each with what to do.
-    """
-
+    # log2sim, python, system: versions; the system with its processor.
     log2sim: str
     python: str
     system: str
-    program: str
-    packages: tuple[Package, ...]
+    program: str  # the Python that runs
+    packages: tuple[Package, ...]  # those that are needed
     extras: tuple[Extra, ...]
-    models: dict[str, str]
-    cache: str
-    cache_bytes: int
+    models: dict[str, str]  # by detector: "ready", or what it needs
+    cache: str  # folder of the cache
+    cache_bytes: int  # size of what is in it
+    # cores, usable_cores: processors of the machine, and those that this process may use.
     cores: int
     usable_cores: int
-    threads: dict[str, str]
-    browser: str | None
-    broken: tuple[str, ...]
+    threads: dict[str, str]  # variables of the environment that limit threads
+    browser: str | None  # A browser that shows the pages of `log2sim view`
+    broken: tuple[str, ...]  # what is needed and does not work, each with what to do
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as a JSON document."""
@@ -144,6 +99,14 @@ def examine() -> Installation:
     packages = tuple(examine_package(r) for r in requirements if not r.marker or "extra" not in str(r.marker))
     cache = find_cache()
     models, unusable = find_models()
+    # Add up the sizes of the files in a folder, bytes; 0 without it.
+    total = 0
+    for place, _, files in os.walk(cache):
+        for file in files:
+            try:
+                total += os.lstat(os.path.join(place, file)).st_size
+            except OSError:  # gone in the meantime
+                continue
     return Installation(
         log2sim=__version__,
         python=platform.python_version(),
@@ -153,7 +116,7 @@ def examine() -> Installation:
         extras=tuple(examine_extras(requirements)),
         models=models,
         cache=str(cache),
-        cache_bytes=measure_folder(cache),
+        cache_bytes=total,
         cores=os.cpu_count() or 1,
         usable_cores=count_usable_cores(),
         threads={name: os.environ[name] for name in THREAD_VARIABLES if os.environ.get(name)},
@@ -278,18 +241,6 @@ def find_cache() -> Path:
     return cache_folder()
 
 
-def measure_folder(folder: Path) -> int:
-    """Add up the sizes of the files in a folder, bytes; 0 without it."""
-    total = 0
-    for place, _, files in os.walk(folder):
-        for file in files:
-            try:
-                total += os.lstat(os.path.join(place, file)).st_size
-            except OSError:  # gone in the meantime
-                continue
-    return total
-
-
 def count_usable_cores() -> int:
     """Count the processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -297,13 +248,10 @@ def count_usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-BROKEN_CODE = 5
-"""As where an extra is missing: something has to be installed."""
+BROKEN_CODE = 5  # as where an extra is missing: something has to be installed
 
 
-def doctor(
-    as_json: AsJson = False,
-) -> None:
+def doctor(as_json: AsJson = False) -> None:
     """Show versions, extras, models, cache and processors, and what is missing with the line that installs it.
 
     Exits with 0, or with 5 when something is broken that every command needs; a missing extra is not.

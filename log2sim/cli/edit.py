@@ -6,9 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, counted, say
+from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, counted, option, say, write_to
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -19,42 +17,32 @@ Changes = list[str] | None
 
 def edit(
     scenario: ScenarioPath,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Scenario file to write.")],
-    shift: Annotated[
-        Changes, typer.Option(metavar="AGENT=SECONDS", help="Delay an agent; negative: advance it.")
-    ] = None,
-    speed: Annotated[Changes, typer.Option(metavar="AGENT=FACTOR", help="Multiply the speed of an agent.")] = None,
-    lateral: Annotated[
-        Changes, typer.Option(metavar="AGENT=METERS", help="Move an agent to its left; negative: to its right.")
-    ] = None,
+    out: Annotated[Path, write_to("FILE", "Scenario file to write.")],
+    shift: Annotated[Changes, option("Delay an agent; negative: advance it.", "AGENT=SECONDS")] = None,
+    speed: Annotated[Changes, option("Multiply the speed of an agent.", "AGENT=FACTOR")] = None,
+    lateral: Annotated[Changes, option("Move an agent to its left; negative: to its right.", "AGENT=METERS")] = None,
     begin: Annotated[
-        float | None,
-        typer.Option("--from", metavar="S", help="Change speed and lateral position from this time on, within --over."),
+        float | None, option("Change speed and lateral position from this time on, within --over.", "S", "--from")
     ] = None,
-    over: Annotated[
-        float | None, typer.Option(metavar="S", help="Seconds that the change takes, with --from; 3 if not given.")
-    ] = None,
+    over: Annotated[float | None, option("Seconds that the change takes, with --from; 3 if not given.", "S")] = None,
     cut_in: Annotated[
-        Changes,
-        typer.Option(metavar="AGENT[=GAP]", help="At --from, bring an agent onto the ego's path, GAP meters ahead."),
+        Changes, option("At --from, bring an agent onto the ego's path, GAP meters ahead.", "AGENT[=GAP]")
     ] = None,
-    add: Annotated[
-        Changes, typer.Option(metavar="CATEGORY", help="Add an agent, at the place that --at gives.")
-    ] = None,
+    add: Annotated[Changes, option("Add an agent, at the place that --at gives.", "CATEGORY")] = None,
     at: Annotated[
         Changes,
-        typer.Option(
-            metavar="X,Y[,DEG[,MPS]]|AGENT+M",
-            help="Place of --add in the map, its heading and speed; or meters ahead of an agent, at its pace.",
+        option(
+            "Place of --add in the map, its heading and speed; or meters ahead of an agent, at its pace.",
+            "X,Y[,DEG[,MPS]]|AGENT+M",
         ),
     ] = None,
     replace: Annotated[
-        Changes, typer.Option(metavar="AGENT=CATEGORY", help="Replace an agent by one of another category and size.")
+        Changes, option("Replace an agent by one of another category and size.", "AGENT=CATEGORY")
     ] = None,
-    remove: Annotated[Changes, typer.Option(metavar="A,B", help="Remove agents.")] = None,
-    only: Annotated[Changes, typer.Option(metavar="A,B", help="Keep only these agents; the ego is 'ego'.")] = None,
+    remove: Annotated[Changes, option("Remove agents.", "A,B")] = None,
+    only: Annotated[Changes, option("Keep only these agents; the ego is 'ego'.", "A,B")] = None,
     drop_doubtful: DropDoubtful = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a check fails.")] = False,
+    strict: Annotated[bool, option("Exit 6 when a check fails.", None, "--strict")] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -183,7 +171,7 @@ def _motions(changes: dict[str, Changes], window: Window | None) -> Iterator[Edi
     from log2sim.edit.edits import Lateral, Shift, Speed
     from log2sim.errors import ConfigError
 
-    for option, entries in changes.items():
+    for name, entries in changes.items():
         for entry in entries or ():
             agent, _, value = entry.rpartition("=")  # an id may hold an equals sign, a number does not
             try:
@@ -191,8 +179,8 @@ def _motions(changes: dict[str, Changes], window: Window | None) -> Iterator[Edi
             except ValueError:
                 number = None
             if not agent or number is None:
-                raise ConfigError(f"--{option} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
-            if option == "shift":
+                raise ConfigError(f"--{name} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
+            if name == "shift":
                 yield Shift(agent, number)
             else:
-                yield (Speed if option == "speed" else Lateral)(agent, number, window)
+                yield (Speed if name == "speed" else Lateral)(agent, number, window)

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Poses, Quiet, SequenceName, Verbose, complete, say, say_written
+from log2sim.cli.options import (
+    Overwrite,
+    Poses,
+    Quiet,
+    SequenceName,
+    Verbose,
+    complete,
+    option,
+    say,
+    say_written,
+    write_to,
+)
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
 
 PROTOCOL = "center"
-MAX_LOGS = 20
-"""Of a batch that are printed; the document has all."""
+MAX_LOGS = 20  # of a batch that are printed; the document has all
 
 
 def evaluate(
@@ -28,46 +39,39 @@ def evaluate(
     ],
     truth: Annotated[
         Path,
-        typer.Option(
-            metavar="TRUTH",
-            help="Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
+        option(
+            "Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
+            "TRUTH",
         ),
     ],
     labels: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="True boxes for the log of --truth: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
+        option(
+            "True boxes for the log of --truth: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
+            "FILE",
         ),
     ] = None,
     sequence: SequenceName = None,
     poses: Poses = None,
     range: Annotated[
-        float | None, typer.Option(metavar="M", help="Compare agents or boxes up to this distance from the ego, in m.")
+        float | None, option("Compare agents or boxes up to this distance from the ego, in m.", "M")
     ] = None,
-    categories: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Compare only these categories or groups, e.g. vehicle.")
-    ] = None,
+    categories: Annotated[str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B")] = None,
     protocol: Annotated[
         str | None,
-        typer.Option(
-            metavar="kitti|dair|center",
-            autocompletion=complete("kitti", "dair", "center"),
-            show_default=PROTOCOL,
-            help="Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
+        option(
+            "Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
             "(nuScenes).",
+            "kitti|dair|center",
+            completes=complete("kitti", "dair", "center"),
+            default=PROTOCOL,
         ),
     ] = None,
     score: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S", help="Of boxes: score from which precision and recall count them.", show_default="0.5"
-        ),
+        float | None, option("Of boxes: score from which precision and recall count them.", "S", default="0.5")
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Reliability diagram of confidences or scores to write.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Metrics file to write.")] = None,
+    plot: Annotated[Path | None, option("Reliability diagram of confidences or scores to write.", "FILE.png")] = None,
+    out: Annotated[Path | None, write_to("FILE", "Metrics file to write.")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -124,7 +128,7 @@ def evaluate(
         with progress(quiet=quiet) as report_progress:
             known = load_truth(
                 truth, scenario, sequence=sequence, labels=labels, points=True,
-                progress=lambda done, total: report_progress("count points", done, total),
+                progress=partial(report_progress, "count points"),
             )  # fmt: skip
         for note in known.provenance.get("notes", ()) if labels is not None else ():
             say(f"note: {note}", quiet=quiet)
@@ -218,7 +222,7 @@ def _batch_figures(
             truth,
             lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
             Scope(max_range_m, categories),
-            progress=lambda done, total: report_progress("logs", done, total),
+            progress=partial(report_progress, "logs"),
         )
     table = f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
     return result, format_batch_verdict(result) + table
@@ -254,7 +258,5 @@ def _boxes_figures(
     except LogError as error:
         raise LogError(f"{path}: {error}") from None
     with progress(quiet=quiet) as report_progress:
-        result = evaluate_boxes(
-            detected, truth(), chosen, progress=lambda done, total: report_progress("count points", done, total)
-        )
+        result = evaluate_boxes(detected, truth(), chosen, progress=partial(report_progress, "count points"))
     return result, format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, choose, complete_plugins, say
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, choose, complete_plugins, option, say, write_to
 
 MAX_NOTES = 5
 FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
@@ -15,29 +13,23 @@ FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun" 
 
 def export(
     scenario: ScenarioPath,
-    to: Annotated[
-        str,
-        typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.", autocompletion=complete_plugins("export")),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write into.")],
+    to: Annotated[str, option(f"One of {FORMATS}.", "FORMAT", "--to", completes=complete_plugins("export"))],
+    out: Annotated[Path, write_to("DIR", "Folder to write into.")],
     revision: Annotated[
         str | None, choose("--revision", "1.0", "1.1", "1.2", help="openscenario: its version.", default="the newest")
     ] = None,
     map: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE file to use instead of a generated one."),
+        Path | None, option("openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")
     ] = None,
     mode: Annotated[
         str | None, choose("--mode", "exact", "pid", help="carla: how agents move.", default="exact")
     ] = None,
-    log: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose images and points are included.")
-    ] = None,
+    log: Annotated[Path | None, option("mcap, rerun: log whose images and points are included.", "LOG")] = None,
     ego: Annotated[
         str | None,
-        typer.Option(
-            metavar="AGENT|external",
-            help="Agent to take as the ego, where the scenario has none; openscenario: external, another program drives the ego.",
+        option(
+            "Agent to take as the ego, where the scenario has none; openscenario: external, another program drives the ego.",
+            "AGENT|external",
         ),
     ] = None,
     doubtful: Annotated[

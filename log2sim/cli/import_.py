@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, say_written
+from log2sim.cli.options import Overwrite, Quiet, say_written, write_to
 
 
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="SCENARIO", help="Scenario file to write.")],
+    out: Annotated[Path, write_to("SCENARIO", "Scenario file to write.")],
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:

@@ -18,6 +18,7 @@ from log2sim.cli.options import (
     Verbose,
     camera_names,
     counted,
+    option,
     say,
     say_written,
 )
@@ -145,14 +146,10 @@ def inspect(
     as_json: AsJson = False,
     overlay: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.png",
-            help="Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.",
-        ),
+        option("Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png"),
     ] = None,
     at: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="Time to draw, in s after the first tick.", show_default="in the middle"),
+        float | None, option("Time to draw, in s after the first tick.", "S", default="in the middle")
     ] = None,
     cameras: Cameras = None,
     overwrite: Overwrite = False,
@@ -180,7 +177,10 @@ def inspect(
     if log.suffix.lower() == ".json":
         if overlay is not None:
             raise ConfigError(f"{log}: is a scenario, which --overlay does not draw; log2sim plot does")
-        document = _summary_of_scenario(log)
+        from log2sim.datatypes import Scenario
+        from log2sim.road.lane_keeping import summarize_scenario
+
+        document = summarize_scenario(Scenario.load(log))
         lines = [json.dumps(document, indent=2)] if as_json else describe_scenario(document, verbose=verbose)
         say("\n".join(lines), quiet=quiet)
         return
@@ -198,10 +198,3 @@ def inspect(
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
     say_written(overlay, quiet=quiet)
-
-
-def _summary_of_scenario(path: Path) -> dict[str, Any]:
-    from log2sim.datatypes import Scenario
-    from log2sim.road.lane_keeping import summarize_scenario
-
-    return summarize_scenario(Scenario.load(path))

@@ -5,9 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, SequenceName, choose, say, say_written
+from log2sim.cli.options import (
+    Format,
+    LogPath,
+    Overwrite,
+    Quiet,
+    SequenceName,
+    choose,
+    option,
+    say,
+    say_written,
+    write_to,
+)
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -15,20 +24,14 @@ if TYPE_CHECKING:
 
 def map_(
     log: LogPath,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="Map to write: .tif (GeoTIFF), .png or .jpg (with a world file)."
-        ),
-    ],
+    out: Annotated[Path, write_to("FILE", "Map to write: .tif (GeoTIFF), .png or .jpg (with a world file).")],
     scenario: Annotated[
-        Path | None,
-        typer.Option(metavar="SCENARIO", help="Scenario of the log; its agents are left out of the map."),
+        Path | None, option("Scenario of the log; its agents are left out of the map.", "SCENARIO")
     ] = None,
     layer: Annotated[
         str, choose("--layer", "color", "intensity", "height", help="What is written; intensity is that of the LiDAR.")
     ] = "color",
-    cell: Annotated[float, typer.Option(metavar="M", help="Edge of a cell, in m.")] = 0.05,
+    cell: Annotated[float, option("Edge of a cell, in m.", "M")] = 0.05,
     format: Format = "auto",
     sequence: SequenceName = None,
     overwrite: Overwrite = False,

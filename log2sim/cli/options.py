@@ -36,26 +36,21 @@ def complete_plugins(*kinds: str, prefix: str = "") -> Callable[[str], list[str]
     return completed
 
 
-def choose(flag: str, *choices: str, help: str, default: str | None = None) -> Any:
-    """Make an option that takes one of a few words: `help` lists them, and a shell completes them.
+def option(
+    help: str, metavar: str | None = None, *flags: str, default: Any = True, completes: Any = None, **more: Any
+) -> Any:
+    """Make an option; `default` says in words what happens without it, where its default is None."""
+    return typer.Option(*flags, metavar=metavar, help=help, show_default=default, autocompletion=completes, **more)
 
-    Parameters
-    ----------
-    flag : str
-        Such as "--mode".
-    choices : str
-    default : str, optional
-        What happens without the option, in words; needed where its default is None.
-    """
-    shown: Any = True if default is None else default
-    return typer.Option(
-        flag, metavar="|".join(choices), help=help, autocompletion=complete(*choices), show_default=shown
-    )
+
+def choose(flag: str, *choices: str, help: str, default: Any = True) -> Any:
+    """Make an option that takes one of a few words: `help` lists them, and a shell completes them."""
+    return option(help, "|".join(choices), flag, completes=complete(*choices), default=default)
 
 
 def write_to(metavar: str, help: str) -> Any:
     """Make the option -o/--out."""
-    return typer.Option("--out", "-o", metavar=metavar, help=help)
+    return option(help, metavar, "--out", "-o")
 
 
 def complete_detectors(incomplete: str) -> list[str]:
@@ -65,53 +60,36 @@ def complete_detectors(incomplete: str) -> list[str]:
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", "-f", envvar="LOG2SIM_OVERWRITE", help="Replace files that exist.")
-]
+Overwrite = Annotated[bool, option("Replace files that exist.", None, "--overwrite", "-f", envvar="LOG2SIM_OVERWRITE")]
 DropDoubtful = Annotated[
-    bool, typer.Option("--drop-doubtful", help="Leave out agents that the scenario itself doubts; the ego stays.")
+    bool, option("Leave out agents that the scenario itself doubts; the ego stays.", None, "--drop-doubtful")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything, not only the first of many.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for programs, instead of a table.")]
+Quiet = Annotated[bool, option("Print nothing but errors.", None, "--quiet", "-q")]
+Verbose = Annotated[bool, option("Print everything, not only the first of many.", None, "--verbose", "-v")]
+AsJson = Annotated[bool, option("Print JSON, for programs, instead of a table.", None, "--json")]
 Format = Annotated[
     str,
-    typer.Option(
-        metavar="FORMAT",
-        help=f"Log format: auto, {', '.join(BUILT_IN['log'])}.",
-        autocompletion=lambda incomplete: [*complete("auto")(incomplete), *complete_plugins("log")(incomplete)],
+    option(
+        f"Log format: auto, {', '.join(BUILT_IN['log'])}.",
+        "FORMAT",
+        completes=lambda incomplete: [*complete("auto")(incomplete), *complete_plugins("log")(incomplete)],
     ),
 ]
 SequenceName = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Sequence to open, when the folder has several.", show_default="the only one"),
+    str | None, option("Sequence to open, when the folder has several.", "NAME", default="the only one")
 ]
-Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; see log2sim config.")
-]
-Cameras = Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.", show_default="all")]
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE.toml", help="File with settings; see log2sim config.")
-]
-Start = Annotated[
-    float | None,
-    typer.Option(metavar="S", help="First time to use, in s from the start of the log.", show_default="the start"),
-]
-Stop = Annotated[
-    float | None,
-    typer.Option(metavar="S", help="Last time to use, in s from the start of the log.", show_default="the end"),
-]
+Settings = Annotated[list[str] | None, option("Change a setting; see log2sim config.", "SECTION.KEY=VALUE", "--set")]
+Cameras = Annotated[str | None, option("Use only these cameras.", "A,B", default="all")]
+ConfigFile = Annotated[Path | None, option("File with settings; see log2sim config.", "FILE.toml", "--config")]
+Start = Annotated[float | None, option("First time to use, in s from the start of the log.", "S", default="the start")]
+Stop = Annotated[float | None, option("Last time to use, in s from the start of the log.", "S", default="the end")]
 Range = Annotated[
-    float | None,
-    typer.Option(metavar="M", help="Compare agents up to this distance from the ego, in m.", show_default="no limit"),
+    float | None, option("Compare agents up to this distance from the ego, in m.", "M", default="no limit")
 ]
 Categories = Annotated[
-    str | None,
-    typer.Option(metavar="A,B", help="Compare only these categories or groups, e.g. vehicle.", show_default="all"),
+    str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B", default="all")
 ]
-Truth = Annotated[
-    Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
-]
+Truth = Annotated[Path | None, option("Ground truth: a scenario file or a log with labels.", "TRUTH")]
 Poses = Annotated[
     str | None,
     choose(
@@ -125,8 +103,7 @@ Poses = Annotated[
 
 
 NoCache = Annotated[
-    bool,
-    typer.Option("--no-cache", help="Search every picture again, and keep nothing of it; see log2sim cache."),
+    bool, option("Search every picture again, and keep nothing of it; see log2sim cache.", None, "--no-cache")
 ]
 
 
@@ -153,10 +130,7 @@ def say_written(*paths: Path | None, quiet: bool) -> None:
 def camera_names(text: str | None) -> tuple[str, ...]:
     """Split what `--cameras` takes; none stands for all.
 
-    Raises
-    ------
-    ConfigError
-        When it is empty.
+    Raises `ConfigError` when it is empty.
     """
     names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
     if text is not None and not names:

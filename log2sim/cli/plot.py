@@ -5,58 +5,37 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, SequenceName, Truth, say, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, SequenceName, Truth, option, say, say_written, write_to
 
 
 def plot(
     scenario: ScenarioPath,
     out: Annotated[Path, write_to("FILE", "Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write.")],
-    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to draw over the scenario.")] = None,
+    replay: Annotated[Path | None, option("Replay to draw over the scenario.", "REPLAY")] = None,
     truth: Truth = None,
     background: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="LOG|MAP.png", help="Log whose map of the ground is the background, or a map of log2sim map."
-        ),
+        Path | None, option("Log whose map of the ground is the background, or a map of log2sim map.", "LOG|MAP.png")
     ] = None,
-    predict: Annotated[
-        float | None, typer.Option(metavar="S", help="Draw where movers were expected to go for this long, in s.")
-    ] = None,
+    predict: Annotated[float | None, option("Draw where movers were expected to go for this long, in s.", "S")] = None,
     start: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="First time of the scenario to show, in s.", show_default="the start"),
+        float | None, option("First time of the scenario to show, in s.", "S", default="the start")
     ] = None,
-    stop: Annotated[
-        float | None, typer.Option(metavar="S", help="Last time of the scenario to show, in s.", show_default="the end")
-    ] = None,
+    stop: Annotated[float | None, option("Last time of the scenario to show, in s.", "S", default="the end")] = None,
     extent: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X0,Y0,X1,Y1", help="Two corners of the part of the map to show, in m.", show_default="what moves"
-        ),
+        str | None, option("Two corners of the part of the map to show, in m.", "X0,Y0,X1,Y1", default="what moves")
     ] = None,
-    agents: Annotated[
-        str | None, typer.Option(metavar="ID,ID", help="Show these agents alone.", show_default="all")
-    ] = None,
-    label_static: Annotated[bool, typer.Option("--label-static", help="Write the ids of static agents too.")] = False,
+    agents: Annotated[str | None, option("Show these agents alone.", "ID,ID", default="all")] = None,
+    label_static: Annotated[bool, option("Write the ids of static agents too.", None, "--label-static")] = False,
     size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WxH", help="Size in pixels, such as 1280x720; not of .svg and .pdf.", show_default="what fits"
-        ),
+        str | None, option("Size in pixels, such as 1280x720; not of .svg and .pdf.", "WxH", default="what fits")
     ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(metavar="N", help="Frames of a film a second.", show_default="25, of a .gif 10"),
-    ] = None,
+    fps: Annotated[float | None, option("Frames of a film a second.", "N", default="25, of a .gif 10")] = None,
     speed: Annotated[
         float | None,
-        typer.Option(
-            metavar="X",
-            help="Times faster than real time that a film plays.",
-            show_default="1, or what fits into a minute, half a minute for a .gif",
+        option(
+            "Times faster than real time that a film plays.",
+            "X",
+            default="1, or what fits into a minute, half a minute for a .gif",
         ),
     ] = None,
     sequence: SequenceName = None,
@@ -72,8 +51,8 @@ def plot(
     log2sim plot scenario.json -o tracks.png
     log2sim plot scenario.json -o film.mp4 --size 1280x720 --start 2 --stop 8
     """
+    from log2sim.cli.layers import load_background, load_placed_truth, load_replay
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario
     from log2sim.files.documents import check_targets
     from log2sim.visualization.plot.selection import PlotOptions, parse_extent, parse_ids, parse_size
@@ -87,20 +66,11 @@ def plot(
     check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
-    known = None
-    if truth is not None:
-        from log2sim.evaluation.metrics.evaluator import place_truth
-        from log2sim.evaluation.metrics.truth import load_truth
-
-        known = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
+    known = None if truth is None else load_placed_truth(truth, loaded, sequence)
     if picture.note is not None:
         say(f"note: {picture.note}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        ground = None
-        if background is not None:
-            from log2sim.cli.background import load_background
-
-            ground = load_background(background, loaded, sequence, report_progress)
+        ground = None if background is None else load_background(background, loaded, sequence, report_progress)
         plot_tracks(
             loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
             overwrite=overwrite, progress=report_progress,

@@ -5,21 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say, say_written
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, say, say_written, write_to
 
 
 def predict(
     scenario: ScenarioPath,
-    horizon: Annotated[float, typer.Option(metavar="S", help="Longest prediction in s, from 0.1 to 10.")] = 3.0,
+    horizon: Annotated[float, option("Longest prediction in s, from 0.1 to 10.", "S")] = 3.0,
     method: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Only these methods: velocity, turn, smoothed, path.", show_default="all"),
+        str | None, option("Only these methods: velocity, turn, smoothed, path.", "A,B", default="all")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Figures file to write.")] = None,
+    out: Annotated[Path | None, write_to("FILE", "Figures file to write.")] = None,
     positions: Annotated[
-        bool, typer.Option("--positions", help="With --out: write every predicted position with its sigma, too.")
+        bool, option("With --out: write every predicted position with its sigma, too.", None, "--positions")
     ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

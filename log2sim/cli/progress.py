@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S = 5.0
 
+# Shown on a terminal alone: elsewhere what is wrong with the log is to be the only line.
 ON_TERMINALS = (OPENING, VALIDATING)
-"""Shown on a terminal alone: elsewhere what is wrong with the log is to be the only line."""
 
+# Called as `report(stage, done, total)`; a total of 0 says that the length of the stage is not known.
 Report = Callable[[str, int, int], None]
-"""Called as `report(stage, done, total)`; a total of 0 says that the length of the stage is not known."""
 
 
 @contextmanager
@@ -35,12 +35,7 @@ def progress(*, quiet: bool) -> Iterator[Report]:
 
 
 class Bars:
-    """A bar for each stage of a run; a stage ends when the next one begins.
-
-    Parameters
-    ----------
-    display : rich.progress.Progress
-    """
+    """A bar for each stage of a run; a stage ends when the next one begins."""
 
     def __init__(self, display: Progress) -> None:
         self._display = display

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from log2sim.pipeline import Result
 
 
+# Stages without which something is missing in a scenario; the others save time.
 LOOKED_FOR = (
     "image decoding",
     "detection in LiDAR sweeps",
@@ -44,7 +45,6 @@ LOOKED_FOR = (
     "colors of vehicles",
     "traffic lights",
 )
-"""Stages without which something is missing in a scenario; the others save time."""
 
 
 def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
@@ -64,7 +64,7 @@ def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = Fals
     ]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
     table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
-    made = ", ".join([f"made in {speed}", *known_pictures(result.report)])
+    made = ", ".join([f"made in {speed}", *known_ticks(result.report)])
     # Never broken into lines: it is there to be copied.
     return [
         f"{out}: {ids} over {scenario.duration_s:.1f} s, {made}",
@@ -73,17 +73,17 @@ def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = Fals
     ]
 
 
-def known_pictures(report: dict[str, Any]) -> list[str]:
-    """Say how many pictures were not searched, since an earlier run had done it."""
+def known_ticks(report: dict[str, Any]) -> list[str]:
+    """Say how many ticks were not looked at, since an earlier run had done it."""
     cache = report["detection_cache"]
     found = 0 if cache is None else cache["found"]
-    return [f"{counted(found, 'picture')} known from earlier runs"] if found else []
+    return [f"{counted(found, 'tick')} known from earlier runs"] if found else []
 
 
 def cache_notes(report: dict[str, Any]) -> list[str]:
-    """Say why detections were not kept, where they should have been."""
+    """Say why the first pass was not kept, where it should have been."""
     cache = report["detection_cache"]
-    return [f"detections are not kept for later runs: {cache['problem']}"] if cache and cache["problem"] else []
+    return [f"the first pass is not kept for later runs: {cache['problem']}"] if cache and cache["problem"] else []
 
 
 def described(scenario: Scenario) -> list[str]:
@@ -307,7 +307,7 @@ def reconstruct(
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
-    from log2sim.cli.background import CELL_M
+    from log2sim.cli.layers import CELL_M
     from log2sim.config import MapConfig
     from log2sim.perception.frames import RecordReader
     from log2sim.road.builder import map_ground

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
-
-import typer
 
 from log2sim.cli.options import (
     DropDoubtful,
@@ -14,6 +13,7 @@ from log2sim.cli.options import (
     ScenarioPath,
     Verbose,
     choose,
+    option,
     say,
     say_written,
     write_to,
@@ -46,12 +46,11 @@ def replay(
             help="Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
         ),
     ] = "auto",
-    dt: Annotated[float, typer.Option(metavar="S", help="Time step in s, from 0.0005 to 1.")] = 0.01,
+    dt: Annotated[float, option("Time step in s, from 0.0005 to 1.", "S")] = 0.01,
     ego: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE",
-            help="Policy that drives the ego: a plug-in, or of a module or file.",
+        option(
+            "Policy that drives the ego: a plug-in, or of a module or file.", "NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE"
         ),
     ] = None,
     warn: Annotated[
@@ -64,14 +63,10 @@ def replay(
             help="Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
         ),
     ] = None,
-    brake: Annotated[bool, typer.Option("--brake", help="With --warn: the ego brakes when it is warned.")] = False,
-    horizon: Annotated[float, typer.Option(metavar="S", help="--warn: predict collisions for so long, in s.")] = 5.0,
-    reaction: Annotated[
-        float, typer.Option(metavar="S", help="--warn: from the warning until the brakes work, in s.")
-    ] = 1.0,
-    deceleration: Annotated[
-        float, typer.Option(metavar="MPS2", help="--warn: how hard the ego brakes, in m/s2.")
-    ] = 8.0,
+    brake: Annotated[bool, option("With --warn: the ego brakes when it is warned.", None, "--brake")] = False,
+    horizon: Annotated[float, option("--warn: predict collisions for so long, in s.", "S")] = 5.0,
+    reaction: Annotated[float, option("--warn: from the warning until the brakes work, in s.", "S")] = 1.0,
+    deceleration: Annotated[float, option("--warn: how hard the ego brakes, in m/s2.", "MPS2")] = 8.0,
     agents: Annotated[
         str,
         choose(
@@ -81,7 +76,7 @@ def replay(
             help="Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
         ),
     ] = "scenario",
-    react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Make only these agents reactive.")] = None,
+    react: Annotated[str | None, option("Make only these agents reactive.", "ID,ID")] = None,
     foresight: Annotated[
         str,
         choose(
@@ -93,32 +88,21 @@ def replay(
     ] = "path",
     confidence: Annotated[
         float | None,
-        typer.Option(
-            metavar="MIN",
-            help="Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.",
-        ),
+        option("Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.", "MIN"),
     ] = None,
     drop_doubtful: DropDoubtful = False,
     simulator: Annotated[
         str, choose("--simulator", "own", "carla", help="own, or carla: agents move in a CARLA server.")
     ] = "own",
-    host: Annotated[
-        str | None, typer.Option(metavar="NAME", help="carla: address of the server.", show_default="127.0.0.1")
-    ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="carla: port of the server.", min=1, max=65535, show_default="2000"),
-    ] = None,
-    map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="carla: map to load first.")] = None,
+    host: Annotated[str | None, option("carla: address of the server.", "NAME", default="127.0.0.1")] = None,
+    port: Annotated[int | None, option("carla: port of the server.", "N", min=1, max=65535, default="2000")] = None,
+    map: Annotated[str | None, option("carla: map to load first.", "TOWN|FILE.xodr")] = None,
     strict: Annotated[
         bool,
-        typer.Option(
-            "--strict", help="Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path."
-        ),
+        option("Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path.", None, "--strict"),
     ] = False,
     limit: Annotated[
-        list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="Report agents beyond this limit, e.g. min_ttc_s=1; see --strict."),
+        list[str] | None, option("Report agents beyond this limit, e.g. min_ttc_s=1; see --strict.", "METRIC=VALUE")
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -169,7 +153,7 @@ def replay(
     with progress(quiet=quiet) as report_progress:
         result = run(
             kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, foresight=foresight, host=moved_by,
-            quarantined=confidence is not None, progress=lambda done, total: report_progress("replay", done, total),
+            quarantined=confidence is not None, progress=partial(report_progress, "replay"),
         )  # fmt: skip
     warned = None if warning is None else find_warnings(kept, result, ends=warning.ends, settings=warning)
     result = changed(result, left_out=left_out, warnings=warned)

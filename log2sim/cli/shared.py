@@ -10,28 +10,24 @@ import signal
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Annotated, Any, TextIO
 
 import typer
+from typer.core import TyperCommand
 
-from log2sim.cli.plugin_help import CommandWithPlugins
 from log2sim.files.inputs import OPTION
 
 ENDING_SIGNALS = ("SIGTERM", "SIGHUP")
-SIGNAL_CODE = 128
-"""A shell adds the number of the signal to this as the exit code: 143 for SIGTERM."""
+SIGNAL_CODE = 128  # a shell adds the number of the signal to this as the exit code: 143 for SIGTERM
 
 
 class Ended:
     """Which signal ended the process.
 
-    Attributes
-    ----------
-    signal : int
-        0 while there was none.
+    `signal`: 0 while there was none.
     """
 
     signal = 0
@@ -105,19 +101,15 @@ class TolerantStream:
             return
 
 
-def fill_closed_descriptors() -> None:
-    """Let the standard streams that are closed lead nowhere: a file opened next would get the number, and what libraries print."""
+@contextmanager
+def tolerating_lost_output() -> Iterator[None]:
+    """Within the block what cannot be printed changes nothing else."""
+    # Let the standard streams that are closed lead nowhere: a file opened next would get the number, and what libraries print.
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
-
-
-@contextmanager
-def tolerating_lost_output() -> Iterator[None]:
-    """Within the block what cannot be printed changes nothing else."""
-    fill_closed_descriptors()
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = TolerantStream(sys.stdout), TolerantStream(sys.stderr)
     try:
@@ -128,8 +120,7 @@ def tolerating_lost_output() -> Iterator[None]:
         sys.stdout, sys.stderr = before
 
 
-MIN_COLUMNS = 40
-"""Narrower terminals are treated as this wide: a word a line reads no better."""
+MIN_COLUMNS = 40  # narrower terminals are treated as this wide: a word a line reads no better
 
 
 def format_rows(rows: Sequence[Sequence[str]], indent: int = 0) -> list[str]:
@@ -164,6 +155,48 @@ def terminal_width() -> int | None:
     return max(shutil.get_terminal_size().columns, MIN_COLUMNS)
 
 
+# Kinds of plug-ins that an option takes, and what stands before their names.
+KINDS = {
+    "--format": {"log": ""},
+    "--detector": {"detector": "", "lidar_detector": "lidar:"},
+    "--to": {"export": ""},
+    "--ego": {"policy": ""},
+    "--model": {"vehicle_model": ""},
+}
+
+# Commands of which alone an option means that; `export --ego` takes the id of an agent.
+ONLY_OF = {"--ego": "replay", "--model": "replay"}
+
+SWEEPS_ALONE = "detect"  # command whose `--detector` takes none in pictures
+
+
+class CommandWithPlugins(TyperCommand):
+    """A command whose help names installed plug-ins; they are looked up only then, and none is imported."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the installed plug-ins by option, then the examples."""
+        options = {name for parameter in self.params for name in parameter.opts}
+        found = []
+        for option in [o for o in KINDS if o in options and ONLY_OF.get(o, self.name) == self.name]:
+            kinds = {k: prefix for k, prefix in KINDS[option].items() if (self.name, k) != (SWEEPS_ALONE, "detector")}
+            found += [(f"{option} {name}", package) for name, package in list_plugins(kinds)]
+        if found:
+            with formatter.section("Plug-ins that are installed"):
+                formatter.write_dl(found)
+        super().format_epilog(ctx, formatter)
+
+
+def list_plugins(kinds: Mapping[str, str]) -> list[tuple[str, str]]:
+    """List names, each behind the prefix of its kind, and packages of plug-ins, without importing them."""
+    from log2sim.files.plugins import installed, package_of
+
+    return [
+        (f"{prefix}{entry.name}", package_of(entry))
+        for kind, prefix in kinds.items()
+        for entry in sorted(installed(kind), key=lambda entry: entry.name)
+    ]
+
+
 DEBUG = "--debug"
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 Debug = Annotated[bool, typer.Option(DEBUG, help="Show where in the program an error comes from.")]
@@ -173,12 +206,8 @@ FollowLinks = Annotated[bool, typer.Option(OPTION, help="Follow links in logs th
 def add_command(app: typer.Typer, command: Callable[..., None], name: str | None = None) -> None:
     """Add a command to the program, with the shared options, and the examples of its docstring below its options.
 
-    Parameters
-    ----------
-    command : callable
-        Its docstring is the help. What stands below the heading "Examples" are lines for the shell.
-    name : str, optional
-        Default: that of the function.
+    `command`: its docstring is the help. What stands below the heading "Examples" are lines for the shell. `name`:
+    default: that of the function.
     """
     text, _, examples = (inspect.getdoc(command) or "").partition("\nExamples\n--------\n")
     app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=format_examples(examples))(

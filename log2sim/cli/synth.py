@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, say_written
+from log2sim.cli.options import Overwrite, Quiet, option, say_written, write_to
 from log2sim.errors import ConfigError
 
 
@@ -44,36 +45,31 @@ class WeatherName(StrEnum):
 
 
 def synth(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
+    out: Annotated[Path, write_to("DIR", "Folder to write.")],
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
     traffic: Annotated[
         Traffic | None,
-        typer.Option(help="Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
+        option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
     ] = None,
-    scenes: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of random scenes.")] = 10,
+    scenes: Annotated[int, option("Number of random scenes.", min=1, max=1_000_000)] = 10,
     sensor: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]",
-        ),
+        option("LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"),
     ] = None,
     layout: Annotated[
         Layout | None,
-        typer.Option(
-            help="Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
+        option(
+            "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
             "pictures]"
         ),
     ] = None,
-    duration: Annotated[
-        float, typer.Option(min=0.5, max=60.0, help="Length of each log of random traffic in s.")
-    ] = 5.0,
-    light: Annotated[LightName | None, typer.Option(help="Light; random scenes draw it otherwise.")] = None,
-    weather: Annotated[WeatherName | None, typer.Option(help="Weather; random scenes draw it otherwise.")] = None,
+    duration: Annotated[float, option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
+    light: Annotated[LightName | None, option("Light; random scenes draw it otherwise.")] = None,
+    weather: Annotated[WeatherName | None, option("Weather; random scenes draw it otherwise.")] = None,
     no_pictures: Annotated[
-        bool, typer.Option("--no-pictures", help="Write no cameras: LiDAR sweeps, poses and labels alone.")
+        bool, option("Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    seed: Annotated[int, option("Seed of all random numbers.", min=0)] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -104,7 +100,7 @@ def synth(
                 out,
                 seed=seed,
                 overwrite=overwrite,
-                progress=lambda done, total: report_progress("synthesize", done, total),
+                progress=partial(report_progress, "synthesize"),
             )
         elif traffic is not None:
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic
@@ -115,7 +111,5 @@ def synth(
                 None if light is None else light.value, None if weather is None else weather.value,
                 pictures=not no_pictures,
             )  # fmt: skip
-            write_traffic(
-                settings, out, overwrite=overwrite, progress=lambda done, total: report_progress("scenes", done, total)
-            )
+            write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
     say_written(out, quiet=quiet)

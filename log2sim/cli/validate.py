@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -43,7 +44,7 @@ def validate(
 
         opened = open_log(path, format=format, sequence=sequence)
         with progress(quiet=quiet) as report_progress:
-            problems = validate_log(opened, progress=lambda done, total: report_progress(VALIDATING, done, total))
+            problems = validate_log(opened, progress=partial(report_progress, VALIDATING))
         # Those of native logs are among the problems.
         for note in () if opened.format == READER.name else opened.notes:
             say(f"note: {note}", quiet=quiet)
@@ -52,32 +53,28 @@ def validate(
         if problems:
             raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
     else:
-        _validate_file(path)
+        from log2sim.datatypes import Scenario
+        from log2sim.errors import ScenarioError
+        from log2sim.evaluation.detection.boxes import DetectedBoxes, is_boxes_document
+        from log2sim.files.documents import check, read_json
+        from log2sim.simulation.result import Replay
+
+        document = read_json(path, ScenarioError)
+        keys = document if isinstance(document, dict) else {}
+        if "replay_version" in keys:
+            Replay.load(path)
+        elif "metrics_version" in keys:
+            check(document, "metrics-1", ScenarioError)
+        elif "detection_metrics_version" in keys:
+            check(document, "detection-metrics-1", ScenarioError)
+        elif is_boxes_document(document):
+            DetectedBoxes.load(path)
+        elif "report_version" in keys:
+            check(document, "report-1", ScenarioError)
+        elif "prediction_version" in keys:
+            check(document, "prediction-1", ScenarioError)
+        elif "bench_version" in keys:
+            check(document, "bench-1", ScenarioError)
+        else:
+            Scenario.load(path)
     say(f"{path}: valid", quiet=quiet)
-
-
-def _validate_file(path: Path) -> None:
-    from log2sim.datatypes import Scenario
-    from log2sim.errors import ScenarioError
-    from log2sim.evaluation.detection.boxes import DetectedBoxes, is_boxes_document
-    from log2sim.files.documents import check, read_json
-    from log2sim.simulation.result import Replay
-
-    document = read_json(path, ScenarioError)
-    keys = document if isinstance(document, dict) else {}
-    if "replay_version" in keys:
-        Replay.load(path)
-    elif "metrics_version" in keys:
-        check(document, "metrics-1", ScenarioError)
-    elif "detection_metrics_version" in keys:
-        check(document, "detection-metrics-1", ScenarioError)
-    elif is_boxes_document(document):
-        DetectedBoxes.load(path)
-    elif "report_version" in keys:
-        check(document, "report-1", ScenarioError)
-    elif "prediction_version" in keys:
-        check(document, "prediction-1", ScenarioError)
-    elif "bench_version" in keys:
-        check(document, "bench-1", ScenarioError)
-    else:
-        Scenario.load(path)

@@ -5,9 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, SequenceName, camera_names, say, write_to
+from log2sim.cli.options import (
+    Cameras,
+    Overwrite,
+    Quiet,
+    ScenarioPath,
+    SequenceName,
+    camera_names,
+    option,
+    say,
+    write_to,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,36 +28,29 @@ def view(
     scenario: ScenarioPath,
     out: Annotated[Path, write_to("FILE.html", "Page to write.")],
     log: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="LOG", help="Log whose pictures with boxes, LiDAR points and map of the ground the page shows."
-        ),
+        Path | None, option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")
     ] = None,
     max_mb: Annotated[
         float | None,
-        typer.Option(
-            metavar="MB",
-            help="Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
-            show_default="40",
+        option(
+            "Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
+            "MB",
+            default="40",
         ),
     ] = None,
     cameras: Cameras = None,
-    truth: Annotated[
-        Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
-    ] = None,
-    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to show as a layer.")] = None,
+    truth: Annotated[Path | None, option("Ground truth: a scenario file or a log with labels.", "TRUTH")] = None,
+    replay: Annotated[Path | None, option("Replay to show as a layer.", "REPLAY")] = None,
     metrics: Annotated[
-        Path | None, typer.Option(metavar="METRICS", help="Metrics file of log2sim evaluate, to show beside the map.")
+        Path | None, option("Metrics file of log2sim evaluate, to show beside the map.", "METRICS")
     ] = None,
-    predict: Annotated[
-        float | None, typer.Option(metavar="S", help="Show where agents were expected to go for this long, in s.")
-    ] = None,
+    predict: Annotated[float | None, option("Show where agents were expected to go for this long, in s.", "S")] = None,
     background: Annotated[
         Path | None,
-        typer.Option(
-            metavar="LOG|MAP.png",
-            help="Log whose map of the ground is shown below, or a map of log2sim map.",
-            show_default="that of --log",
+        option(
+            "Log whose map of the ground is shown below, or a map of log2sim map.",
+            "LOG|MAP.png",
+            default="that of --log",
         ),
     ] = None,
     sequence: SequenceName = None,
@@ -63,8 +64,8 @@ def view(
     log2sim view s.json --log samples/crossing -o s.html
     log2sim view s.json --replay replay.json --truth samples/crossing -o s.html
     """
+    from log2sim.cli.layers import load_background, load_placed_truth, load_replay, map_of
     from log2sim.cli.progress import progress
-    from log2sim.cli.truth import load_replay
     from log2sim.datatypes import Scenario, say_agents
     from log2sim.errors import ConfigError
     from log2sim.files.documents import check_targets
@@ -79,14 +80,9 @@ def view(
     loaded = Scenario.load(scenario)
     layers: dict[str, Any] = {
         "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
-        "truth": None,
+        "truth": load_placed_truth(truth, loaded, sequence) if truth is not None else None,
         "metrics": [] if metrics is None else [_metrics(metrics)],
     }
-    if truth is not None:
-        from log2sim.evaluation.metrics.evaluator import place_truth
-        from log2sim.evaluation.metrics.truth import load_truth
-
-        layers["truth"] = place_truth(load_truth(truth, loaded, sequence=sequence), loaded)[0]
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
@@ -95,12 +91,8 @@ def view(
             max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
             layers["recorded"] = _recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
         if background is not None:
-            from log2sim.cli.background import load_background
-
             layers["background"] = load_background(background, loaded, sequence, report_progress)
         elif log is not None and _shows_ground(opened := layers["recorded"].log):
-            from log2sim.cli.background import map_of
-
             layers["background"] = map_of(opened, loaded, report_progress)
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:
@@ -134,10 +126,7 @@ def _shows_ground(log: Log) -> bool:
 def _metrics(path: Path) -> tuple[str, str]:
     """Return title and table of a metrics file.
 
-    Raises
-    ------
-    LogError
-        When it is none.
+    Raises `LogError` when it is none.
     """
     from log2sim.errors import LogError
     from log2sim.evaluation.metrics.table import format_table, format_verdict

@@ -25,15 +25,6 @@ SAME_CONTACT_S = 0.5
 RELATIVE_TOLERANCE = 1 + 1e-6
 
 
-def warnings_of(before: Scenario, after: Scenario) -> tuple[str, ...]:
-    """Return what is wrong with the edited scenario and not with its source, a line each, with agent, time and value."""
-    source = {a.id: a for a in before.agents}
-    changed = [a for a in after.agents if a is not source.get(a.id)]
-    infeasible = [line for a in changed for line in _infeasible(source.get(a.id), a)]
-    undrivable = () if infeasible else _undrivable(before, after, changed)
-    return (*_collisions(before, after, {a.id for a in changed}), *infeasible, *undrivable)
-
-
 def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterator[str]:
     """Yield overlaps of boxes where the source has none of the same two agents within `SAME_CONTACT_S`."""
     if not changed:
@@ -126,16 +117,10 @@ def _peak(t_s: Array, values: Array) -> PeakValue:
 
 @dataclass(frozen=True, eq=False)
 class Edited:
-    """The edited scenario, and problems that its source does not have.
-
-    Attributes
-    ----------
-    warnings : tuple of str
-        New collisions and infeasible motion.
-    """
+    """The edited scenario, and problems that its source does not have."""
 
     scenario: Scenario
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # new collisions and infeasible motion
 
     def require_clean(self) -> None:
         """Raise `CheckFailed` with all warnings, if there are any."""
@@ -181,7 +166,12 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
         duration_s=max(scenario.duration_s, end_s),
         provenance={**scenario.provenance, "edits": _history(scenario, edits)},
     )
-    return Edited(edited, warnings_of(scenario, edited))
+    # What is wrong with the edited scenario and not with its source, a line each, with agent, time and value.
+    source = {a.id: a for a in scenario.agents}
+    changed = [a for a in edited.agents if a is not source.get(a.id)]
+    infeasible = [line for a in changed for line in _infeasible(source.get(a.id), a)]
+    undrivable = () if infeasible else _undrivable(scenario, edited, changed)
+    return Edited(edited, (*_collisions(scenario, edited, {a.id for a in changed}), *infeasible, *undrivable))
 
 
 def _check_names(scenario: Scenario, edits: Sequence[Edit]) -> None:

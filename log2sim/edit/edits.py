@@ -28,11 +28,8 @@ from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
 
-MAX_STEP_S = 1.0
-"""Waypoints of an agent that is added are at most so far apart, as those of a reconstruction."""
-
-Agents = Mapping[str, Agent]
-"""Agents by id, in the order of the scenario."""
+MAX_STEP_S = 1.0  # waypoints of an agent that is added are at most so far apart, as those of a reconstruction
+Agents = Mapping[str, Agent]  # agents by id, in the order of the scenario
 
 
 class Edit:
@@ -276,26 +273,15 @@ class CutIn(_AgentEdit):
 
 @dataclass(frozen=True)
 class Add(Edit):
-    """Add an agent of the typical size of its category.
+    """Add an agent of the typical size of its category."""
 
-    Attributes
-    ----------
-    category : str
-        One of `CATEGORIES`.
-    x_m, y_m, yaw_rad : float
-        Where its center is at the start.
-    speed_mps : float, m/s
-        It goes straight on from there; it is static at 0.
-    ahead_of : str
-        Instead: it moves `meters` ahead of this agent on its path, behind where negative.
-    """
-
-    category: str
+    category: str  # one of `CATEGORIES`
+    # x_m, y_m, yaw_rad: where its center is at the start.
     x_m: float = 0.0
     y_m: float = 0.0
     yaw_rad: float = 0.0
-    speed_mps: float = 0.0
-    ahead_of: str = ""
+    speed_mps: float = 0.0  # it goes straight on from there; it is static at 0
+    ahead_of: str = ""  # instead: it moves `meters` ahead of this agent on its path, behind where negative
     meters: float = 0.0
     kind: ClassVar[str] = "add"
 

@@ -13,8 +13,8 @@ from log2sim.datatypes import Agent, Doubt, Waypoints
 from log2sim.geometry import Array, wrap_angle
 
 MIN_PATH_MPS = 0.5  # slower waypoints do not define the curvature of a path
+# Waypoints of a maneuver are so far apart: a lane change of 2 s is then right to a millimeter between them.
 STEP_S = 0.1
-"""Waypoints of a maneuver are so far apart: a lane change of 2 s is then right to a millimeter between them."""
 OLD_TIME = "before it was moved in time"
 _NAMES_A_TIME = re.compile(r"\d s\b")
 
@@ -65,8 +65,6 @@ def sped_up(w: Waypoints, factor: float) -> Waypoints:
 def shifted_left(w: Waypoints, meters: float) -> Waypoints:
     """Return waypoints `meters` to the left of their headings, to the right where negative.
 
-    Notes
-    -----
     A point fixed to the left of a rigid body moves along the body's heading, `meters` times the yaw rate slower than
     the body, which is 1 - curvature times `meters` of its speed. So all points of the body, also the rear axle, drive a
     parallel curve, and a standing body keeps its heading. `parallel_fails` tells where no parallel curve exists. The
@@ -117,8 +115,6 @@ def with_steps(w: Waypoints, begin_s: float, end_s: float) -> Array:
 def smooth_step(share: Array) -> tuple[Array, Array]:
     """Return the polynomial of least jerk from 0 to 1 at shares (T,) of its duration, and its derivative.
 
-    Notes
-    -----
     Flash and Hogan, "The coordination of arm movements", Journal of Neuroscience 5, 1985: velocity and acceleration are 0 at
     both ends. Its largest derivative is 15/8, its largest second derivative 10 / sqrt(3).
     """

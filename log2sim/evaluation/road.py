@@ -27,33 +27,18 @@ PATH_TOLERANCE_M = 0.05  # to which the ego's path is simplified before its surr
 
 @dataclass(frozen=True, eq=False)
 class Area:
-    """Where map features count.
+    """Where map features count."""
 
-    Attributes
-    ----------
-    near : polygon or None
-        Surroundings of the ego's path; None without an ego, where all counts.
-    close : polygon or None
-        Its nearer part.
-    seen : polygon or None
-        Ground that a sensor saw; None where the truth does not tell.
-    path_m : float
-        Length of the ego's path, m; 0 without an ego.
-    """
-
-    near: BaseGeometry | None
-    close: BaseGeometry | None
-    seen: BaseGeometry | None
-    path_m: float
+    near: BaseGeometry | None  # surroundings of the ego's path; None without an ego, where all counts
+    close: BaseGeometry | None  # its nearer part
+    seen: BaseGeometry | None  # ground that a sensor saw; None where the truth does not tell
+    path_m: float  # length of the ego's path, m; 0 without an ego
 
     @classmethod
     def of(cls, scenario: Scenario, truth: Scenario, shift_m: Array) -> Area:
         """Take it from a truth that was moved into the scenario's map by `shift_m` (3,).
 
-        Raises
-        ------
-        ScenarioError
-            When the truth names cells in a way that cannot be read.
+        Raises `ScenarioError` when the truth names cells in a way that cannot be read.
         """
         ego = truth.ego or scenario.ego
         seen = seen_ground(truth, shift_m)
@@ -133,28 +118,20 @@ def sampled(points_m: Array) -> tuple[Array, Array, float]:
 
 
 MATCH_M = 0.3
+# Found points farther from every true line than this, about a third of a lane, belong to none and have no lateral
+# error.
 LATERAL_REACH_M = 1.0
-"""Found points farther from every true line than this, about a third of a lane, belong to none and have no lateral error."""
 
 Line = Marking | RoadBorder
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of lines, S in all.
+    """Points of lines, S in all."""
 
-    Attributes
-    ----------
-    xy_m : (S, 2) float64, m
-    length_m : (S,) float64, m
-        That each stands for.
-    line : (S,) int64
-        Index of its line.
-    """
-
-    xy_m: Array
-    length_m: Array
-    line: NDArray[np.int64]
+    xy_m: Array  # (S, 2)
+    length_m: Array  # (S,) that each stands for
+    line: NDArray[np.int64]  # (S,) index of its line
 
     @classmethod
     def of(cls, lines: Sequence[Line]) -> Samples:
@@ -188,12 +165,10 @@ def nearest(samples: Samples, lines: Sequence[Line]) -> tuple[NDArray[np.int64],
 def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dict[str, Any]:
     """Compare found lines with true ones.
 
-    Returns
-    -------
-    dict
-        `precision` is the share of found length within `MATCH_M` of a true line, `recall` the share of true length within
-        that of a found one, where a sensor saw the ground; `recall_20_m` the same within 20 m of the path. The lateral errors are distances of found points to the nearest
-        true line within `LATERAL_REACH_M`. None where there is nothing to compute a figure from.
+    `precision` is the share of found length within `MATCH_M` of a true line, `recall` the share of true length
+    within that of a found one, where a sensor saw the ground; `recall_20_m` the same within 20 m of the path. The
+    lateral errors are distances of found points to the nearest true line within `LATERAL_REACH_M`. None where there is
+    nothing to compute a figure from.
     """
     ours = Samples.of(found)
     ours = ours.where(area.counts(ours.xy_m))
@@ -252,8 +227,8 @@ def _quantile(values: Array, weight: Array, share: float) -> float | None:
 
 
 STOP_LINE_REACH_M = 0.5
+# What two of a kind share at least to be the same: of the length of the longer stop line, of the union of outlines.
 MIN_STOP_LINE_SHARE, MIN_OVERLAP, MIN_ARROW_OVERLAP = 0.5, 0.5, 0.2
-"""What two of a kind share at least to be the same: of the length of the longer stop line, of the union of outlines."""
 
 
 def shape_figures(found: Sequence[Marking], true: Sequence[Marking], area: Area) -> dict[str, Any]:
@@ -308,11 +283,9 @@ def _mostly(inside: Any, geometry: BaseGeometry) -> bool:
 
 
 CENTER_MATCH_M = 0.5
-CENTER_REACH_M = 1.5
-"""About half a lane: a found center line farther from all true ones belongs to none."""
+CENTER_REACH_M = 1.5  # about half a lane: a found center line farther from all true ones belongs to none
 MAX_TURN_RAD = np.deg2rad(45.0)
-MIN_SPEED_MPS = 0.5
-"""Who is slower may stand beside the lanes."""
+MIN_SPEED_MPS = 0.5  # who is slower may stand beside the lanes
 
 
 def lane_figures(found: Sequence[MapLane], true: Sequence[MapLane], area: Area) -> dict[str, Any]:
@@ -322,7 +295,8 @@ def lane_figures(found: Sequence[MapLane], true: Sequence[MapLane], area: Area) 
     # In junctions a found lane may be any; what lies on a true junction lane counts neither way.
     crossed = shapely.union_all([_band(lane) for lane in true if lane.junction is not None])
     away, weight = _distances(ours, true, area.counts)
-    at_junction = _inside(crossed, ours, area.counts)
+    xy, _, _ = _samples(ours, area.counts)
+    at_junction = np.asarray(shapely.contains_xy(crossed, xy[:, 0], xy[:, 1]), dtype=bool)
     away, weight = away[~at_junction], weight[~at_junction]
     missed, true_weight = _distances(theirs, found, area.expects)
     near = away <= CENTER_REACH_M
@@ -370,11 +344,6 @@ def _distances(lanes: Sequence[MapLane], others: Sequence[MapLane], counts: Any)
     return distance, weight
 
 
-def _inside(area: Any, lanes: Sequence[MapLane], counts: Any) -> NDArray[np.bool_]:
-    xy, _, _ = _samples(lanes, counts)
-    return np.asarray(shapely.contains_xy(area, xy[:, 0], xy[:, 1]), dtype=bool)
-
-
 def _band(lane: MapLane) -> Any:
     return shapely.LineString(lane.points_m[:, :2]).buffer(float(np.mean(lane.width_m)) / 2, cap_style="flat")
 
@@ -406,17 +375,10 @@ def _to_lanes(xy: Array, heading: Array, lanes: Sequence[MapLane]) -> tuple[Arra
 def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str, Any] | None:
     """Compare the colors of vehicles that were found with the true ones.
 
-    Parameters
-    ----------
-    found : mapping
-        The agent that each true one is matched with most often, by the true one's id.
-
-    Returns
-    -------
-    dict or None
-        `accuracy` is the share of right names among vehicles with a color whose true color has a name of the fixed list;
-        `ciede2000_median` the difference of the RGB values (Sharma et al., 2005; about 2 is just noticeable). None where the
-        truth has no colors.
+    `found`: the agent that each true one is matched with most often, by the true one's id. `accuracy` is the
+    share of right names among vehicles with a color whose true color has a name of the fixed list; `ciede2000_median`
+    the difference of the RGB values (Sharma et al., 2005; about 2 is just noticeable). None where the truth has no
+    colors.
     """
     colored = [a for a in true if a.color is not None and GROUP_OF.get(a.category) == "vehicle"]
     if not colored:
@@ -452,8 +414,7 @@ def _difference(a: Any, b: Any) -> float:
     return float(deltaE_ciede2000(first, second)[0, 0])
 
 
-MAX_DISTANCE_M = 3.0
-"""Between a found and a true signal head; those of one approach stand farther apart."""
+MAX_DISTANCE_M = 3.0  # between a found and a true signal head; those of one approach stand farther apart
 STEP_S = 0.05
 
 
@@ -490,10 +451,8 @@ def signal_figures(scenario: Scenario, truth: Scenario) -> dict[str, Any] | None
 def map_figures(scenario: Scenario, truth: Scenario) -> dict[str, Any] | None:
     """Compare the map features of a scenario with those of its truth, wherever its map lies; None without either.
 
-    Raises
-    ------
-    ScenarioError
-        When a line is too long, or the truth says in a way that cannot be read which ground sensors saw.
+    Raises `ScenarioError` when a line is too long, or the truth says in a way that cannot be read which ground sensors
+    saw.
     """
     if scenario.map_features is None or truth.map_features is None:
         return None

@@ -101,8 +101,6 @@ def require_start_as_in_scenario(agents: Sequence[Agent], placed: Array) -> None
 def overlaps_at_entry(agents: Sequence[Agent]) -> Iterator[tuple[int, int, float]]:
     """Yield pairs of agents (indices) whose boxes overlap when the later of both appears, with their IoU.
 
-    Notes
-    -----
     Cost: A samples for every block of times at which agents appear, then each agent that appears against those present.
     Pairs are compared in batches, and only as far as the caller asks for them.
     """

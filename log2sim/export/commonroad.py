@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapFrame, MapLane, Scenario, Signal
+from log2sim.datatypes import Agent, MapLane, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.csv_table import write_table
@@ -62,9 +62,35 @@ class CommonRoad:
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write the scenario file and the table of agents."""
-        ego, t_s = _ego_and_clock(scenario)
+        # The ego, and all steps from its first waypoint to the last of any agent.
+        ego = scenario.ego
+        if ego is None:
+            raise ScenarioError(
+                f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; choose one with --ego AGENT"
+            )
+        start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
+        if stop - start < STEP_S:
+            raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
+        ego, t_s = ego, step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
         name = f"ZAM_{_camel_case(scenario.name)}-1_1_T-1"
-        root = _root(scenario, name)
+        # The document with its header, dated by the start of the scenario so that the same scenario gives the same bytes.
+        root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
+        root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
+        root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
+        frame = scenario.map
+        place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
+        if frame.latitude_deg is not None and frame.longitude_deg is not None:
+            place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
+        location = _texts(element("location"), **place)
+        if frame.projection is not None:
+            x, y, _ = frame.offset_m  # from projected coordinates to those of the file
+            transformation = _texts(
+                element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection)
+            )
+            shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
+            _texts(element("additionalTransformation", transformation), **shift)
+        root.append(location)
+        element("scenarioTags", root)
         roads = lanes(scenario)
         number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
         lights = [{lane.id for lane in signal_lanes(signal, roads)} for signal in scenario.signals]
@@ -94,19 +120,6 @@ def _trust(agent: Agent) -> tuple[float, str]:
     return agent.confidence, ", ".join(doubt.reason for doubt in agent.doubts)
 
 
-def _ego_and_clock(scenario: Scenario) -> tuple[Agent, Array]:
-    """Return the ego, and all steps from its first waypoint to the last of any agent."""
-    ego = scenario.ego
-    if ego is None:
-        raise ScenarioError(
-            f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; choose one with --ego AGENT"
-        )
-    start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
-    if stop - start < STEP_S:
-        raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
-    return ego, step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
-
-
 def _camel_case(text: str) -> str:
     """Return a name of letters and digits only, as benchmark ids need it."""
     return "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", text))[:50] or "Scenario"
@@ -124,29 +137,6 @@ def _texts(parent: Element, **children: str) -> Element:
 
 def _point(parent: Element, xyz: Array) -> None:
     _texts(element("point", parent), **dict(zip("xyz", map(_decimal, xyz))))
-
-
-def _root(scenario: Scenario, name: str) -> Element:
-    """Return the document with its header, dated by the start of the scenario so that the same scenario gives the same bytes."""
-    root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
-    root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
-    root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
-    root.append(_location(scenario.map))
-    element("scenarioTags", root)
-    return root
-
-
-def _location(frame: MapFrame) -> Element:
-    place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
-    if frame.latitude_deg is not None and frame.longitude_deg is not None:
-        place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
-    location = _texts(element("location"), **place)
-    if frame.projection is not None:
-        x, y, _ = frame.offset_m  # from projected coordinates to those of the file
-        transformation = _texts(element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection))
-        shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
-        _texts(element("additionalTransformation", transformation), **shift)
-    return location
 
 
 def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder, lights: Sequence[int]) -> Element:

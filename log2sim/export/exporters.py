@@ -21,8 +21,7 @@ from log2sim.geometry import Array, whole_kilometers, wrap_angle
 
 __all__ = ["EXTERNAL", "Exporter", "Options", "export", "formats"]
 
-EXTERNAL = "external"
-"""As the ego of an export: another program drives it, from its place and speed in the scenario."""
+EXTERNAL = "external"  # as the ego of an export: another program drives it, from its place and speed in the scenario
 
 
 @dataclass(frozen=True)
@@ -31,16 +30,12 @@ class ExportPlacement:
 
     Positions of the scenario plus `offset_m` are coordinates of `projection`. With a `target` they are projected into
     it, else they stay on their axes; then `origin_m` is subtracted.
-
-    Attributes
-    ----------
-    origin_m, offset_m : (3,) tuple of float, m
-    projection, target : str or None
-        PROJ strings.
     """
 
+    # origin_m, offset_m: (3,), m.
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # projection, target: pROJ strings.
     projection: str | None = None
     target: str | None = None
 
@@ -101,8 +96,6 @@ def on_map(frame: MapFrame, projection: str | None, offset_m: tuple[float, float
 def geo_reference(projection: str) -> str:
     """Return a PROJ string with the same coordinates in the words that esmini reads, too; others stay as they are.
 
-    Notes
-    -----
     esmini requires lat_0 and lon_0, and knows neither R, south, no_defs nor type. UTM is the transverse Mercator projection
     about the middle of its zone, a sphere of radius R has both axes R, and PROJ takes 0 for an origin that is not given.
     """
@@ -153,21 +146,12 @@ BYTES_PER_STATE = 96
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """States of one agent at requested times (T,), zero where `valid` is False.
+    """States of one agent at requested times (T,), zero where `valid` is False."""
 
-    Attributes
-    ----------
-    valid : (T,) bool
-    position_m : (T, 3) float64
-        Box center.
-    yaw_rad : (T,) float64, in [-pi, pi)
-    velocity_mps, acceleration_mps2 : (T, 2) float64
-        Of the box center, on the axes of the positions.
-    """
-
-    valid: NDArray[np.bool_]
-    position_m: Array
-    yaw_rad: Array
+    valid: NDArray[np.bool_]  # (T,)
+    position_m: Array  # (T, 3) box center
+    yaw_rad: Array  # (T,), in [-pi, pi)
+    # velocity_mps, acceleration_mps2: (T, 2) of the box center, on the axes of the positions.
     velocity_mps: Array
     acceleration_mps2: Array
 
@@ -175,8 +159,6 @@ class SampledMotion:
 def sample_motion(agent: Agent, t_s: Array, margin_s: float = ROUNDING_S) -> SampledMotion:
     """Sample an agent at times (T,); times within `margin_s` outside its lifetime take the nearest end.
 
-    Notes
-    -----
     The speed of waypoints is along the heading. Where an agent turns, its box center also moves laterally, by yaw rate
     times its distance from the rear axle; without that term velocities contradict the positions.
     """
@@ -231,10 +213,8 @@ def sample_steps(agent: Agent, t_s: Array, step_s: float, at_least: int = 1) -> 
 def step_times(start_s: float, stop_s: float, step_s: float, agents: int = 1) -> Array:
     """Return times (T,) from `start_s` in equal steps up to `stop_s`, at least one, at which a number of agents are sampled.
 
-    Raises
-    ------
-    ScenarioError
-        For more than `MAX_STEPS`, or states of all agents of more than `MAX_SAMPLED_BYTES`, before anything is allocated.
+    Raises `ScenarioError` for more than `MAX_STEPS`, or states of all agents of more than `MAX_SAMPLED_BYTES`, before
+    anything is allocated.
     """
     steps = (stop_s - start_s) / step_s + 1e-6
     if steps > MAX_STEPS:
@@ -262,27 +242,13 @@ def file_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of an export; None leaves the choice to the format, which lists the options that it takes.
+    """Options of an export; None leaves the choice to the format, which lists the options that it takes."""
 
-    Attributes
-    ----------
-    revision : str or None
-        Of the format's standard.
-    map : Path or None
-        A road network to use in place of an inferred one.
-    mode : str or None
-        "exact" or "pid", for scripts that move agents.
-    log : Log or None
-        The opened log, for formats that also hold its images and points.
-    ego : str or None
-        `EXTERNAL`, for an ego without a trajectory.
-    """
-
-    revision: str | None = None
-    map: Path | None = None
-    mode: str | None = None
-    log: Log | None = None
-    ego: str | None = None
+    revision: str | None = None  # of the format's standard
+    map: Path | None = None  # A road network to use in place of an inferred one
+    mode: str | None = None  # "exact" or "pid", for scripts that move agents
+    log: Log | None = None  # the opened log, for formats that also hold its images and points
+    ego: str | None = None  # `EXTERNAL`, for an ego without a trajectory
 
 
 class Exporter(Protocol):
@@ -359,10 +325,7 @@ def export(
 def with_ego(scenario: Scenario, agent: str) -> Scenario:
     """Call one of the agents "ego", as scenarios of roadside sensors need it for formats with an ego.
 
-    Raises
-    ------
-    ConfigError
-        When the scenario has another ego or no such agent.
+    Raises `ConfigError` when the scenario has another ego or no such agent.
     """
     ids = [a.id for a in scenario.agents]
     if agent not in ids:
@@ -377,10 +340,7 @@ def with_ego(scenario: Scenario, agent: str) -> Scenario:
 def with_doubtful(scenario: Scenario, choice: str) -> Scenario:
     """Return a scenario with its doubtful agents but the quarantined ("keep"), without ("drop"), or with all of them ("all").
 
-    Raises
-    ------
-    ConfigError
-        For another choice.
+    Raises `ConfigError` for another choice.
     """
     choices = {"keep": scenario.active, "drop": scenario.without_doubtful(), "all": scenario}
     if choice not in choices:

@@ -40,8 +40,7 @@ LABEL_ABOVE_M = 0.5
 PATH_PX, OUTLINE_PX, TEXT_PX = 2.0, 2.0, 12.0
 PLUMB_BOB = 5  # number of coefficients of this model; with more it is called rational
 
-Message = tuple[int, str, Any]
-"""Time in ns, topic and message."""
+Message = tuple[int, str, Any]  # time in ns, topic and message
 
 
 def scene_messages(steps: AgentSteps, origin: Array) -> Iterator[Message]:

@@ -18,16 +18,16 @@ from log2sim.export.roads.opendrive import edges_of, lanes
 from log2sim.export.viewers import agent_steps
 from log2sim.geometry import NS_PER_S, Array
 
+# Length, width and height of a signal head with three lamps of 200 mm (EN 12368); not measured.
 LIGHT_SIZE_M = (0.3, 0.3, 0.9)
-"""Length, width and height of a signal head with three lamps of 200 mm (EN 12368); not measured."""
 
 BOUNDARY_TYPE = {"solid": "SOLID_LINE", "broken": "DASHED_LINE", "curb": "CURB", "none": "NO_LINE"}
 BOUNDARY_COLOR = {"white": "WHITE", "yellow": "YELLOW", "standard": "UNKNOWN"}
+# Color and mode by state; OSI has one lamp a light, so that red with yellow is written as yellow.
 LIGHT = {
     "red": ("RED", "CONSTANT"), "red_yellow": ("YELLOW", "CONSTANT"), "yellow": ("YELLOW", "CONSTANT"), "green": ("GREEN", "CONSTANT"),
     "off": ("UNKNOWN", "OFF"), "unknown": ("UNKNOWN", "UNKNOWN"),
 }  # fmt: skip
-"""Color and mode by state; OSI has one lamp a light, so that red with yellow is written as yellow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,16 @@ class Osi:
         except ImportError:
             raise MissingExtra("export to OSI", "osi") from None
         steps = agent_steps(scenario)
-        head = _head(betterosi, scenario)
+        # The fields that all frames share.
+        major, minor, patch = map(int, betterosi.__version_osi__.split("."))
+        head: dict[str, Any] = {
+            "version": betterosi.InterfaceVersion(version_major=major, version_minor=minor, version_patch=patch),
+            "proj_frame_offset": _offset(betterosi, scenario.map),
+        }
+        if scenario.map.projection is not None:
+            head["proj_string"] = scenario.map.projection
+        if scenario.ego is not None:
+            head["host_vehicle_id"] = betterosi.Identifier(value=scenario.agents.index(scenario.ego) + 1)
         ground = static_map(betterosi, scenario, first=len(scenario.agents) + 1)
         with betterosi.Writer(folder / _trace_name(betterosi, scenario, len(steps.t_ns))) as writer:
             for k, stamp_ns in enumerate(steps.t_ns.tolist()):
@@ -207,20 +216,6 @@ def _trace_name(osi: Any, scenario: Scenario, frames: int) -> str:
     keys = (osi.OSI_CHANNEL_OSI_VERSION_KEY, osi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
     standard, protobuf = (versions[key].replace(".", "") for key in keys)
     return f"{start}_gt_{standard}_{protobuf}_{frames}_{file_name(scenario.name)}.osi"
-
-
-def _head(osi: Any, scenario: Scenario) -> dict[str, Any]:
-    """Return the fields that all frames share."""
-    major, minor, patch = map(int, osi.__version_osi__.split("."))
-    head: dict[str, Any] = {
-        "version": osi.InterfaceVersion(version_major=major, version_minor=minor, version_patch=patch),
-        "proj_frame_offset": _offset(osi, scenario.map),
-    }
-    if scenario.map.projection is not None:
-        head["proj_string"] = scenario.map.projection
-    if scenario.ego is not None:
-        head["host_vehicle_id"] = osi.Identifier(value=scenario.agents.index(scenario.ego) + 1)
-    return head
 
 
 def _offset(osi: Any, frame: MapFrame) -> Any:

@@ -21,14 +21,12 @@ from log2sim.export.roads.opendrive import lanes, signal_lanes
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.road.polyline import Polyline
 
-SPACING_M = 1.0
-"""Of points of lanes, as MetaDrive's own maps have them."""
-
+SPACING_M = 1.0  # of points of lanes, as MetaDrive's own maps have them
+# Types of lane lines by kind and color; MetaDrive has none for lines of unknown color, which are written as white.
 LINE_TYPE = {
     ("solid", "white"): "ROAD_LINE_SOLID_SINGLE_WHITE", ("dashed", "white"): "ROAD_LINE_BROKEN_SINGLE_WHITE",
     ("solid", "yellow"): "ROAD_LINE_SOLID_SINGLE_YELLOW", ("dashed", "yellow"): "ROAD_LINE_BROKEN_SINGLE_YELLOW",
 }  # fmt: skip
-"""Types of lane lines by kind and color; MetaDrive has none for lines of unknown color, which are written as white."""
 
 
 def map_features(scenario: Scenario, origin_m: Array) -> dict[str, Any]:
@@ -70,11 +68,11 @@ def _marking(marking: Marking, origin_m: Array) -> dict[str, Any] | None:
     return None
 
 
+# States of traffic lights, as Waymo names them.
 LIGHT_STATE = {
     "red": "LANE_STATE_STOP", "red_yellow": "LANE_STATE_CAUTION", "yellow": "LANE_STATE_CAUTION", "green": "LANE_STATE_GO",
     "off": "LANE_STATE_UNKNOWN", "unknown": "LANE_STATE_UNKNOWN",
 }  # fmt: skip
-"""States of traffic lights, as Waymo names them."""
 
 
 def dynamic_map_states(scenario: Scenario, t_s: Array, origin_m: Array) -> dict[str, Any]:
@@ -132,10 +130,7 @@ class ScenarioNet:
 def describe(scenario: Scenario) -> Value:
     """Return the scenario description as a dictionary of plain values and arrays with T steps of 0.1 s from the ego's first.
 
-    Raises
-    ------
-    ScenarioError
-        When the scenario has no ego.
+    Raises `ScenarioError` when the scenario has no ego.
     """
     ego = scenario.ego
     if ego is None:
@@ -156,7 +151,25 @@ def describe(scenario: Scenario) -> Value:
         "left_out": left_out,
         "object_summary": {k: _object_summary(k, track) for k, track in tracks.items()},
     }
-    metadata["number_summary"] = _number_summary(metadata["object_summary"], features, lights)
+    objects = metadata["object_summary"]
+    heights = np.concatenate(
+        [feature["polyline" if "polyline" in feature else "polygon"][:, 2] for feature in features.values()]
+    )
+    moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
+    kinds = [o["type"] for o in objects.values()]
+    states = Counter(state for light in lights.values() for state in light["state"]["object_state"])
+    metadata["number_summary"] = {
+        "num_objects": len(objects),
+        "object_types": sorted(set(kinds)),
+        "num_objects_each_type": dict(Counter(kinds)),
+        "num_moving_objects": len(moving),
+        "num_moving_objects_each_type": dict(Counter(moving)),
+        "num_traffic_lights": len(lights),
+        "num_traffic_light_types": sorted(states),
+        "num_traffic_light_each_step": dict(states),
+        "num_map_features": len(features),
+        "map_height_diff": float(np.ptp(heights)),
+    }
     return {
         "id": scenario.name,
         "version": f"{DATASET}_{VERSION}",
@@ -223,27 +236,6 @@ def _object_summary(name: str, track: Value) -> Value:
         "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         "valid_length": int(valid.sum()),
         "continuous_valid_length": int(after_first.argmin()) if not after_first.all() else len(after_first),
-    }
-
-
-def _number_summary(objects: Value, features: Value, lights: Value) -> Value:
-    heights = np.concatenate(
-        [feature["polyline" if "polyline" in feature else "polygon"][:, 2] for feature in features.values()]
-    )
-    moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
-    kinds = [o["type"] for o in objects.values()]
-    states = Counter(state for light in lights.values() for state in light["state"]["object_state"])
-    return {
-        "num_objects": len(objects),
-        "object_types": sorted(set(kinds)),
-        "num_objects_each_type": dict(Counter(kinds)),
-        "num_moving_objects": len(moving),
-        "num_moving_objects_each_type": dict(Counter(moving)),
-        "num_traffic_lights": len(lights),
-        "num_traffic_light_types": sorted(states),
-        "num_traffic_light_each_step": dict(states),
-        "num_map_features": len(features),
-        "map_height_diff": float(np.ptp(heights)),
     }
 
 

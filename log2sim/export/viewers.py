@@ -37,51 +37,30 @@ RGB_OF_CATEGORY = {
 
 @dataclass(frozen=True, eq=False)
 class AgentSteps:
-    """All agents at equal steps.
+    """All agents at equal steps."""
 
-    Attributes
-    ----------
-    t_ns : (T,) int64
-        Absolute time.
-    moves : tuple of (Agent, SampledMotion)
-    """
-
-    t_ns: NDArray[np.int64]
+    t_ns: NDArray[np.int64]  # (T,) absolute time
     moves: tuple[tuple[Agent, SampledMotion], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFrame:
-    """A camera image with the boxes of agents.
-
-    Attributes
-    ----------
-    camera : Camera
-        Of the size of the image.
-    map_T_cam : (4, 4) float64 or None
-    outlines : tuple of (Agent, (E, 2, 2) float64)
-        Lines of each box, px.
-    """
+    """A camera image with the boxes of agents."""
 
     t_ns: int
-    camera: Camera
-    map_T_cam: Array | None
+    camera: Camera  # of the size of the image
+    map_T_cam: Array | None  # (4, 4) or None
     jpeg: bytes
-    outlines: tuple[tuple[Agent, Array], ...]
+    outlines: tuple[tuple[Agent, Array], ...]  # lines of each box, px
 
 
 @dataclass(frozen=True, eq=False)
 class ThinnedSweep:
-    """A LiDAR sweep with fewer points.
-
-    Attributes
-    ----------
-    points_map : (N, 3) float64
-    """
+    """A LiDAR sweep with fewer points."""
 
     t_ns: int
     lidar: str
-    points_map: Array
+    points_map: Array  # (N, 3)
 
 
 @dataclass(frozen=True)
@@ -112,10 +91,7 @@ def agent_steps(scenario: Scenario) -> AgentSteps:
 def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
     """Yield images and points of a log within the scenario's time, in order of time; each is read when requested.
 
-    Raises
-    ------
-    ConfigError
-        When the log has no record in that time.
+    Raises `ConfigError` when the log has no record in that time.
     """
     start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
     index = [
@@ -140,23 +116,21 @@ def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -
     except RecordError as error:
         return UnreadableRecord(t_ns, name, str(error))
     if name in log.cameras:
-        return _camera_frame(scenario, log, log.cameras[name], record, t_ns)
+        camera = log.cameras[name]
+        image_bgr = record
+        import cv2
+        import simplejpeg
+
+        small = _downscaled(camera, min(1.0, MAX_IMAGE_PX / camera.width_px))
+        if small is not camera:
+            size = (small.width_px, small.height_px)
+            image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
+        poses, known = log.map_T_sensor(camera.name, t_ns)
+        if not known[0]:
+            return CameraFrame(t_ns, small, None, jpeg, ())
+        return CameraFrame(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
     return ThinnedSweep(t_ns, name, _points_map(log, name, record))
-
-
-def _camera_frame(scenario: Scenario, log: Log, camera: Camera, image_bgr: NDArray[np.uint8], t_ns: int) -> CameraFrame:
-    import cv2
-    import simplejpeg
-
-    small = _downscaled(camera, min(1.0, MAX_IMAGE_PX / camera.width_px))
-    if small is not camera:
-        size = (small.width_px, small.height_px)
-        image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
-    poses, known = log.map_T_sensor(camera.name, t_ns)
-    if not known[0]:
-        return CameraFrame(t_ns, small, None, jpeg, ())
-    return CameraFrame(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
 
 
 def _downscaled(camera: Camera, scale: float) -> Camera:

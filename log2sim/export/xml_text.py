@@ -72,10 +72,8 @@ def write(root: ElementTree.Element, path: Path) -> None:
 def read(path: Path) -> ElementTree.Element:
     """Parse a file of at most `SIZE_LIMIT_BYTES` without entities, DTDs or anything outside it.
 
-    Raises
-    ------
-    ScenarioError
-        When the file is missing, too large, nested too deeply or no XML, or declares a document type.
+    Raises `ScenarioError` when the file is missing, too large, nested too deeply or no XML, or declares a document
+    type.
     """
     data = read_file(path, SIZE_LIMIT_BYTES, ScenarioError, missing="no such file; expected an XML file")
     depth, root = 0, None
@@ -102,10 +100,7 @@ def read(path: Path) -> ElementTree.Element:
 def require_number(value: str | None, where: str) -> float:
     """Parse a finite number from an attribute.
 
-    Raises
-    ------
-    LogError
-        When the attribute is absent or no finite number.
+    Raises `LogError` when the attribute is absent or no finite number.
     """
     try:
         found = parse_float(value) if value is not None else float("nan")

@@ -52,13 +52,13 @@ def cache_folder() -> Path:
 
 
 def detection_folder() -> Path:
-    """Return the folder of detections in the user's cache, which need not exist."""
+    """Return the folder of what was detected and measured in the user's cache, which need not exist."""
     return cache_folder() / "detections"
 
 
 DEFAULT_MAX_MB = 2048
-# Of an entry; one of detections has some tens of KB.
-MAX_ENTRY_BYTES = 16 * 1024**2
+# Of an entry; five ticks with two LiDARs have some MB.
+MAX_ENTRY_BYTES = 64 * 1024**2
 MAX_JSON_BYTES = 64 * 1024
 # Entries are spread over folders by the last digit of their names, each with an equal share of the size, so that only one of
 # them has to be listed to keep the limit.
@@ -142,8 +142,8 @@ class DiskCache:
         return True
 
     def finish(self, note: Mapping[str, Any]) -> None:
-        """Keep the limit in all folders that were written to, and note what this run did."""
-        for digit in list(self._written):
+        """Keep the limit, and note what this run did; other processes may have written for it."""
+        for digit in DIGITS:
             self._trim(digit)
         if self.problem is None and self.folder.is_dir():
             self._write_json(_LAST_RUN, note)

@@ -10,7 +10,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -37,7 +37,7 @@ def default_jobs() -> int:
     return usable_threads() if sys.platform == "linux" and alone else 1
 
 
-def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: int) -> Iterator[Out]:
+def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: int) -> Generator[Out, None, None]:
     """Yield what `work` makes of each task, in their order.
 
     Parameters
@@ -74,9 +74,9 @@ def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: i
                 continue
             if not running:
                 return
-            for connection in wait(list(running)):
-                assert isinstance(connection, Connection)
-                done[running.pop(connection)] = _receive(connection, workers[connection])
+            for ready in wait(list(running)):
+                assert isinstance(ready, Connection)
+                done[running.pop(ready)] = _receive(ready, workers[ready])
     finally:
         for connection, process in workers.items():
             process.kill()

@@ -554,6 +554,13 @@ class EndsDetector:
         names = dict.fromkeys((self.vehicle.name, self.road.name))
         return "|".join(names)
 
+    @property
+    def cache_key(self) -> str | None:
+        """What its boxes depend on besides the clouds; None where a detector does not say."""
+        keys = [getattr(detector, "cache_key", None) for detector in (self.vehicle, self.road)]
+        method = [name for name, method in METHODS.items() if method is self.method]
+        return f"{keys} {method}" if all(isinstance(key, str) for key in keys) else None
+
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in the cloud of each viewpoint and join them; `earlier` clouds are those of the same viewpoint."""
         parts = [self._search(view, earlier) for view in cloud.views]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -12,21 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles, Rays, Sweep
+from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles, OtherView, Rays, Sweep
+from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
+from log2sim.files.packing import pack
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Array
 from log2sim.perception.alignment import align_parts
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.detection_cache import MAX_CROPS, DetectionCache, LightBox
+from log2sim.perception.first_pass_cache import FirstPassCache
 from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, sample_rays
 from log2sim.perception.observe_tick import Observed, TickObserver
 from log2sim.perception.records import Look, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.sync import Schedule
+from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox
 from log2sim.plan import FusionLevel, Plan, Stage
 
 
@@ -104,7 +108,7 @@ class ObstacleList(Sequence["Obstacles | None"]):
 OBSTACLE_REACH_M = 70.0
 OBSTACLE_VOXEL_M = 0.12
 RANK_BITS = 25  # more than the points of any sweep
-# Sweeps of each LiDAR that are kept for the next ticks.
+# Sweeps of each LiDAR that are kept for the next ticks, which may share some.
 SWEEPS_KEPT = 4
 # Ticks that are worked on together; where frames are skipped between some of them, a multiple of these.
 PART_TICKS = 5
@@ -147,7 +151,10 @@ class CloudMaker:
         self.before: list[tuple[Key, Boxes3D]] = []
         self.compensated: dict[tuple[str, int], str] = {}
         self._next = 0
-        self._sweeps: dict[tuple[str, int], tuple[Sweep, SweepSketch] | None] = {}
+        # How many sweeps of each LiDAR are kept for the next ticks.
+        self.most_kept = SWEEPS_KEPT
+        self._sweeps: dict[tuple[str, int], Sweep | None] = {}
+        self._sketches: dict[tuple[str, int], SweepSketch] = {}
         self._live: set[tuple[str, int]] = set()
         self._clouds: dict[Key, Cloud | None] = {}
         self._earlier: list[tuple[Key, Cloud | None]] = []
@@ -200,30 +207,42 @@ class CloudMaker:
                 last = sweeps
         return found[::-1]
 
+    def sweeps_of(self, ticks: range, records: RecordReader) -> list[Sweep | None]:
+        """Return all sweeps that the clouds of some ticks are made of, None for those that cannot be read."""
+        rows = [self._sweeps_of(tick, row) for tick in ticks for row in range(self._schedule.rows)]
+        return [self._sweep(*key, records) for key in self._listed([*self._searched_before(ticks.start), *rows])]
+
+    def _listed(self, keys: Sequence[Key]) -> list[tuple[str, int]]:
+        return sorted({(name, i) for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0})
+
+    def _sweep(self, name: str, i: int, records: RecordReader) -> Sweep | None:
+        sweep = self._sweeps.pop((name, i)) if (name, i) in self._sweeps else records.get(name, i)
+        self._sweeps[name, i] = sweep  # the last one in
+        return sweep
+
     def _read(self, keys: Sequence[Key], records: RecordReader) -> None:
         """Read and judge the sweeps of some clouds in their order, and forget those that only earlier ticks needed."""
-        wanted = {(name, i) for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0}
+        wanted, compensates = self._listed(keys), self._plan.keeps(Stage.MOTION_COMPENSATION)
         self._live = set()
-        for name, i in sorted(wanted):
-            if (name, i) in self._sweeps:
-                self._sweeps[name, i] = self._sweeps.pop((name, i))  # to the end
-            else:
-                sweep: Sweep | None = records.get(name, i)
-                self._sweeps[name, i] = None if sweep is None else (sweep, sketch_sweep(self._log, name, sweep))
-            read = self._sweeps[name, i]
-            if read is not None and records.is_live(name, i, read[1]):
+        for name, i in wanted:
+            sweep = self._sweep(name, i, records)
+            if sweep is None:
+                continue
+            if (name, i) not in self._sketches:
+                self._sketches[name, i] = sketch_sweep(self._log, name, sweep)
+            if records.is_live(name, i, self._sketches[name, i]):
                 self._live.add((name, i))
-                compensates = self._plan.keeps(Stage.MOTION_COMPENSATION)
-                kind = compensation_of(self._log, name, read[0]) if compensates else "left out"
+                kind = compensation_of(self._log, name, sweep) if compensates else "left out"
                 self.compensated[name, i] = kind
-        for key in list(self._sweeps)[: -max(SWEEPS_KEPT * len(self._schedule.sweeps), len(wanted), 1)]:
-            del self._sweeps[key]
+        most = max(self.most_kept * len(self._schedule.sweeps), len(wanted), 1)
+        self._sweeps = dict(list(self._sweeps.items())[-most:])
+        self._sketches = {key: sketch for key, sketch in self._sketches.items() if key in self._sweeps}
 
     def _cloud(self, key: Key) -> Cloud | None:
         """Return the cloud of some sweeps, which is made if the tick before had another."""
         if key in self._clouds:
             return self._clouds[key]
-        sweeps = {name: read[0] for name, i in zip(self._schedule.sweeps, key) if (read := self._sweeps.get((name, i)))}
+        sweeps = {name: sweep for name, i in zip(self._schedule.sweeps, key) if (sweep := self._sweeps.get((name, i)))}
         if not sweeps:
             return None
         origin, ground_z = cloud_origin(self._log, next(iter(sweeps.values())).stamp_ns)
@@ -351,12 +370,31 @@ class Part:
     failed: dict[str, list[str]]
     compensated: dict[tuple[str, int], str]
     before: list[tuple[Key, Boxes3D]]
-    cached: tuple[int, int]
-    clock: StageClock
 
 
-Task = tuple[range, RecordWatch, list[tuple[Key, Boxes3D]]]
-"""Ticks, what is known of the records before them, and what was found in the two clouds before them."""
+PACKED = (
+    Part, SeenTick, Observed, Measurements, OtherView, Correspondences, Obstacles, Rays, LightBox, Look, SweepSketch, Boxes3D,
+)  # fmt: skip
+
+
+@dataclass(eq=False)
+class Task:
+    """Ticks that are to be observed.
+
+    Attributes
+    ----------
+    watch : RecordWatch
+        What is known of the records before them.
+    before : list of (Key, Boxes3D)
+        See `CloudMaker`, before these ticks.
+    judged : bool
+        Whether all that is to be known of the records is known already.
+    """
+
+    ticks: range
+    watch: RecordWatch
+    before: list[tuple[Key, Boxes3D]]
+    judged: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,20 +408,62 @@ class FirstPass:
     observer: TickObserver
     frames: FrameDetector | None
     lidar_detector: LidarDetector | None
-    cache: DetectionCache | None
+    cache: FirstPassCache | None
 
-    def observe(self, task: Task) -> Part:
-        """Detect and measure in some ticks."""
-        ticks, watch, self.clouds.before = task
-        watch.attach(self.log)
-        records, clock, self.clouds.compensated = RecordReader(self.log, watch), StageClock(), {}
-        known = (0, 0) if self.cache is None else self.cache.counts()
-        seen = [self._tick(tick, records, clock) for tick in ticks]
-        cached = (0, 0) if self.cache is None else self.cache.counts(known)
-        return Part(
-            seen, list(records.looks.values()), records.read, records.failed, self.clouds.compensated,
-            self.clouds.before, cached, clock,
-        )  # fmt: skip
+    def observe(self, task: Task) -> tuple[Part, StageClock, tuple[int, int, str | None]]:
+        """Detect and measure in some ticks; returns how many were known and how many were kept, and why no more, too."""
+        task.watch.attach(self.log)
+        records, clock, count = RecordReader(self.log, task.watch), StageClock(), len(task.ticks)
+        if self.cache is not None:
+            with clock.stage("recall"):
+                key = self._content(task, records)
+                part: Part | None = self.cache.get(key, PACKED)
+            if part is not None and len(part.ticks) == count:
+                return part, clock, (count, 0, None)
+        self.clouds.before, self.clouds.compensated = task.before, {}
+        seen = [self._tick(tick, records, clock) for tick in task.ticks]
+        looks = list(records.looks.values())
+        part = Part(seen, looks, records.read, records.failed, self.clouds.compensated, self.clouds.before)
+        if self.cache is None:
+            return part, clock, (0, 0, None)
+        with clock.stage("recall"):
+            kept = self.cache.put(key, part)
+        return part, clock, (0, count * kept, self.cache.store_problem)
+
+    def _content(self, task: Task, records: RecordReader) -> bytes:
+        """Return a digest of the records of some ticks, and of all else that what is seen there depends on."""
+        ticks, total = task.ticks, len(self.schedule)
+        looked = range(ticks.start, min(ticks.stop + (self.plan.detector_stride > 1), total))
+        value, described = hashlib.blake2b(digest_size=32), list[Any]()
+        for camera in self.plan.cameras if self.frames is not None else ():
+            for tick in looked:
+                index = int(self.schedule.frames[camera][tick])
+                if index >= 0:
+                    described.append([camera, index, int(self.log.streams[camera].t_ns[index])])
+                    value.update(self._picture(camera, index, records))
+        for sweep in self.clouds.sweeps_of(ticks, records):
+            columns: dict[str, Any] = {} if sweep is None else vars(sweep)
+            for column in columns.values():
+                if isinstance(column, np.ndarray):
+                    described.append([column.dtype.str, *column.shape])
+                    value.update(np.ascontiguousarray(column).data)
+                else:
+                    described.append(column)
+        sweeps = {name: index[:, ticks.start : ticks.stop] for name, index in self.schedule.sweeps.items()}
+        before = task.before if self.plan.fusion is FusionLevel.POINTS else []
+        states = [sorted(records.watch.known(s).items()) for s in self.log.streams] if task.judged else None
+        described += [self.schedule.t_ns[ticks.start : ticks.stop], sweeps, before, ticks.stop == total, states]
+        value.update(pack(described))
+        return value.digest()
+
+    def _picture(self, camera: str, index: int, records: RecordReader) -> bytes:
+        """Return a digest of a picture: of its file where the log has one, which is not decoded then, else of its pixels."""
+        stream = self.log.streams[camera]
+        try:
+            content = pack(records.get(camera, index)) if stream.encoded is None else stream.encoded(index)
+        except RecordError as error:
+            content = str(error).encode()
+        return hashlib.blake2b(content, digest_size=32).digest()
 
     def _tick(self, tick: int, records: RecordReader, clock: StageClock) -> SeenTick:
         out, plan, live = SeenTick(), self.plan, dict[str, Detections]()
@@ -395,7 +475,7 @@ class FirstPass:
                 if plan.picture_stride > 1:
                     continue
             boxes = Detections.empty() if findings is None else findings.detections
-            thumbnail = None if findings is None or not findings.thumbnail.size else findings.thumbnail
+            thumbnail = None if findings is None else findings.thumbnail
             out.frames += findings is not None
             decodes = plan.keeps(Stage.IMAGE_DECODING)
             if not decodes or records.is_live(camera, index, thumbnail, found=len(boxes) > 0):
@@ -431,7 +511,7 @@ def observe(
     progress: Callable[[int, int], None],
     lidar_detector: LidarDetector | None = None,
     sweeps: int = 1,
-    cache: DetectionCache | None = None,
+    cache: FirstPassCache | None = None,
     jobs: int = 1,
 ) -> Observations:
     """Run detection and measurement over all ticks.
@@ -444,8 +524,8 @@ def observe(
         Searches the clouds of the reference sensor.
     sweeps : int
         Successive clouds that it sees as one.
-    cache : DetectionCache, optional
-        Of the detector in images: frames that it knows are not searched again.
+    cache : FirstPassCache, optional
+        Ticks that it knows are not looked at again.
     jobs : int
         Processes that share the ticks. The result is the same for any number; with fusion of points each cloud needs the
         one before, so that one process does all.
@@ -458,29 +538,34 @@ def observe(
     out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     obstacles = out.obstacles = ObstacleList(out.points)
     clouds = CloudMaker(log, schedule, plan, max_range_m=max_range_m, detector=lidar_detector, sweeps=sweeps)
-    frames = None if detector is None else FrameDetector(log, schedule, detector, plan, cache)
+    frames = None if detector is None else FrameDetector(log, schedule, detector, plan)
     observer = TickObserver(log, schedule, plan, mode, max_range_m)
     first_pass = FirstPass(log, schedule, plan, clouds, observer, frames, lidar_detector, cache)
     step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
     ranges = [range(k, min(k + step, len(schedule))) for k in range(0, len(schedule), step)]
     jobs = 1 if plan.fusion is FusionLevel.POINTS else min(jobs, len(ranges))
+    if cache is not None:
+        clouds.most_kept = step + 1
+        # Of the plan what this pass looks at, so that other later stages leave the key as it is.
+        looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
+        planned = [plan.detector_stride, plan.picture_stride, plan.fusion, [plan.keeps(stage) for stage in looked_at]]
+        cache.begin(log, [list(plan.cameras), planned, mode, max_range_m, sweeps, schedule.reference_row])
     records = out.records = RecordReader(log)
     before: list[tuple[Key, Boxes3D]] = []
     compensated: dict[tuple[str, int], str] = {}
     skipped: Counter[str] = Counter()
 
-    parts = map_in_processes(first_pass.observe, ((ticks, records.watch, before) for ticks in ranges), jobs)
+    parts = map_in_processes(first_pass.observe, (Task(ticks, records.watch, before) for ticks in ranges), jobs)
     with closing(parts):
-        for ticks, part in zip(ranges, parts):
-            states = [records.watch.judge(look) for look in part.looks]
-            if states != [look.state for look in part.looks]:
-                part = first_pass.observe((ticks, records.watch, before))
+        for ticks, (part, spent, known) in zip(ranges, parts):
+            if [records.watch.judge(look) for look in part.looks] != [look.state for look in part.looks]:
+                part, spent, known = first_pass.observe(Task(ticks, records.watch, before, judged=True))
             before = part.before
             records.add(part.read, part.failed)
             compensated |= part.compensated
-            clock.add(part.clock, jobs)
+            clock.add(spent, jobs)
             if cache is not None:
-                cache.add(*part.cached)
+                cache.count(*known)
             for tick, seen in zip(ticks, part.ticks):
                 out.measurements.append(seen.seen.measurements.stored(out.points))
                 obstacles.append(seen.obstacles)

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Frame, Log, Sweep
+from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.stages import StageClock
 from log2sim.perception.detect.detectors import Detector, detect_all
-from log2sim.perception.detection_cache import DetectionCache, PictureFindings, crop_lights
 from log2sim.perception.records import Look, RecordWatch, SweepSketch, Thumbnail, shrink
 from log2sim.perception.sync import Schedule
+from log2sim.perception.traffic_light_boxes import LightBox, crop_lights
 from log2sim.plan import Plan, Stage
 
 Item = TypeVar("Item")
@@ -47,10 +47,6 @@ def work_ahead(work: Callable[[Item], Out], items: Iterable[Item], ahead: int = 
         # Without waiting: an iterator that is left early may be closed by the garbage collector, in any thread, while that
         # thread holds a lock that ending threads need.
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-# Of a frame that is not decoded.
-EMPTY: Thumbnail = np.zeros((0, 0), np.float32)
 
 
 class RecordReader:
@@ -127,6 +123,23 @@ class RecordReader:
         return {s: {"count": len(p), "first": p[0]} for s, p in sorted(self.failed.items())}
 
 
+@dataclass(frozen=True, eq=False)
+class PictureFindings:
+    """What a run takes from a picture.
+
+    Attributes
+    ----------
+    thumbnail : (h, w) float32 or None
+        By which it is compared with other pictures; None where it was not decoded.
+    lights : tuple of LightBox
+        Traffic lights, cut out.
+    """
+
+    detections: Detections
+    thumbnail: Thumbnail | None
+    lights: tuple[LightBox, ...] = ()
+
+
 class FrameDetector:
     """Detect objects in the camera frames of successive ticks.
 
@@ -136,11 +149,9 @@ class FrameDetector:
     measured as often.
     """
 
-    def __init__(
-        self, log: Log, schedule: Schedule, detector: Detector, plan: Plan, cache: DetectionCache | None = None
-    ) -> None:
+    def __init__(self, log: Log, schedule: Schedule, detector: Detector, plan: Plan) -> None:
         self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
-        self._cache, self._empty = cache, set[str]()
+        self._empty = set[str]()
         self._known: dict[tuple[str, int], PictureFindings | None] = {}
 
     def search(self, tick: int, reader: RecordReader, clock: StageClock) -> dict[str, PictureFindings | None]:
@@ -169,39 +180,24 @@ class FrameDetector:
         self, tick: int, cameras: Iterable[str], reader: RecordReader, clock: StageClock
     ) -> dict[str, PictureFindings]:
         """Search a tick's frames of some cameras, each once; those that have none or cannot be read are left out."""
-        frames, keys = dict[str, Frame](), dict[str, bytes | None]()
+        frames, thumbnails = dict[str, Frame](), dict[str, Thumbnail | None]()
         for name in cameras:
             index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
             if index >= 0 and (name, tick) not in self._known:
                 encoded = None if stream.encoded is None else partial(stream.encoded, index)
                 image = _LazyImage(reader, name, index)
                 frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
-        with clock.stage("detect"):
-            for name, frame in frames.items() if self._cache is not None else ():
-                assert self._cache is not None
-                key = keys[name] = self._cache.key_of(frame)
-                findings = None if key is None else self._cache.get(key, frame)
-                if findings is not None:
-                    self._known[name, tick] = findings
-                    self._cache.found += 1
-                    reader.count(name)
-        frames = {name: frame for name, frame in frames.items() if (name, tick) not in self._known}
-        thumbnails: dict[str, Thumbnail | None] = dict.fromkeys(frames, EMPTY)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with clock.stage("decode"):
                 thumbnails = {name: _thumbnail_of(frame) for name, frame in frames.items()}
-        self._known |= {(name, tick): None for name, small in thumbnails.items() if small is None}
-        readable = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
+            self._known |= {(name, tick): None for name, small in thumbnails.items() if small is None}
+            frames = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
         with clock.stage("detect"):
-            searched = detect_all(self._detector, list(readable.values()))
-            for (name, frame), boxes in zip(readable.items(), searched, strict=True):
-                lights, thumbnail = boxes.traffic_lights, thumbnails[name]
+            searched = detect_all(self._detector, list(frames.values()))
+            for (name, frame), boxes in zip(frames.items(), searched, strict=True):
+                lights = boxes.traffic_lights
                 cut = crop_lights(name, frame.t_ns, frame.image(), lights) if len(lights) else []
-                findings = PictureFindings(boxes, EMPTY if thumbnail is None else thumbnail, tuple(cut))
-                self._known[name, tick] = findings
-                key = keys.get(name)
-                if self._cache is not None and key is not None:
-                    self._cache.put(key, findings)
+                self._known[name, tick] = PictureFindings(boxes, thumbnails.get(name), tuple(cut))
         return {name: found for name in cameras if (found := self._known.get((name, tick))) is not None}
 
 

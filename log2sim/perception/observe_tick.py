@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import ENDS, Boxes3D, Detections, Log, Measurements, end_of
 from log2sim.geometry import Array, inverse
-from log2sim.perception.detection_cache import LightBox, with_ranges
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin, join_parts
 from log2sim.perception.lidar.measure import Frame, measure, outside_ego, project_cloud
 from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.sync import Schedule
+from log2sim.perception.traffic_light_boxes import LightBox, with_ranges
 from log2sim.plan import FusionLevel, Plan, Stage
 
 MAX_GROUND_POINTS_PER_FRAME = 40

@@ -606,6 +606,12 @@ class RecordWatch:
         for watch in (self, *self.cameras.values(), *self.lidars.values()):
             setattr(watch, "_log" if watch is self else "log", log)
 
+    def known(self, sensor: str) -> dict[int, Any]:
+        """Return what was found so far of a sensor's records, by stamp."""
+        if sensor in self.cameras:
+            return dict(self.cameras[sensor].states)
+        return dict(self.lidars[sensor].repeated) if sensor in self.lidars else {}
+
     def judge(self, look: Look) -> str:
         """Return the state of a record, which is judged if it was not yet; records of a sensor come in the order of their stamps."""
         if isinstance(look.shown, SweepSketch):

@@ -16,7 +16,7 @@ from log2sim.perception.cooperative import create_for_ends
 from log2sim.perception.detect.detectors import CheckedDetector, Detector, FunctionDetector, checked, create_detector
 from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
 from log2sim.perception.detect3d.detectors import checked as checked_lidar
-from log2sim.perception.detection_cache import DetectionCache, open_cache
+from log2sim.perception.first_pass_cache import FirstPassCache, open_cache
 
 EXPECTED = (
     "a function of a picture that returns rows, an object with name, default_min_score and detect(frame) or, for LiDAR "
@@ -117,13 +117,13 @@ class Detectors:
         Searches the frames of all cameras.
     sweeps : LidarDetector, optional
         Searches the clouds.
-    cache : DetectionCache, optional
-        What the detector in images found in earlier runs.
+    cache : FirstPassCache, optional
+        The first pass of earlier runs with these detectors.
     """
 
     images: Detector | None
     sweeps: LidarDetector | None
-    cache: DetectionCache | None = None
+    cache: FirstPassCache | None = None
 
     @property
     def own(self) -> bool:
@@ -142,11 +142,11 @@ def create_detectors(log: Log, config: Config, given: GivenDetectors, *, cache: 
     Parameters
     ----------
     cache : bool
-        Whether what the detector finds in images is taken from the user's cache, and kept there.
+        Whether what earlier runs of the first pass found is taken from the user's cache, and kept there.
     """
     images = given.images or create_image_detector(log, config) if config.detect.in_images else None
     sweeps = create_for_ends(log, config, given.sweeps) if config.detect.in_sweeps else None
-    return Detectors(images, sweeps, open_cache(images) if cache and images is not None else None)
+    return Detectors(images, sweeps, open_cache(images, sweeps) if cache else None)
 
 
 def create_image_detector(log: Log, config: Config) -> Detector:

@@ -17,8 +17,8 @@ from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
 from log2sim.localization.choice import PoseChoice
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.detection_cache import LightBox
 from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
+from log2sim.perception.traffic_light_boxes import LightBox
 from log2sim.plan import Decision, Outcome, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler

@@ -14,59 +14,36 @@ from log2sim.geometry import Array
 
 TIME_STEP_S = 0.1  # linear interpolation errs by a h^2 / 8, a centimeter at 10 m/s2
 SPACING_M = 1.0
-EXTENSION_M = 120.0
-"""Straight extension of a path beyond the end of the scenario: as far as a driver looks ahead."""
-
+EXTENSION_M = 120.0  # straight extension of a path beyond the end of the scenario: as far as a driver looks ahead
+# Range about its last place in which an agent is searched on its path: so it stays on its branch where paths cross.
 SEARCH_BACK_M, SEARCH_AHEAD_M = 5.0, 20.0
-"""Range about its last place in which an agent is searched on its path: so it stays on its branch where paths cross."""
 
 COARSE_STRIDE = 4  # rows between those of the first pass of a search
 
 
 class Pose(NamedTuple):
-    """Box centers relative to the origin of the table.
-
-    Attributes
-    ----------
-    x_m, y_m, z_m : float64 array
-    yaw_rad : float64 array
-        Unwrapped.
-    speed_mps : float64 array
-        Signed.
-    distance_m : float64 array
-        Distance traveled since the begin of the trajectory.
-    """
+    """Box centers relative to the origin of the table."""
 
     x_m: Array
     y_m: Array
     z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    distance_m: Array
+    yaw_rad: Array  # unwrapped
+    speed_mps: Array  # signed
+    distance_m: Array  # distance traveled since the begin of the trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class PathProjection:
-    """Points relative to the nearest places of a path.
+    """Points relative to the nearest places of a path."""
 
-    Attributes
-    ----------
-    ahead_m, left_m : float64 array
-        Of the point, from that place.
-    cos, sin : float64 array
-        Direction of travel there.
-    distance_m : float64 array
-        Distance along the path up to there.
-    t_s : float64 array
-        Time of the scenario there; NaN beyond its end.
-    """
-
+    # ahead_m, left_m: of the point, from that place.
     ahead_m: Array
     left_m: Array
+    # cos, sin: direction of travel there.
     cos: Array
     sin: Array
-    distance_m: Array
-    t_s: Array
+    distance_m: Array  # distance along the path up to there
+    t_s: Array  # time of the scenario there; NaN beyond its end
 
 
 class PathTable:
@@ -209,98 +186,58 @@ def _row_ranges(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.i
     return np.cumsum(count) - count, count
 
 
+# Times (H,) ahead at which others are predicted: a car that crosses at 20 m/s moves by its length in between.
 HORIZON_S = np.arange(0.0, 3.01, 0.25)
-"""Times (H,) ahead at which others are predicted: a car that crosses at 20 m/s moves by its length in between."""
 
 
 class PredictedBoxes(NamedTuple):
-    """Boxes of the other agents of pairs (P,) at the times of the horizon (H,).
+    """Boxes of the other agents of pairs (P,) at the times of the horizon (H,)."""
 
-    Attributes
-    ----------
-    x_m, y_m, yaw_rad, speed_mps : (P, H) float64
-    length_m, width_m : (P,) float64
-    """
-
+    # x_m, y_m, yaw_rad, speed_mps: (P, H)
     x_m: Array
     y_m: Array
     yaw_rad: Array
     speed_mps: Array
+    # length_m, width_m: (P,)
     length_m: Array
     width_m: Array
 
 
 class SweptCorridor(NamedTuple):
-    """The corridors that agents (P,) will sweep.
+    """The corridors that agents (P,) will sweep."""
 
-    Attributes
-    ----------
-    agent : (P,) int
-        Whose path.
-    distance_m : (P,) float64
-        Present distance along it.
-    length_m, width_m : (P,) float64
-    pace_mps : (P,) float64
-    progress_m : (P, H) float64
-        How far they intend to go from here until the times of the horizon.
-    reach_m : float
-        Look-ahead distance.
-    """
-
-    agent: NDArray[np.intp]
-    distance_m: Array
+    agent: NDArray[np.intp]  # (P,) whose path
+    distance_m: Array  # (P,) present distance along it
+    # length_m, width_m: (P,)
     length_m: Array
     width_m: Array
-    pace_mps: Array
-    progress_m: Array
-    reach_m: float
+    pace_mps: Array  # (P,)
+    progress_m: Array  # (P, H) how far they intend to go from here until the times of the horizon
+    reach_m: float  # look-ahead distance
 
 
 class SafetyMargins(NamedTuple):
-    """Margins that are kept to other agents.
+    """Margins that are kept to other agents."""
 
-    Attributes
-    ----------
-    side_m : float
-        On both sides of the corridor.
-    crossing_m, crossing_s : float
-        Before a crossing agent, as a distance and as a time.
-    behind_m : float
-        How far behind the agent's progress another center still counts as ahead.
-    """
-
-    side_m: float
+    side_m: float  # on both sides of the corridor
+    # crossing_m, crossing_s: before a crossing agent, as a distance and as a time.
     crossing_m: float
     crossing_s: float
-    behind_m: float
+    behind_m: float  # how far behind the agent's progress another center still counts as ahead
 
 
 class Leaders(NamedTuple):
-    """What agents (P,) have to keep clear of.
+    """What agents (P,) have to keep clear of."""
 
-    Attributes
-    ----------
-    gap_m : (P,) float64
-        From the front bumper; inf without a leader.
-    speed_mps : (P,) float64
-        Of the leader, along the path.
-    ahead_s : (P,) float64
-        When it is in the corridor; 0 if it is now.
-    own_t_s : (P,) float64
-        The scenario's time of the agent at that place.
-    """
-
-    gap_m: Array
-    speed_mps: Array
-    ahead_s: Array
-    own_t_s: Array
+    gap_m: Array  # (P,) from the front bumper; inf without a leader
+    speed_mps: Array  # (P,) of the leader, along the path
+    ahead_s: Array  # (P,) when it is in the corridor; 0 if it is now
+    own_t_s: Array  # (P,) the scenario's time of the agent at that place
 
 
 def leaders(paths: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, margins: SafetyMargins) -> Leaders:
     """Find for each pair what the agent has to keep clear of in the other's box, now or within the horizon.
 
-    Notes
-    -----
     A box that is in the corridor and will stay there is followed. A crossing box counts if the agent, at its intended
     progress, comes near it while it is in the corridor. Boxes whose center is behind that of the agent never count. For a
     box that moves along the path while it enters, the gap is reduced by its motion until then, so a cut-in is a leader.
@@ -352,11 +289,11 @@ def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_
     return result
 
 
+# A driven agent this near to its path in the scenario, and pointing along it, is expected to stay on it.
 ON_PATH_M, ON_PATH_COS = 1.5, 0.9
-"""A driven agent this near to its path in the scenario, and pointing along it, is expected to stay on it."""
 
+# x, y relative to the origin of the path table, yaw and speed, all (P, H) at the times of the horizon.
 Prediction = tuple[Array, Array, Array, Array]
-"""x, y relative to the origin of the path table, yaw and speed, all (P, H) at the times of the horizon."""
 
 
 def predict_by_log(paths: PathTable, agent: NDArray[np.intp], t_s: Array, rate: Array) -> Prediction:

@@ -130,7 +130,11 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
         if not self._begun:
             raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
-        pedal, wheel = _action_values(action)
+        # Check an action and return pedal and steering in [-1, 1].
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != (2,) or not np.isfinite(values).all():
+            raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
+        pedal, wheel = np.clip(values, -1.0, 1.0).tolist()
         brake, throttle = self.accel_limits_mps2
         before_m, begin_s = self._observation.path.progress_m, self._observation.t_s
         self.world.steer(Controls(pedal * (throttle if pedal > 0 else brake), wheel * self.max_steer_rad))
@@ -141,7 +145,14 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
             if not self.world.ego_lives:
                 break
             self._observation = self.world.observe()
-            collides = _collides(self._observation)
+            o, ego = self._observation.others, self._observation.ego
+            own = np.broadcast_to([ego.length_m, ego.width_m], (len(o), 2))
+            size = np.stack([o.length_m, o.width_m], axis=1)
+            yaw = np.full(len(o), ego.yaw_rad)
+            level = np.abs(o.z_m - ego.z_m) < (o.height_m + ego.height_m) / 2
+            collides = bool(
+                (level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any()
+            )
             if collides or over:
                 break
         observation = self._observation
@@ -189,15 +200,6 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         return {**shown, "others_mask": (np.arange(count) < len(near)).astype(np.int8)}
 
 
-def _action_values(action: Any) -> tuple[float, float]:
-    """Check an action and return pedal and steering in [-1, 1]."""
-    values = np.asarray(action, dtype=np.float64)
-    if values.shape != (2,) or not np.isfinite(values).all():
-        raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
-    pedal, wheel = np.clip(values, -1.0, 1.0).tolist()
-    return pedal, wheel
-
-
 def _in_ego_axes(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:
     """Rotate vectors (N,), (N,) from map axes to forward and left of the ego."""
     cos, sin = np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)
@@ -214,15 +216,6 @@ def _path_errors(observation: Observation) -> tuple[Array, Array]:
     x, y, yaw = observation.path.x_m[0], observation.path.y_m[0], observation.path.yaw_rad[0]
     dx, dy = observation.ego.x_m - x, observation.ego.y_m - y
     return dy * np.cos(yaw) - dx * np.sin(yaw), wrap_angle(observation.ego.yaw_rad - yaw)
-
-
-def _collides(observation: Observation) -> bool:
-    o, ego = observation.others, observation.ego
-    own = np.broadcast_to([ego.length_m, ego.width_m], (len(o), 2))
-    size = np.stack([o.length_m, o.width_m], axis=1)
-    yaw = np.full(len(o), ego.yaw_rad)
-    level = np.abs(o.z_m - ego.z_m) < (o.height_m + ego.height_m) / 2
-    return bool((level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any())
 
 
 def _rendered(observation: Observation) -> Any:

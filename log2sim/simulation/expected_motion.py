@@ -21,8 +21,8 @@ from log2sim.simulation.corridors import ON_PATH_COS, ON_PATH_M, PathTable
 from log2sim.simulation.metrics.conflicts import touching
 from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
 
+# Whose observations count: those of the sensors of the ego, of those at the roadside, or all.
 CHOICES = (*ENDS, "both")
-"""Whose observations count: those of the sensors of the ego, of those at the roadside, or all."""
 
 _RANGES = {
     "horizon_s": (0.5, 10.0),
@@ -103,8 +103,8 @@ class WarningSettings:
         return speed_mps**2 / (2 * left_m) if left_m > 0 else None
 
 
+# Between observations: most LiDARs turn ten times a second. Logs with fewer ticks are observed at these.
 MIN_INTERVAL_S = 0.1
-"""Between observations: most LiDARs turn ten times a second. Logs with fewer ticks are observed at these."""
 
 _MARGIN_S = 1e-6
 
@@ -115,24 +115,13 @@ class Known:
 
     An agent is known from its third observation on (`TENTATIVE_HITS`), which is when trackers take it for an object, until it
     was not observed for `CONFIRMED_AGE_S`. A static one stays known.
-
-    Attributes
-    ----------
-    since_s : (A,) float64, s
-        When each agent is first known; infinite for those that never are.
-    source : (A, T) int
-        Tick of the last observation, where an agent is known; else -1.
-    observed : (A, T) bool
-    count : (A, T) int
-        Observations since the agent was found, at least 0.
-    piece : (A, T) int
-        Rises by one when an agent is found again after it was lost; -1 before the first observation.
     """
 
-    since_s: Array
-    source: NDArray[np.intp]
-    observed: NDArray[np.bool_]
-    count: NDArray[np.intp]
+    since_s: Array  # (A,) when each agent is first known; infinite for those that never are
+    source: NDArray[np.intp]  # (A, T) tick of the last observation, where an agent is known; else -1
+    observed: NDArray[np.bool_]  # (A, T)
+    count: NDArray[np.intp]  # (A, T) observations since the agent was found, at least 0
+    # (A, T) rises by one when an agent is found again after it was lost; -1 before the first observation.
     piece: NDArray[np.intp]
 
 
@@ -209,37 +198,24 @@ def observation_interval_s(scenario: Scenario) -> float:
     return max(min(steps, default=MIN_INTERVAL_S), MIN_INTERVAL_S)
 
 
+# Between expected places; motion between them is straight, which is 3 cm off where a car turns with 4 m/s2 across.
 LEAD_STEP_S = 0.25
-"""Between expected places; motion between them is straight, which is 3 cm off where a car turns with 4 m/s2 across."""
 
+# A tracker's speed rests on about a second of observations; older ones say nothing about the present.
 LEARNED_OBSERVATIONS = 11
-"""A tracker's speed rests on about a second of observations; older ones say nothing about the present."""
 
 Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedPaths:
-    """Expected motion of C boxes at the leads (H,).
+    """Expected motion of C boxes at the leads (H,)."""
 
-    Attributes
-    ----------
-    position_m : (C, H) complex128, m
-        Box centers x + iy, map frame.
-    yaw_rad : (C, H) float64
-    course : (C, H) complex128
-        Unit vectors along which and across which `sigma_m` holds.
-    sigma_m : (C, H, 2) float64, m
-        Standard deviations along and across.
-    size_m : (C, 2) float64, m
-        Length and width.
-    """
-
-    position_m: Complex
-    yaw_rad: Array
-    course: Complex
-    sigma_m: Array
-    size_m: Array
+    position_m: Complex  # (C, H) box centers x + iy, map frame
+    yaw_rad: Array  # (C, H)
+    course: Complex  # (C, H) unit vectors along which and across which `sigma_m` holds
+    sigma_m: Array  # (C, H, 2) standard deviations along and across
+    size_m: Array  # (C, 2) length and width
 
     def take(self, index: NDArray[np.generic]) -> ExpectedPaths:
         """Return some of the boxes."""
@@ -248,26 +224,12 @@ class ExpectedPaths:
         )
 
 
-def lead_times(horizon_s: float) -> Array:
-    """Return leads (H,), s, from 0 to a horizon."""
-    return np.linspace(0.0, horizon_s, int(np.ceil(horizon_s / LEAD_STEP_S - 1e-9)) + 1)
-
-
 class ExpectedAgents:
     """Where agents (A,) are expected from any tick, by the observations up to then.
 
-    Parameters
-    ----------
-    table : MotionTable
-        States of the agents at all ticks.
-    known : Known
-        What is known of them at these ticks.
-    interval_s : float, s
-        Between observations.
-    horizon_s : float, s
+    `table`: states of the agents at all ticks. `known`: what is known of them at these ticks. `interval_s`: between
+    observations.
 
-    Notes
-    -----
     Movers are predicted by `log2sim.prediction` from the states at ticks at which they were observed. To its standard deviations
     comes that of a speed which a tracker has learned from few observations: of the slope of a line through n places with
     errors sigma, sigma sqrt(12 / (n (n^2 - 1))) per interval. Static agents stay where they are.
@@ -275,7 +237,7 @@ class ExpectedAgents:
 
     def __init__(self, table: MotionTable, known: Known, interval_s: float, horizon_s: float) -> None:
         self.table, self.known, self._interval_s = table, known, interval_s
-        self.lead_s = lead_times(horizon_s)
+        self.lead_s = np.linspace(0.0, horizon_s, int(np.ceil(horizon_s / LEAD_STEP_S - 1e-9)) + 1)
         self.size_m = np.array([a.size_m[:2] for a in table.agents], dtype=np.float64).reshape(-1, 2)
         self._static = np.array([a.static for a in table.agents], dtype=bool)
         movers = np.flatnonzero(~self._static)
@@ -357,32 +319,21 @@ def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:
     return np.asarray(values[row, k] + part * (values[row, k + 1] - values[row, k]))
 
 
+# Drivers keep to a lane within some 0.3 m, which they may be off after about a second: what nearly touches may just
+# as well not.
 KEEPING_SIGMA_M, KEEPING_S = 0.3, 1.0
-"""Drivers keep to a lane within some 0.3 m, which they may be off after about a second: what nearly touches may just as well
-not."""
 
 
 class EgoStates(NamedTuple):
-    """States of the ego (C,).
+    """States of the ego (C,)."""
 
-    Attributes
-    ----------
-    x_m, y_m : (C,) float64, m
-        Box center, map frame.
-    yaw_rad : (C,) float64
-    speed_mps : (C,) float64, m/s
-    accel_mps2 : (C,) float64, m/s2
-        Of the speed's amount.
-    progress_m : (C,) float64, m
-        How far along its path.
-    """
-
+    # x_m, y_m: (C,) box center, map frame.
     x_m: Array
     y_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    accel_mps2: Array
-    progress_m: Array
+    yaw_rad: Array  # (C,)
+    speed_mps: Array  # (C,)
+    accel_mps2: Array  # (C,), m/s2 of the speed's amount
+    progress_m: Array  # (C,) how far along its path
 
     def take(self, index: NDArray[np.generic]) -> EgoStates:
         """Return some of the states."""
@@ -409,7 +360,12 @@ class EgoPath:
 
         It keeps its speed, or goes on braking as it does until it stands.
         """
-        ahead = way_after(np.abs(ego.speed_mps), np.minimum(ego.accel_mps2, 0.0), lead_s)
+        speed_mps = np.abs(ego.speed_mps)
+        accel_mps2 = np.minimum(ego.accel_mps2, 0.0)
+        brakes = accel_mps2 < 0
+        stands_s = np.divide(-speed_mps, accel_mps2, out=np.full(len(speed_mps), np.inf), where=brakes)
+        t = np.minimum(lead_s, stands_s[:, None])
+        ahead = np.asarray(speed_mps[:, None] * t + np.where(brakes, accel_mps2, 0.0)[:, None] * t**2 / 2)
         one = np.zeros((1, 1), dtype=np.intp)
         x0, y0, cos0, sin0, _ = self._paths.along(one, ego.progress_m[:, None])
         x, y, cos, sin, _ = self._paths.along(one, ego.progress_m[:, None] + ahead)
@@ -437,48 +393,29 @@ class EgoPath:
         return self._trajectory.heights(at_s.ravel()).reshape(at_s.shape)
 
 
-def way_after(speed_mps: Array, accel_mps2: Array, lead_s: Array) -> Array:
-    """Compute the ways (C, H), m, of vehicles with speeds (C,) that keep their deceleration (C,) until they stand."""
-    brakes = accel_mps2 < 0
-    stands_s = np.divide(-speed_mps, accel_mps2, out=np.full(len(speed_mps), np.inf), where=brakes)
-    t = np.minimum(lead_s, stands_s[:, None])
-    return np.asarray(speed_mps[:, None] * t + np.where(brakes, accel_mps2, 0.0)[:, None] * t**2 / 2)
-
-
+# Of the errors along and across, so that a probability is exact to a hundredth; odd, so that one of them is no error.
 QUANTILES = 9
-"""Of the errors along and across, so that a probability is exact to a hundredth; odd, so that one of them is no error."""
 
-CHUNK = 256
-"""Pairs of ways that are compared at once."""
-
+CHUNK = 256  # pairs of ways that are compared at once
+# Beyond the outermost quantile, which is 1.6 standard deviations off, so that nothing is missed by looking no
+# farther.
 REACH_SIGMA = 2.0
-"""Beyond the outermost quantile, which is 1.6 standard deviations off, so that nothing is missed by looking no farther."""
 
-MIN_TRAVEL_M = 1e-6
-"""An ego that moves by less between leads stands."""
+MIN_TRAVEL_M = 1e-6  # an ego that moves by less between leads stands
 
 
 class Contacts(NamedTuple):
-    """Expected contacts of C pairs of ways.
+    """Expected contacts of C pairs of ways."""
 
-    Attributes
-    ----------
-    probability : (C,) float64
-        That they meet within the horizon.
-    time_s : (C,) float64, s
-        Until they do: as expected without error; where that does not meet, the median of the times of errors that do.
-        Infinite where none does.
-    """
-
-    probability: Array
+    probability: Array  # (C,) that they meet within the horizon
+    # (C,) until they do: as expected without error; where that does not meet, the median of the times of errors that
+    # do. Infinite where none does.
     time_s: Array
 
 
 def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Contacts:
     """Compare C ways of the ego with one of another agent each, at leads (H,).
 
-    Notes
-    -----
     The errors of an agent at different leads are one: who is faster than expected is so throughout. They are normal along and
     across its course, with those of the ego added, and each takes `QUANTILES` values of equal probability; the probability is
     the share of the pairs of values with which the boxes meet. Between leads both move straight, and the time is exact. A
@@ -486,7 +423,12 @@ def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) 
     where boxes overlap already.
     """
     probability, time = np.zeros(len(ego.size_m)), np.full(len(ego.size_m), np.inf)
-    near = np.flatnonzero(_in_reach(ego, others))
+    # Whether two ways come so near that their boxes may meet with any of the errors.
+    radius = (np.hypot(*ego.size_m.T) + np.hypot(*others.size_m.T)) / 2
+    step = np.abs(np.diff(others.position_m - ego.position_m, axis=1)).max(axis=1, initial=0.0)
+    sigma = np.hypot(others.sigma_m, ego.sigma_m)
+    room = radius + step + REACH_SIGMA * np.hypot(sigma[..., 0], sigma[..., 1]).max(axis=1)
+    near = np.flatnonzero(np.asarray(np.abs(others.position_m - ego.position_m).min(axis=1) <= room))
     for begin in range(0, len(near), CHUNK):
         rows = near[begin : begin + CHUNK]
         times = _contact_times(ego.take(rows), others.take(rows), lead_s)
@@ -500,18 +442,11 @@ def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) 
     return Contacts(probability, time)
 
 
-def _in_reach(ego: ExpectedPaths, others: ExpectedPaths) -> NDArray[np.bool_]:
-    """Whether two ways come so near that their boxes may meet with any of the errors."""
-    radius = (np.hypot(*ego.size_m.T) + np.hypot(*others.size_m.T)) / 2
-    step = np.abs(np.diff(others.position_m - ego.position_m, axis=1)).max(axis=1, initial=0.0)
-    sigma = np.hypot(others.sigma_m, ego.sigma_m)
-    room = radius + step + REACH_SIGMA * np.hypot(sigma[..., 0], sigma[..., 1]).max(axis=1)
-    return np.asarray(np.abs(others.position_m - ego.position_m).min(axis=1) <= room)
-
-
 def _contact_times(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Array:
     """Return for pairs (C,) and all errors (K,) the times (C, K) of the first contact, infinite without."""
-    along, across = _errors()
+    normal = NormalDist()
+    values = np.array([normal.inv_cdf((k + 0.5) / QUANTILES) for k in range(QUANTILES)])
+    along, across = np.repeat(values, QUANTILES), np.tile(values, QUANTILES)
     sigma = np.hypot(others.sigma_m, ego.sigma_m)[:, None]
     off = sigma[..., 0] * along[:, None] + 1j * sigma[..., 1] * across[:, None]
     apart = (others.position_m - ego.position_m)[:, None] + off * others.course[:, None]
@@ -534,13 +469,6 @@ def _contact_times(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> 
     counts = (ahead > -ego.size_m[:, :1, None] / 2) & moves
     time, counts = (np.take_along_axis(c, first, axis=-1)[..., 0] for c in (times, counts))
     return np.where(counts & (time > 0), time, np.inf)
-
-
-def _errors() -> tuple[Array, Array]:
-    """Return pairs of errors (K,), (K,) in standard deviations that are equally probable."""
-    normal = NormalDist()
-    values = np.array([normal.inv_cdf((k + 0.5) / QUANTILES) for k in range(QUANTILES)])
-    return np.repeat(values, QUANTILES), np.tile(values, QUANTILES)
 
 
 def _middle(yaw_rad: Array) -> Array:

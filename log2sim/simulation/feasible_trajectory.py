@@ -40,47 +40,27 @@ DAMPING_SCALE = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED
 
 @dataclass(frozen=True)
 class FeasibilityLimits:
-    """What a vehicle can do.
+    """What a vehicle can do."""
 
-    Attributes
-    ----------
-    offset_m : float
-        From the rear axle forward to the box center.
-    max_lateral_mps2 : float
-        Below the 9 m/s2 of a dry road; the rest is left to the controller.
-    """
-
-    offset_m: float
+    offset_m: float  # from the rear axle forward to the box center
     max_curvature_1pm: float
     max_curvature_rate_1pmps: float
     max_accel_mps2: float
-    max_lateral_mps2: float = 8.0
+    max_lateral_mps2: float = 8.0  # below the 9 m/s2 of a dry road; the rest is left to the controller
 
 
 @dataclass(frozen=True, eq=False)
 class FeasibleTrajectory:
-    """States of a rear axle that rolls without slip, at times `t_s` (K,).
+    """States of a rear axle that rolls without slip, at times `t_s` (K,)."""
 
-    Attributes
-    ----------
-    t_s : (K,) float64, s
-    x_m, y_m : (K,) float64, m
-    yaw_rad : (K,) float64
-        Unwrapped.
-    speed_mps : (K,) float64
-        Negative in reverse.
-    accel_mps2 : (K,) float64
-    curvature_1pm : (K,) float64
-        Positive to the left.
-    """
-
-    t_s: Array
+    t_s: Array  # (K,)
+    # x_m, y_m: (K,)
     x_m: Array
     y_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    accel_mps2: Array
-    curvature_1pm: Array
+    yaw_rad: Array  # (K,) unwrapped
+    speed_mps: Array  # (K,) negative in reverse
+    accel_mps2: Array  # (K,)
+    curvature_1pm: Array  # (K,) positive to the left
 
     @cached_property
     def motion(self) -> tuple[Array, Array]:
@@ -97,13 +77,12 @@ def fit_trajectory(
 ) -> FeasibleTrajectory:
     """Fit a feasible trajectory to box centers and headings at evenly spaced times (K,), K >= 2.
 
-    Notes
-    -----
     Least squares over all knots at once, by Gauss-Newton steps with Levenberg-Marquardt damping. Rolling without slip is a
     residual as well (direct multiple shooting, Bock & Plitt, 1984), which makes every step a banded system: cost O(K).
     Headings and speeds enter by the pseudo-Huber loss, so outliers have little influence.
     """
-    axis = _consistent_heading(yaw_rad)
+    axis = np.unwrap(yaw_rad, period=np.pi)
+    axis = axis + np.pi if np.sum(np.cos(axis - yaw_rad)) < 0 else axis
     away = wrap_angle(yaw_rad - axis)
     logged = np.stack([x_m, y_m, axis + away, np.where(np.abs(away) > np.pi / 2, -speed_mps, speed_mps)], axis=1)
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
@@ -133,12 +112,6 @@ def unfitted_trajectory(
 ) -> FeasibleTrajectory:
     """Return the given trajectory at times (K,), K >= 1: for a single time, or a lifetime that is too long to be fitted."""
     return FeasibleTrajectory(t_s, *_initial_states(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
-
-
-def _consistent_heading(yaw: Array) -> Array:
-    """Remove turns of more than a quarter between knots (K,); where the heading flips, the more frequent direction is kept."""
-    axis = np.unwrap(yaw, period=np.pi)
-    return axis + np.pi if np.sum(np.cos(axis - yaw)) < 0 else axis
 
 
 def _initial_states(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: FeasibilityLimits) -> Array:
@@ -172,18 +145,10 @@ class ResidualTerm(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _LeastSquares:
-    """The least-squares problem of one trajectory.
+    """The least-squares problem of one trajectory."""
 
-    Attributes
-    ----------
-    h_s : float
-        Spacing of the knots.
-    logged : (K, 4) float64
-        Box center x, y, yaw and speed at the knots.
-    """
-
-    h_s: float
-    logged: Array
+    h_s: float  # spacing of the knots
+    logged: Array  # (K, 4) box center x, y, yaw and speed at the knots
     limits: FeasibilityLimits
 
     def terms(self, state: Array) -> list[ResidualTerm]:

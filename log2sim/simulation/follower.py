@@ -26,48 +26,31 @@ from log2sim.simulation.vehicles.vehicle import (
 
 @dataclass(frozen=True)
 class ControllerGains:
-    """Gains of the controllers. The defaults are stable with actuator lags of 0.1 s and steps of up to 0.1 s.
+    """Gains of the controllers. The defaults are stable with actuator lags of 0.1 s and steps of up to 0.1 s."""
 
-    Attributes
-    ----------
-    along_s, across_s : float, s
-        Time constants of the errors along and across the path.
-    across_min_m : float, m
-        At walking pace errors decay over this distance, since a car cannot move sideways.
-    integral_s : float, s
-    derivative_filter_s : float, s
-    point_s : float, s
-        Time constant of point masses.
-    hold_below_mps, hold_brake_mps2, hold_within_m : float
-        The brake holds a vehicle below this speed that has stopped within this distance; one that stopped earlier
-        drives up.
-    max_lateral_accel_mps2 : float
-        Grip of a dry road.
-    integral_share : float
-        Limit of the lateral integral, as a share of the curvature that steering and grip allow.
-    max_along_m : float, m
-        Longest extrapolation along the arc at the reference; limits catching up to 2.5 m/s.
-    """
-
+    # along_s, across_s: time constants of the errors along and across the path.
     along_s: float = 0.6
     across_s: float = 0.6
-    across_min_m: float = 1.5
+    across_min_m: float = 1.5  # at walking pace errors decay over this distance, since a car cannot move sideways
     integral_s: float = 4.0
     derivative_filter_s: float = 0.05
     damping: float = 1.0
-    point_s: float = 0.3
+    point_s: float = 0.3  # time constant of point masses
+    # hold_below_mps, hold_brake_mps2, hold_within_m: the brake holds a vehicle below this speed that has stopped
+    # within this distance; one that stopped earlier drives up.
     hold_below_mps: float = 0.05
     hold_brake_mps2: float = 2.0
     hold_within_m: float = 0.1
-    max_lateral_accel_mps2: float = 9.0
+    max_lateral_accel_mps2: float = 9.0  # grip of a dry road
     integral_limit_mps2: float = 1.0
+    # Limit of the lateral integral, as a share of the curvature that steering and grip allow.
     integral_share: float = 0.2
-    max_along_m: float = 3.0
+    max_along_m: float = 3.0  # longest extrapolation along the arc at the reference; limits catching up to 2.5 m/s
 
 
 GAINS = ControllerGains()
+# Longest time for which controls are held: a third of the shortest time in which an error decays.
 MAX_CONTROL_STEP_S = 0.1
-"""Longest time for which controls are held: a third of the shortest time in which an error decays."""
 
 
 def control_step(dt_s: float) -> float:
@@ -77,18 +60,10 @@ def control_step(dt_s: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ControllerMemory(Columns):
-    """State of the controllers of vehicles, rows along and across the path, (2, A) each.
+    """State of the controllers of vehicles, rows along and across the path, (2, A) each."""
 
-    Attributes
-    ----------
-    integral : (2, A) float64
-        In m/s2 and 1/m.
-    rate : (2, A) float64
-        Filtered derivatives of the errors: a speed in m/s, and the slope toward the path.
-    """
-
-    integral: Array
-    rate: Array
+    integral: Array  # (2, A) in m/s2 and 1/m
+    rate: Array  # (2, A) filtered derivatives of the errors: a speed in m/s, and the slope toward the path
 
     @classmethod
     def fresh(cls, count: int) -> ControllerMemory:
@@ -106,13 +81,8 @@ def follow_vehicles(
 ) -> tuple[VehicleControls, ControllerMemory]:
     """Compute the controls of vehicles that follow their references.
 
-    Parameters
-    ----------
-    row : (C, A) float64
-        The references now, as `VEHICLE_COLUMNS`.
+    `row` (C, A): the references now, as `VEHICLE_COLUMNS`.
 
-    Notes
-    -----
     Two PID controllers with feed-forward, along and across the path, are the rows of (2, A) arrays: with up to a thousand
     agents the overhead of a NumPy call is as large as the computation. The correction across the path is a curvature that
     depends on distance and not on time, so nothing is divided by the speed.
@@ -121,7 +91,16 @@ def follow_vehicles(
     pace = np.abs(state.speed_mps)
     moves, square = pace > 0, pace * pace
     gear = np.sign(state.speed_mps + TINY * reference_gear)
-    error, raw_rate = _errors(row, state, gains)
+    # Errors along and across the path in m (2, A), and their derivatives: speed difference, slope toward the path.
+    x, y, yaw, speed, _, curvature, _, _ = row
+    cos, sin = cos_sin(yaw)
+    dx, dy = x - state.x_m, y - state.y_m
+    along = cos * dx + sin * dy
+    along = np.minimum(np.maximum(along, -gains.max_along_m), gains.max_along_m)
+    turn = curvature * along
+    across = cos * dy - sin * dx + turn * along / 2
+    _, slope = cos_sin(yaw - turn - state.yaw_rad)
+    error, raw_rate = rows(along, across), rows(speed - state.speed_mps, slope)
     rate = memory.rate - math.expm1(-dt_s / gains.derivative_filter_s) * (raw_rate - memory.rate)
     damping = 2 * gains.damping * rate
     damping[1] *= gear  # in reverse, turning to the left leads to the right
@@ -149,23 +128,6 @@ def follow_vehicles(
     steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * square))
     controls = VehicleControls(given[0], steer, reference_gear < 0)
     return controls, ControllerMemory(integral, rate)
-
-
-def _errors(row: Array, state: VehicleState, gains: ControllerGains) -> tuple[Array, Array]:
-    """Return errors along and across the path in m (2, A), and their derivatives: speed difference, slope toward the path.
-
-    They are taken at the foot point: the arc at the reference is followed back by the error along it, so a vehicle that
-    is late in a curve is not pulled inside.
-    """
-    x, y, yaw, speed, _, curvature, _, _ = row
-    cos, sin = cos_sin(yaw)
-    dx, dy = x - state.x_m, y - state.y_m
-    along = cos * dx + sin * dy
-    along = np.minimum(np.maximum(along, -gains.max_along_m), gains.max_along_m)
-    turn = curvature * along
-    across = cos * dy - sin * dx + turn * along / 2
-    _, slope = cos_sin(yaw - turn - state.yaw_rad)
-    return rows(along, across), rows(speed - state.speed_mps, slope)
 
 
 def follow_points(row: Array, state: PointState, gains: ControllerGains = GAINS) -> PointControls:

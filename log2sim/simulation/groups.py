@@ -48,17 +48,10 @@ MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10
 
 @dataclass(frozen=True)
 class StepClock:
-    """Steps at `begin_s + n * dt_s` for n in [0, `steps`).
-
-    Attributes
-    ----------
-    begin_s : float, s
-    dt_s : float, s
-        Length of a step.
-    """
+    """Steps at `begin_s + n * dt_s` for n in [0, `steps`)."""
 
     begin_s: float
-    dt_s: float
+    dt_s: float  # length of a step
     steps: int
 
     @classmethod
@@ -89,22 +82,16 @@ class Snapshot(Columns):
     """Box centers and actuators of agents (A,), map frame.
 
     Commands are those held over the last step; NaN for agents without.
-
-    Attributes
-    ----------
-    x_m, y_m, yaw_rad, speed_mps : (A,) float64
-    steer_rad : (A,) float64
-    accel_mps2 : (A,) float64
-        NaN where the model has no such state.
-    pedal_command_mps2, steer_command_rad, gear : (A,) float64
     """
 
+    # x_m, y_m, yaw_rad, speed_mps: (A,)
     x_m: Array
     y_m: Array
     yaw_rad: Array
     speed_mps: Array
-    steer_rad: Array
-    accel_mps2: Array
+    steer_rad: Array  # (A,)
+    accel_mps2: Array  # (A,) NaN where the model has no such state
+    # pedal_command_mps2, steer_command_rad, gear: (A,)
     pedal_command_mps2: Array
     steer_command_rad: Array
     gear: Array
@@ -329,8 +316,8 @@ def _copy_rows(window: Array, reference: Reference, row0: int) -> None:
     window[high:] = columns[-1]
 
 
+# By agent id: the stored steps (S,) and the columns (C, S) of `Snapshot` at these steps.
 RecordedTracks = dict[str, tuple[NDArray[np.intp], Array]]
-"""By agent id: the stored steps (S,) and the columns (C, S) of `Snapshot` at these steps."""
 
 COLUMNS = tuple(f.name for f in fields(Snapshot))
 
@@ -384,7 +371,8 @@ class PolicyObserver:
         self._trajectory = ego.references[0].trajectory
         self._path_table = PathTable([self._trajectory])
         self._groups = [g for g in groups if g is not ego]
-        self._statics = _static_poses(statics)
+        first = [(a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.yaw_rad[0], 0.0) for a in statics]
+        self._statics = np.array(first, dtype=np.float64).reshape(-1, 4).T
         lives = [(-np.inf, np.inf) if a.is_permanent else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
         self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
         self._agents = [_identities(g.agents, [r.trajectory for r in g.references]) for g in self._groups]
@@ -465,12 +453,6 @@ def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> 
     rows = [(a.id, a.category, *a.size_m, trajectory) for a, trajectory in zip(agents, trajectories)]
     sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
     return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("trajectory", object)])
-
-
-def _static_poses(agents: Sequence[Agent]) -> Array:
-    """Return x, y, yaw and speed (4, A) of static agents."""
-    first = [(a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.yaw_rad[0], 0.0) for a in agents]
-    return np.array(first, dtype=np.float64).reshape(-1, 4).T
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:

@@ -179,8 +179,8 @@ class Observation:
     path: PathAhead
 
 
+# A function, or an object with `__call__` and, if it has a state of its own, `reset(scenario)`.
 Policy = Callable[[Observation], Controls]
-"""A function, or an object with `__call__` and, if it has a state of its own, `reset(scenario)`."""
 
 
 def reset_policy(policy: Policy, scenario: Scenario) -> None:
@@ -251,17 +251,10 @@ def load_policy(name: str) -> Policy:
 
 @dataclass(frozen=True, eq=False)
 class PluginPolicy:
-    """A policy of another package; its faults are told with the name of the package.
-
-    Attributes
-    ----------
-    inner : callable
-    source : str
-        How messages name it.
-    """
+    """A policy of another package; its faults are told with the name of the package."""
 
     inner: Policy
-    source: str
+    source: str  # how messages name it
 
     def reset(self, scenario: Scenario) -> None:
         """Prepare it for a replay, if it wants to be."""

@@ -54,26 +54,13 @@ ON_FOOT = (0.5, 0.7, 1.0, 1.5, 4.0)
 
 @dataclass(frozen=True, eq=False)
 class IdmParameters(Columns):
-    """Parameters of the intelligent driver model, all (A,).
+    """Parameters of the intelligent driver model, all (A,)."""
 
-    Attributes
-    ----------
-    time_gap_s : (A,) float64
-    gap_m : (A,) float64
-        Minimum gap, kept at standstill.
-    accel_mps2 : (A,) float64
-        Free acceleration.
-    comfort_mps2 : (A,) float64
-        Comfortable braking.
-    brake_mps2 : (A,) float64
-        Hardest braking.
-    """
-
-    time_gap_s: Array
-    gap_m: Array
-    accel_mps2: Array
-    comfort_mps2: Array
-    brake_mps2: Array
+    time_gap_s: Array  # (A,)
+    gap_m: Array  # (A,) minimum gap, kept at standstill
+    accel_mps2: Array  # (A,) free acceleration
+    comfort_mps2: Array  # (A,) comfortable braking
+    brake_mps2: Array  # (A,) hardest braking
 
 
 def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
@@ -85,8 +72,6 @@ def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
 def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_mps: Array) -> Array:
     """Return the share of the free acceleration that a leader takes: (s* / s)^2 of the model; 1 at the minimum gap at low speed.
 
-    Notes
-    -----
     Treiber, Hennecke and Helbing, "Congested traffic states in empirical observations and microscopic simulations", 2000.
     """
     closing = pace_mps * (pace_mps - leader_mps) / (2 * np.sqrt(driver.accel_mps2 * driver.comfort_mps2))
@@ -100,8 +85,6 @@ def rate_response(
 ) -> tuple[Array, Array]:
     """Return the rate and its slope in 1/s, (A,) each, of trajectories at `pace_mps` here, with demand `taken`.
 
-    Notes
-    -----
     The scenario's speed at a place is the model's desired speed, so the rate is its v / v0, and the model's
     acceleration is added to the scenario's. Braking that the scenario does anyway counts as a response to the leader.
     Without demand a rate of 1 stays 1: the agent follows the scenario.
@@ -115,12 +98,12 @@ def rate_response(
     return np.where(held, 0.0, rate), np.where(held, 0.0, slope)
 
 
+# `path`: others go where the scenario has them go. `motion`: they go on as they have moved so far, as who sees them
+# for the first time expects.
 FORESIGHTS = ("path", "motion")
-"""`path`: others go where the scenario has them go. `motion`: they go on as they have moved so far, as who sees them for the
-first time expects."""
 
+# Time constant of the turn rate of a vehicle that a policy drives: short, since simulated headings have no noise.
 DRIVEN_TURN_S = 0.3
-"""Time constant of the turn rate of a vehicle that a policy drives: short, since simulated headings have no noise."""
 
 Index = NDArray[np.intp]
 
@@ -213,8 +196,8 @@ MIN_LOOKAHEAD_M = 10.0  # also at standstill
 
 MARGINS_NOW = SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
 MARGINS_IN_SCENARIO = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
+# Tolerances, besides the difference of the margins, within which an interaction counts as that of the scenario.
 GAP_M, SPEED_MPS = 0.5, 0.5
-"""Tolerances, besides the difference of the margins, within which an interaction counts as that of the scenario."""
 
 MIN_DEMAND = 1e-3  # share of the free acceleration below which a demand is ignored
 PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their points
@@ -222,37 +205,18 @@ PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their p
 
 @dataclass(frozen=True, eq=False)
 class TrafficState:
-    """All agents (A,) at one time.
-
-    Attributes
-    ----------
-    size_m : (A, 3) float64
-    reacts : (A,) bool
-        Whether an agent is reactive.
-    driven : int
-        The agent that a policy drives, -1 without.
-    t_s : (A,) float64
-        Time on the scenario of each agent.
-    rate : (A,) float64
-        Rate at which each agent passes its trajectory.
-    pose : Pose
-        Where the agents are, (A,).
-    prediction : Prediction
-        Where they are expected to go, (A, H).
-    foresight : Foresight
-        What expects it.
-    """
+    """All agents (A,) at one time."""
 
     paths: PathTable
     idm: IdmParameters
-    size_m: Array
-    reacts: NDArray[np.bool_]
-    driven: int
-    t_s: Array
-    rate: Array
-    pose: Pose
-    prediction: Prediction
-    foresight: Foresight
+    size_m: Array  # (A, 3)
+    reacts: NDArray[np.bool_]  # (A,) whether an agent is reactive
+    driven: int  # the agent that a policy drives, -1 without
+    t_s: Array  # (A,) time on the scenario of each agent
+    rate: Array  # (A,) rate at which each agent passes its trajectory
+    pose: Pose  # where the agents are, (A,)
+    prediction: Prediction  # where they are expected to go, (A, H)
+    foresight: Foresight  # what expects it
 
     def reach_m(self, i: Index) -> Array:
         """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
@@ -353,17 +317,6 @@ def _boxes(m: TrafficState, j: Index, prediction: Prediction) -> PredictedBoxes:
     return PredictedBoxes(*prediction, m.size_m[j, 0], m.size_m[j, 1])
 
 
-def predict_all(foresight: Foresight, t_s: float, pose: Pose, own_s: Array, rate: Array, driven: int) -> Prediction:
-    """Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,)."""
-    everyone = np.arange(len(own_s))
-    prediction = foresight.expect(everyone, own_s, rate)
-    return (
-        prediction
-        if driven < 0
-        else _select(everyone == driven, foresight.expect_driven(driven, t_s, pose), prediction)
-    )
-
-
 def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
     """Predict agents (P,) from the scenario at times (P,), by the same rules."""
     prediction = m.foresight.expect(j, t_s, np.ones(len(j)))
@@ -412,8 +365,8 @@ def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) ->
 
 DECISION_STEP_S = 0.1
 CHUNK = 4096  # pairs evaluated together
+# A demand fades over this time after it ends, so that the rate does not oscillate at the edge of a conflict.
 RELEASE_S, MAX_KEPT_DEMAND = 0.5, 4.0
-"""A demand fades over this time after it ends, so that the rate does not oscillate at the edge of a conflict."""
 
 SAME_DELAY_S = 1e-9  # delays that differ by rounding are the same
 
@@ -421,19 +374,10 @@ SAME_DELAY_S = 1e-9  # delays that differ by rounding are the same
 class Traffic:
     """Decisions of the reactive agents among the A agents of a scenario; all columns are (A,) over all of them.
 
-    Parameters
-    ----------
-    agents, trajectories : sequences
-        All agents, and the trajectories of their box centers; for static agents one pose.
-    reactive : collection of str
-        Ids of the reactive agents.
-    driven : str, optional
-        Id of the agent whose states are given with each decision, since a policy drives it.
-    foresight : str
-        One of `FORESIGHTS`: what the reactive agents expect of others.
+    `agents`, `trajectories`: all agents, and the trajectories of their box centers; for static agents one pose.
+    `reactive`: ids of the reactive agents. `driven`: id of the agent whose states are given with each decision, since a
+    policy drives it. `foresight`: one of `FORESIGHTS`: what the reactive agents expect of others.
 
-    Notes
-    -----
     A pair of agents is evaluated only while it differs from the scenario: one is driven by a policy, or their delays
     differ, or they overlap in the scenario itself. The demand of a leader is compared with its demand in the scenario
     when the agent was at this place, and only the excess counts; so a scenario that drives closer than the model would
@@ -488,7 +432,14 @@ class Traffic:
         pace = np.abs(pose.speed_mps[own])
         log_accel = (np.abs(self.paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
         pose = self._with_ego(pose, ego)
-        prediction = predict_all(self._foresight, t_s, pose, tau, self.rate, self._driven)
+        # Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,).
+        everyone = np.arange(len(tau))
+        prediction = self._foresight.expect(everyone, tau, self.rate)
+        prediction = (
+            prediction
+            if self._driven < 0
+            else _select(everyone == self._driven, self._foresight.expect_driven(self._driven, t_s, pose), prediction)
+        )
         moment = TrafficState(
             self.paths,
             self.idm,
@@ -540,8 +491,8 @@ class Traffic:
         return own[row], j
 
 
+# Columns that scale with the rate, and the columns of their derivatives.
 RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
-"""Columns that scale with the rate, and the columns of their derivatives."""
 
 
 class ReactiveGroup(AgentGroup):

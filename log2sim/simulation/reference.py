@@ -25,14 +25,10 @@ from log2sim.simulation.feasible_trajectory import (
 from log2sim.simulation.follower import control_step
 from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for
 
-GRID_S = 0.02
-"""Spacing of the tables; linear interpolation errs by at most a h^2 / 8 = 0.5 mm at 10 m/s2."""
-
-SMOOTHING_S = 0.12
-"""Standard deviation of the Gaussian over the velocity of points: one waypoint at 10 Hz."""
-
+GRID_S = 0.02  # spacing of the tables; linear interpolation errs by at most a h^2 / 8 = 0.5 mm at 10 m/s2
+SMOOTHING_S = 0.12  # standard deviation of the Gaussian over the velocity of points: one waypoint at 10 Hz
+# The brake holds while the reference is slower: below `STANDSTILL_MPS`, so that a start is not delayed.
 REFERENCE_HOLD_MPS = 0.08
-"""The brake holds while the reference is slower: below `STANDSTILL_MPS`, so that a start is not delayed."""
 
 MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # a movement that is both shorter and slower is noise of a standing agent
 MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
@@ -43,31 +39,15 @@ MAX_DEPARTURE_M = 0.3  # larger than the errors of boxes
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """An agent's reference table: row k of `columns` holds for the time (first_row + k) * GRID_S.
+    """An agent's reference table: row k of `columns` holds for the time (first_row + k) * GRID_S."""
 
-    Attributes
-    ----------
-    trajectory : Trajectory
-        The box centers in the scenario.
-    columns : (K, C) float64
-        `VEHICLE_COLUMNS`, `POINT_COLUMNS`, or x, y, yaw, speed.
-    exact : callable
-        Rows (N, C) at any times (N,), without blending across rows.
-    offset_m : float
-        From the reference point forward to the box center.
-    flags : tuple of str
-        What in the scenario cannot be driven.
-    slips : bool
-        Whether the reference holds slip angles, so that it does not move along its yaw.
-    """
-
-    trajectory: Trajectory
+    trajectory: Trajectory  # the box centers in the scenario
     first_row: int
-    columns: Array
-    exact: Callable[[Array], Array]
-    offset_m: float = 0.0
-    flags: tuple[str, ...] = ()
-    slips: bool = False
+    columns: Array  # (K, C) `VEHICLE_COLUMNS`, `POINT_COLUMNS`, or x, y, yaw, speed
+    exact: Callable[[Array], Array]  # rows (N, C) at any times (N,), without blending across rows
+    offset_m: float = 0.0  # from the reference point forward to the box center
+    flags: tuple[str, ...] = ()  # what in the scenario cannot be driven
+    slips: bool = False  # whether the reference holds slip angles, so that it does not move along its yaw
 
 
 VEHICLE_COLUMNS = ("x", "y", "yaw", "speed", "accel_ahead", "curvature_ahead", "gear_ahead", "stands_ahead")

@@ -19,66 +19,33 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True)
 class Moment:
-    """The ego and another agent at one time.
-
-    Attributes
-    ----------
-    t_s : float, s
-    distance_m : float
-        Between the boxes.
-    stopping_m : float
-        Way of the ego until it stands, with the reaction.
-    """
+    """The ego and another agent at one time."""
 
     t_s: float
-    distance_m: float
+    distance_m: float  # between the boxes
     ego_speed_mps: float
-    stopping_m: float
+    stopping_m: float  # way of the ego until it stands, with the reaction
 
 
 @dataclass(frozen=True)
 class CollisionWarning:
-    """What is known of an agent on a collision course with the ego, or with another vehicle that is warned in its place.
-
-    Attributes
-    ----------
-    known : Moment or None
-        When it is first known; None where it never is.
-    known_by : mapping of str to float
-        When each end alone knows it first, s; only where both have observed somebody.
-    warned : Moment or None
-        When it is first warned of; None for a collision that was not predicted.
-    probability : float
-        Of the collision, at that time.
-    ttc_s : float or None, s
-        Time to the collision then.
-    way_m : float or None, m
-        Of the ego until then, at its speed.
-    needed_mps2 : float or None, m/s2
-        Deceleration with which the ego stands before that place; None where it is too late.
-    braking_suffices : bool
-        Whether the ego can stand before that place.
-    spans_s : tuple of (float, float), s
-        While it is warned of.
-    collision_s : float or None, s
-        When the ego touches it in the replay.
-    driver : str
-        Who is warned: the ego, or a vehicle of a scenario without one.
-    """
+    """What is known of an agent on a collision course with the ego, or with another vehicle that is warned in its place."""
 
     agent: str
     category: str
-    known: Moment | None
+    known: Moment | None  # when it is first known; None where it never is
+    # When each end alone knows it first, s; only where both have observed somebody.
     known_by: Mapping[str, float] = field(default_factory=dict)
-    warned: Moment | None = None
-    probability: float = 0.0
-    ttc_s: float | None = None
-    way_m: float | None = None
+    warned: Moment | None = None  # when it is first warned of; None for a collision that was not predicted
+    probability: float = 0.0  # of the collision, at that time
+    ttc_s: float | None = None  # time to the collision then
+    way_m: float | None = None  # of the ego until then, at its speed
+    # M/s2, deceleration with which the ego stands before that place; None where it is too late.
     needed_mps2: float | None = None
-    braking_suffices: bool = False
-    spans_s: tuple[tuple[float, float], ...] = ()
-    collision_s: float | None = None
-    driver: str = EGO
+    braking_suffices: bool = False  # whether the ego can stand before that place
+    spans_s: tuple[tuple[float, float], ...] = ()  # while it is warned of
+    collision_s: float | None = None  # when the ego touches it in the replay
+    driver: str = EGO  # who is warned: the ego, or a vehicle of a scenario without one
 
     @property
     def begin_s(self) -> float:
@@ -95,33 +62,21 @@ class CollisionWarning:
 
 @dataclass(frozen=True)
 class Warnings:
-    """All warnings of a replay, in order of time.
+    """All warnings of a replay, in order of time."""
 
-    Attributes
-    ----------
-    ends : str
-        Whose observations count: "vehicle", "road" or "both".
-    tells_ends : bool
-        Whether the scenario says which end observed its agents; else what it observed counts.
-    horizon_s, min_probability, early_probability, margin_s, reaction_s, brake_mps2 : float
-        As in `WarningSettings`.
-    agents, known_agents : int
-        Agents without the ego, and how many of them the ends get to know.
-    driven_s : float, s
-        For how long the ego moved, or all together who are warned in its place.
-    """
-
-    ends: str
-    tells_ends: bool
+    ends: str  # whose observations count: "vehicle", "road" or "both"
+    tells_ends: bool  # whether the scenario says which end observed its agents; else what it observed counts
+    # horizon_s, min_probability, early_probability, margin_s, reaction_s, brake_mps2: as in `WarningSettings`.
     horizon_s: float
     min_probability: float
     early_probability: float
     margin_s: float
     reaction_s: float
     brake_mps2: float
+    # agents, known_agents: agents without the ego, and how many of them the ends get to know.
     agents: int
     known_agents: int
-    driven_s: float
+    driven_s: float  # for how long the ego moved, or all together who are warned in its place
     events: tuple[CollisionWarning, ...] = ()
 
     def of(self, agent: str) -> CollisionWarning | None:

@@ -42,8 +42,8 @@ from log2sim.simulation.simulators import EmbeddedSimulator, ExternalSimulator, 
 from log2sim.simulation.vehicles.model_choice import AUTO, ModelChoice, choose_model, slipping_reference, understeer
 from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
+# Agents by driver: "policy", "reactive", "pid", "exact", or "static" for those that never move.
 DriverAssignment = dict[str, list[Agent]]
-"""Agents by driver: "policy", "reactive", "pid", "exact", or "static" for those that never move."""
 
 
 def assign_drivers(
@@ -66,10 +66,8 @@ def assign_drivers(
 def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, drives_ego: bool) -> frozenset[str]:
     """Return the ids of the agents that react: all that can for "reactive", none for "scenario", or those named.
 
-    Raises
-    ------
-    ConfigError
-        When a name is not known, or is that of an agent that cannot react: static, seen once, or driven by a policy.
+    Raises `ConfigError` when a name is not known, or is that of an agent that cannot react: static, seen once, or
+    driven by a policy.
     """
     able = [a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)]
     if isinstance(wanted, str):
@@ -172,11 +170,8 @@ def _lifespans(agents: Sequence[Agent], clock: StepClock) -> tuple[NDArray[np.in
     return clock.first_step(begin), clock.last_step(end)
 
 
-STATE_DIGITS = 6
-"""Decimals of stored states: a micrometer."""
-
-COMMAND_DIGITS = 4
-"""Decimals of commands and errors: a tenth of a millimeter."""
+STATE_DIGITS = 6  # decimals of stored states: a micrometer
+COMMAND_DIGITS = 4  # decimals of commands and errors: a tenth of a millimeter
 
 
 def replay_result(
@@ -426,20 +421,15 @@ def open_world(
         problem = agent.waypoints.problem()
         if problem is not None:
             raise ScenarioError(f"agent '{agent.id}': {problem}")
-    clock = _clock(scenario.agents, dt_s)
-    reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
-    assigned = assign_drivers(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
-    groups, choices = agent_groups(assigned, clock, mode, model)
-    traffic = reactive_traffic(scenario.agents, groups, clock, foresight)
-    return World(groups, clock, assigned["static"], traffic, choices, sight_m)
-
-
-def _clock(agents: Sequence[Agent], dt_s: float) -> StepClock:
-    begin_s = min((float(a.waypoints.t_s[0]) for a in agents), default=0.0)
-    end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
+    begin_s = min((float(a.waypoints.t_s[0]) for a in scenario.agents), default=0.0)
+    end_s = max((float(a.waypoints.t_s[-1]) for a in scenario.agents), default=0.0)
     clock = StepClock.spanning(begin_s, end_s, dt_s)
     if clock.steps > MAX_STEPS:
         raise ScenarioError(
             f"waypoints span {end_s - begin_s:g} s, {clock.steps} steps of {dt_s} s; at most {MAX_STEPS} can be run"
         )
-    return clock
+    reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
+    assigned = assign_drivers(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
+    groups, choices = agent_groups(assigned, clock, mode, model)
+    traffic = reactive_traffic(scenario.agents, groups, clock, foresight)
+    return World(groups, clock, assigned["static"], traffic, choices, sight_m)

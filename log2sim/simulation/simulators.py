@@ -92,12 +92,7 @@ class EmbeddedSimulator:
 def load_step(model: str) -> VehicleStep:
     """Return the step of a vehicle model by its name.
 
-    Raises
-    ------
-    ConfigError
-        When there is no such model.
-    PluginError
-        When one of another package cannot be used.
+    Raises `ConfigError` when there is no such model. Raises `PluginError` when one of another package cannot be used.
     """
     step: VehicleStep = plugins.load("vehicle_model", model)
     return step if plugins.is_built_in("vehicle_model", model) else _checked(step, model)

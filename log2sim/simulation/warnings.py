@@ -110,40 +110,22 @@ def _known(warning: CollisionWarning) -> str:
     return f"{since} ({ends})." if ends else f"{since}."
 
 
-MAX_SLOPE = 0.06
-"""Of a road beyond the heights of the ego's path: more is rare outside of mountains."""
-
-SPARE_MPS = 5.0
-"""By so much an agent may become faster within the horizon, and be compared with the ego still."""
-
-MIN_EGO_MPS = 1.0
-"""A slower ego stands within a meter whenever it has to, so that it need not be warned."""
-
+MAX_SLOPE = 0.06  # of a road beyond the heights of the ego's path: more is rare outside of mountains
+SPARE_MPS = 5.0  # by so much an agent may become faster within the horizon, and be compared with the ego still
+MIN_EGO_MPS = 1.0  # a slower ego stands within a meter whenever it has to, so that it need not be warned
 Index = NDArray[np.intp]
 
 
 class Courses(NamedTuple):
-    """Agents that may collide with the ego, by tick.
+    """Agents that may collide with the ego, by tick."""
 
-    Attributes
-    ----------
-    agent, row : (C,) int
-        Index of the agent, and of the state of the ego.
-    probability : (C,) float64
-    ttc_s : (C,) float64, s
-        Time to the collision.
-    way_m : (C,) float64, m
-        Of the ego until then.
-    due : (C,) bool
-        Whether the ego has to be warned: the collision is probable enough and near enough.
-    """
-
+    # agent, row: (C,) index of the agent, and of the state of the ego.
     agent: Index
     row: Index
-    probability: Array
-    ttc_s: Array
-    way_m: Array
-    due: NDArray[np.bool_]
+    probability: Array  # (C,)
+    ttc_s: Array  # (C,) time to the collision
+    way_m: Array  # (C,) of the ego until then
+    due: NDArray[np.bool_]  # (C,) whether the ego has to be warned: the collision is probable enough and near enough
 
 
 class Watch:
@@ -151,15 +133,8 @@ class Watch:
 
     The ego is warned; `of_driver` gives the same watch for another vehicle.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        With what was observed when.
-    agents : sequence of Agent
-        All but the ego, where they are: as in the scenario, or in a replay of it.
-    settings : WarningSettings
-    t_s : (T,) float64, s
-        Ticks, `TICK_S` apart.
+    `scenario`: with what was observed when. `agents`: all but the ego, where they are: as in the scenario, or in a
+    replay of it. `t_s` (T,), s: ticks, `TICK_S` apart.
     """
 
     ego_path: EgoPath
@@ -187,12 +162,9 @@ class Watch:
     def courses(self, ego: EgoStates, ticks: Index, seen: tuple[Complex, Array] | None = None) -> Courses:
         """Find who may collide with the ego, whose states are those at ticks (T,).
 
-        Parameters
-        ----------
-        ticks : (T,) int
-        seen : (A,) complex128, m, and (A,) float64, m/s, optional
-            Where agents are, and how fast, if they may be elsewhere than in the table: then they are expected to do from there
-            what is expected in the table, as much faster as they are. NaN for those that are as in the table.
+        `ticks` (T,) int. `seen` (A,) complex128, m, and (A,), m/s, optional: where agents are, and how fast, if they
+        may be elsewhere than in the table: then they are expected to do from there what is expected in the table, as
+        much faster as they are. NaN for those that are as in the table.
         """
         row, agent = np.nonzero(self.known.source[:, ticks].T >= 0)
         kept = np.abs(ego.speed_mps[row]) >= MIN_EGO_MPS
@@ -243,12 +215,11 @@ class Watch:
         return np.where(measured[:, None], moved, way)
 
 
+# The ego's deceleration is that of its speed over this time: three ticks give it to 0.5 m/s2 where a speed is good to
+# 0.1 m/s.
 BRAKING_SEEN_S = 0.3
-"""The ego's deceleration is that of its speed over this time: three ticks give it to 0.5 m/s2 where a speed is good to 0.1 m/s."""
 
-SAME_WARNING_S = 1.0
-"""A warning that ends for less time goes on."""
-
+SAME_WARNING_S = 1.0  # a warning that ends for less time goes on
 _DIGITS = 3
 
 
@@ -314,10 +285,7 @@ def warn(
 def warnable(scenario: Scenario) -> list[Agent]:
     """Return who is warned: the ego, or in a scenario without one the vehicles that move.
 
-    Raises
-    ------
-    ConfigError
-        When there is nobody.
+    Raises `ConfigError` when there is nobody.
     """
     if scenario.ego is not None:
         return [scenario.ego]
@@ -354,10 +322,11 @@ class _Drive(NamedTuple):
         x, y, _, yaw, _ = other.trajectory.at(np.array([t_s]))
         columns = (self.ego.x_m, self.ego.y_m, np.unwrap(self.ego.yaw_rad), self.ego.speed_mps)
         own_x, own_y, own_yaw, own_speed = (float(np.interp(t_s, self.t_s, c)) for c in columns)
-        gap_m = _gap_m(
-            box_corners_bev([[own_x, own_y]], size[0], size[1], own_yaw),
-            box_corners_bev([[x[0], y[0]]], other.size_m[0], other.size_m[1], yaw[0]),
-        )
+        a_m = box_corners_bev([[own_x, own_y]], size[0], size[1], own_yaw)
+        b_m = box_corners_bev([[x[0], y[0]]], other.size_m[0], other.size_m[1], yaw[0])
+        import shapely
+
+        gap_m = float(shapely.distance(shapely.polygons(a_m), shapely.polygons(b_m))[0])
         stopping_m = float(self.watch.settings.stopping_distance_m(np.array(own_speed)))
         return Moment(*(round(v, _DIGITS) for v in (t_s, gap_m, abs(own_speed), stopping_m)))
 
@@ -391,13 +360,6 @@ def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
         )
         events.append(event)
     return events
-
-
-def _gap_m(a_m: Array, b_m: Array) -> float:
-    """Return the distance of the nearest points of two boxes (1, 4, 2)."""
-    import shapely
-
-    return float(shapely.distance(shapely.polygons(a_m), shapely.polygons(b_m))[0])
 
 
 def _spans(t_s: Array) -> tuple[tuple[float, float], ...]:
@@ -453,20 +415,16 @@ def _known_by(agent: Agent, t_s: Array, interval_s: float) -> dict[str, float]:
     return found
 
 
+# Of a car that pulls away: twice what the intelligent driver model takes for comfortable in towns.
 MAX_THROTTLE_MPS2 = 3.0
-"""Of a car that pulls away: twice what the intelligent driver model takes for comfortable in towns."""
 
-CATCH_UP_S = 0.2
-"""After it has braked, the ego catches up with so much and no more."""
+CATCH_UP_S = 0.2  # after it has braked, the ego catches up with so much and no more
 
 
 class LateDriver:
     """Follows the ego's trajectory by the controller of `pid`, by the scenario's time less a delay.
 
-    Parameters
-    ----------
-    ego : Agent
-        On wheels.
+    `ego`: on wheels.
     """
 
     def __init__(self, ego: Agent) -> None:
@@ -514,8 +472,7 @@ class LateDriver:
         return at_s if np.isfinite(at_s) else float(self._ego.waypoints.t_s[-1])
 
 
-CLEAR_S = 1.0
-"""The ego drives on when its way has been clear for so long."""
+CLEAR_S = 1.0  # the ego drives on when its way has been clear for so long
 
 
 class BrakeWhenWarned:

@@ -38,15 +38,9 @@ ABOVE_PX, ABOVE_REACH_M = 236, 40.0
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A small picture.
+    """A small picture."""
 
-    Attributes
-    ----------
-    media_type : str
-        "image/png" or "image/jpeg".
-    """
-
-    media_type: str
+    media_type: str  # "image/png" or "image/jpeg"
     data: bytes
     caption: str = ""
 
@@ -64,7 +58,10 @@ def thumbnails_of_log(log: Log) -> list[Thumbnail]:
         name = next(iter(log.lidars))
         sweep = _middle_record(log, name)
         if sweep is not None:
-            found.append(_jpeg(_from_above(sweep.xyz_m), f"{name}, from above"))
+            limits = [(-ABOVE_REACH_M, ABOVE_REACH_M)] * 2
+            count, _, _ = np.histogram2d(sweep.xyz_m[:, 0], sweep.xyz_m[:, 1], bins=ABOVE_PX, range=limits)
+            shade = 255 * (1 - np.minimum(np.sqrt(count[::-1, ::-1]) / 4, 1))
+            found.append(_jpeg(np.ascontiguousarray(shade.astype(np.uint8)), f"{name}, from above"))
     return found
 
 
@@ -109,14 +106,6 @@ def _middle_record(log: Log, name: str) -> Any:
         return None
 
 
-def _from_above(xyz_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Draw points around the sensor as a gray picture, x up as a LiDAR looks ahead."""
-    limits = [(-ABOVE_REACH_M, ABOVE_REACH_M)] * 2
-    count, _, _ = np.histogram2d(xyz_m[:, 0], xyz_m[:, 1], bins=ABOVE_PX, range=limits)
-    shade = 255 * (1 - np.minimum(np.sqrt(count[::-1, ::-1]) / 4, 1))
-    return np.ascontiguousarray(shade.astype(np.uint8))
-
-
 def _jpeg(image: NDArray[np.uint8], caption: str) -> Thumbnail:
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return Thumbnail("image/jpeg", data.tobytes(), caption)
@@ -128,9 +117,7 @@ def _png(figure: Figure) -> Thumbnail:
     return Thumbnail("image/png", data.getvalue())
 
 
-MAX_TEXT = 200
-"""Letters of a name or a note that are shown."""
-
+MAX_TEXT = 200  # letters of a name or a note that are shown
 MAX_SENSORS = 12
 Row = tuple[str, str]
 
@@ -228,18 +215,13 @@ def _count(count: int, noun: str) -> str:
 
 
 SHOWN_DPI, SAVED_DPI = 100, 150
+# Times around a tick at which agents are looked up: pictures of a tick are not of one time.
 AROUND_S = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])
-"""Times around a tick at which agents are looked up: pictures of a tick are not of one time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture that a notebook shows.
-
-    Attributes
-    ----------
-    figure : matplotlib.figure.Figure
-    """
+    """A picture that a notebook shows."""
 
     figure: Figure
     title: str
@@ -257,10 +239,7 @@ class Picture:
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
         """Write the picture, in the format of the file's name.
 
-        Raises
-        ------
-        ConfigError
-            When the file exists and `overwrite` is False, or it cannot be written.
+        Raises `ConfigError` when the file exists and `overwrite` is False, or it cannot be written.
         """
         refuse_existing(path, overwrite=overwrite)
         with replaced(path) as temporary:

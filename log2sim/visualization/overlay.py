@@ -44,83 +44,41 @@ STAMP_TOLERANCE_NS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class SweepInMap:
-    """One sweep in the map frame.
+    """One sweep in the map frame."""
 
-    Attributes
-    ----------
-    name : str
-        Of the LiDAR.
-    xyz : (N, 3) float64, m, map frame
-    middle_ns : int
-        Middle of its point times; its stamp where it has none.
-    motion : str
-        How the motion of the sensor during the sweep was compensated.
-    """
-
-    name: str
-    xyz: Array
-    middle_ns: int
-    motion: str
+    name: str  # of the LiDAR
+    xyz: Array  # (N, 3), m, map frame
+    middle_ns: int  # middle of its point times; its stamp where it has none
+    motion: str  # how the motion of the sensor during the sweep was compensated
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """The image of one camera with what was projected into it.
-
-    Attributes
-    ----------
-    t_ns : int
-        Stamp of the image.
-    image : (H, W, 3) uint8 BGR or None
-        None where it cannot be read.
-    uv_px, depth_m : (N, 2), (N,) float64
-        LiDAR points in the image.
-    boxes : tuple of ((E, 2, 2) float64, str)
-        Edges of each 3D box in px, and its category.
-    image_boxes_px : (M, 4) float64
-        Labeled 2D boxes.
-    residuals_s : mapping of LiDAR to float
-        Middle of the sweep less the stamp of the image.
-    problem : str
-        Why a part is missing; empty where nothing is.
-    """
+    """The image of one camera with what was projected into it."""
 
     camera: Camera
-    t_ns: int
-    image: NDArray[np.uint8] | None
+    t_ns: int  # stamp of the image
+    image: NDArray[np.uint8] | None  # (H, W, 3) uint8 BGR none where it cannot be read
+    # uv_px, depth_m: (N, 2), (N,) liDAR points in the image.
     uv_px: Array
     depth_m: Array
-    boxes: tuple[tuple[Array, str], ...]
-    image_boxes_px: Array
-    residuals_s: dict[str, float]
-    problem: str = ""
+    boxes: tuple[tuple[Array, str], ...]  # str), edges of each 3D box in px, and its category
+    image_boxes_px: Array  # (M, 4) labeled 2D boxes
+    residuals_s: dict[str, float]  # middle of the sweep less the stamp of the image
+    problem: str = ""  # why a part is missing; empty where nothing is
 
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """All sensors at one tick.
+    """All sensors at one tick."""
 
-    Attributes
-    ----------
-    log : Log
-        With standing poses where it has none.
-    at_s : float
-        Since the first tick.
-    sweeps : tuple of SweepInMap
-        Those nearest to the tick.
-    boxes : LabelBoxes
-        Labels at the tick.
-    notes : tuple of str
-        What is missing.
-    """
-
-    log: Log
+    log: Log  # with standing poses where it has none
     t_ns: int
-    at_s: float
+    at_s: float  # since the first tick
     shots: tuple[Shot, ...]
-    sweeps: tuple[SweepInMap, ...]
-    boxes: LabelBoxes
-    notes: tuple[str, ...]
+    sweeps: tuple[SweepInMap, ...]  # those nearest to the tick
+    boxes: LabelBoxes  # labels at the tick
+    notes: tuple[str, ...]  # what is missing
 
 
 def read_moment(
@@ -133,21 +91,10 @@ def read_moment(
 ) -> Moment:
     """Read the records of one tick.
 
-    Parameters
-    ----------
-    cameras : sequence of str
-        All of the log where it is empty.
-    at_s : float, optional
-        Time of the tick since the first one, s; by default in the middle of those with the most records.
-    t_ns : int, optional
-        Absolute stamp; the tick nearest to it is read, whatever `at_s` says.
-    labels : callable, optional
-        Returns for the stamp of the tick the 3D boxes that are drawn in place of those of the log.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown camera, and for a time outside the log.
+    `cameras`: all of the log where it is empty. `at_s`: time of the tick since the first one, s; by default in the
+    middle of those with the most records. `t_ns`: absolute stamp; the tick nearest to it is read, whatever `at_s` says.
+    `labels`: returns for the stamp of the tick the 3D boxes that are drawn in place of those of the log. Raises
+    `ConfigError` for an unknown camera, and for a time outside the log.
     """
     unknown = [name for name in cameras if name not in log.cameras]
     if unknown:
@@ -157,7 +104,9 @@ def read_moment(
     mounts = {*(c.mount for c in log.cameras.values()), *(lidar.mount for lidar in log.lidars.values())}
     if log.ego is None and "ego" in mounts:
         notes.append("the log has no poses: drawn as if the ego stood still")
-        log = _standing(log)
+        ends = [int(t) for stream in log.streams.values() for t in (stream.t_ns[0], stream.t_ns[-1])]
+        stamps = np.array([min(ends), max(ends) + 1], dtype=np.int64)
+        log = log.changed(ego=PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
     schedule = synchronize(log, tuple(cameras) or tuple(log.cameras))
     tick = _find_tick(schedule, at_s) if t_ns is None else int(np.argmin(np.abs(schedule.t_ns - t_ns)))
     t_ns = int(schedule.t_ns[tick])
@@ -197,13 +146,6 @@ def labels_at(labels: Labels | None, t_ns: int) -> LabelBoxes:
 
 def _columns(boxes: LabelBoxes) -> tuple[NDArray[np.str_], Array, Array, Array]:
     return boxes.category, boxes.center_m, boxes.size_m, boxes.yaw_rad
-
-
-def _standing(log: Log) -> Log:
-    """Give a log without poses an ego that stands in the origin of the map."""
-    ends = [int(t) for stream in log.streams.values() for t in (stream.t_ns[0], stream.t_ns[-1])]
-    stamps = np.array([min(ends), max(ends) + 1], dtype=np.int64)
-    return log.changed(ego=PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
 
 
 def _find_tick(schedule: Schedule, at_s: float | None) -> int:
@@ -303,8 +245,8 @@ def _image_boxes(log: Log, name: str, t_ns: int) -> Array:
     return np.asarray(labels.box_px[np.abs(labels.t_ns - t_ns) <= STAMP_TOLERANCE_NS], dtype=np.float64)
 
 
+# Colors of boxes by group, none of which the colors of depths have.
 COLORS = {"vehicle": "#FFFFFF", "two_wheeler": "#FF4FD8", "pedestrian": "#00E5FF", "other": "#B0B0B0"}
-"""Colors of boxes by group, none of which the colors of depths have."""
 
 IMAGE_BOX_COLOR = "#FFE000"
 DEPTHS = "turbo_r"
@@ -326,10 +268,8 @@ DPI = 150
 def write_overlay(moment: Moment, path: Path | str, *, overwrite: bool = False) -> None:
     """Write a moment as a .png.
 
-    Raises
-    ------
-    ConfigError
-        When the name has another suffix, the file exists and `overwrite` is False, or it cannot be written.
+    Raises `ConfigError` when the name has another suffix, the file exists and `overwrite` is False, or it cannot be
+    written.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
@@ -388,10 +328,6 @@ def _draw_shot(ax: Axes, shot: Shot, moment: Moment) -> tuple[str, str]:
         ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.9, zorder=3.1), autolim=False)
     for u0, v0, u1, v1 in shot.image_boxes_px:
         ax.plot([u0, u1, u1, u0, u0], [v0, v0, v1, v1, v0], color=IMAGE_BOX_COLOR, lw=0.9, ls=(0, (3, 2)), zorder=4)
-    return _caption(shot, moment)
-
-
-def _caption(shot: Shot, moment: Moment) -> tuple[str, str]:
     shutter = shot.camera.rolling_shutter
     first, second = [shot.camera.name], []
     if shot.t_ns:
@@ -406,7 +342,10 @@ def _caption(shot: Shot, moment: Moment) -> tuple[str, str]:
 def _draw_above(ax: Axes, moment: Moment, aspect: float) -> tuple[str, str]:
     """Draw points and boxes from above, x to the right and y up as in the map, and return the caption."""
     origin, ground_z = cloud_origin(moment.log, moment.t_ns)
-    reach = _reach(moment, origin)
+    far = [np.abs(s.xyz[:, :2] - origin[:2]).max(axis=1) for s in moment.sweeps]
+    far.append(np.abs(moment.boxes.center_m[:, :2] - origin[:2]).max(axis=1))
+    everything = np.concatenate(far)
+    reach = float(np.clip(np.percentile(everything, 97) if len(everything) else 0.0, 15.0, ABOVE_REACH_M))
     ax.set(xlim=(-reach * aspect, reach * aspect), ylim=(-reach, reach), facecolor="#10151D")
     ax.tick_params(labelsize=5.5, colors=MUTED, length=2, direction="in", pad=-9)
     for sweep in moment.sweeps:
@@ -436,14 +375,6 @@ def _outline(corners: Array) -> Array:
     return np.array([front, *corners, corners[0], front, corners.mean(axis=0)])
 
 
-def _reach(moment: Moment, origin: Array) -> float:
-    """Half width of the view from above, m: most of the points and boxes, within limits."""
-    far = [np.abs(s.xyz[:, :2] - origin[:2]).max(axis=1) for s in moment.sweeps]
-    far.append(np.abs(moment.boxes.center_m[:, :2] - origin[:2]).max(axis=1))
-    everything = np.concatenate(far)
-    return float(np.clip(np.percentile(everything, 97) if len(everything) else 0.0, 15.0, ABOVE_REACH_M))
-
-
 def _draw_frame(figure: Figure, moment: Moment, box_name: str) -> None:
     """Write the title, the scale of depths and the legend of boxes."""
     width, height = figure.get_size_inches()
@@ -453,7 +384,13 @@ def _draw_frame(figure: Figure, moment: Moment, box_name: str) -> None:
     figure.text(0.06 / width, 1 - 0.08 / height, printable(title, 160), fontsize=9, color=INK, **text)
     notes = "; ".join(moment.notes)
     figure.text(0.06 / width, 1 - 0.27 / height, printable(notes, 220), fontsize=6.5, color="#C8102E", **text)
-    _draw_legend(figure, box_name)
+    groups = list(dict.fromkeys(CATEGORY[c].group for c in CATEGORIES))
+    handles = [Line2D([], [], color=COLORS[g], lw=1.6, label=f"{box_name}: {g.replace('_', '-')}") for g in groups]
+    handles.append(Line2D([], [], color=IMAGE_BOX_COLOR, lw=1.6, ls=(0, (3, 2)), label="2D label"))
+    figure.legend(
+        handles=handles, loc="lower left", ncols=len(handles) + 1, fontsize=6.5, frameon=True, facecolor="#10151D",
+        edgecolor=FRAME, labelcolor=PAPER, title="the front of a box is crossed out", title_fontsize=6.5, alignment="left",
+    ).get_title().set_color(PAPER)  # fmt: skip
     if not moment.shots:
         return
     bar = figure.add_axes(((width - 0.6) / width, 0.25, 0.12 / width, 0.5))
@@ -463,13 +400,3 @@ def _draw_frame(figure: Figure, moment: Moment, box_name: str) -> None:
     bar.minorticks_off()
     bar.tick_params(labelsize=6.5, colors=MUTED, length=2)
     bar.set_title("depth, m", fontsize=6.5, color=MUTED, family=FONT)
-
-
-def _draw_legend(figure: Figure, box_name: str) -> None:
-    groups = list(dict.fromkeys(CATEGORY[c].group for c in CATEGORIES))
-    handles = [Line2D([], [], color=COLORS[g], lw=1.6, label=f"{box_name}: {g.replace('_', '-')}") for g in groups]
-    handles.append(Line2D([], [], color=IMAGE_BOX_COLOR, lw=1.6, ls=(0, (3, 2)), label="2D label"))
-    figure.legend(
-        handles=handles, loc="lower left", ncols=len(handles) + 1, fontsize=6.5, frameon=True, facecolor="#10151D",
-        edgecolor=FRAME, labelcolor=PAPER, title="the front of a box is crossed out", title_fontsize=6.5, alignment="left",
-    ).get_title().set_color(PAPER)  # fmt: skip

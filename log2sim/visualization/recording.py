@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.datatypes import Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import (
     NS_PER_S,
@@ -33,20 +33,14 @@ from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 from log2sim.perception.sync import sweep_middle_ns
 
-MARGIN_S = 0.05
-"""Records this far outside the scenario are taken too: half a tick of most logs."""
-
-BACK_RAD = np.radians(150.0)
-"""Cameras that are turned farther from the front than this look back."""
+MARGIN_S = 0.05  # records this far outside the scenario are taken too: half a tick of most logs
+BACK_RAD = np.radians(150.0)  # cameras that are turned farther from the front than this look back
 
 
 def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Return the cameras to show, from left to right: those asked for, else those that the scenario was made with, else all.
 
-    Raises
-    ------
-    ConfigError
-        For a camera that the log does not have.
+    Raises `ConfigError` for a camera that the log does not have.
     """
     unknown = [name for name in asked if name not in log.cameras]
     if unknown:
@@ -68,10 +62,7 @@ def _place(camera: Camera) -> tuple[int, float]:
 def require_overlap(log: Log, scenario: Scenario) -> None:
     """Require that a log has records during a scenario.
 
-    Raises
-    ------
-    LogError
-        When it has none.
+    Raises `LogError` when it has none.
     """
     spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
     if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
@@ -109,29 +100,18 @@ def take_evenly(count: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.rint(np.linspace(0, count - 1, max(most, 1))).astype(np.int64))
 
 
-MIN_SHARE = 1 / 200
-"""Of the height of a picture: smaller boxes would be dots in it."""
-
+MIN_SHARE = 1 / 200  # of the height of a picture: smaller boxes would be dots in it
+# Of the width of a picture, one pixel of the usual size: edges that a lens bends by less are drawn straight.
 STRAIGHT_SHARE = 1 / 640
-"""Of the width of a picture, one pixel of the usual size: edges that a lens bends by less are drawn straight."""
 
+# Kinds of outlines: eight corners u, v in the order of `box_corners`, or segments u0, v0, u1, v1.
 CORNERS, SEGMENTS = 1, 0
-"""Kinds of outlines: eight corners u, v in the order of `box_corners`, or segments u0, v0, u1, v1."""
 
 
 class OutlineProjector:
     """Projects the agents of a scenario, but for the ego, into the frames of a log.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses that the scenario was made with.
-    scenario : Scenario
-
-    Attributes
-    ----------
-    agents : tuple of Agent
-        Outlines name them by their place among these.
+    `log`: with the poses that the scenario was made with. `agents`: outlines name them by their place among these.
     """
 
     def __init__(self, log: Log, scenario: Scenario) -> None:
@@ -142,15 +122,24 @@ class OutlineProjector:
     def outlines(self, camera: str, t_ns: int) -> list[list[int]]:
         """Project the agents into the frame of a camera at a stamp, the farthest first.
 
-        Returns
-        -------
-        list of [agent, kind, coordinates...]
-            Whole pixels of the camera; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not known.
+        Returns whole pixels of the camera; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not
+        known.
         """
         view = view_of(self._log, camera, t_ns)
         if view is None or not self.agents:
             return []
-        center, yaw, present = _states(self.agents, (t_ns - self._t0_ns) / NS_PER_S)
+        # Centers (A, 3), m, yaws (A,) and whether each agent is present at a time.
+        agents = self.agents
+        t_s = (t_ns - self._t0_ns) / NS_PER_S
+        center, yaw, present = (
+            np.full((len(agents), 3), np.nan),
+            np.zeros(len(agents)),
+            np.zeros(len(agents), dtype=bool),
+        )
+        for k, agent in enumerate(agents):
+            at = agent.at(float(agent.waypoints.t_s[0]) if agent.is_permanent else t_s)
+            if at.valid[0]:
+                center[k], yaw[k], present[k] = (at.x_m[0], at.y_m[0], at.z_m[0]), at.yaw_rad[0], True
         rows = np.flatnonzero(present)
         found = project_boxes_in_view(view, center[rows], self._size_m[rows], yaw[rows])
         height_px = found.box_px[:, 3] - found.box_px[:, 1]
@@ -193,18 +182,7 @@ def _cam_T_map(view: View, middle_px: Array) -> Array:
     return np.asarray(view.cam_T_map_at(line_time_s(view.camera, middle_px))[0])
 
 
-def _states(agents: Sequence[Agent], t_s: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return centers (A, 3), m, yaws (A,) and whether each agent is present at a time."""
-    center, yaw, present = np.full((len(agents), 3), np.nan), np.zeros(len(agents)), np.zeros(len(agents), dtype=bool)
-    for k, agent in enumerate(agents):
-        at = agent.at(float(agent.waypoints.t_s[0]) if agent.is_permanent else t_s)
-        if at.valid[0]:
-            center[k], yaw[k], present[k] = (at.x_m[0], at.y_m[0], at.z_m[0]), at.yaw_rad[0], True
-    return center, yaw, present
-
-
-QUALITY = 72
-"""Of JPEGs, of 100: at the sizes of a page, blocks are hardly seen."""
+QUALITY = 72  # of JPEGs, of 100: at the sizes of a page, blocks are hardly seen
 
 
 class PictureSize(NamedTuple):
@@ -214,6 +192,7 @@ class PictureSize(NamedTuple):
     rate_hz: float
 
 
+# From the best down; the first that fits is taken. Motion is followed at 5 a second, and people are seen at 400 px.
 SIZES = tuple(
     PictureSize(*size)
     for size in (
@@ -221,35 +200,19 @@ SIZES = tuple(
         (160, 0.2),
     )
 )  # fmt: skip
-"""From the best down; the first that fits is taken. Motion is followed at 5 a second, and people are seen at 400 px."""
 
-PROBES = 3
-"""Pictures of each camera that are encoded in all sizes, to estimate how many bytes the others will have."""
-
-SAFETY = 1.1
-"""By how much a scene may have more bytes than its probes tell; what is still too much is thinned out."""
-
-OUTLINE_BYTES = 100
-"""Of an outline in the page: sixteen numbers of up to four digits, mostly."""
+PROBES = 3  # pictures of each camera that are encoded in all sizes, to estimate how many bytes the others will have
+SAFETY = 1.1  # by how much a scene may have more bytes than its probes tell; what is still too much is thinned out
+OUTLINE_BYTES = 100  # of an outline in the page: sixteen numbers of up to four digits, mostly
 
 
 @dataclass(eq=False)
 class ShrunkPictures:
-    """Takes pictures of a log as JPEGs; a `PictureConsumer`.
+    """Takes pictures of a log as JPEGs; a `PictureConsumer`."""
 
-    Attributes
-    ----------
-    chosen : mapping of str to (n,) int64
-        Indices of the frames by camera.
-    width_px : int
-        Pictures that are wider are made as wide as this.
-    jpeg : dict of str to dict of int to bytes
-        Pictures taken so far, by camera and index.
-    """
-
-    chosen: Mapping[str, NDArray[np.int64]]
-    width_px: int
-    jpeg: dict[str, dict[int, bytes]] = field(default_factory=dict)
+    chosen: Mapping[str, NDArray[np.int64]]  # indices of the frames by camera
+    width_px: int  # pictures that are wider are made as wide as this
+    jpeg: dict[str, dict[int, bytes]] = field(default_factory=dict)  # pictures taken so far, by camera and index
 
     def frames(self) -> Mapping[str, NDArray[np.int64]]:
         """Return the indices of the frames that are wanted, by camera."""
@@ -270,11 +233,6 @@ def encode_small(image_bgr: NDArray[np.uint8], width_px: int) -> bytes:
     return bytes(data.tobytes()) if done else b""
 
 
-def text_bytes(count: int) -> int:
-    """Return how many bytes of base64 text `count` bytes become."""
-    return 4 * -(-count // 3)
-
-
 def picture_document(
     log: Log,
     scenario: Scenario,
@@ -285,22 +243,10 @@ def picture_document(
 ) -> dict[str, Any]:
     """Return the pictures of cameras within a budget, with the outlines of the agents in them.
 
-    Parameters
-    ----------
-    budget_bytes : int
-        Of the pictures and outlines as text in a page.
-
-    Returns
-    -------
-    dict
-        "cameras": for each name, size in px, times in s, JPEGs as base64 and outlines; "ahead": which of them looks ahead;
-        "agents": ids that outlines refer to;
-        "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out.
-
-    Raises
-    ------
-    ConfigError
-        When not even one small picture of each camera fits.
+    `budget_bytes`: of the pictures and outlines as text in a page. Returns "cameras": for each name, size in px, times
+    in s, JPEGs as base64 and outlines; "ahead": which of them looks ahead; "agents": ids that outlines refer to;
+    "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out. Raises
+    `ConfigError` when not even one small picture of each camera fits.
     """
     projector = OutlineProjector(log, scenario)
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
@@ -336,7 +282,7 @@ def _probe(
                 continue
             outlines = OUTLINE_BYTES * len(projector.outlines(name, int(log.streams[name].t_ns[i])))
             for width in widths:
-                sizes[width].append(text_bytes(len(encode_small(image, width))) + outlines)
+                sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines)
         if sizes[widths[0]]:
             out[name] = {width: float(np.mean(found)) for width, found in sizes.items()}
     return out
@@ -403,18 +349,13 @@ def _bytes_of(entry: Mapping[str, Any]) -> int:
     return sum(map(len, entry["jpeg"])) + numbers + 12 * len(entry["t_s"])
 
 
-UNIT_M = 0.05
-"""Of stored positions: a pixel of a screen that shows 50 m."""
-
-REACH_M = 120.0
-"""Points farther from the ego, or from the middle of the sensors, are left out."""
-
+UNIT_M = 0.05  # of stored positions: a pixel of a screen that shows 50 m
+REACH_M = 120.0  # points farther from the ego, or from the middle of the sensors, are left out
+# Above the ground: what is higher, such as trees and bridges, would cover the road from above.
 MIN_HEIGHT_M, MAX_HEIGHT_M = -1.0, 5.0
-"""Above the ground: what is higher, such as trees and bridges, would cover the road from above."""
 
 HEIGHT_UNIT_M = (MAX_HEIGHT_M - MIN_HEIGHT_M) / 255
-MAX_APART_S = 0.1
-"""Between the sweeps of several LiDARs that are shown as one."""
+MAX_APART_S = 0.1  # between the sweeps of several LiDARs that are shown as one
 
 
 class PointSpacing(NamedTuple):
@@ -424,38 +365,25 @@ class PointSpacing(NamedTuple):
     rate_hz: float
 
 
+# From the best down; the first that fits is taken. People are still seen as a point or two at 0.4 m.
 SPACINGS = tuple(
     PointSpacing(*spacing)
     for spacing in ((0.15, 10), (0.25, 10), (0.4, 10), (0.4, 5), (0.6, 5), (0.6, 2), (1.0, 2), (1.0, 1), (1.0, 0.5), (1.0, 0.2))
 )  # fmt: skip
-"""From the best down; the first that fits is taken. People are still seen as a point or two at 0.4 m."""
 
 POINT_PROBES, POINT_SAFETY = 3, 1.15
-BYTES_OF_ENTRY = 60
-"""Time and origin of a sweep in the page."""
+BYTES_OF_ENTRY = 60  # time and origin of a sweep in the page
 
 
 @dataclass(frozen=True, eq=False)
 class PointsAbove:
-    """Points of one moment.
-
-    Attributes
-    ----------
-    origin : (2,) tuple of int, m
-        Map position that the points are relative to.
-    xy_m : (N, 2) float64
-        Relative to `origin`.
-    height_m : (N,) float64
-        Above the ground.
-    intensity : (N,) float64
-        NaN where it is not known.
-    """
+    """Points of one moment."""
 
     t_ns: int
-    origin: tuple[int, int]
-    xy_m: Array
-    height_m: Array
-    intensity: Array
+    origin: tuple[int, int]  # (2,) tuple of, m map position that the points are relative to
+    xy_m: Array  # (N, 2) relative to `origin`
+    height_m: Array  # (N,) above the ground
+    intensity: Array  # (N,) NaN where it is not known
 
 
 def point_document(
@@ -463,17 +391,9 @@ def point_document(
 ) -> dict[str, Any] | None:
     """Return the points of a log's LiDARs within a budget; None where there are none during the scenario.
 
-    Returns
-    -------
-    dict
-        "t_s", "origin_m" and "points" of each moment, the last as base64 of deflated columns, see `pack`; "unit_m",
-        "height_m", the lowest height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and
-        "bytes" as chosen.
-
-    Raises
-    ------
-    ConfigError
-        When not even one sweep fits.
+    Returns "t_s", "origin_m" and "points" of each moment, the last as base64 of deflated columns, see `pack`; "unit_m",
+    "height_m", the lowest height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and
+    "bytes" as chosen. Raises `ConfigError` when not even one sweep fits.
     """
     lidars = [n for n in log.lidars if n in log.streams and len(records_within(log.streams[n].t_ns, scenario))]
     if not lidars:
@@ -484,7 +404,8 @@ def point_document(
     probes = [p for i in take_evenly(len(within), POINT_PROBES) if (p := sweeps.at(main, int(within[i]))) is not None]
     if not probes:
         return None
-    bright = _brightest(probes)
+    known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in probes])
+    bright = max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
     spacing, chosen = _fit_points(log.streams[main].t_ns, within, scenario.t0_ns, probes, bright, budget_bytes)
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
@@ -509,8 +430,6 @@ def point_document(
 def pack(points: PointsAbove, cell_m: float, bright: float) -> str:
     """Keep the highest point of each cell and pack the rest as base64 of a zlib stream.
 
-    Notes
-    -----
     For N points in rows of cells from south to north, each from west to east: low bytes of the steps in x (N), their high
     bytes, the same of y, heights and intensities as bytes. Steps are in `UNIT_M`, modulo 2**16, the first from 0. Small steps
     in planes of bytes deflate to less than half.
@@ -526,12 +445,6 @@ def pack(points: PointsAbove, cell_m: float, bright: float) -> str:
     intensity = np.clip(np.nan_to_num(points.intensity[kept]) / (bright or 1.0) * 255, 0, 255)
     planes = [steps[:, 0] & 255, steps[:, 0] >> 8, steps[:, 1] & 255, steps[:, 1] >> 8, height, intensity]
     return base64.b64encode(zlib.compress(np.concatenate(planes).astype(np.uint8).tobytes(), 9)).decode()
-
-
-def _brightest(points: list[PointsAbove]) -> float:
-    """Return the intensity that is shown as the brightest, which only mirrors exceed; 0 where none is known."""
-    known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in points])
-    return max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
 
 
 def _fit_points(
@@ -600,55 +513,34 @@ class _Sweeps:
         return PointsAbove(t_ns, at, local[kept, :2], height[kept], intensity[near][kept])
 
 
-POINT_SHARE = 0.3
-"""Of the budget, for points, where there are pictures too; what they leave is for the pictures."""
+POINT_SHARE = 0.3  # of the budget, for points, where there are pictures too; what they leave is for the pictures
 
 
 def _silent(stage: str, done: int, total: int) -> None:
     """Report nothing."""
 
 
+# Of a page with pictures: mail and chat programs take so much, and a phone still opens it.
 DEFAULT_MAX_BYTES = 40_000_000
-"""Of a page with pictures: mail and chat programs take so much, and a phone still opens it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What to take of a log, and how much of it.
+    """What to take of a log, and how much of it."""
 
-    Attributes
-    ----------
-    log : Log
-        With the poses that the scenario was made with.
-    max_bytes : int
-        Of the whole page.
-    cameras : tuple of str
-        Whose pictures to take; those that the scenario was made with where it is empty.
-    progress : callable
-        Called as `progress(stage, done, total)` while records are read.
-    """
-
-    log: Log
-    max_bytes: int = DEFAULT_MAX_BYTES
-    cameras: tuple[str, ...] = ()
+    log: Log  # with the poses that the scenario was made with
+    max_bytes: int = DEFAULT_MAX_BYTES  # of the whole page
+    cameras: tuple[str, ...] = ()  # whose pictures to take; those that the scenario was made with where it is empty
+    # Called as `progress(stage, done, total)` while records are read.
     progress: Callable[[str, int, int], None] = _silent
 
 
 def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int) -> dict[str, Any]:
     """Return the pictures and points of a log for a page, within a budget.
 
-    Returns
-    -------
-    dict
-        "pictures" and "points", see `picture_document` and `point_document`, None where there are none, and "notes": what
-        was chosen, in sentences.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown camera, or when the budget is too small for a single moment.
-    LogError
-        When none of the records asked for can be read.
+    Returns "pictures" and "points", see `picture_document` and `point_document`, None where there are none, and
+    "notes": what was chosen, in sentences. Raises `ConfigError` for an unknown camera, or when the budget is too small
+    for a single moment. Raises `LogError` when none of the records asked for can be read.
     """
     log, report = recorded.log, recorded.progress
     reader = RecordReader(log)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -45,6 +44,7 @@ from log2sim.evaluation.bench.settings import (
     recommend,
     short,
 )
+from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.files.documents import check, replaced
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.version import __version__
@@ -60,22 +60,15 @@ WITHOUT_TRUTH = "the log has no labels: these figures say how steady a setting i
 
 @dataclass(frozen=True)
 class Panel:
-    """The settings of a stage.
-
-    Attributes
-    ----------
-    error, label, unit : str
-        Key of the figure that is the error, its description and its unit.
-    on_front : tuple of bool
-        Which points are Pareto-optimal.
-    """
+    """The settings of a stage."""
 
     stage: str
+    # error, label, unit: key of the figure that is the error, its description and its unit.
     error: str
     label: str
     unit: str
     points: tuple[Point, ...]
-    on_front: tuple[bool, ...]
+    on_front: tuple[bool, ...]  # which points are Pareto-optimal
     recommendation: Recommendation
 
 
@@ -278,28 +271,23 @@ def bench(
         context = make_context(log, grid, truth, report, scope)
         default = default_settings(log, config)
         panels = make_panels(context, report, whole_points(log, default, truth, scope, report))
-        notes = _notes(context, panels)
+        notes = []
+        if context.truth is None:
+            notes.append(
+                "no truth: jitter, gaps, residuals of the homography and consistency with LiDAR are all that is measured"
+            )
+        if len(context.grid.detect) == 1:
+            notes.append(
+                f"detector '{context.grid.detect[0].config.detect.name}' has no setting of tiles or input size to compare"
+            )
+        if all(p.stage != "homography" for p in panels):
+            notes.append("too few obstacles with LiDAR points within 60 m to judge homographies by")
     else:
         context = make_context_of_ends(log, ends, truth, scope)
         panels, notes = [], ["the log has no camera: only vehicle, road, and both are compared"]
     if ends:
         panels.append(make_ends_panel(whole_points(log, ends, truth, scope, report), truth))
     return Benchmark(context, tuple(panels), tuple(notes))
-
-
-def _notes(context: BenchContext, panels: list[Panel]) -> list[str]:
-    notes = []
-    if context.truth is None:
-        notes.append(
-            "no truth: jitter, gaps, residuals of the homography and consistency with LiDAR are all that is measured"
-        )
-    if len(context.grid.detect) == 1:
-        notes.append(
-            f"detector '{context.grid.detect[0].config.detect.name}' has no setting of tiles or input size to compare"
-        )
-    if all(p.stage != "homography" for p in panels):
-        notes.append("too few obstacles with LiDAR points within 60 m to judge homographies by")
-    return notes
 
 
 SIZE_PT, LETTER_PT, LINE_PT, POINT_PT = 6.8, 3.9, 9.0, 6.0
@@ -315,8 +303,7 @@ CANDIDATES = tuple(
     if side or abs(rise) > 9
 )
 
-Box = tuple[float, float, float, float]
-"""Left, bottom, right, top in display pixels."""
+Box = tuple[float, float, float, float]  # left, bottom, right, top in display pixels
 
 
 def place_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
@@ -462,7 +449,13 @@ def _title(figure: Figure, result: Benchmark) -> None:
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     shown = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
-    _style(ax)
+    ax.set_facecolor("#FBFCFD")
+    ax.set_axisbelow(True)
+    ax.grid(True, color=GRID, lw=0.7)
+    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
+    ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=MUTED, family=FONT)
+    for spine in ax.spines.values():
+        spine.set(color=FRAME, linewidth=0.8)
     style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
     ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
     label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
@@ -497,16 +490,6 @@ def _mark(ax: Axes, point: Point, *, on_front: bool, chosen: bool) -> None:
     ax.plot(
         x, y, "D" if point.present else "o", ms=6.5 if point.present else 5.5, mfc=face, mec=edge, mew=1.1, zorder=4
     )
-
-
-def _style(ax: Axes) -> None:
-    ax.set_facecolor("#FBFCFD")
-    ax.set_axisbelow(True)
-    ax.grid(True, color=GRID, lw=0.7)
-    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
-    ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=MUTED, family=FONT)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
 
 
 def _limits(ax: Axes, x: Array, y: Array) -> None:
@@ -607,9 +590,9 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
                 "present": p.present,
                 "on_front": on_front,
                 "ms_per_tick": round(p.ms_per_tick, 4),
-                "error": _finite(p.error),
+                "error": rounded_tree(p.error),
                 "error_interval": _interval(p),
-                "figures": _finite(p.figures),
+                "figures": rounded_tree(p.figures),
             }
             for p, on_front in zip(panel.points, panel.on_front, strict=True)
         ],
@@ -625,15 +608,6 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
 def _interval(point: Point) -> list[float] | None:
     found = error_interval(point.by_object) if point.error is not None else None
     return None if found is None else [round(value, 6) for value in found]
-
-
-def _finite(value: Any) -> Any:
-    """Round nested figures to six decimals; None for a number that is not finite."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, float):
-        return round(value, 6) if math.isfinite(value) else None
-    return value
 
 
 def format_table(result: Benchmark) -> str:

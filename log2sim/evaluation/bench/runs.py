@@ -45,20 +45,12 @@ from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, S
 
 @dataclass(frozen=True, eq=False)
 class RecordedDetections:
-    """A `Detector` that returns recorded detections; none for a frame that was not recorded.
-
-    Attributes
-    ----------
-    found : dict of (str, int) to Detections
-        By camera and stamp.
-    spent_s : list of float, s
-        Time of the recorded detector for each frame.
-    """
+    """A `Detector` that returns recorded detections; none for a frame that was not recorded."""
 
     name: str
     default_min_score: float
-    found: dict[tuple[str, int], Detections] = field(default_factory=dict)
-    spent_s: list[float] = field(default_factory=list)
+    found: dict[tuple[str, int], Detections] = field(default_factory=dict)  # by camera and stamp
+    spent_s: list[float] = field(default_factory=list)  # time of the recorded detector for each frame
 
     @property
     def seconds(self) -> float:
@@ -89,15 +81,8 @@ def detect_once(
 
     Detectors take turns on each frame, so that a change of the machine's speed affects all of them.
 
-    Returns
-    -------
-    dict, float
-        Recorded detections by the same names, and the seconds of decoding.
-
-    Raises
-    ------
-    LogError
-        When no frame of a camera can be read.
+    Returns recorded detections by the same names, and the seconds of decoding. Raises `LogError` when no frame of a
+    camera can be read.
     """
     recorded = {key: RecordedDetections(d.name, d.default_min_score) for key, d in detectors.items()}
     records, decoding_s = RecordReader(log), 0.0
@@ -128,20 +113,13 @@ def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class SeamBench:
-    """Pictures to align mounts by, and registered seams of other ticks to measure homographies by.
-
-    Attributes
-    ----------
-    survey : SeamSurvey
-        Which pixels of two cameras show one point of the road 15 m away, registered once for all homographies.
-    reading_s : float, s
-        Time of reading the pictures to align by.
-    """
+    """Pictures to align mounts by, and registered seams of other ticks to measure homographies by."""
 
     aligning: SeamPictures
     measuring: SeamPictures
+    # Which pixels of two cameras show one point of the road 15 m away, registered once for all homographies.
     survey: SeamSurvey
-    reading_s: float
+    reading_s: float  # time of reading the pictures to align by
 
     @classmethod
     def of(
@@ -180,11 +158,8 @@ class SeamBench:
         return float(np.median(known)) if len(known) else None
 
 
-REPEATS = 3
-"""Repetitions of short stages, taking turns; the least time counts, since other processes only add to it."""
-
-MEASURE_REPEATS = 2
-"""Repetitions of the measurement, which takes longer."""
+REPEATS = 3  # repetitions of short stages, taking turns; the least time counts, since other processes only add to it
+MEASURE_REPEATS = 2  # repetitions of the measurement, which takes longer
 
 
 Progress = Callable[[str, int, int], None]
@@ -193,26 +168,16 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class BenchContext:
-    """What all runs have in common.
+    """What all runs have in common."""
 
-    Attributes
-    ----------
-    log : Log
-        Narrowed to the cameras and sensors of the plan.
-    found : dict of str to RecordedDetections
-        Detections by setting of the detector.
-    shared_s : dict of str to float, s
-        Time of stages that all runs share.
-    """
-
-    log: Log
+    log: Log  # narrowed to the cameras and sensors of the plan
     plan: Plan
     schedule: Schedule
     truth: Scenario | None
     scope: Scope
     grid: Grid
-    found: dict[str, RecordedDetections]
-    shared_s: dict[str, float]
+    found: dict[str, RecordedDetections]  # detections by setting of the detector
+    shared_s: dict[str, float]  # time of stages that all runs share
 
     @property
     def tick_s(self) -> float:
@@ -226,22 +191,12 @@ class BenchContext:
 
 @dataclass(frozen=True, eq=False)
 class BenchRun:
-    """A whole run with one setting.
-
-    Attributes
-    ----------
-    score : Score
-        Of the scenario.
-    measurement_score : Score
-        Of the measured centers; empty without truth.
-    stages_s : dict of str to float, s
-        Time of each stage, including those shared with other runs.
-    """
+    """A whole run with one setting."""
 
     setting: Setting
-    score: Score
-    measurement_score: Score
-    stages_s: dict[str, float]
+    score: Score  # of the scenario
+    measurement_score: Score  # of the measured centers; empty without truth
+    stages_s: dict[str, float]  # time of each stage, including those shared with other runs
 
     @property
     def seconds(self) -> float:
@@ -345,13 +300,8 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
         runs += run_settings(context, [setting], (observations[n], stages_s[n]), report)
     for setting in grid.detect[1:]:
         runs += run_settings(context, [setting], timed_first_pass(context, setting, grid.measure[0], report), report)
-    return _share_clouds(runs), observations[0]
-
-
-def _share_clouds(runs: Sequence[BenchRun]) -> list[BenchRun]:
-    """Give all runs the least time for clouds, which no compared setting affects."""
     least = min(r.stages_s["cloud"] for r in runs)
-    return [replace(r, stages_s={**r.stages_s, "cloud": least}) for r in runs]
+    return [replace(r, stages_s={**r.stages_s, "cloud": least}) for r in runs], observations[0]
 
 
 def warm_up(context: BenchContext) -> None:
@@ -433,22 +383,13 @@ def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
 
 
 STAGE = "ends"
-DETECTOR = "lidar:vehicle"
-"""Searches sweeps where the settings name no detector for them."""
-
-
-def has_both_ends(log: Log) -> bool:
-    """Return whether a log has LiDARs of the vehicle and of the road."""
-    return {end_of(lidar) for lidar in log.lidars.values()} >= set(ENDS)
+DETECTOR = "lidar:vehicle"  # searches sweeps where the settings name no detector for them
 
 
 def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: Scope) -> BenchContext:
     """Synchronize a log without cameras, of which the ends alone are compared.
 
-    Raises
-    ------
-    LogError
-        For a log without LiDARs at both ends.
+    Raises `LogError` for a log without LiDARs at both ends.
     """
     if not ends:
         raise LogError(
@@ -468,7 +409,7 @@ def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:
 
     LiDAR sweeps alone are searched, so that the LiDARs of the ends are what is compared.
     """
-    if not has_both_ends(log):
+    if not ({end_of(lidar) for lidar in log.lidars.values()} >= set(ENDS)):
         return ()
     name = config.detect.in_sweeps or DETECTOR
     present = config.cooperation.ends if config.cooperation.ends != "both" else config.cooperation.fusion

@@ -22,10 +22,9 @@ from log2sim.perception.homography_stage import CameraHomography, place_by_homog
 from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import Schedule
 
-CUTOFF_M = 2.0
-"""Cutoff distance of GOSPA, m; the metrics match objects up to it."""
-
+CUTOFF_M = 2.0  # cutoff distance of GOSPA, m; the metrics match objects up to it
 HORIZON_S = 1.0
+# Figures of `evaluate` that a score keeps.
 EVALUATE_KEYS = (
     "recall",
     "precision",
@@ -36,7 +35,6 @@ EVALUATE_KEYS = (
     "hota",
     "id_switches",
 )
-"""Figures of `evaluate` that a score keeps."""
 
 
 @dataclass(frozen=True)
@@ -60,34 +58,29 @@ def check_scope(truth: Scenario | None, scope: Scope) -> None:
 
 @dataclass(frozen=True)
 class Score:
-    """Figures of a run.
-
-    Attributes
-    ----------
-    by_object : mapping of str to ErrorSums
-        Contributions of single objects, for figures that are errors.
-    """
+    """Figures of a run."""
 
     figures: dict[str, Any]
+    # Contributions of single objects, for figures that are errors.
     by_object: Mapping[str, ErrorSums] = field(default_factory=dict)
 
 
 def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: Scope = EVERYTHING) -> Score:
     """Score a scenario; without truth only by figures that need none.
 
-    Notes
-    -----
     - `error_m`: root mean square position error; a missed and a false object together count as one at `CUTOFF_M`.
     - `state_error_m`: position error after extrapolation by `HORIZON_S`, from the errors of position and speed.
     - `jitter_m`: see `jitter`.
     - `gap_share`: fraction of the agents' ticks without a detection.
     - `smoothing_residual_m`: median over agents of the distance of measurements from the smoothed trajectory.
     """
+    known = [a.quality.get("smoothing_residual_rms_m") for a in scenario.others]
+    values = [v for v in known if v is not None]
     out: dict[str, Any] = {
         "agents": len(scenario.others),
         "jitter_m": jitter(scenario, tick_s),
         "gap_share": _gap_share(scenario, tick_s),
-        "smoothing_residual_m": _smoothing_residual(scenario),
+        "smoothing_residual_m": (float(np.median(values)) if values else None),
     }
     if truth is None:
         return Score(out)
@@ -100,8 +93,6 @@ def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, sc
 def _error_parts(found: Mapping[str, Any]) -> ErrorSums:
     """Compute the contribution of each object to `error_m`.
 
-    Notes
-    -----
     GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of objects so that it is a distance:
     0 for a perfect result, the cutoff for one without a match.
     """
@@ -131,8 +122,6 @@ def _state_parts(found: Mapping[str, Any]) -> ErrorSums:
 def jitter(scenario: Scenario, tick_s: float) -> float | None:
     """Estimate the noise of waypoints, m: median over moving agents; None when none moves for long enough.
 
-    Notes
-    -----
     Third differences vanish for constant acceleration; of white noise with variance s^2 they have variance 20 s^2. Between
     waypoints farther apart than a tick, motion is the cubic Hermite spline through their positions and velocities.
     """
@@ -168,17 +157,9 @@ def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
     return float(np.clip(1 - detected / ticks, 0.0, 1.0))
 
 
-def _smoothing_residual(scenario: Scenario) -> float | None:
-    known = [a.quality.get("smoothing_residual_rms_m") for a in scenario.others]
-    values = [v for v in known if v is not None]
-    return float(np.median(values)) if values else None
-
-
 MIN_IOU = 0.5
 NEAR_M = 25.0
-HOLDOUT_FRACTION = 0.25
-"""Fraction of the measured obstacles that homographies are not fitted to and are scored by."""
-
+HOLDOUT_FRACTION = 0.25  # fraction of the measured obstacles that homographies are not fitted to and are scored by
 MIN_POINTS = 20
 MAX_SAME_FOOT_PX = 0.01
 BLOCK_S = 0.5
@@ -186,18 +167,10 @@ BLOCK_S = 0.5
 
 @dataclass(frozen=True, eq=False)
 class KnownPositions:
-    """Known positions of the objects of one tick's measurements.
+    """Known positions of the objects of one tick's measurements."""
 
-    Attributes
-    ----------
-    xy : (M, 2) float64, m
-        Map frame; NaN where unknown.
-    object_id : (M,) int64
-        Which object each measurement is of, -1 where unknown.
-    """
-
-    xy: Array
-    object_id: NDArray[np.int64]
+    xy: Array  # (M, 2), m map frame; NaN where unknown
+    object_id: NDArray[np.int64]  # (M,) which object each measurement is of, -1 where unknown
 
 
 def true_positions(
@@ -210,13 +183,8 @@ def true_positions(
 ) -> list[KnownPositions]:
     """Find, for each tick, the true centers of the objects that its measurements are of.
 
-    Parameters
-    ----------
-    when : {"measured", "imaged"}
-        At the times of the measurements, or at the stamps of the images.
+    `when`: at the times of the measurements, or at the stamps of the images.
 
-    Notes
-    -----
     Measurements are matched with objects by IoU of their boxes in the image, independently of the measured position.
     """
     shift_m = np.array(truth.map.offset_m) - np.array(log.map.offset_m)
@@ -300,24 +268,12 @@ def _score_of_distances(distance: Array, object_id: NDArray[np.int64]) -> Score:
 
 @dataclass(frozen=True, eq=False)
 class Holdout:
-    """Measured obstacles that homographies are not fitted to, by camera, one entry for each tick.
+    """Measured obstacles that homographies are not fitted to, by camera, one entry for each tick."""
 
-    Attributes
-    ----------
-    observations : Observations
-        What is left to fit to.
-    obstacles : dict of str to list of Measurements
-        The held-out obstacles without their LiDAR positions.
-    known : dict of str to list of KnownPositions
-        Of their centers.
-    feet : dict of str to list of Correspondences
-        Their foot points by LiDAR.
-    """
-
-    observations: Observations
-    obstacles: dict[str, list[Measurements]]
-    known: dict[str, list[KnownPositions]]
-    feet: dict[str, list[Correspondences]]
+    observations: Observations  # what is left to fit to
+    obstacles: dict[str, list[Measurements]]  # the held-out obstacles without their LiDAR positions
+    known: dict[str, list[KnownPositions]]  # of their centers
+    feet: dict[str, list[Correspondences]]  # their foot points by LiDAR
 
     def __len__(self) -> int:
         """Return the number of held-out obstacles."""
@@ -415,7 +371,10 @@ def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> A
         return np.zeros((0, 2))
     observations = Observations(measurements=[m], obstacles=[None])
     found = place_by_homography(log, observations, {ground.camera.name: at_tick(ground, tick)})[0]
-    return _in_order(m, found)
+    xy = np.full((len(m), 2), np.nan)
+    for box, center in zip(found.box_px, found.center_m):
+        xy[np.all(m.box_px == box, axis=1)] = center[:2]
+    return xy
 
 
 def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
@@ -423,11 +382,3 @@ def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
     own = ground.fit.at_tick(tick)
     h = np.full((3, 3), np.nan) if own is None else own
     return replace(ground, fit=replace(ground.fit, ground_H_image=h, per_tick=None, ok=own is not None))
-
-
-def _in_order(requested: Measurements, found: Measurements) -> Array:
-    """Order found centers (M, 2) as requested, matching rows by their boxes; NaN for missing ones."""
-    xy = np.full((len(requested), 2), np.nan)
-    for box, center in zip(found.box_px, found.center_m):
-        xy[np.all(requested.box_px == box, axis=1)] = center[:2]
-    return xy

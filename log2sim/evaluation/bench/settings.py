@@ -17,8 +17,8 @@ from log2sim.perception.detect.onnx_detector import OnnxDetector, plan_tiles
 from log2sim.perception.run_detectors import create_image_detector
 from log2sim.plan import IMAGE_DETECTOR, choose_detector
 
+# By object: sum of its squared errors, m^2, and their number. The error is the root of the ratio of both sums.
 ErrorSums = Mapping[str, tuple[float, float]]
-"""By object: sum of its squared errors, m^2, and their number. The error is the root of the ratio of both sums."""
 
 RESAMPLES = 1000
 MIN_OBJECTS = 5
@@ -51,8 +51,6 @@ def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) ->
 
     It is 0 with fewer than `MIN_OBJECTS` objects.
 
-    Notes
-    -----
     Paired bootstrap (Efron, 1979) over objects, because errors of one object at successive ticks are correlated. An object of
     one side only, such as a false one, adds nothing to the other.
     """
@@ -69,36 +67,20 @@ def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) ->
     return float(np.mean(a[:, 0] * b[:, 1] <= b[:, 0] * a[:, 1] * (1 + allowance) ** 2))
 
 
-TILES = (0, 1, 2, 3, 5)
-"""Numbers of tiles to try besides the present one; 0 is "auto"."""
-
-SIDES_PX = (320, 416, 640, 960)
-"""Input sizes to try with models that accept any."""
-
-HYPOTHESES = (8, 30, 100, 300, 1000, 3000)
-"""Numbers of RANSAC hypotheses to try besides the present one."""
-
+TILES = (0, 1, 2, 3, 5)  # numbers of tiles to try besides the present one; 0 is "auto"
+SIDES_PX = (320, 416, 640, 960)  # input sizes to try with models that accept any
+HYPOTHESES = (8, 30, 100, 300, 1000, 3000)  # numbers of RANSAC hypotheses to try besides the present one
 NO_METHOD = "off"
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting of a stage.
-
-    Attributes
-    ----------
-    name : str
-        Within the stage.
-    config : Config
-        Of the whole run.
-    present : bool
-        Whether it is the present setting.
-    """
+    """One setting of a stage."""
 
     stage: str
-    name: str
-    config: Config
-    present: bool
+    name: str  # within the stage
+    config: Config  # of the whole run
+    present: bool  # whether it is the present setting
 
     @property
     def key(self) -> str:
@@ -125,28 +107,32 @@ class Grid:
 def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     """List the settings to compare on a log, each differing from the present ones in one stage.
 
-    Parameters
-    ----------
-    config : Config
-        The present settings. `topdown.method` "off" is replaced by the first method.
-    detectors : sequence of str
-        Detectors to compare with the present one: names, or paths of ONNX files.
-
-    Raises
-    ------
-    ConfigError, MissingExtra
-        For a detector that cannot be loaded.
+    `config`: the present settings. `topdown.method` "off" is replaced by the first method. `detectors`: detectors to
+    compare with the present one: names, or paths of ONNX files. Raises `ConfigError` or `MissingExtra` for a detector that
+    cannot be loaded.
     """
     if config.detect.name == AUTO:
         config = with_changes(config, "detect", name=IMAGE_DETECTOR)
     if config.topdown.method == NO_METHOD:
         config = with_changes(config, "topdown", method=choices(config.topdown, "method")[0])
+    # List smoothing on and off, and all values of its other settings.
+    keys = type(config.smooth).model_fields
+    switches = [key for key in keys if isinstance(getattr(config.smooth, key), bool)]
+    named = [key for key in keys if config.smooth.choices(key)]
+    out = [Setting("smooth", _smooth_name(config, switches, named), config, True)]
+    for key in switches:
+        other = with_changes(config, "smooth", **{key: not getattr(config.smooth, key)})
+        out.append(Setting("smooth", _smooth_name(other, [key], []), other, False))
+    for key in named:
+        for value in choices(config.smooth, key)[1:]:
+            other = with_changes(config, "smooth", **{key: value})
+            out.append(Setting("smooth", value, other, False))
     return Grid(
         detect=tuple(_detector_settings(log, config, detectors)),
         measure=_choices("measure", config, "measure", "mode"),
         homography=(*_methods_apart(config), *_rig_settings(log, config)),
         hypotheses=tuple(_hypotheses(config)),
-        smooth=tuple(_smooth_settings(config)),
+        smooth=tuple(out),
     )
 
 
@@ -197,22 +183,6 @@ def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Settin
     return tuple(
         Setting(stage, name, with_changes(config, section, **{key: name}), k == 0) for k, name in enumerate(names)
     )
-
-
-def _smooth_settings(config: Config) -> list[Setting]:
-    """List smoothing on and off, and all values of its other settings."""
-    keys = type(config.smooth).model_fields
-    switches = [key for key in keys if isinstance(getattr(config.smooth, key), bool)]
-    named = [key for key in keys if config.smooth.choices(key)]
-    out = [Setting("smooth", _smooth_name(config, switches, named), config, True)]
-    for key in switches:
-        other = with_changes(config, "smooth", **{key: not getattr(config.smooth, key)})
-        out.append(Setting("smooth", _smooth_name(other, [key], []), other, False))
-    for key in named:
-        for value in choices(config.smooth, key)[1:]:
-            other = with_changes(config, "smooth", **{key: value})
-            out.append(Setting("smooth", value, other, False))
-    return out
 
 
 def _smooth_name(config: Config, switches: Sequence[str], named: Sequence[str]) -> str:
@@ -292,27 +262,14 @@ TIME_TOLERANCE = 0.05
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of a stage.
-
-    Attributes
-    ----------
-    present : bool
-        Whether it is the present setting.
-    ms_per_tick : float, ms
-    error : float or None
-        None when it cannot be computed.
-    figures : dict
-        Everything else that was measured.
-    by_object : ErrorSums
-        Contributions of single objects to the error, where known.
-    """
+    """One setting of a stage."""
 
     setting: str
-    present: bool
-    ms_per_tick: float
-    error: float | None
-    figures: dict[str, Any] = field(default_factory=dict)
-    by_object: ErrorSums = field(default_factory=dict)
+    present: bool  # whether it is the present setting
+    ms_per_tick: float  # ms
+    error: float | None  # none when it cannot be computed
+    figures: dict[str, Any] = field(default_factory=dict)  # everything else that was measured
+    by_object: ErrorSums = field(default_factory=dict)  # contributions of single objects to the error, where known
 
     @property
     def coverage(self) -> dict[str, float]:
@@ -330,15 +287,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Recommendation:
-    """The recommended setting of a stage.
+    """The recommended setting of a stage."""
 
-    Attributes
-    ----------
-    supported : str or None
-        The setting that the figures support; None when they do not decide.
-    """
-
-    supported: str | None
+    supported: str | None  # the setting that the figures support; None when they do not decide
     present: str
     reason: str
 
@@ -368,14 +319,8 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
 
     Another setting replaces the present one only when it finds and places as many objects and is no worse with `MIN_CONFIDENCE`.
 
-    Parameters
-    ----------
-    points : sequence of Point
-        One of them is the present setting.
-    unit : str
-        Of the error, for the reason.
-    whole_ms : float
-        Time of a whole run, ms a tick, which a stage's time is compared with.
+    `points`: one of them is the present setting. `unit`: of the error, for the reason. `whole_ms`: time of a whole run,
+    ms a tick, which a stage's time is compared with.
     """
     present = next(p for p in points if p.present)
     others = [p for p in points if p.error is not None and p is not present]

@@ -19,31 +19,17 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class SceneBoxes:
-    """Boxes of several scenes, one row a box: those that a detector found, or the true ones.
+    """Boxes of several scenes, one row a box: those that a detector found, or the true ones."""
 
-    Attributes
-    ----------
-    scene : (M,) int64
-        Number of the scene (one sweep, one sample) that each box belongs to; only boxes of one scene match.
-    box : (M, 7) float64, m and rad
-        Center x, y, z, length, width, height, yaw; found and true boxes in the same frame.
-    category : (M,) str
-    score : (M,) float64
-        Of found boxes; 1 for true ones.
-    points : (M,) int64 or None
-        Number of LiDAR points in each box; None when it was not counted.
-    range_m : (M,) float64
-        Horizontal distance from the sensor.
-    ignored : (M,) bool
-        Boxes that are neither right nor wrong: true ones that nobody has to find, found ones that truth cannot judge.
-    """
-
+    # (M,) number of the scene (one sweep, one sample) that each box belongs to; only boxes of one scene match.
     scene: NDArray[np.int64]
-    box: Array
-    category: NDArray[np.str_]
-    score: Array
-    points: NDArray[np.int64] | None
-    range_m: Array
+    box: Array  # (M, 7), m and rad center x, y, z, length, width, height, yaw; found and true boxes in the same frame
+    category: NDArray[np.str_]  # (M,)
+    score: Array  # (M,) of found boxes; 1 for true ones
+    points: NDArray[np.int64] | None  # (M,) number of LiDAR points in each box; None when it was not counted
+    range_m: Array  # (M,) horizontal distance from the sensor
+    # (M,) boxes that are neither right nor wrong: true ones that nobody has to find, found ones that truth cannot
+    # judge.
     ignored: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
@@ -76,13 +62,9 @@ class SceneBoxes:
     ) -> Self:
         """Make a table from arrays; a single value holds for all rows.
 
-        Parameters
-        ----------
-        box : (M, 7), m and rad
-            x, y, z, length, width, height, yaw.
-        category, score, scene, points, ignored : (M,) or a single value
-        range_m : (M,) or a single value, optional
-            By default the distance from the origin of the boxes' frame.
+        `box` (M, 7), m and rad: x, y, z, length, width, height, yaw. `category`, `score`, `scene`, `points`, `ignored`
+        (M,) or a single value. `range_m` (M,) or a single value, optional: by default the distance from the origin of
+        the boxes' frame.
         """
         rows = np.asarray(box, dtype=np.float64).reshape(-1, 7)
         away = np.hypot(rows[:, 0], rows[:, 1]) if range_m is None else range_m
@@ -137,26 +119,16 @@ DIGITS = 4  # 0.1 mm, 0.006 degrees, 0.01 % of a score
 
 @dataclass(frozen=True, eq=False)
 class DetectedBoxes:
-    """Boxes that a detector found in a log, sweep by sweep.
-
-    Attributes
-    ----------
-    log, detector : str
-        Names of both.
-    t_ns : (F,) int64
-        Absolute stamps of the sweeps, increasing; also of those in which nothing was found.
-    boxes : F Boxes3D
-        Map frame of the log.
-    poses : mapping of str to Any
-        Where the poses come from that place them there, see `PoseChoice.to_provenance`.
-    """
+    """Boxes that a detector found in a log, sweep by sweep."""
 
     __repr__ = short_repr
 
+    # log, detector: names of both.
     log: str
     detector: str
-    t_ns: NDArray[np.int64]
-    boxes: tuple[Boxes3D, ...]
+    t_ns: NDArray[np.int64]  # (F,) absolute stamps of the sweeps, increasing; also of those in which nothing was found
+    boxes: tuple[Boxes3D, ...]  # map frame of the log
+    # Where the poses come from that place them there, see `PoseChoice.to_provenance`.
     poses: Mapping[str, Any] = field(default_factory=dict)
 
     def save(self, path: Path | str) -> None:
@@ -187,10 +159,7 @@ class DetectedBoxes:
     def from_dict(cls, document: Any) -> DetectedBoxes:
         """Build them from a document, which is checked against the schema.
 
-        Raises
-        ------
-        LogError
-            As for `load`.
+        Raises `LogError`: as for `load`.
         """
         _check(document)
         frames = document["frames"]

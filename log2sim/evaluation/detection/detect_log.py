@@ -27,19 +27,11 @@ from log2sim.plan import FusionLevel
 
 @dataclass(frozen=True, eq=False)
 class SearchedCloud:
-    """A cloud and what a detector found in it.
-
-    Attributes
-    ----------
-    cloud : Cloud or None
-        None where the sweep cannot be read or has no pose.
-    boxes : Boxes3D
-        Empty without a detector.
-    """
+    """A cloud and what a detector found in it."""
 
     tick: int
-    cloud: Cloud | None
-    boxes: Boxes3D
+    cloud: Cloud | None  # none where the sweep cannot be read or has no pose
+    boxes: Boxes3D  # empty without a detector
 
 
 def clouds(run: Run, records: RecordReader, detector: LidarDetector | None) -> Iterator[SearchedCloud]:
@@ -80,22 +72,12 @@ def only_ticks(run: Run, ticks: NDArray[np.int64]) -> Run:
 
 @dataclass(frozen=True, eq=False)
 class LogDetections:
-    """Boxes of a log, and what could not be searched.
-
-    Attributes
-    ----------
-    left_out : int
-        Sweeps that cannot be read or have no pose.
-    unreadable : dict
-        Count and first message by stream.
-    poses : PoseChoice
-        Where the poses come from that place the boxes in the map.
-    """
+    """Boxes of a log, and what could not be searched."""
 
     found: DetectedBoxes
-    left_out: int
-    unreadable: dict[str, Any]
-    poses: PoseChoice
+    left_out: int  # sweeps that cannot be read or have no pose
+    unreadable: dict[str, Any]  # count and first message by stream
+    poses: PoseChoice  # where the poses come from that place the boxes in the map
 
 
 def detect_log(

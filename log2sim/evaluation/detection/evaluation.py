@@ -33,29 +33,19 @@ from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, wrap_angle
 
 ROUNDING = 1e-9
-SAMPLES = 40
-"""Steps of recall of KITTI's published program."""
-NUSCENES_FLOOR = 0.1
-"""nuScenes leaves out what lies below this precision and this recall."""
+SAMPLES = 40  # steps of recall of KITTI's published program
+NUSCENES_FLOOR = 0.1  # nuScenes leaves out what lies below this precision and this recall
 
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecall:
-    """Precision and recall at each distinct score, greatest first.
+    """Precision and recall at each distinct score, greatest first."""
 
-    Attributes
-    ----------
-    score : (K,) float64
-        Boxes of this score and above are reported.
-    precision, recall : (K,) float64
-    truths : int
-        Number of counted true boxes.
-    """
-
-    score: Array
+    score: Array  # (K,) boxes of this score and above are reported
+    # precision, recall: (K,)
     precision: Array
     recall: Array
-    truths: int
+    truths: int  # number of counted true boxes
 
     def best_precision(self, recall: Array) -> Array:
         """Return the greatest precision at or beyond recalls (R,), 0 where none is reached."""
@@ -66,11 +56,8 @@ class PrecisionRecall:
     def average(self, recall_points: int = 40) -> float | None:
         """Average the best precision over recalls; None without true boxes.
 
-        Parameters
-        ----------
-        recall_points : {40, 11}
-            40: recalls 1/40 to 1, KITTI's rule since 2019, which drops the first of 41 points (Simonelli et al., ICCV 2019);
-            11: recalls 0 to 1 (PASCAL VOC; Everingham et al., IJCV 2010), KITTI's rule before.
+        `recall_points`: 40: recalls 1/40 to 1, KITTI's rule since 2019, which drops the first of 41 points (Simonelli
+        et al., ICCV 2019); 11: recalls 0 to 1 (PASCAL VOC; Everingham et al., IJCV 2010), KITTI's rule before.
         """
         if recall_points not in (40, 11):
             raise ValueError(f"recall_points is {recall_points}, expected 40 or 11")
@@ -80,8 +67,6 @@ class PrecisionRecall:
     def nuscenes_average(self) -> float | None:
         """Average as nuScenes does (Caesar et al., CVPR 2020, section 3.1); None without true boxes.
 
-        Notes
-        -----
         Over recalls 0.11 to 1 in steps of 0.01, of the precision above 0.1, scaled to 1. The precision is the best one at or
         beyond each recall; nuScenes interpolates between neighbors instead.
         """
@@ -93,8 +78,6 @@ class PrecisionRecall:
     def sampled_average(self, recall_points: int = 40) -> float | None:
         """Average as KITTI's published program does; None without true boxes.
 
-        Notes
-        -----
         The program looks at no more than 41 of the scores of right boxes, those at which the recall is nearest to 0, 1/40 and
         so on; points that are not reached count 0, and the last right box counts as one more point, which adds up to 1/40. With
         fewer than 40 true boxes even a perfect detector gets less than 1: take `average` for small sets, and this figure to
@@ -132,10 +115,7 @@ def average_precision(
 ) -> float | None:
     """Compute the average precision of the boxes of one class; None without counted true boxes.
 
-    Parameters
-    ----------
-    recall_points : {40, 11}
-        As in `PrecisionRecall.average`.
+    `recall_points`: as in `PrecisionRecall.average`.
     """
     return precision_recall(found, match(found, truth, criterion)).average(recall_points)
 
@@ -143,12 +123,9 @@ def average_precision(
 def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> dict[str, Any]:
     """Count what is right when only boxes of at least a score are reported.
 
-    Returns
-    -------
-    dict
-        "true_positives", "false_positives", "false_negatives", and "precision", "recall", "f1" and
-        "precision_times_recall", which are None where nothing was reported or nothing was there to be found. Some authors
-        call the last one mean average precision, which it is not: it is one point of the curve.
+    Returns "true_positives", "false_positives", "false_negatives", and "precision", "recall", "f1" and
+    "precision_times_recall", which are None where nothing was reported or nothing was there to be found. Some authors
+    call the last one mean average precision, which it is not: it is one point of the curve.
     """
     reported = found.score >= min_score
     right, false = (int(np.count_nonzero(rows & reported)) for rows in (matches.right, matches.false))
@@ -174,14 +151,9 @@ def rates(right: int, false: int, missed: int) -> dict[str, Any]:
 def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
     """Compare scores with the share of right boxes.
 
-    Returns
-    -------
-    dict
-        "boxes", "expected_calibration_error" (None without boxes), and "bins" of equal width from 0 to 1 with "low", "high",
-        "boxes", "mean_score" and "precision" (None in empty bins).
+    Returns "boxes", "expected_calibration_error" (None without boxes), and "bins" of equal width from 0 to 1 with
+    "low", "high", "boxes", "mean_score" and "precision" (None in empty bins).
 
-    Notes
-    -----
     See `reliability`. Ignored boxes are left out.
     """
     judged = matches.right | matches.false
@@ -205,51 +177,33 @@ def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
 
 Mask = NDArray[np.bool_]
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
-POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))
-"""The last one joins the two before."""
+POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))  # the last one joins the two before
 
 
 @dataclass(frozen=True, eq=False)
 class ClassBoxes:
-    """Found and true boxes of one class.
+    """Found and true boxes of one class."""
 
-    Attributes
-    ----------
-    found, truth : SceneBoxes
-        M found and L true boxes; true ones are ignored where they never count.
-    far : (M,) bool
-        Found boxes out of range, which are not false where they match nothing.
-    unlabeled : (M,) bool
-        Those where nothing was labeled, likewise.
-    found_views, truth_views : ImageViews or None
-        In the reference camera, for KITTI's difficulties.
-    occlusion : (L,) int64 or None
-        As the log states it.
-    """
-
+    # found, truth: m found and L true boxes; true ones are ignored where they never count.
     found: SceneBoxes
     truth: SceneBoxes
-    far: Mask
-    unlabeled: Mask
+    far: Mask  # (M,) found boxes out of range, which are not false where they match nothing
+    unlabeled: Mask  # (M,) those where nothing was labeled, likewise
+    # found_views, truth_views: in the reference camera, for KITTI's difficulties.
     found_views: ImageViews | None = None
     truth_views: ImageViews | None = None
-    occlusion: NDArray[np.int64] | None = None
+    occlusion: NDArray[np.int64] | None = None  # (L,) as the log states it
 
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored.
-
-    Attributes
-    ----------
-    elsewhere : (M,) bool
-        Found boxes that are not false where they match nothing, since they are out of range or of other objects.
-    """
+    """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored."""
 
     name: str
     boxes: ClassBoxes
     found: SceneBoxes
     truth: SceneBoxes
+    # (M,) found boxes that are not false where they match nothing, since they are out of range or of other objects.
     elsewhere: Mask
 
     def matches(self, pairs: Pairs, criterion: Criterion) -> Matches:
@@ -261,12 +215,8 @@ class Objects:
 def class_figures(boxes: ClassBoxes, of_class: ObjectClass, min_score: float) -> dict[str, Any]:
     """Compute all figures of a class.
 
-    Parameters
-    ----------
-    of_class : ObjectClass
-        The first of its criteria is that of the tables by range and by points.
-    min_score : float
-        Score from which boxes are reported, for precision and recall.
+    `of_class`: the first of its criteria is that of the tables by range and by points. `min_score`: score from which
+    boxes are reported, for precision and recall.
     """
     pairs = {c: candidate_pairs(boxes.found, boxes.truth, c) for c in of_class.criteria}
     everything, main = all_objects(boxes), of_class.criteria[0]
@@ -355,8 +305,6 @@ def figures(objects: Objects, pairs: Pairs, criterion: Criterion, min_score: flo
 def published(objects: Objects, pairs: Pairs, criterion: Criterion) -> dict[str, Any]:
     """Compute average precision as KITTI's published program does: sampled, and false in regions without labels too.
 
-    Notes
-    -----
     The program compares the 3D boxes of these regions, which do not exist, so that its figures for 3D boxes lack the rule.
     """
     found = assign(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
@@ -501,24 +449,12 @@ DEFAULT_SCORE = 0.5
 
 @dataclass(frozen=True)
 class Options:
-    """What to evaluate.
+    """What to evaluate."""
 
-    Attributes
-    ----------
-    protocol : str
-        "kitti", "dair" or "center".
-    min_score : float
-        Score in [0, 1] from which boxes are reported, for precision and recall.
-    max_range_m : float or None
-        Objects farther away count for nothing.
-    classes : sequence of str or None
-        Names of classes or categories; None for all.
-    """
-
-    protocol: str
-    min_score: float = DEFAULT_SCORE
-    max_range_m: float | None = None
-    classes: Sequence[str] | None = None
+    protocol: str  # "kitti", "dair" or "center"
+    min_score: float = DEFAULT_SCORE  # score in [0, 1] from which boxes are reported, for precision and recall
+    max_range_m: float | None = None  # objects farther away count for nothing
+    classes: Sequence[str] | None = None  # names of classes or categories; None for all
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -535,10 +471,7 @@ class Options:
     def chosen(self) -> tuple[ObjectClass, ...]:
         """Select the classes of the protocol.
 
-        Raises
-        ------
-        ConfigError
-            For a name that is neither a class of the protocol nor a category of one.
+        Raises `ConfigError` for a name that is neither a class of the protocol nor a category of one.
         """
         classes = PROTOCOLS[self.protocol].classes
         if self.classes is None:
@@ -558,31 +491,24 @@ def evaluate_boxes(
 ) -> dict[str, Any]:
     """Compute the figures of a detector on a log.
 
-    Parameters
-    ----------
-    log : Log
-        With labels; its sweeps are read to count points.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps).
-
-    Returns
-    -------
-    dict
-        A document of `schemas/detection-metrics-1.json`.
-
-    Raises
-    ------
-    LogError
-        For a log without labels, or none of these sweeps, and boxes of another log.
-    ConfigError
-        For a protocol that needs a camera and a log without.
+    `log`: with labels; its sweeps are read to count points. `progress`: called with (sweeps done, all sweeps). Returns
+    a document of `schemas/detection-metrics-1.json`. Raises `LogError` for a log without labels, or none of these
+    sweeps, and boxes of another log. Raises `ConfigError` for a protocol that needs a camera and a log without.
     """
     protocol, classes = PROTOCOLS[options.protocol], options.chosen()
     if len(detected.t_ns) == 0:
         raise LogError(f"the boxes of '{detected.log}' are of no sweep at all; detect them in a log with LiDAR sweeps")
     camera = _reference_camera(log, protocol)
     truth = truth_of_sweeps(log, detected.t_ns, progress=progress)
-    found = found_in_sweeps(detected, truth)
+    # Collect the found boxes of the labeled sweeps; their scenes are indices of sweeps.
+    tables = []
+    for k in np.flatnonzero(truth.labeled).tolist():
+        b = detected.boxes[k]
+        box = np.column_stack([b.center_m, b.size_m, b.yaw_rad])
+        away = np.hypot(*(b.center_m[:, :2] - truth.origin_m[k, :2]).T)
+        tables.append(SceneBoxes.of(box, b.category, b.score, points=b.points, range_m=away))
+    joined = SceneBoxes.join(tables)
+    found = replace(joined, scene=np.flatnonzero(truth.labeled)[joined.scene])
     sides = _sides(log, detected.t_ns, found, truth, camera)
     figures = {c.name: class_figures(_class_boxes(sides, c, options, protocol), c, options.min_score) for c in classes}
     return {
@@ -601,18 +527,6 @@ def evaluate_boxes(
         "overall": overall(figures),
         "classes": figures,
     }
-
-
-def found_in_sweeps(detected: DetectedBoxes, truth: SweepTruth) -> SceneBoxes:
-    """Collect the found boxes of the labeled sweeps; their scenes are indices of sweeps."""
-    tables = []
-    for k in np.flatnonzero(truth.labeled).tolist():
-        b = detected.boxes[k]
-        box = np.column_stack([b.center_m, b.size_m, b.yaw_rad])
-        away = np.hypot(*(b.center_m[:, :2] - truth.origin_m[k, :2]).T)
-        tables.append(SceneBoxes.of(box, b.category, b.score, points=b.points, range_m=away))
-    joined = SceneBoxes.join(tables)
-    return replace(joined, scene=np.flatnonzero(truth.labeled)[joined.scene])
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,24 +16,17 @@ from log2sim.geometry import Array, rectangle_iou, upright_box_iou
 
 Measure = Literal["iou_3d", "iou_bev", "center_m"]
 FLAT = [0, 1, 3, 4, 6]  # x, y, length, width, yaw
-MAX_PAIRS_AT_ONCE = 2_000_000
-"""Limits memory to some 100 MB."""
+MAX_PAIRS_AT_ONCE = 2_000_000  # limits memory to some 100 MB
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """When a found and a true box match.
+    """When a found and a true box match."""
 
-    Attributes
-    ----------
-    measure : {"iou_3d", "iou_bev", "center_m"}
-        IoU of the boxes, IoU of their outlines on the ground, or horizontal distance of their centers.
-    limit : float
-        IoU above which, or distance in m below which, boxes match.
-    """
-
+    # {"iou_3d", "iou_bev", "center_m"}, ioU of the boxes, IoU of their outlines on the ground, or horizontal distance
+    # of their centers.
     measure: Measure
-    limit: float
+    limit: float  # ioU above which, or distance in m below which, boxes match
 
     def __post_init__(self) -> None:
         """Check the limit."""
@@ -52,44 +45,23 @@ class Criterion:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of found and true boxes that may match.
+    """Pairs of found and true boxes that may match."""
 
-    Attributes
-    ----------
-    found, truth : (P,) int64
-        Rows of both tables.
-    value : (P,) float64
-        IoU or distance.
-    """
-
+    # found, truth: (P,) rows of both tables.
     found: NDArray[np.int64]
     truth: NDArray[np.int64]
-    value: Array
+    value: Array  # (P,) ioU or distance
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """The true box of each found one.
+    """The true box of each found one."""
 
-    Attributes
-    ----------
-    truth : (M,) int64
-        Row of the true box; -1 without.
-    value : (M,) float64
-        IoU or distance of the match, NaN without.
-    right : (M,) bool
-        Found boxes that match a counted true box.
-    false : (M,) bool
-        Found boxes that match nothing; ignored ones are neither right nor false.
-    truths : int
-        Number of counted true boxes.
-    """
-
-    truth: NDArray[np.int64]
-    value: Array
-    right: NDArray[np.bool_]
-    false: NDArray[np.bool_]
-    truths: int
+    truth: NDArray[np.int64]  # (M,) row of the true box; -1 without
+    value: Array  # (M,) ioU or distance of the match, NaN without
+    right: NDArray[np.bool_]  # (M,) found boxes that match a counted true box
+    false: NDArray[np.bool_]  # (M,) found boxes that match nothing; ignored ones are neither right nor false
+    truths: int  # number of counted true boxes
 
     def excusing(self, rows: NDArray[np.bool_]) -> Matches:
         """Return matches in which the boxes of a mask (M,) are not false where they match nothing."""
@@ -99,10 +71,7 @@ class Matches:
 def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches:
     """Match found and true boxes of all scenes one to one, best score first.
 
-    Parameters
-    ----------
-    found, truth : SceneBoxes
-        Of one class: categories are not compared.
+    `found`, `truth`: of one class: categories are not compared.
     """
     return assign(found, truth, candidate_pairs(found, truth, criterion), criterion)
 
@@ -110,8 +79,6 @@ def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches
 def assign(found: SceneBoxes, truth: SceneBoxes, pairs: Pairs, criterion: Criterion) -> Matches:
     """Choose among candidate pairs, which do not depend on what is ignored; see `match`.
 
-    Notes
-    -----
     A found box takes the best true box that is free, a counted one before an ignored one. Ignored found boxes come last. So
     the matches of the boxes above a score do not depend on those below. This is the order of PASCAL VOC and nuScenes; KITTI
     lets true boxes choose, which gives the same counts wherever a found box can match one true box only, as above an IoU of
@@ -171,44 +138,28 @@ def _pairs_in_scenes(
         yield np.repeat(rows, n).astype(np.int64), order[np.repeat(begin[rows], n) + within].astype(np.int64)
 
 
+# True boxes with fewer points are ignored, outside KITTI's difficulties: they show no extent (Waymo's level 1 asks
+# for more than 5).
 MIN_POINTS = 5
-"""True boxes with fewer points are ignored, outside KITTI's difficulties: they show no extent (Waymo's level 1 asks for more
-than 5)."""
 
 
 @dataclass(frozen=True)
 class ObjectClass:
-    """A class of a protocol.
-
-    Attributes
-    ----------
-    categories : tuple of str
-        Categories that make it up; they match freely among each other.
-    criteria : tuple of Criterion
-        The first one decides in tables.
-    ignored_kinds : tuple of str
-        The log's own words of true boxes of these categories that are ignored.
-    """
+    """A class of a protocol."""
 
     name: str
-    categories: tuple[str, ...]
-    criteria: tuple[Criterion, ...]
-    ignored_kinds: tuple[str, ...] = ()
+    categories: tuple[str, ...]  # categories that make it up; they match freely among each other
+    criteria: tuple[Criterion, ...]  # the first one decides in tables
+    ignored_kinds: tuple[str, ...] = ()  # the log's own words of true boxes of these categories that are ignored
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """A way to evaluate.
-
-    Attributes
-    ----------
-    of_camera : bool
-        Whether only boxes count that the reference camera shows, by KITTI's difficulties.
-    """
+    """A way to evaluate."""
 
     name: str
     classes: tuple[ObjectClass, ...]
-    of_camera: bool = False
+    of_camera: bool = False  # whether only boxes count that the reference camera shows, by KITTI's difficulties
 
 
 @dataclass(frozen=True)
@@ -238,8 +189,8 @@ def _ious(*limits: float) -> tuple[Criterion, ...]:
     return tuple(Criterion(measure, limit) for limit in limits for measure in ("iou_3d", "iou_bev"))
 
 
+# nuScenes' distances; the table uses 1 m, about the IoU of 0.5 of a car shifted along its length.
 CENTERS = tuple(Criterion("center_m", limit) for limit in (1.0, 0.5, 2.0, 4.0))
-"""nuScenes' distances; the table uses 1 m, about the IoU of 0.5 of a car shifted along its length."""
 
 VEHICLES, PEOPLE, RIDERS = ("car", "truck", "bus"), ("pedestrian",), ("motorcycle", "cyclist")
 

@@ -17,40 +17,24 @@ from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of, project_boxes, wrap_angle
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.frames import RecordReader
-from log2sim.perception.lidar.cloud import Cloud, cloud_origin
+from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.pipeline import Run, start
 
-MAX_LAG_NS = 60_000_000
-"""A label holds for this time around its stamp: half a period at 10 Hz, and jitter."""
+MAX_LAG_NS = 60_000_000  # a label holds for this time around its stamp: half a period at 10 Hz, and jitter
+# Between labels of a track that are farther apart than this many periods the object was not labeled.
 MAX_PERIODS = 1.5
-"""Between labels of a track that are farther apart than this many periods the object was not labeled."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelTracks:
-    """Labels in the order of their tracks and stamps.
+    """Labels in the order of their tracks and stamps."""
 
-    Attributes
-    ----------
-    t_ns : (L,) int64
-    pose : (L, 4) float64
-        Center x, y, z and yaw.
-    size_m : (rows of the log's labels, 3) float64
-        In the order of the log.
-    row : (L,) int64
-        Index in the log's labels.
-    first : (K + 1,) int64
-        Where each of K tracks begins, and L.
-    period_s : float
-        Median time between labels of a track; 0 where no track has two.
-    """
-
-    t_ns: NDArray[np.int64]
-    pose: Array
-    size_m: Array
-    row: NDArray[np.int64]
-    first: NDArray[np.int64]
-    period_s: float
+    t_ns: NDArray[np.int64]  # (L,)
+    pose: Array  # (L, 4) center x, y, z and yaw
+    size_m: Array  # (rows of the log's labels, 3) in the order of the log
+    row: NDArray[np.int64]  # (L,) index in the log's labels
+    first: NDArray[np.int64]  # (K + 1,) where each of K tracks begins, and L
+    period_s: float  # median time between labels of a track; 0 where no track has two
 
     @classmethod
     def of(cls, labels: Labels) -> LabelTracks:
@@ -129,24 +113,12 @@ def _along(
 
 @dataclass(frozen=True, eq=False)
 class ImageViews:
-    """M boxes in the images of one camera.
+    """M boxes in the images of one camera."""
 
-    Attributes
-    ----------
-    shown : (M,) bool
-        Whether the image shows a part of the box.
-    height_px : (M,) float64
-        Height of the box in the image, clipped to it; 0 where it is not shown.
-    truncation : (M,) float64
-        Share of the outline outside the image; 1 where it is not shown.
-    region_share : (M,) float64
-        Greatest share of the image box in one region left without labels.
-    """
-
-    shown: NDArray[np.bool_]
-    height_px: Array
-    truncation: Array
-    region_share: Array
+    shown: NDArray[np.bool_]  # (M,) whether the image shows a part of the box
+    height_px: Array  # (M,) height of the box in the image, clipped to it; 0 where it is not shown
+    truncation: Array  # (M,) share of the outline outside the image; 1 where it is not shown
+    region_share: Array  # (M,) greatest share of the image box in one region left without labels
 
     def take(self, rows: NDArray[np.bool_]) -> ImageViews:
         """Take the rows of a mask."""
@@ -158,14 +130,9 @@ def image_views(
 ) -> ImageViews:
     """Project boxes into the images of a camera.
 
-    Parameters
-    ----------
-    t_ns : (F,) int64
-        Stamps of the scenes, absolute; the camera is taken where it was then.
-    boxes : SceneBoxes
-        Their scenes are indices into `t_ns`, the boxes are in the map frame.
-    truncation : bool
-        Whether to compute it, which takes a millisecond a box at the border of the image; 0 for all shown boxes otherwise.
+    `t_ns` (F,): stamps of the scenes, absolute; the camera is taken where it was then. `boxes`: their scenes are
+    indices into `t_ns`, the boxes are in the map frame. `truncation`: whether to compute it, which takes a millisecond
+    a box at the border of the image; 0 for all shown boxes otherwise.
     """
     count = len(boxes)
     shown, height, share = np.zeros(count, dtype=bool), np.zeros(count), np.zeros(count)
@@ -205,33 +172,18 @@ def _region_share(box_px: Array, region_px: Array) -> Array:
     return np.asarray(np.divide(shared, area, out=np.zeros_like(area), where=area > 0))
 
 
-MAX_STAMP_ERROR_NS = 1_000_000
-"""Stamps of one sweep differ by rounding at most this much."""
+MAX_STAMP_ERROR_NS = 1_000_000  # stamps of one sweep differ by rounding at most this much
 
 
 @dataclass(frozen=True, eq=False)
 class SweepTruth:
-    """Labels by sweep; L rows.
+    """Labels by sweep; L rows."""
 
-    Attributes
-    ----------
-    labeled : (F,) bool
-        Whether each of the sweeps asked for is labeled.
-    boxes : SceneBoxes
-        Their scenes are indices of sweeps; points are None for a log without LiDAR.
-    origin_m : (F, 3) float64
-        From where ranges are measured, map frame: the ego, or the middle of the sensors.
-    kind : (L,) str
-        The log's own word for the category, "" where it has none.
-    occlusion : (L,) int64
-        As the log states it; 0 where it states nothing.
-    """
-
-    labeled: NDArray[np.bool_]
-    boxes: SceneBoxes
-    origin_m: Array
-    kind: NDArray[np.str_]
-    occlusion: NDArray[np.int64]
+    labeled: NDArray[np.bool_]  # (F,) whether each of the sweeps asked for is labeled
+    boxes: SceneBoxes  # their scenes are indices of sweeps; points are None for a log without LiDAR
+    origin_m: Array  # (F, 3) from where ranges are measured, map frame: the ego, or the middle of the sensors
+    kind: NDArray[np.str_]  # (L,) the log's own word for the category, "" where it has none
+    occlusion: NDArray[np.int64]  # (L,) as the log states it; 0 where it states nothing
 
 
 def truth_of_sweeps(
@@ -239,20 +191,9 @@ def truth_of_sweeps(
 ) -> SweepTruth:
     """Assign the labels of a log to sweeps and count the points in each.
 
-    Parameters
-    ----------
-    t_ns : (F,) int64
-        Stamps of the sweeps, absolute, increasing.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps); every sweep is read once.
+    `t_ns` (F,): stamps of the sweeps, absolute, increasing. `progress`: called with (sweeps done, all sweeps); every
+    sweep is read once. Raises `LogError` when the log has no labels, or none of these sweeps.
 
-    Raises
-    ------
-    LogError
-        When the log has no labels, or none of these sweeps.
-
-    Notes
-    -----
     A turning LiDAR sees objects at different times of a sweep, and labels may have the stamps of cameras. Each label is moved
     along its track to the mean time of the points in it, which is where a detector finds the object: at 15 m/s and 10 Hz it
     is up to 0.75 m off otherwise.
@@ -303,14 +244,8 @@ def _run_of(log: Log) -> Run | None:
 def labeled_sweeps(labels: Labels, middle_ns: NDArray[np.int64], period_s: float) -> NDArray[np.bool_]:
     """Mark (F,) the sweeps that are labeled: those near a label and, where every sweep is labeled, all between labels.
 
-    Parameters
-    ----------
-    labels : Labels
-        At least one; where they tell what was labeled, only sweeps near that are.
-    middle_ns : (F,) int64
-        Middles of the sweeps.
-    period_s : float
-        Time between labels of one object.
+    `labels`: at least one; where they tell what was labeled, only sweeps near that are. `middle_ns` (F,): middles of
+    the sweeps. `period_s`: time between labels of one object.
     """
     stamps = np.sort(labels.t_ns) if labels.labeled_ns is None else labels.labeled_ns
     near = np.abs(stamps[nearest_index(stamps, middle_ns)] - middle_ns) <= MAX_LAG_NS
@@ -321,22 +256,13 @@ def labeled_sweeps(labels: Labels, middle_ns: NDArray[np.int64], period_s: float
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Labeled objects in sweeps; L rows.
+    """Labeled objects in sweeps; L rows."""
 
-    Attributes
-    ----------
-    sweep, track : (L,) int64
-        Indices of both.
-    t_ns : (L,) int64
-        When the LiDARs saw the object, the middle of the sweep where they did not.
-    points : (L,) int64 or None
-        Points above the ground in its box.
-    """
-
+    # sweep, track: (L,) indices of both.
     sweep: NDArray[np.int64]
     track: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
-    points: NDArray[np.int64] | None
+    t_ns: NDArray[np.int64]  # (L,) when the LiDARs saw the object, the middle of the sweep where they did not
+    points: NDArray[np.int64] | None  # (L,) points above the ground in its box
 
 
 def _seen_by_lidar(
@@ -357,15 +283,15 @@ def _seen_by_lidar(
         if searched.cloud is not None:
             for _ in range(2):  # where objects are in the middle of the sweep, then where they were seen
                 pose, rows = tracks.at(asked.track[mine], seen_ns[mine])
-                points[mine], mean_ns = points_above_ground(searched.cloud, pose, tracks.size_m[rows])
+                cloud = searched.cloud
+                size_m = tracks.size_m[rows]
+                above = ~cloud.ground
+                inside = points_of_boxes(cloud.xyz[above], pose[:, :3] - cloud.origin, size_m, pose[:, 3])
+                points[mine], mean_ns = (
+                    inside.count,
+                    cloud.stamp_ns + np.round(inside.mean(cloud.t_s[above]) * NS_PER_S).astype(np.int64),
+                )
                 seen_ns[mine] = np.where(points[mine] > 0, mean_ns, seen_ns[mine])
         if progress is not None:
             progress(done, len(needed))
     return Sightings(asked.sweep, asked.track, seen_ns, points)
-
-
-def points_above_ground(cloud: Cloud, pose: Array, size_m: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Count the points (M,) above the ground in boxes with poses (M, 4), x, y, z, yaw, and average their stamps (M,), ns."""
-    above = ~cloud.ground
-    inside = points_of_boxes(cloud.xyz[above], pose[:, :3] - cloud.origin, size_m, pose[:, 3])
-    return inside.count, cloud.stamp_ns + np.round(inside.mean(cloud.t_s[above]) * NS_PER_S).astype(np.int64)

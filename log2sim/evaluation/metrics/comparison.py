@@ -22,8 +22,6 @@ GATE_PER_LENGTH = 0.25
 def gate_m(length_m: Array) -> Array:
     """Compute the gate (A,), m: the largest distance of matching box centers, by the truth's length (A,), m.
 
-    Notes
-    -----
     nuScenes matches within 2 m. The center of a partly visible bus or truck is uncertain by more, so the gate is at least a
     quarter of the length.
     """
@@ -32,36 +30,19 @@ def gate_m(length_m: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs within the gate, sorted by tick.
+    """Pairs within the gate, sorted by tick."""
 
-    Attributes
-    ----------
-    tick : (P,) int64
-    truth, other : (P,) int64
-        Indices of the truth agent and of the reconstructed agent.
-    distance_m : (P,) float64
-    similarity : (P,) float64
-        1 - distance / gate; 0 across groups of categories.
-    same_group : (P,) bool
-    """
-
-    tick: Index
+    tick: Index  # (P,)
+    # truth, other: (P,) indices of the truth agent and of the reconstructed agent.
     truth: Index
     other: Index
-    distance_m: Array
-    similarity: Array
-    same_group: Mask
+    distance_m: Array  # (P,)
+    similarity: Array  # (P,) 1 - distance / gate; 0 across groups of categories
+    same_group: Mask  # (P,)
 
     def take(self, index: Mask | Index) -> Pairs:
         """Return the rows at `index`."""
-        return Pairs(
-            self.tick[index],
-            self.truth[index],
-            self.other[index],
-            self.distance_m[index],
-            self.similarity[index],
-            self.same_group[index],
-        )
+        return Pairs(*(column[index] for column in vars(self).values()))
 
     def bounds(self, ticks: int) -> Index:
         """Return row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""
@@ -71,12 +52,8 @@ class Pairs:
 def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mask) -> Pairs:
     """Collect the pairs within the gate.
 
-    Parameters
-    ----------
-    truth_xy, other_xy : (A, T, 2), (B, T, 2) float64, m
-        Box centers in one frame, NaN where an agent is absent.
-    gates_m : (A,) float64
-    same_group : (A, B) bool
+    `truth_xy`, `other_xy` (A, T, 2), (B, T, 2), m: box centers in one frame, NaN where an agent is absent. `gates_m`
+    (A,). `same_group` (A, B).
     """
     found: list[tuple[Index, ...]] = []
     distances = []
@@ -100,20 +77,9 @@ def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mas
 def assign(rows: Index, cols: Index, score: Array) -> Index:
     """Choose pairs one to one so that the sum of their scores is greatest.
 
-    Parameters
-    ----------
-    rows, cols : (P,) int64
-        The candidate pairs, each once.
-    score : (P,) float64
-        Greater than 0 for a pair that may be chosen.
+    `rows`, `cols` (P,): the candidate pairs, each once. `score` (P,): greater than 0 for a pair that may be chosen.
+    Returns (K,) indices of the chosen candidates.
 
-    Returns
-    -------
-    (K,) int64
-        Indices of the chosen candidates.
-
-    Notes
-    -----
     Pairs whose row and column have no other candidate, nearly all in a sparse scene, are chosen without the solver.
     """
     usable = np.flatnonzero(score > 0)
@@ -139,28 +105,16 @@ def assign(rows: Index, cols: Index, score: Array) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Matches of A truth agents and B reconstructed agents at T ticks.
+    """Matches of A truth agents and B reconstructed agents at T ticks."""
 
-    Attributes
-    ----------
-    match : (A, T) int64
-        Index of the reconstructed agent, -1 for none.
-    used : (B, T) bool
-        Reconstructed agents matched within their group of categories.
-    absorbed : (B, T) bool
-        Reconstructed agents without such a match that are at a labeled object of another group.
-    """
-
-    match: NDArray[np.int64]
-    used: Mask
-    absorbed: Mask
+    match: NDArray[np.int64]  # (A, T) index of the reconstructed agent, -1 for none
+    used: Mask  # (B, T) reconstructed agents matched within their group of categories
+    absorbed: Mask  # (B, T) reconstructed agents without such a match that are at a labeled object of another group
 
 
 def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association:
     """Match agents tick by tick, keeping what was matched before while it is within the gate.
 
-    Notes
-    -----
     Bernardin and Stiefelhagen (2008), section 2.2.1: previous matches within the gate are kept, then the remaining agents
     are matched with the most pairs and the least total distance. A truth agent keeps its previous match over gaps. When two
     truth agents have the same previous match, the nearer one keeps it.
@@ -217,30 +171,21 @@ def mota(truth_ticks: int, missed: int, false: int, id_switches: int) -> float |
 
 
 MAX_TRUTH_GAP_S = 0.25
-MAX_SIMPLIFIED_GAP_S = 1.05
-"""Simplified trajectories omit waypoints of straight uniform motion for up to a second."""
-
+MAX_SIMPLIFIED_GAP_S = 1.05  # simplified trajectories omit waypoints of straight uniform motion for up to a second
+# Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself.
 MIN_TICK_S = 0.02
-"""Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself."""
 
+# A truth agent is extrapolated this far beyond its first and last label, without being counted there.
 TRUTH_MARGIN_S = 0.15
-"""A truth agent is extrapolated this far beyond its first and last label, without being counted there."""
 
 
 @dataclass(frozen=True, eq=False)
 class StateTable(AgentTable):
     """Agents at T ticks with what makes them count.
 
-    Attributes
-    ----------
-    range_m : (A, T) float64, m
-        From the ego's center; infinite without an ego.
-    visible : (A, T) bool
-        False where the truth does not count.
-    labeled : (A, T) bool
-        False where the truth's state is interpolated over a gap of its labels or extrapolated.
-    lidar_points : (A, T) float64
-        LiDAR points in the truth's box; NaN where they were not counted.
+    `range_m` (A, T), m: from the ego's center; infinite without an ego. `visible` (A, T): False where the truth does
+    not count. `labeled` (A, T): False where the truth's state is interpolated over a gap of its labels or extrapolated.
+    `lidar_points` (A, T): LiDAR points in the truth's box; NaN where they were not counted.
     """
 
     range_m: Array
@@ -252,8 +197,6 @@ class StateTable(AgentTable):
 def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     """Choose the instants (T,), seconds of the scenario, at which to compare; all within the time of the truth.
 
-    Notes
-    -----
     These are the times of the ego's waypoints. When they are on average more than 0.25 s apart, which simplification does,
     the waypoints of all agents are added, and when that is not enough, those of the truth, at least `MIN_TICK_S` apart.
     """
@@ -303,8 +246,6 @@ def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Arra
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
     """Sample truth agents at the ticks (seconds of the truth), moved by `shift_m`.
 
-    Notes
-    -----
     `visible` is that of the nearest waypoint. In gaps longer than 0.25 s and outside the trajectory it is False: there an
     interpolated or extrapolated box only prevents a reconstructed agent from counting as false.
     """
@@ -352,24 +293,15 @@ def _with_range(
 
 
 MIN_REGION_SHARE = 0.5
-MAX_FRAME_LAG_S = 0.15
-"""A tick is compared with the nearest labeled frame of a camera within this time."""
+MAX_FRAME_LAG_S = 0.15  # a tick is compared with the nearest labeled frame of a camera within this time
 
 
 def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, candidates: Mask) -> Mask:
     """Mark (B, T) the boxes that no labeled camera shows in a labeled part of its image.
 
-    Parameters
-    ----------
-    t_s : (T,)
-        Ticks, seconds of the truth.
-    agents : StateTable
-        B agents at these ticks, the truth's map frame.
-    candidates : (B, T) bool
-        The boxes to decide on; all others are False.
+    `t_s` (T,): ticks, seconds of the truth. `agents`: B agents at these ticks, the truth's map frame. `candidates` (B,
+    T): the boxes to decide on; all others are False.
 
-    Notes
-    -----
     A camera shows a box in an ignore region when at least half of the visible outline lies in the union of the regions of
     the nearest frame. One camera that shows it in a labeled part suffices to keep it.
     """
@@ -391,8 +323,6 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
 def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
     """Find the nearest frame (T,), whether it is within `MAX_FRAME_LAG_S`, and the camera poses (T, 4, 4) at instants (T,).
 
-    Notes
-    -----
     Poses are interpolated: at 30 m/s a car moves 1.5 m in half a frame at 10 Hz.
     """
     if len(view.t_s) == 0:
@@ -416,12 +346,11 @@ def _inside_any(uv: Array, regions: Array) -> Mask:
     return np.asarray(within.any(axis=1))
 
 
-MIN_COUNTED_S = 1.0
-"""A truth agent counts when its counted ticks make up at least this time."""
-
+MIN_COUNTED_S = 1.0  # a truth agent counts when its counted ticks make up at least this time
+# Of LiDARs on an object that some sensor hit. Waymo's first level of difficulty is drawn at as many.
 MIN_HIT_POINTS = 5
-"""Of LiDARs on an object that some sensor hit. Waymo's first level of difficulty is drawn at as many."""
 
+# Why a labeled object does not count at a tick; the first that applies.
 REASONS = {
     "other_category": "of a category that was not asked for",
     "out_of_range": "out of range",
@@ -430,7 +359,6 @@ REASONS = {
     "hidden": "hidden according to the truth",
     "short": f"in sight for less than {MIN_COUNTED_S:g} s",
 }
-"""Why a labeled object does not count at a tick; the first that applies."""
 
 COUNTED, NOT_LABELED = 0, -1
 
@@ -457,38 +385,21 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A truth agents and B reconstructed agents at T ticks, matched.
+    """A truth agents and B reconstructed agents at T ticks, matched."""
 
-    Attributes
-    ----------
-    truth, other : StateTable
-        Truth and reconstruction.
-    match : (A, T) int64
-        Index of the reconstructed agent, -1 for none.
-    counted : (A, T) bool
-        Ticks at which a truth agent counts.
-    why_not : (A, T) int64
-        Where it is labeled: 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not labeled.
-    switched : (A, T) bool
-        Identity switches.
-    selected : (B, T) bool
-        Ticks at which a reconstructed agent is present, within range and of a selected category.
-    false : (B, T) bool
-        Ticks at which a reconstructed agent is false.
-    ignored : (B, T) bool
-        Unmatched ticks in ignore regions.
-    """
-
+    # truth, other: truth and reconstruction.
     truth: StateTable
     other: StateTable
     pairs: Pairs
-    match: Index
-    counted: Mask
+    match: Index  # (A, T) index of the reconstructed agent, -1 for none
+    counted: Mask  # (A, T) ticks at which a truth agent counts
+    # (A, T) where it is labeled: 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not
+    # labeled.
     why_not: Index
-    switched: Mask
-    selected: Mask
-    false: Mask
-    ignored: Mask
+    switched: Mask  # (A, T) identity switches
+    selected: Mask  # (B, T) ticks at which a reconstructed agent is present, within range and of a selected category
+    false: Mask  # (B, T) ticks at which a reconstructed agent is false
+    ignored: Mask  # (B, T) unmatched ticks in ignore regions
 
     @property
     def asked_for(self) -> Mask:
@@ -501,12 +412,8 @@ def compare(
 ) -> Comparison:
     """Match agents and mark what counts.
 
-    Parameters
-    ----------
-    tick_s : float, s
-        Interval of the ticks.
-    visibility_stated : bool
-        Whether the truth states what is visible; else it follows from `MIN_POINTS` points and from pictures.
+    `tick_s`: interval of the ticks. `visibility_stated`: whether the truth states what is visible; else it follows from
+    `MIN_POINTS` points and from pictures.
     """
     same_group = truth.group[:, None] == other.group[None]
     pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
@@ -530,12 +437,9 @@ def compare(
 def coverage(c: Comparison, selected: Mask) -> dict[str, Any]:
     """Count what was labeled at the selected ticks (A, T) of the truth, what of it counts, and why the rest does not.
 
-    Returns
-    -------
-    dict
-        Agent-ticks: "labeled", "counted", "why_not" by the names in `REASONS`; "hit", those within range and of a selected
-        category with at least `MIN_HIT_POINTS` LiDAR points, counted or not, "hit_matched" and "hit_recall" of these; all
-        three None where nobody counted the points.
+    Returns agent-ticks: "labeled", "counted", "why_not" by the names in `REASONS`; "hit", those within range and of a
+    selected category with at least `MIN_HIT_POINTS` LiDAR points, counted or not, "hit_matched" and "hit_recall" of
+    these; all three None where nobody counted the points.
     """
     labeled = selected & (c.why_not != NOT_LABELED)
     wanted = selected & c.asked_for
@@ -556,13 +460,8 @@ def coverage(c: Comparison, selected: Mask) -> dict[str, Any]:
 def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
     """Move false ticks in ignore regions, and of categories never labeled, to the ignored ones.
 
-    Parameters
-    ----------
-    regions : IgnoreRegions or None
-        None where the labels are complete.
-    truth_ticks_s : (T,) float64, s
-    shift_m : (3,) float64, m
-        From the truth's map to the scenario's.
+    `regions`: None where the labels are complete. `truth_ticks_s` (T,), s. `shift_m` (3,), m: from the truth's map to
+    the scenario's.
     """
     if regions is None:
         return c

@@ -15,21 +15,16 @@ from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_
 from log2sim.geometry import Array
 
 BINS = 10
+# 95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05.
 CHI2_95 = {1: 3.841, 2: 5.991}
-"""95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05."""
 
 
 def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
     """Compare confidences (N,) in [0, 1] with what is right (N,).
 
-    Returns
-    -------
-    dict
-        "count", "expected_calibration_error" (None without any), and "bins" of equal width from 0 to 1 with "low", "high",
-        "count", "mean_confidence" and "right" (None in empty bins).
+    Returns "count", "expected_calibration_error" (None without any), and "bins" of equal width from 0 to 1 with "low",
+    "high", "count", "mean_confidence" and "right" (None in empty bins).
 
-    Notes
-    -----
     Expected calibration error (Naeini, Cooper, Hauskrecht, AAAI 2015; Guo et al., ICML 2017): the mean over all of the
     difference between the mean confidence and the share of right ones in their bin. What lies outside 0 to 1 is in the
     outermost bins. Bins of few have an error by chance alone: sqrt(p (1 - p) / count) for a share p.
@@ -56,15 +51,10 @@ def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
 
     Rows with an error of NaN are left out.
 
-    Returns
-    -------
-    dict
-        "count"; "without_sigma", those with a sigma of 0 or NaN, left out of all else; "nees", the mean of e^T P^-1 e / D
-        with P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", 0.69 = ln 2 for D = 2 and
-        0.45 for D = 1 where errors are Gaussian too; "within_95", the share inside of the 95 % circle or interval.
+    Returns "count"; "without_sigma", those with a sigma of 0 or NaN, left out of all else; "nees", the mean of e^T P^-1
+    e / D with P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", 0.69 = ln 2 for D = 2
+    and 0.45 for D = 1 where errors are Gaussian too; "within_95", the share inside of the 95 % circle or interval.
 
-    Notes
-    -----
     Normalized estimation error squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
     Navigation", 2001, section 5.4.2). A few gross errors dominate the mean, the other two describe the rest. The noise of
     the labels is part of the errors. Errors of positions end at the gate of the matching.
@@ -82,57 +72,31 @@ def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
 
 
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
+# An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
+# Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009).
 MAX_WRONG_SHARE = 0.2
-"""An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
-Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009)."""
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedAgents:
-    """B reconstructed agents with verdicts at T ticks, with their confidence, doubts and sigma from the scenario.
-
-    Attributes
-    ----------
-    wrong : (B, T) bool
-    confidence : (B,) float64
-    reasons : tuple of tuple of str
-        Why the scenario doubts each agent; empty where it does not.
-    doubted : (B, T) bool
-        When it does.
-    sigma_m : (B, T) float64, m
-        Standard deviation of the position for each axis.
-    sigma_rad : (B, T) float64
-        Of the heading; NaN where the scenario states none, as in the next one.
-    sigma_mps : (B, T) float64, m/s
-        Of the speed.
-    """
+    """B reconstructed agents with verdicts at T ticks, with their confidence, doubts and sigma from the scenario."""
 
     states: StateTable
     verdicts: Verdicts
-    wrong: Mask
-    confidence: Array
-    reasons: tuple[tuple[str, ...], ...]
-    doubted: Mask
-    sigma_m: Array
-    sigma_rad: Array
-    sigma_mps: Array
+    wrong: Mask  # (B, T)
+    confidence: Array  # (B,)
+    reasons: tuple[tuple[str, ...], ...]  # why the scenario doubts each agent; empty where it does not
+    doubted: Mask  # (B, T) when it does
+    sigma_m: Array  # (B, T) standard deviation of the position for each axis
+    sigma_rad: Array  # (B, T) of the heading; NaN where the scenario states none, as in the next one
+    sigma_mps: Array  # (B, T) of the speed
 
 
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
     """Judge the reconstructed agents and summarize by kind, category and range.
 
-    Parameters
-    ----------
-    agents : sequence of Agent
-        The B reconstructed agents of the comparison.
-    ticks_s : (T,) float64, s
-    ego : StateTable or None
-        One row; without it there are no figures by range.
-
-    Returns
-    -------
-    dict
-        The part `correctness` of a document of `schemas/metrics-1.json`.
+    `agents`: the B reconstructed agents of the comparison. `ticks_s` (T,), s. `ego`: one row; without it there are no
+    figures by range. Returns the part `correctness` of a document of `schemas/metrics-1.json`.
     """
     verdicts, ranged = judge(c, ego), ego is not None
     judged = JudgedAgents(

@@ -58,8 +58,8 @@ if TYPE_CHECKING:
     from log2sim.pipeline import Result
 
 
+# Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged.
 ALPHAS: Array = np.arange(1, 20) / 20
-"""Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +74,9 @@ class Hota:
 def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     """Score the tracking.
 
-    Parameters
-    ----------
-    pairs : Pairs
-        Candidates; those of absent agents and those with similarity 0 are left out.
-    truth_present, other_present : (A, T), (B, T) bool
-        Which agents count at which ticks.
+    `pairs`: candidates; those of absent agents and those with similarity 0 are left out. `truth_present`,
+    `other_present` (A, T), (B, T): which agents count at which ticks. None when there is no truth.
 
-    Returns
-    -------
-    Hota or None
-        None when there is no truth.
-
-    Notes
-    -----
     Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize the sum of similarity times the global alignment of
     both identities. Without any reconstructed agent all figures are 0.
     """
@@ -98,7 +87,16 @@ def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
     pairs = pairs.take(present)
     truth_count, other_count = truth_present.sum(1), other_present.sum(1)
-    alignment = _alignment(pairs, truth_count, other_count, truth_present.shape[1])
+    # Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment.
+    ticks = truth_present.shape[1]
+    row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
+    np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
+    np.add.at(col_sum, (pairs.other, pairs.tick), pairs.similarity)
+    share = row_sum[pairs.truth, pairs.tick] + col_sum[pairs.other, pairs.tick] - pairs.similarity
+    potential = np.zeros((len(truth_count), len(other_count)))
+    np.add.at(potential, (pairs.truth, pairs.other), pairs.similarity / share)
+    union = truth_count[:, None] + other_count[None] - potential
+    alignment = np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
     matched = _matched_pairs(pairs, alignment[pairs.truth, pairs.other] * pairs.similarity, truth_present.shape[1])
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
@@ -114,18 +112,6 @@ def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
         ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
         det_a[k] = tpa.sum() / (total - tpa.sum())
     return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
-
-
-def _alignment(pairs: Pairs, truth_count: Array, other_count: Array, ticks: int) -> Array:
-    """Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment."""
-    row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
-    np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
-    np.add.at(col_sum, (pairs.other, pairs.tick), pairs.similarity)
-    share = row_sum[pairs.truth, pairs.tick] + col_sum[pairs.other, pairs.tick] - pairs.similarity
-    potential = np.zeros((len(truth_count), len(other_count)))
-    np.add.at(potential, (pairs.truth, pairs.other), pairs.similarity / share)
-    union = truth_count[:, None] + other_count[None] - potential
-    return np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
 
 
 def _matched_pairs(pairs: Pairs, score: Array, ticks: int) -> Pairs:
@@ -211,8 +197,8 @@ def rounded_tree(value: Any) -> Any:
     return value
 
 
+# Takes states (N, 4), x, y, z in m and heading in rad, at times (N,), s of the truth, to those in the other map.
 Move = Callable[[Array, Array], Array]
-"""Takes states (N, 4), x, y, z in m and heading in rad, at times (N,), s of the truth, to those in the other map."""
 
 
 def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str, Any]]:
@@ -276,7 +262,7 @@ def _with_ego(truth: Scenario, scenario: Scenario) -> Scenario:
 
     def to_refined(_states: Array, t_s: Array) -> Array:
         s = ego.at(np.clip(t_s + since_s, w.t_s[0], w.t_s[-1]))
-        return np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1) - [*shift_m, 0.0]
+        return np.asarray(np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1) - [*shift_m, 0.0])
 
     return _moved(truth, _around(truth.ego, to_refined), lambda states, _t_s: states)
 
@@ -441,6 +427,13 @@ def evaluate(
     ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
+    # The agent that each truth agent is matched with most often, by its id.
+    agents = {agent.id: agent for agent in scenario.others}
+    partners = {}
+    for row, agent in enumerate(compared.truth.agents):
+        hits = compared.match[row][compared.counted[row] & (compared.match[row] >= 0)]
+        if len(hits):
+            partners[agent.id] = agents[compared.other.agents[int(np.bincount(hits).argmax())].id]
     result = {
         "metrics_version": VERSION,
         "scenario": scenario.name,
@@ -457,7 +450,7 @@ def evaluate(
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
         "map_features": map_figures(scenario, truth),
-        "colors": color_figures(truth.others, _matched(compared, scenario)),
+        "colors": color_figures(truth.others, partners),
         "signals": signal_figures(scenario, truth),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
@@ -499,17 +492,6 @@ def compare_scenarios(
     stated = truth.provenance.get("visibility") != "computed"
     compared = compare(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
     return without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
-
-
-def _matched(c: Comparison, scenario: Scenario) -> dict[str, Agent]:
-    """Return the agent that each truth agent is matched with most often, by its id."""
-    agents = {agent.id: agent for agent in scenario.others}
-    out = {}
-    for row, agent in enumerate(c.truth.agents):
-        hits = c.match[row][c.counted[row] & (c.match[row] >= 0)]
-        if len(hits):
-            out[agent.id] = agents[c.other.agents[int(np.bincount(hits).argmax())].id]
-    return out
 
 
 def _tick_s(ticks_s: Array) -> float:

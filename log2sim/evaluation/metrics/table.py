@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from log2sim.evaluation.metrics.comparison import MIN_HIT_POINTS, REASONS
@@ -26,8 +26,7 @@ _FAULTS = dict(CORRECTNESS_COLUMNS) | {
     k: f"wrong {n}" for k, n in CORRECTNESS_COLUMNS if k in ("wrong_speed", "wrong_motion", "wrong_size")
 }
 NEES = {"sigma": "NEES", "sigma_yaw": "yaw", "sigma_speed": "speed"}
-MAX_WORST = 6
-"""Agents that are named; the document has all."""
+MAX_WORST = 6  # agents that are named; the document has all
 
 
 def wrong_parts(found: Mapping[str, Any]) -> list[str]:
@@ -46,9 +45,7 @@ def wrong_parts(found: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def correctness_lines(
-    found: Mapping[str, Any], columns_text: Callable[[Sequence[Sequence[str]]], list[str]]
-) -> list[str]:
+def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     """Format the part `correctness` of a result of `evaluate` as tables; no line where nothing was judged."""
     if not found["ticks"]:
         return []
@@ -76,8 +73,8 @@ def _cells(found: Mapping[str, Any]) -> list[list[str]]:
         if figures["ticks"]:
             parts = [figures[key] for key, _ in CORRECTNESS_COLUMNS]
             shares = [f"{100 * p['share']:.1f} ({p['agents']})" if p["ticks"] else "-" for p in parts]
-            doubted = [_number(_times_100(figures["doubted"][key]), 0) for key in ("wrong_ticks", "right_ticks")]
-            nees = [_number(figures[key]["nees"], 1) for key in NEES]
+            doubted = [_cell(figures["doubted"][key], 0, 100) for key in ("wrong_ticks", "right_ticks")]
+            nees = [_cell(figures[key]["nees"], 1) for key in NEES]
             cells.append([name, str(figures["agents"]), str(figures["ticks"]), *shares, *doubted, *nees])
     return cells
 
@@ -104,8 +101,8 @@ def _calibration_lines(found: Mapping[str, Any]) -> list[str]:
     for a, b in zip(ticks["bins"], agents["bins"], strict=True):
         if a["count"]:
             lines.append(
-                f"  {a['low']:.1f}-{a['high']:.1f}: {_number(a['right'], 3)} of {a['count']} ticks right, "
-                f"{_number(b['right'], 3)} of {_noun(b['count'], 'agent')}"
+                f"  {a['low']:.1f}-{a['high']:.1f}: {_cell(a['right'], 3)} of {a['count']} ticks right, "
+                f"{_cell(b['right'], 3)} of {_noun(b['count'], 'agent')}"
             )
     return lines
 
@@ -138,25 +135,13 @@ def _noun(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
-def _times_100(value: float | None) -> float | None:
-    return None if value is None else 100 * value
-
-
 def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.0f} %"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
 MAX_COLUMNS = 100
-MAX_NAMED = 3
-"""Agents that a line of the verdict names; the tables have more, the document all."""
-
-MAX_NAME = 16
-"""Characters of the id of a labeled object; some logs use 36."""
-
+MAX_NAMED = 3  # agents that a line of the verdict names; the tables have more, the document all
+MAX_NAME = 16  # characters of the id of a labeled object; some logs use 36
 _COLUMNS = (
     ("recall", "recall %", 1), ("precision", "precis. %", 1), ("position_rmse_m", "rms m", 2), ("position_median_m", "med m", 2),
     ("yaw_median_deg", "yaw deg", 1), ("speed_rmse_mps", "m/s", 2), ("size_median_m", "size m", 2), ("id_switches", "id sw", 0),
@@ -269,7 +254,7 @@ def format_table(result: Mapping[str, Any]) -> str:
     if result["ego"] is not None:
         cells.append(["ego", "", *_values(result["ego"])])
     blocks += ["", *columns_text(cells)] if blocks else columns_text(cells)
-    return "\n".join([*blocks, *correctness_lines(result["correctness"], columns_text), *map_lines(result)])
+    return "\n".join([*blocks, *correctness_lines(result["correctness"]), *map_lines(result)])
 
 
 def _values(figures: Mapping[str, Any]) -> list[str]:

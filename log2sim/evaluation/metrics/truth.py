@@ -67,8 +67,6 @@ class PointGrid:
 def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> Array:
     """Compute the share (M,) of the outline of each box of the map frame that lies inside the image.
 
-    Notes
-    -----
     The outline is the convex hull of the part of the box in front of the camera on the plane at depth 1, where edges are
     straight for any lens. The share is that of a grid of samples, accurate to 1 or 2 %: exact clipping would need the
     image border on that plane, which does not exist for every strong distortion.
@@ -90,27 +88,20 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
 def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> list[Array]:
     """Sample pixels (S, 2) evenly over the part of each box's outline inside the image; none for a box outside.
 
-    Notes
-    -----
     As in `image_shares`, but with a grid over the view only: next to the camera an outline on the plane at depth 1 can be
     so wide that a grid over all of it has no sample inside the image.
     """
     corners = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3)).reshape(-1, 8, 3)
-    low, high = _view(camera)
+    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
+    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
+    # Distortion widens a view on this plane to at most three times that of a pinhole.
+    low, high = (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
     found = []
     for box in corners:
         rays = _samples(convex_hull(outline(box)), low, high)
         uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
         found.append(uv[inside])
     return found
-
-
-def _view(camera: Camera) -> tuple[Array, Array]:
-    """Bound the view on the plane at depth 1 by corners (2,), (2,); exact without distortion."""
-    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
-    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
-    # Distortion widens a view on this plane to at most three times that of a pinhole.
-    return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
 
 
 def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
@@ -131,8 +122,6 @@ def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | f
 def convex_hull(points: Array) -> Array:
     """Compute the convex hull (K, 2), counter-clockwise, of points (N, 2).
 
-    Notes
-    -----
     Andrew's monotone chain (1979). Points on one line give a polygon without area.
     """
     ordered = np.unique(points, axis=0).tolist()
@@ -153,24 +142,14 @@ def _turn(a: list[float], b: list[float], c: list[float]) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-MAX_STAMP_LAG_NS = 50_000_000
-"""A region belongs to the frame nearest to its stamp within this time."""
+MAX_STAMP_LAG_NS = 50_000_000  # a region belongs to the frame nearest to its stamp within this time
 
 
 def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
     """Collect the ignore regions of a log; None when its labels are complete.
 
-    Parameters
-    ----------
-    log : Log
-        Its labels may be limited to the views of some cameras and to some categories, and it may have ignored regions.
-    t0_ns : int
-        Start of the truth.
-
-    Raises
-    ------
-    LogError
-        When labels refer to a camera that the log does not have.
+    `log`: its labels may be limited to the views of some cameras and to some categories, and it may have ignored
+    regions. `t0_ns`: start of the truth. Raises `LogError` when labels refer to a camera that the log does not have.
     """
     only = None if log.labels is None else log.labels.cameras
     never = () if log.labels is None else log.labels.never_labeled
@@ -203,8 +182,7 @@ def _label_view(log: Log, name: str, t0_ns: int) -> LabelView:
 
 MIN_POINTS = 20
 MIN_IMAGE_SHARE = 0.5
-MAX_LAG_S = 0.1
-"""A label is compared with the nearest sweep and frames within this time."""
+MAX_LAG_S = 0.1  # a label is compared with the nearest sweep and frames within this time
 SPEED_WINDOW_S = 0.25
 MAX_STATIC_REACH_M = 0.5
 MAX_STATIC_DRIFT_MPS = 0.2
@@ -241,26 +219,11 @@ def truth_at(
 ) -> Scenario:
     """Load ground truth from a scenario or a log: its `truth.json`, else its labels in view of the sensors used.
 
-    Parameters
-    ----------
-    source : Scenario, Log, Path or str
-    used : iterable of str or None
-        Cameras that were used, all of the log for None. Without any camera, what the LiDARs show counts as visible.
-    sequence : str or None
-        Of a folder with several.
-    provenance : mapping, optional
-        States the poses by which labels are placed, so that they are in the map of what is compared.
-    labels : Path, optional
-        File with the true boxes of the log; see `log2sim.logs.label_files`.
-    points : bool
-        Whether LiDAR points are counted in all boxes, also where the truth states what is visible.
-    progress : callable, optional
-        As for `truth_from_log`.
-
-    Raises
-    ------
-    LogError
-        When there are no labels, or they cannot be read.
+    `used`: cameras that were used, all of the log for None. Without any camera, what the LiDARs show counts as visible.
+    `sequence`: of a folder with several. `provenance`: states the poses by which labels are placed, so that they are in
+    the map of what is compared. `labels`: file with the true boxes of the log; see `log2sim.logs.label_files`.
+    `points`: whether LiDAR points are counted in all boxes, also where the truth states what is visible. `progress`: as
+    for `truth_from_log`. Raises `LogError` when there are no labels, or they cannot be read.
     """
     if isinstance(source, Scenario):
         return source
@@ -294,24 +257,11 @@ def truth_from_log(
 ) -> Scenario:
     """Make a truth scenario of a log's labeled 3D boxes and its ego poses.
 
-    Parameters
-    ----------
-    cameras : sequence of str, optional
-        Cameras that were used, all by default; only what they show counts as visible.
-    points : bool
-        Whether LiDAR points are counted also where the log states visibility, which needs none.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps); every sweep is read once.
+    `cameras`: cameras that were used, all by default; only what they show counts as visible. `points`: whether LiDAR
+    points are counted also where the log states visibility, which needs none. `progress`: called with (sweeps done, all
+    sweeps); every sweep is read once. Raises `LogError` when the log has no labels. Raises `ConfigError` for a camera
+    that the log does not have.
 
-    Raises
-    ------
-    LogError
-        When the log has no labels.
-    ConfigError
-        For a camera that the log does not have.
-
-    Notes
-    -----
     A box is visible when at least half of its outline is inside a used camera's image and at least 20 LiDAR points are in
     it. Without cameras or without LiDAR the other condition decides; visibility that the log states takes precedence.
     """
@@ -536,8 +486,6 @@ def is_static(t_s: Array, xy_m: Array) -> bool:
 def speed_along(t_s: Array, xy_m: Array, yaw_rad: Array) -> Array:
     """Estimate the speed (T,), m/s, along the heading by a line fitted to positions (T, 2) within a quarter second.
 
-    Notes
-    -----
     5 cm of label noise give 0.7 m/s in differences of neighbors, 0.16 m/s in the fit at 10 Hz. A waypoint with no neighbor
     within the window takes the slope to its neighbors, a single one has speed 0.
     """

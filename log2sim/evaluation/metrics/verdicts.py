@@ -24,54 +24,30 @@ from log2sim.evaluation.metrics.comparison import (
 )
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 
-MIN_WALKING_MPS = 0.5
-"""The heading of a slower pedestrian does not count."""
+MIN_WALKING_MPS = 0.5  # the heading of a slower pedestrian does not count
 
 
 @dataclass(frozen=True, eq=False)
 class StateErrors:
-    """Errors of K matched agent-ticks.
+    """Errors of K matched agent-ticks."""
 
-    Attributes
-    ----------
-    truth, tick, other : (K,) int64
-        Indices of the truth agent, the tick and the reconstructed agent.
-    position_m : (K,) float64
-        2D distance of box centers.
-    yaw_rad : (K,) float64
-        Absolute, in [0, pi]; NaN where yaw does not count.
-    speed_mps : (K,) float64
-        Signed.
-    size_m : (K, 3) float64
-        Signed errors of length, width, height.
-    """
-
+    # truth, tick, other: (K,) indices of the truth agent, the tick and the reconstructed agent.
     truth: Index
     tick: Index
     other: Index
-    position_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    size_m: Array
+    position_m: Array  # (K,) 2D distance of box centers
+    yaw_rad: Array  # (K,) absolute, in [0, pi]; NaN where yaw does not count
+    speed_mps: Array  # (K,) signed
+    size_m: Array  # (K, 3) signed errors of length, width, height
 
     def take(self, index: Mask) -> StateErrors:
         """Return the rows at `index`."""
-        return StateErrors(
-            self.truth[index],
-            self.tick[index],
-            self.other[index],
-            self.position_m[index],
-            self.yaw_rad[index],
-            self.speed_mps[index],
-            self.size_m[index],
-        )
+        return StateErrors(*(column[index] for column in vars(self).values()))
 
 
 def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64], counted: Mask) -> StateErrors:
     """Compare matched states at the counted ticks.
 
-    Notes
-    -----
     Yaw counts for vehicles, two-wheelers and pedestrians of at least 0.5 m/s. The speed of a box turned by more than 90
     degrees is taken along the truth's heading, so that a flipped box is an error of yaw only.
     """
@@ -103,7 +79,11 @@ def summarize(errors: StateErrors) -> dict[str, float | None]:
     truth agents of their mean distance.
     """
     headed = errors.yaw_rad[np.isfinite(errors.yaw_rad)]
-    by_agent = agent_means(errors.truth, np.column_stack([np.abs(errors.size_m), errors.position_m]))
+    values = np.column_stack([np.abs(errors.size_m), errors.position_m])
+    names, index, count = np.unique(errors.truth, return_inverse=True, return_counts=True)
+    total = np.zeros((len(names), values.shape[1]))
+    np.add.at(total, index, values)
+    by_agent = total / count[:, None]
     return {
         "position_rmse_m": root_mean_square(errors.position_m),
         "position_median_m": median(errors.position_m),
@@ -118,14 +98,6 @@ def summarize(errors: StateErrors) -> dict[str, float | None]:
     }
 
 
-def agent_means(agent: Index, values: Array) -> Array:
-    """Average values (K, V) over the rows of each agent that occurs in `agent` (K,): (A', V)."""
-    names, index, count = np.unique(agent, return_inverse=True, return_counts=True)
-    total = np.zeros((len(names), values.shape[1]))
-    np.add.at(total, index, values)
-    return total / count[:, None]
-
-
 def root_mean_square(values: Array) -> float | None:
     """Compute the root mean square of values (K,); None without any."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
@@ -136,58 +108,37 @@ def median(values: Array) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
+# Six standard deviations of a speed from labels with 5 cm of noise at 10 Hz, 0.16 m/s; see `truth.speed_along`.
 MAX_SPEED_ERROR_MPS = 1.0
-"""Six standard deviations of a speed from labels with 5 cm of noise at 10 Hz, 0.16 m/s; see `truth.speed_along`."""
 
-MAX_STANDING_MPS = 0.5
-"""Slower is standing: three standard deviations of such a speed, and no more than a body sways."""
-
+MAX_STANDING_MPS = 0.5  # slower is standing: three standard deviations of such a speed, and no more than a body sways
+# From here on an object surely moves, a slow walk already. Speeds between both limits count as neither.
 MIN_MOVING_MPS = 1.0
-"""From here on an object surely moves, a slow walk already. Speeds between both limits count as neither."""
 
 MAX_SIZE_ERROR_SHARE = 0.25
+# A smaller error of a length or width is never wrong: stride and arms change the box of a person by as much.
 MIN_SIZE_ERROR_M = 0.3
-"""A smaller error of a length or width is never wrong: stride and arms change the box of a person by as much."""
 
+# An agent is wrong at a tick when at least one of these is true of it.
 MEASURES = ("invented", "duplicate", "in_ego", "wrong_speed", "wrong_motion", "backwards", "wrong_size")
-"""An agent is wrong at a tick when at least one of these is true of it."""
 
 REPORTED = (*MEASURES, "wrong_class")
 
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """Verdicts on B reconstructed agents at T ticks.
+    """Verdicts on B reconstructed agents at T ticks."""
 
-    Attributes
-    ----------
-    judged : (B, T) bool
-        Where the labels are complete or the agent matches one; no other mask is true elsewhere.
-    undecided : (B, T) bool
-        The other selected ticks.
-    matched : (B, T) int64
-        Index of the matched truth agent at judged ticks, -1 for none.
-    taken_for : (B, T) int64
-        Index of the truth agent that is there: the matched one, else the nearest of the same kind within its gate, else the
-        nearest of another kind within its gate; -1 for none.
-    measures : mapping of str to (B, T) bool
-        By the names in `REPORTED`.
-    error_m : (B, T, 2) float64, m
-        Position error of matched agents; NaN elsewhere.
-    error_rad : (B, T) float64
-        Error of their heading up to half turns; NaN elsewhere and where heading does not count.
-    error_mps : (B, T) float64, m/s
-        Error of their speed; NaN elsewhere.
-    """
-
-    judged: Mask
-    undecided: Mask
-    matched: Index
+    judged: Mask  # (B, T) where the labels are complete or the agent matches one; no other mask is true elsewhere
+    undecided: Mask  # (B, T) the other selected ticks
+    matched: Index  # (B, T) index of the matched truth agent at judged ticks, -1 for none
+    # (B, T) index of the truth agent that is there: the matched one, else the nearest of the same kind within its
+    # gate, else the nearest of another kind within its gate; -1 for none.
     taken_for: Index
-    measures: Mapping[str, Mask]
-    error_m: Array
-    error_rad: Array
-    error_mps: Array
+    measures: Mapping[str, Mask]  # T) bool, by the names in `REPORTED`
+    error_m: Array  # (B, T, 2) position error of matched agents; NaN elsewhere
+    error_rad: Array  # (B, T) error of their heading up to half turns; NaN elsewhere and where heading does not count
+    error_mps: Array  # (B, T) error of their speed; NaN elsewhere
 
     @property
     def wrong(self) -> Mask:
@@ -198,8 +149,6 @@ class Verdicts:
 def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     """Judge every selected tick of every reconstructed agent; `ego` has one row.
 
-    Notes
-    -----
     Agents are associated one to one with labeled objects of their kind (`GROUPS`), visible or hidden, as for recall and
     precision (`clear_mot.associate`): within 2 m, less than half a car's length, or a quarter of the true length where
     that is more.
@@ -220,7 +169,9 @@ def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     the ego is there, and where the only labeled object within the gate is interpolated over a gap of its labels.
     """
     truth, other = c.truth, c.other
-    matched = _partners(c)
+    i, t = np.nonzero(c.match >= 0)
+    matched: Index = np.full(c.false.shape, -1, dtype=np.int64)
+    matched[c.match[i, t], t] = i
     same = c.pairs.take(c.pairs.same_group)
     near, near_labeled = (_marked(c.false.shape, same.other[k], same.tick[k]) for k in (slice(None), _labeled_rows(c)))
     in_ego = _in_ego(truth, other, matched, ego)
@@ -232,7 +183,15 @@ def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     errors = errors.take(known[errors.other, errors.tick])
     measures = {"invented": invented, "duplicate": duplicate, "in_ego": in_ego & judged}
     measures |= {k: _at(errors, wrong, judged.shape) for k, wrong in _state_verdicts(truth, other, errors).items()}
-    taken_for = np.where(judged, _nearest(c, matched), -1)
+    # (B, T) the matched truth agent, else the nearest within the gate, those of the same kind first; -1 for none.
+    p = c.pairs
+    place = p.other * matched.shape[1] + p.tick
+    order = np.lexsort((p.distance_m, ~p.same_group, place))
+    _, first = np.unique(place[order], return_index=True)
+    rows = order[first]
+    nearest = np.full(matched.shape, -1, dtype=np.int64)
+    nearest[p.other[rows], p.tick[rows]] = p.truth[rows]
+    taken_for = np.where(judged, np.where(matched >= 0, matched, nearest), -1)
     measures["wrong_class"] = (taken_for >= 0) & (_category(truth, taken_for) != other.category[:, None])
     gap = other.xy_m[errors.other, errors.tick] - truth.xy_m[errors.truth, errors.tick]
     return Verdicts(
@@ -292,30 +251,10 @@ def _of_matched(matched: Index, of_truth: Mask) -> Mask:
     return mask
 
 
-def _partners(c: Comparison) -> Index:
-    """Return (B, T) the truth agent that matches each reconstructed agent, -1 for none."""
-    i, t = np.nonzero(c.match >= 0)
-    partner = np.full(c.false.shape, -1, dtype=np.int64)
-    partner[c.match[i, t], t] = i
-    return partner
-
-
 def _labeled_rows(c: Comparison) -> Index:
     """Select of the pairs of one kind those whose truth is labeled at the tick."""
     same = c.pairs.take(c.pairs.same_group)
     return np.flatnonzero(c.truth.labeled[same.truth, same.tick])
-
-
-def _nearest(c: Comparison, matched: Index) -> Index:
-    """Return (B, T) the matched truth agent, else the nearest within the gate, those of the same kind first; -1 for none."""
-    p = c.pairs
-    place = p.other * matched.shape[1] + p.tick
-    order = np.lexsort((p.distance_m, ~p.same_group, place))
-    _, first = np.unique(place[order], return_index=True)
-    rows = order[first]
-    nearest = np.full(matched.shape, -1, dtype=np.int64)
-    nearest[p.other[rows], p.tick[rows]] = p.truth[rows]
-    return np.where(matched >= 0, matched, nearest)
 
 
 def _category(truth: StateTable, index: Index) -> np.ndarray[tuple[int, ...], np.dtype[np.str_]]:

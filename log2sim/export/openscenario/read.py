@@ -57,11 +57,7 @@ def _polyline(follow: Element, where: str) -> Array:
     scale, offset = (require_number(timing.get(key), f"{where}: Timing {key}") for key in ("scale", "offset"))
     rows = np.array([[require_number(n.get("time"), f"{where}: Vertex time"), *_pose(n, where)] for n in nodes])
     rows[:, 0] = offset + scale * rows[:, 0]
-    return _with_headings(rows)
-
-
-def _with_headings(rows: Array) -> Array:
-    """Fill in the direction of travel for vertices (V, 5) without a heading: leaving it out does not mean 0."""
+    # Fill in the direction of travel for vertices (V, 5) without a heading: leaving it out does not mean 0.
     absent = np.isnan(rows[:, 4])
     steps = np.diff(rows[:, 1:3], axis=0)
     moving = np.flatnonzero(np.hypot(*steps.T) > 0)
@@ -87,25 +83,6 @@ def _pose(node: Element, where: str) -> list[float]:
     if abs(heading) > MAX_HEADING_RAD:
         raise ScenarioError(f"{where}: WorldPosition h is {heading:g}, expected radians")
     return [x, y, z, heading]
-
-
-def initial_positions(root: Element) -> dict[str, Element]:
-    """Return by entity its initial position in the file."""
-    found: dict[str, Element] = {}
-    for private in root.iterfind("Storyboard/Init/Actions/Private"):
-        teleport = private.find("PrivateAction/TeleportAction")
-        if teleport is not None:
-            found.setdefault(private.get("entityRef", ""), teleport)
-    return found
-
-
-def stationary_vertices(start: Element | None, where: str, last_s: float) -> Array:
-    """Return vertices (2, 5) of an entity that stands at its initial position."""
-    if start is None:
-        raise ScenarioError(f"{where}: has neither a trajectory nor a position at the start; nothing says where it is")
-    pose = _pose(start, where)
-    result: Array = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
-    return result
 
 
 def speeds_of(vertices: Array) -> Array:
@@ -154,7 +131,12 @@ def _scenario(root: Element, path: Path) -> Scenario:
     placement = _placement(parameters, frame)
     vertices = vertices_by_entity(root)
     last_s = max((rows[-1, 0] for rows in vertices.values()), default=0.0)
-    starts = initial_positions(root)
+    # By entity its initial position in the file.
+    starts: dict[str, Element] = {}
+    for private in root.iterfind("Storyboard/Init/Actions/Private"):
+        teleport = private.find("PrivateAction/TeleportAction")
+        if teleport is not None:
+            starts.setdefault(private.get("entityRef", ""), teleport)
     agents = [
         _agent(o, vertices.get(o.get("name", "")), starts, last_s, placement)
         for o in root.iterfind("Entities/ScenarioObject")
@@ -163,11 +145,14 @@ def _scenario(root: Element, path: Path) -> Scenario:
         raise ScenarioError("its <Entities> hold no <ScenarioObject>, expected at least one")
     header = root.find("FileHeader")
     title = header.get("description", "") if header is not None else ""
+    text = parameters.get("log2sim_t0_ns", "0")
+    if not re.fullmatch(r"-?[0-9]{1,19}", text):
+        raise ScenarioError(f"parameter log2sim_t0_ns is {text[:40]!r}, expected nanoseconds")
     return Scenario.from_dict(
         {
             "scenario_version": VERSION,
             "name": unescaped(parameters["log2sim_name"]) if "log2sim_name" in parameters else title or path.stem,
-            "t0_ns": _nanoseconds(parameters.get("log2sim_t0_ns", "0")),
+            "t0_ns": int(text),
             "duration_s": require_number(
                 parameters.get("log2sim_duration_s", str(last_s)), "parameter log2sim_duration_s"
             ),
@@ -190,12 +175,6 @@ def _resolve(root: Element, parameters: Mapping[str, str]) -> None:
                         f"<{node.tag}> {key}: {value[:40]!r} is no parameter of the file, expected one or a value"
                     )
                 node.set(key, parameters[value[1:]])
-
-
-def _nanoseconds(text: str) -> int:
-    if not re.fullmatch(r"-?[0-9]{1,19}", text):
-        raise ScenarioError(f"parameter log2sim_t0_ns is {text[:40]!r}, expected nanoseconds")
-    return int(text)
 
 
 def _map(text: str | None) -> MapFrame:
@@ -242,7 +221,14 @@ def _agent(
     offset_m = require_number(center.get("x"), f"{where}: Center x")
     height_m = require_number(center.get("z"), f"{where}: Center z")
     if vertices is None:
-        vertices = stationary_vertices(starts.get(name), where, last_s)
+        # Vertices (2, 5) of an entity that stands at its initial position.
+        start = starts.get(name)
+        if start is None:
+            raise ScenarioError(
+                f"{where}: has neither a trajectory nor a position at the start; nothing says where it is"
+            )
+        pose = _pose(start, where)
+        vertices = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
     return {
         "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _agent_id(name, properties),
         "category": properties.get(PREFIX + "category") or _category(body),

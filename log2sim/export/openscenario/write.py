@@ -24,28 +24,19 @@ from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
 from log2sim.geometry import Array
 
-PREFIX = "log2sim."
-"""Prefix of the properties that only `log2sim import` reads."""
+PREFIX = "log2sim."  # prefix of the properties that only `log2sim import` reads
 
 
 @dataclass(frozen=True)
 class VehicleDefaults:
-    """Values that OpenSCENARIO requires and scenarios do not contain; the limits are only wide enough for the scenario.
+    """Values that OpenSCENARIO requires and scenarios do not contain; the limits are only wide enough for the scenario."""
 
-    Attributes
-    ----------
-    category : str
-        OpenSCENARIO's vehicle category.
-    tracks : bool
-        Whether an axle has two wheels.
-    """
-
-    category: str
+    category: str  # openSCENARIO's vehicle category
     wheel_diameter_m: float
     max_steering_rad: float
     max_speed_mps: float
     max_acceleration_mps2: float
-    tracks: bool = True
+    tracks: bool = True  # whether an axle has two wheels
 
 
 VEHICLE_DEFAULTS: Mapping[str, VehicleDefaults] = {
@@ -75,7 +66,21 @@ def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external
         kind = VEHICLE_DEFAULTS[agent.category]
         body = element("Vehicle", scenario_object, name=agent.category, vehicleCategory=kind.category)
         _add_box(body, agent)
-        _add_limits(body, agent, kind)
+        length, width, _ = agent.size_m
+        fastest = float(np.abs(agent.waypoints.speed_mps).max())
+        acceleration = number(kind.max_acceleration_mps2)
+        element(
+            "Performance", body, maxSpeed=number(max(kind.max_speed_mps, fastest)), maxAcceleration=acceleration, maxDeceleration=acceleration
+        )  # fmt: skip
+        wheelbase = 2 * agent.rear_axle_offset_m if agent.rear_axle_offset_m > 0 else WHEELBASE_SHARE * length
+        shared = {
+            "wheelDiameter": number(kind.wheel_diameter_m),
+            "trackWidth": number(TRACK_SHARE * width if kind.tracks else 0.0),
+            "positionZ": number(kind.wheel_diameter_m / 2),
+        }
+        axles = element("Axles", body)
+        element("FrontAxle", axles, maxSteering=number(kind.max_steering_rad), positionX=number(wheelbase), **shared)
+        element("RearAxle", axles, maxSteering="0", positionX="0", **shared)
     _add_properties(body, agent, minor)
     if external and minor > 0:
         controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
@@ -89,24 +94,6 @@ def _add_box(parent: Element, agent: Agent) -> None:
     box = element("BoundingBox", parent)
     element("Center", box, x=number(agent.rear_axle_offset_m), y="0", z=number(height / 2))
     element("Dimensions", box, width=number(width), length=number(length), height=number(height))
-
-
-def _add_limits(parent: Element, agent: Agent, kind: VehicleDefaults) -> None:
-    length, width, _ = agent.size_m
-    fastest = float(np.abs(agent.waypoints.speed_mps).max())
-    acceleration = number(kind.max_acceleration_mps2)
-    element(
-        "Performance", parent, maxSpeed=number(max(kind.max_speed_mps, fastest)), maxAcceleration=acceleration, maxDeceleration=acceleration
-    )  # fmt: skip
-    wheelbase = 2 * agent.rear_axle_offset_m if agent.rear_axle_offset_m > 0 else WHEELBASE_SHARE * length
-    shared = {
-        "wheelDiameter": number(kind.wheel_diameter_m),
-        "trackWidth": number(TRACK_SHARE * width if kind.tracks else 0.0),
-        "positionZ": number(kind.wheel_diameter_m / 2),
-    }
-    axles = element("Axles", parent)
-    element("FrontAxle", axles, maxSteering=number(kind.max_steering_rad), positionX=number(wheelbase), **shared)
-    element("RearAxle", axles, maxSteering="0", positionX="0", **shared)
 
 
 def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
@@ -170,28 +157,16 @@ class Revision:
 
 @dataclass(frozen=True, eq=False)
 class AgentStory:
-    """What one agent does.
-
-    Attributes
-    ----------
-    vertices : (V, 5) float64
-        t, x, y, z, heading of the reference point.
-    speed_mps : float
-        At the start.
-    enters, leaves : bool
-        Whether it is absent before and after the vertices.
-    hidden_m : float
-        How far below it waits in revisions without spawning.
-    external : bool
-        Whether it is driven from outside: it gets a place and a speed at the start, and nothing else.
-    """
+    """What one agent does."""
 
     name: str
-    vertices: Array
-    speed_mps: float
+    vertices: Array  # (V, 5) t, x, y, z, heading of the reference point
+    speed_mps: float  # at the start
+    # enters, leaves: whether it is absent before and after the vertices.
     enters: bool
     leaves: bool
-    hidden_m: float = HIDDEN_DEPTH_M
+    hidden_m: float = HIDDEN_DEPTH_M  # how far below it waits in revisions without spawning
+    # Whether it is driven from outside: it gets a place and a speed at the start, and nothing else.
     external: bool = False
 
     @property
@@ -209,14 +184,6 @@ class AgentStory:
         """The first pose as a vertex (5,), or the pose at 0 s if its waypoints begin before."""
         t_s = max(self.first_s, 0.0)
         return np.array([np.interp(t_s, self.vertices[:, 0], column) for column in self.vertices.T])
-
-
-def agent_stories(
-    agents: Sequence[Agent], names: Sequence[str], duration_s: float, placement: ExportPlacement
-) -> list[AgentStory]:
-    """Return the stories of all agents, each with a depth of its own where it is hidden."""
-    stories = [_agent_story(agent, name, duration_s, placement) for agent, name in zip(agents, names)]
-    return [replace(story, hidden_m=HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k) for k, story in enumerate(stories)]
 
 
 def _agent_story(agent: Agent, name: str, duration_s: float, placement: ExportPlacement) -> AgentStory:
@@ -248,7 +215,10 @@ def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float
     actions = element("Actions", element("Init", storyboard))
     for story in stories:
         if not story.enters or not revision.spawns:
-            _add_start(actions, story)
+            private = element("Private", actions, entityRef=story.name)
+            below_m = story.hidden_m if story.enters else 0.0
+            _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
+            _add_speed(private, "PrivateAction", 0.0 if story.enters else story.speed_mps)
         if story.external:
             _add_external_control(actions[-1], revision)
     act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
@@ -257,13 +227,6 @@ def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float
             _add_group(act, story, revision)
     _add_trigger(act, "StartTrigger", "at the start", 0.0, revision)
     _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, revision)
-
-
-def _add_start(actions: Element, story: AgentStory) -> None:
-    private = element("Private", actions, entityRef=story.name)
-    below_m = story.hidden_m if story.enters else 0.0
-    _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
-    _add_speed(private, "PrivateAction", 0.0 if story.enters else story.speed_mps)
 
 
 def _add_external_control(private: Element, revision: Revision) -> None:
@@ -294,7 +257,15 @@ def _add_group(act: Element, story: AgentStory, revision: Revision) -> None:
             _add_position(element("TeleportAction", element("PrivateAction", action)), story.vertices[0])
         _add_trigger(event, "StartTrigger", f"{story.name} is seen", story.first_s, revision)
     action, event = _event(maneuver, f"{story.name} follows", "parallel")
-    _add_trajectory(action, story, revision)
+    follow = element("FollowTrajectoryAction", element("RoutingAction", element("PrivateAction", action)))
+    holder = element("TrajectoryRef", follow) if revision.minor >= 1 else follow
+    trajectory = element("Trajectory", holder, name=f"{story.name} trajectory", closed="false")
+    polyline = element("Polyline", element("Shape", trajectory))
+    for row in story.vertices:
+        _add_position(element("Vertex", polyline, time=number(row[0], 9)), row)
+    timing = element("TimeReference", follow)
+    element("Timing", timing, domainAbsoluteRelative="absolute", scale="1", offset="0")
+    element("TrajectoryFollowingMode", follow, followingMode="position")
     _add_trigger(event, "StartTrigger", f"{story.name} may move", max(story.first_s, 0.0), revision)
     _add_end(maneuver, story, revision)
 
@@ -317,18 +288,6 @@ def _add_end(maneuver: Element, story: AgentStory, revision: Revision) -> None:
 def _event(maneuver: Element, name: str, priority: str) -> tuple[Element, Element]:
     event = element("Event", maneuver, name=name, priority=priority, maximumExecutionCount="1")
     return element("Action", event, name=f"{name} action"), event
-
-
-def _add_trajectory(action: Element, story: AgentStory, revision: Revision) -> None:
-    follow = element("FollowTrajectoryAction", element("RoutingAction", element("PrivateAction", action)))
-    holder = element("TrajectoryRef", follow) if revision.minor >= 1 else follow
-    trajectory = element("Trajectory", holder, name=f"{story.name} trajectory", closed="false")
-    polyline = element("Polyline", element("Shape", trajectory))
-    for row in story.vertices:
-        _add_position(element("Vertex", polyline, time=number(row[0], 9)), row)
-    timing = element("TimeReference", follow)
-    element("Timing", timing, domainAbsoluteRelative="absolute", scale="1", offset="0")
-    element("TrajectoryFollowingMode", follow, followingMode="position")
 
 
 def _add_position(parent: Element, vertex: Array, below_m: float = 0.0) -> None:
@@ -374,24 +333,23 @@ class OpenScenario:
             raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
         external = options.ego is not None
         if external:
-            _require_drivable_ego(scenario, str(options.ego))
+            # Raise unless there is an ego on wheels from the start, which another program can drive.
+            driver = str(options.ego)
+            if driver != EXTERNAL:
+                raise ConfigError(f"--ego {driver}: expected '{EXTERNAL}', an ego that another program drives")
+            ego = scenario.ego
+            if ego is None or ego.category == "pedestrian":
+                raise ConfigError(
+                    f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive"
+                )
+            if ego.waypoints.t_s[0] > SAME_TIME_S:
+                first_s = float(ego.waypoints.t_s[0])
+                raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
         road, placement = add_road_file(scenario, folder, options.map)
         write(document(scenario, road, placement, revision, external=external), folder / "scenario.xosc")
 
 
 EXPORTER = OpenScenario()
-
-
-def _require_drivable_ego(scenario: Scenario, driver: str) -> None:
-    """Raise unless there is an ego on wheels from the start, which another program can drive."""
-    if driver != EXTERNAL:
-        raise ConfigError(f"--ego {driver}: expected '{EXTERNAL}', an ego that another program drives")
-    ego = scenario.ego
-    if ego is None or ego.category == "pedestrian":
-        raise ConfigError(f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
-    if ego.waypoints.t_s[0] > SAME_TIME_S:
-        first_s = float(ego.waypoints.t_s[0])
-        raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
 
 
 def document(
@@ -400,7 +358,8 @@ def document(
     """Return the document of a scenario whose road is in the file `road` beside it; an `external` ego is driven from outside."""
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
-    stories = agent_stories(scenario.agents, names, duration_s, placement)
+    stories = [_agent_story(agent, name, duration_s, placement) for agent, name in zip(scenario.agents, names)]
+    stories = [replace(story, hidden_m=HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k) for k, story in enumerate(stories)]
     driven = [external and agent.id == EGO for agent in scenario.agents]
     stories = [replace(story, external=flag) for story, flag in zip(stories, driven)]
     require_start_as_in_scenario(scenario.agents, _boxes(scenario, start_poses(stories, revision)))

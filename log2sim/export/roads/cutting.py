@@ -12,11 +12,10 @@ from log2sim.datatypes import MapLane
 from log2sim.road.polyline import Polyline
 from log2sim.road.routes import Beside, find_beside
 
-ALIGNED_M = 0.3
-"""Lanes side by side whose ends are farther apart along the road than this are roads of their own."""
-
+ALIGNED_M = 0.3  # lanes side by side whose ends are farther apart along the road than this are roads of their own
+# An end that is linked with nothing may move back by so much: a vehicle beyond it still stands on the road with its
+# rear.
 FREE_M = 1.0
-"""An end that is linked with nothing may move back by so much: a vehicle beyond it still stands on the road with its rear."""
 
 
 def is_connection(lane: MapLane, by_id: Mapping[str, MapLane]) -> bool:

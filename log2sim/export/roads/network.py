@@ -14,11 +14,8 @@ from log2sim.export.roads.reference_line import ReferenceLine, fit
 from log2sim.geometry import Array
 from log2sim.road.polyline import Polyline
 
-LEVEL_M = 5.0
-"""Length over which heights are averaged against their noise."""
-
-EXACT_M = 0.002
-"""How far widths between stations may be from what is written."""
+LEVEL_M = 5.0  # length over which heights are averaged against their noise
+EXACT_M = 0.002  # how far widths between stations may be from what is written
 
 
 def elevation_profile(stations: Array, ground_m: Array, length_m: float) -> Array:
@@ -64,8 +61,7 @@ def _merged_cubics(rows: Array) -> Array:
     return np.array(kept)
 
 
-USUAL_WIDTH_M = 0.12
-"""Of lane lines: 12 cm on most roads (RMS 1993)."""
+USUAL_WIDTH_M = 0.12  # of lane lines: 12 cm on most roads (RMS 1993)
 
 
 @dataclass(frozen=True)
@@ -110,15 +106,14 @@ class MarkFinder:
         return RoadMark("broken" if item.kind == "dashed" else "solid", item.color or "standard", item.width_m)
 
 
+# Roads go on straight for so long where nothing is known of what is before or after them, so that whole vehicles are
+# on them.
 EXTENSION_M = 10.0
-"""Roads go on straight for so long where nothing is known of what is before or after them, so that whole vehicles are on them."""
 
-STEP_M = 2.0
-"""Stations at which widths are taken."""
+STEP_M = 2.0  # stations at which widths are taken
 
 
-TAPER_M = 10.0
-"""Over so much of its length a lane changes to the width that it has in the next road."""
+TAPER_M = 10.0  # over so much of its length a lane changes to the width that it has in the next road
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,51 +126,29 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """What is before or after a road.
+    """What is before or after a road."""
 
-    Attributes
-    ----------
-    kind : str
-        "road" or "junction".
-    number : int
-        Its id.
-    lanes : mapping of int to int
-        Lane ids of this road and those of the other, empty for a junction.
-    point : int
-        Start (0) or end (-1) of the other road.
-    """
-
-    kind: str
-    number: int
+    kind: str  # "road" or "junction"
+    number: int  # its id
+    # Lane ids of this road and those of the other, empty for a junction.
     lanes: Mapping[int, int] = field(default_factory=dict)
-    point: int = 0
+    point: int = 0  # start (0) or end (-1) of the other road
 
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A road whose reference line is the middle of one of the lanes that lead along it.
+    """A road whose reference line is the middle of one of the lanes that lead along it."""
 
-    Attributes
-    ----------
-    number : int
-        Its id.
-    lanes : tuple of MapLane
-        Along the line, from the left to the right: lane -1, -2, ...
-    elevation, offset : (K, 5) float64
-        Stations and coefficients a, b, c, d of cubics: the height, and how far the left edge of lane -1 is left of the line.
-    widths, opposite_widths : tuple of (K, 5) float64
-        Of the lanes, along the line.
-    opposite : tuple of MapLane
-        Against the line, from the right to the left: lane 1, 2, ...
-    """
-
-    number: int
-    lanes: tuple[MapLane, ...]
+    number: int  # its id
+    lanes: tuple[MapLane, ...]  # along the line, from the left to the right: lane -1, -2,
     line: ReferenceLine
+    # elevation, offset: (K, 5) stations and coefficients a, b, c, d of cubics: the height, and how far the left edge
+    # of lane -1 is left of the line.
     elevation: Array
     offset: Array
+    # widths, opposite_widths: of the lanes, along the line.
     widths: tuple[Array, ...]
-    opposite: tuple[MapLane, ...] = ()
+    opposite: tuple[MapLane, ...] = ()  # against the line, from the right to the left: lane 1, 2,
     opposite_widths: tuple[Array, ...] = ()
     junction: int | None = None
     before: Link | None = None
@@ -199,7 +172,7 @@ def road_of_lanes(
     shared = [cross_heading(across, at) if h is None else h for at, h in zip((0, -1), headings)]
     poses = [None if f else np.array([*p[:2], h]) for f, p, h in zip(free, base.points_m[[0, -1]], shared)]
     line, stations = fit(base.points_m[:, :2], poses[0], poses[1])
-    s = _width_stations(line)
+    s = np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / STEP_M)), 1) + 1)
     edges = _edges(across, base, line.at(s))
     for at in (0, -1):
         near = np.clip(1.0 - np.abs(s - s[at]) / min(TAPER_M, line.length_m), 0.0, 1.0)
@@ -259,10 +232,6 @@ def cross_heading(group: Sequence[MapLane], at: int) -> float:
 def _surest(group: Sequence[MapLane]) -> MapLane:
     """Return the lane whose middle is the reference line of a road."""
     return max(group, key=lambda lane: (lane.confidence, -len(lane.id), lane.id))
-
-
-def _width_stations(line: ReferenceLine) -> Array:
-    return np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / STEP_M)), 1) + 1)
 
 
 def _edges(group: Sequence[MapLane], base: MapLane, reference: Array) -> Array:

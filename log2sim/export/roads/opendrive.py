@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapFeatures, MapFrame, MapLane, Marking, Scenario, Signal
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
 from log2sim.export.roads.network import MarkFinder, Network, Road, RoadMark, build_network
@@ -19,11 +19,8 @@ from log2sim.geometry import Array, wrap_angle
 from log2sim.road.lane_graph import add_missing_lanes, infer_lanes
 from log2sim.road.polyline import Polyline
 
-STANDING_M = 20.0
-"""Length of the lane under an agent that stands, where nobody moves: its whole vehicle is on it."""
-
-STANDING_WIDTH_M = 3.5
-"""Of that lane, as of lanes along paths."""
+STANDING_M = 20.0  # length of the lane under an agent that stands, where nobody moves: its whole vehicle is on it
+STANDING_WIDTH_M = 3.5  # of that lane, as of lanes along paths
 
 
 def lanes(scenario: Scenario) -> tuple[MapLane, ...]:
@@ -68,14 +65,13 @@ def edges_of(lane: MapLane) -> tuple[Array, Array]:
     return lane.points_m + left * half, lane.points_m - left * half
 
 
+# Lamps face the traffic that they are for; posts beside the road turn them by some degrees towards it.
 FACING_RAD = float(np.deg2rad(40.0))
-"""Lamps face the traffic that they are for; posts beside the road turn them by some degrees towards it."""
 
+# A light beyond a junction is at most so far from where its lanes end: across six lanes and two sidewalks.
 REACH_M = 40.0
-"""A light beyond a junction is at most so far from where its lanes end: across six lanes and two sidewalks."""
 
-ASIDE_M = 12.0
-"""It is at most so far beside the middle of a lane: three lanes and a sidewalk."""
+ASIDE_M = 12.0  # it is at most so far beside the middle of a lane: three lanes and a sidewalk
 
 
 def signal_lanes(signal: Signal, lanes: Sequence[MapLane]) -> list[MapLane]:
@@ -97,23 +93,15 @@ def signal_lanes(signal: Signal, lanes: Sequence[MapLane]) -> list[MapLane]:
     return found
 
 
-MARGIN_M = 5.0
-"""Lights before the junction stand at the stop line, which may be behind where the lane ends."""
+MARGIN_M = 5.0  # lights before the junction stand at the stop line, which may be behind where the lane ends
 
 
-LIGHT_TYPE = "1000001"
-"""Of a traffic light with three lamps, in the catalog "OpenDRIVE" that players know."""
-
-LIGHT_HEIGHT_M, LIGHT_WIDTH_M = 0.9, 0.3
-"""Of a signal head with three lamps of 200 mm (EN 12368)."""
-
+LIGHT_TYPE = "1000001"  # of a traffic light with three lamps, in the catalog "OpenDRIVE" that players know
+LIGHT_HEIGHT_M, LIGHT_WIDTH_M = 0.9, 0.3  # of a signal head with three lamps of 200 mm (EN 12368)
 DIGITS = 4
 
-STEP_M = 0.5
-"""Stations at which the nearest point of a road is looked for."""
-
-MAX_ASIDE_M = 15.0
-"""Crosswalks farther beside a road's reference line belong to another one."""
+STEP_M = 0.5  # stations at which the nearest point of a road is looked for
+MAX_ASIDE_M = 15.0  # crosswalks farther beside a road's reference line belong to another one
 
 
 @dataclass(frozen=True)
@@ -152,15 +140,6 @@ def _place_on(road: Road, xy_m: Array) -> tuple[float, float]:
     along = dx * np.cos(heading[k]) + dy * np.sin(heading[k])
     beyond = abs(along) > STEP_M
     return float(s[k]), np.inf if beyond else float(dy * np.cos(heading[k]) - dx * np.sin(heading[k]))
-
-
-def add_objects(parent: Element, road: Road, objects: RoadObjects) -> None:
-    """Add the crosswalks of a road."""
-    own = objects.crosswalks.get(road.number, ())
-    nodes = element("objects", parent) if own else parent
-    for marking, s, t in own:
-        heading = float(road.line.at(np.array([s]))[0, 2])
-        _add_crosswalk(nodes, marking, (s, t, heading))
 
 
 def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float, float]) -> None:
@@ -211,10 +190,7 @@ GAP_M = 1e-4
 def require_roads(root: Element, where: str) -> None:
     """Raise unless every road has geometry without gaps along s, stations in order and lanes with a width.
 
-    Raises
-    ------
-    ScenarioError
-        Naming the file and the road.
+    Raises `ScenarioError` that names the file and the road.
     """
     if root.tag != "OpenDRIVE" or root.find("header") is None:
         raise ScenarioError(f"{where}: its root is <{root.tag[:40]}>, expected <OpenDRIVE> with a <header>")
@@ -275,12 +251,8 @@ FAR_M = 1000.0
 def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, ExportPlacement]:
     """Write the road of a scenario into a folder, or a copy of the user's; return its name and the placement of agents on it.
 
-    Raises
-    ------
-    ScenarioError
-        When the user's file is no OpenDRIVE file that players can use.
-    ConfigError
-        When its coordinates cannot be brought together with the scenario's.
+    Raises `ScenarioError` when the user's file is no OpenDRIVE file that players can use. Raises `ConfigError` when its
+    coordinates cannot be brought together with the scenario's.
     """
     if map_path is None:
         placement = near_origin(scenario)
@@ -339,24 +311,25 @@ def document(scenario: Scenario, placement: ExportPlacement) -> Element:
         "header", root, revMajor="1", revMinor="7", name=escaped(scenario.name), version="1", vendor="log2sim",
         north=number(north), south=number(south), east=number(east), west=number(west),
     )  # fmt: skip
-    _add_place(header, scenario.map, placement)
+    # Add the geographic reference: projected coordinates are those of the file plus its offset.
+    if scenario.map.projection is not None:
+        element("geoReference", header).text = geo_reference(scenario.map.projection)
+    x, y, z = (float(a + b) for a, b in zip(scenario.map.offset_m, placement.origin_m))
+    if (x, y, z) != (0.0, 0.0, 0.0):
+        element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
     marks, objects = MarkFinder.of(scenario), RoadObjects.of(scenario, network.roads)
     for road in network.roads:
         node = _add_road(root, road, placement, marks)
-        add_objects(node, road, objects)
+        # Add the crosswalks of a road.
+        own = objects.crosswalks.get(road.number, ())
+        nodes = element("objects", node) if own else node
+        for marking, s, t in own:
+            heading = float(road.line.at(np.array([s]))[0, 2])
+            _add_crosswalk(nodes, marking, (s, t, heading))
         add_signals(node, road, objects, placement)
     for junction, name in network.junctions.items():
         _add_junction(root, junction, name, network)
     return root
-
-
-def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> None:
-    """Add the geographic reference: projected coordinates are those of the file plus its offset."""
-    if frame.projection is not None:
-        element("geoReference", header).text = geo_reference(frame.projection)
-    x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
-    if (x, y, z) != (0.0, 0.0, 0.0):
-        element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
 
 
 def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> Element:

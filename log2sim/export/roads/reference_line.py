@@ -30,24 +30,15 @@ MAX_LINE_SAGITTA_M = 1e-6
 
 @dataclass(frozen=True)
 class LinePiece:
-    """A line (curvature 0) or an arc.
+    """A line (curvature 0) or an arc."""
 
-    Attributes
-    ----------
-    s_m : float
-        Station of its start.
-    x_m, y_m, heading_rad : float
-        At its start.
-    curvature_1pm : float
-        Positive to the left.
-    """
-
-    s_m: float
+    s_m: float  # station of its start
+    # x_m, y_m, heading_rad: at its start.
     x_m: float
     y_m: float
     heading_rad: float
     length_m: float
-    curvature_1pm: float
+    curvature_1pm: float  # positive to the left
 
     @property
     def end(self) -> Array:

@@ -168,6 +168,11 @@ class NetworkDetector:
     range_m: float
     min_score: float | None
 
+    @property
+    def cache_key(self) -> str:
+        """All that its boxes depend on besides the clouds."""
+        return f"{self.network.digest()} {self.decode} {self.range_m} {self.min_score}"
+
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""
         found = self.candidates(cloud, earlier, weak=False)
@@ -387,6 +392,11 @@ class CheckedLidarDetector:
     def name(self) -> str:
         """Name in the provenance of a scenario."""
         return self.inner.name
+
+    @property
+    def cache_key(self) -> str | None:
+        """What its result depends on besides the clouds; None where it does not say, so that nothing of it is cached."""
+        return getattr(self.inner, "cache_key", None)
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud; `PluginError` when the detector raises something, or returns no `Boxes3D`."""

@@ -9,6 +9,7 @@ by a JSON document, see `NetworkInfo`. `log2sim/README.md` lists the channels fo
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from log2sim.datatypes import GROUPS
 from log2sim.errors import ConfigError
 from log2sim.files.documents import first_problem
-from log2sim.files.inputs import require_readable
+from log2sim.files.inputs import read_file, require_readable
 from log2sim.geometry import Array
 from log2sim.perception.detect3d.box_points import PointsOfBoxes
 from log2sim.perception.lidar.cloud import Cloud
@@ -395,6 +396,13 @@ class Network:
     path: Path
     info: NetworkInfo
     session: Any
+
+    def digest(self) -> str:
+        """Return what tells it from other networks: the content of its file, and the version of what runs it."""
+        import onnxruntime
+
+        content = read_file(self.path, MAX_FILE_BYTES, ConfigError)
+        return f"{hashlib.sha256(content).hexdigest()} onnxruntime {onnxruntime.__version__}"
 
     def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
         """Compute the maps (C, H / stride, W / stride) of a grid (12, H, W).

@@ -29,19 +29,11 @@ Size = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Asset:
-    """A blueprint and the difference of its size from the agent's.
-
-    Attributes
-    ----------
-    size_m : (3,) tuple of float, m
-        Length, width, height.
-    error_m : (3,) tuple of float, m
-        Size of the blueprint less that of the agent.
-    """
+    """A blueprint and the difference of its size from the agent's."""
 
     blueprint: str
-    size_m: Size
-    error_m: Size
+    size_m: Size  # (3,), m length, width, height
+    error_m: Size  # (3,), m size of the blueprint less that of the agent
 
 
 CARS: Mapping[str, Size] = {
@@ -149,12 +141,10 @@ def nearest_assets(agent: Agent, *, turn: int = 0, count: int = 3) -> tuple[Asse
     return tuple(assets[:count])
 
 
-SAMPLE_S = 0.05
-"""Spacing of the samples; linear interpolation errs by at most a h^2 / 8 = 3 mm at 10 m/s2."""
-
+SAMPLE_S = 0.05  # spacing of the samples; linear interpolation errs by at most a h^2 / 8 = 3 mm at 10 m/s2
 MAX_SAMPLED_BYTES = 1536 * 1024 * 1024
+# Of the numbers of a sample in the lists that are written, as objects of Python; 1.5 GiB hold 46 hours of one agent.
 BYTES_PER_SAMPLE = 480
-"""Of the numbers of a sample in the lists that are written, as objects of Python; 1.5 GiB hold 46 hours of one agent."""
 
 DISCONTINUITY_S = 1e-6  # spacing of the two samples at a discontinuity of the scenario
 
@@ -167,10 +157,8 @@ def controller_data() -> dict[str, float]:
 def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
     """Describe agents as `player` reads them. Their positions should be near the origin: CARLA computes in float32.
 
-    Raises
-    ------
-    ScenarioError
-        When their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for them.
+    Raises `ScenarioError` when their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for
+    them.
     """
     _require_few_samples(agents)
     begin_s = min(float(a.waypoints.t_s[0]) for a in agents)

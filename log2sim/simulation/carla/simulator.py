@@ -33,19 +33,13 @@ from log2sim.simulation.vehicles.vehicle import (
 
 @dataclass(frozen=True)
 class CarlaServer:
-    """Address of a CARLA server, and the world that it loads first, if any.
-
-    Attributes
-    ----------
-    opendrive : Path or None
-        An OpenDRIVE file.
-    """
+    """Address of a CARLA server, and the world that it loads first, if any."""
 
     host: str = "127.0.0.1"
     port: int = 2000
     timeout_s: float = 60.0
     town: str | None = None
-    opendrive: Path | None = None
+    opendrive: Path | None = None  # an OpenDRIVE file
 
 
 class _PendingControls:
@@ -80,18 +74,16 @@ class CarlaSimulator:
     def open(self, groups: Sequence[AgentGroup], clock: StepClock, statics: Sequence[Agent]) -> None:
         """Connect, and take the groups over.
 
-        Raises
-        ------
-        MissingExtra
-            Without CARLA's client.
-        ConfigError
-            When no server answers, or it cannot load the world.
+        Raises `MissingExtra`: without CARLA's client. Raises `ConfigError` when no server answers, or it cannot load
+        the world.
         """
         self.clock = clock
         all_agents = [a for g in groups for a in g.agents] + list(statics)
         log_groups = [g for g in groups if isinstance(g, LogReplayGroup)]
         replayed = [a for g in log_groups if g.follows_scenario_time for a in g.agents] + list(statics)
-        self.offset_m = _offset_m(all_agents)
+        xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in all_agents])
+        x, y = whole_kilometers(xy)
+        self.offset_m = float(x), float(y)
         data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in all_agents])}
         self._data, self._trajectories = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
         self._read: dict[str, tuple[float, float]] = {}
@@ -243,13 +235,6 @@ class CarlaSimulator:
         """Convert a position in CARLA's frame to that of a group's state."""
         i = group.live[slot]
         return x + self.offset_m[0] - group.origin_x_m[i], -y + self.offset_m[1] - group.origin_y_m[i]
-
-
-def _offset_m(agents: Sequence[Agent]) -> tuple[float, float]:
-    """Return whole kilometers x, y that bring all agents near CARLA's origin, zero if they are: as for exported roads."""
-    xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in agents])
-    x, y = whole_kilometers(xy)
-    return float(x), float(y)
 
 
 def _shifted(agent: Agent, offset_m: tuple[float, float]) -> Agent:

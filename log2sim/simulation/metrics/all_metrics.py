@@ -27,19 +27,15 @@ from log2sim.simulation.warnings import describe_warnings
 SEARCH_S = 1.0
 SEARCH_STEP_S = 0.05
 
+# Cross-track error beyond which an agent is off its path: a 1.9 m wide car in a 3.5 m lane has 0.8 m on each side.
 OFF_PATH_M = 0.5
-"""Cross-track error beyond which an agent is off its path: a 1.9 m wide car in a 3.5 m lane has 0.8 m on each side."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackingErrors:
-    """Distance of an agent from the scenario at its rows (S,); left, ahead, faster and counter-clockwise are positive.
+    """Distance of an agent from the scenario at its rows (S,); left, ahead, faster and counter-clockwise are positive."""
 
-    Attributes
-    ----------
-    across_m, along_m, speed_mps, yaw_rad : (S,) float64
-    """
-
+    # across_m, along_m, speed_mps, yaw_rad: (S,)
     across_m: Array
     along_m: Array
     speed_mps: Array
@@ -92,36 +88,13 @@ def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
     """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
     across = np.abs(errors.across_m)
     return {
-        "cross_track_rms_m": _rms(errors.across_m),
+        "cross_track_rms_m": round(_rms(errors.across_m), 6),
         "cross_track_max_m": round(float(np.max(across)), 6),
-        "along_track_rms_m": _rms(errors.along_m),
-        "speed_rms_mps": _rms(errors.speed_mps),
-        "yaw_rms_rad": _rms(errors.yaw_rad),
+        "along_track_rms_m": round(_rms(errors.along_m), 6),
+        "speed_rms_mps": round(_rms(errors.speed_mps), 6),
+        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6),
         "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
     }
-
-
-def scenario_metrics(
-    by_agent: Mapping[str, Mapping[str, Any]], on_time: Mapping[str, int], on_way: Mapping[str, int]
-) -> dict[str, Any]:
-    """Average the errors over all followers, every stored sample counting alike; 0 without followers.
-
-    Parameters
-    ----------
-    by_agent : by id
-        The errors of each agent.
-    on_time, on_way : by id
-        The samples of agents that follow the scenario in time, and of all that keep to its path.
-    """
-    out: dict[str, Any] = {}
-    for key, samples in (
-        ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
-    ):  # fmt: skip
-        out[key] = round(float(np.sqrt(_mean({k: e[key] ** 2 for k, e in by_agent.items()}, samples))), 6)
-    out["cross_track_max_m"] = max((e["cross_track_max_m"] for k, e in by_agent.items() if k in on_way), default=0.0)
-    out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
-    out["followers"] = len(on_time)
-    return out
 
 
 def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
@@ -144,16 +117,17 @@ def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
 
 
 def _rms(values: Array) -> float:
-    return round(float(np.sqrt(np.mean(values**2))), 6)
+    return float(np.sqrt(np.mean(values**2)))
 
 
 ACCEL_WINDOW_S = 0.75
+# Lengths of the fits. Shorter ones show the steps of the controller and the noise of the scenario.
 JERK_WINDOW_S = 1.5
-"""Lengths of the fits. Shorter ones show the steps of the controller and the noise of the scenario."""
 
+# Fewest rows of a window: a cubic with one degree of freedom left. With sparse rows the windows are longer.
 MIN_ROWS = 5
-"""Fewest rows of a window: a cubic with one degree of freedom left. With sparse rows the windows are longer."""
 
+# Comfort limits of nuPlan's planning benchmark (Karnchanachari et al., 2024), derived from human drivers.
 LIMITS = {
     "lon_accel_max_mps2": 2.40,
     "lon_decel_max_mps2": 4.05,
@@ -163,24 +137,14 @@ LIMITS = {
     "yaw_rate_max_radps": 0.95,
     "yaw_accel_max_radps2": 1.93,
 }
-"""Comfort limits of nuPlan's planning benchmark (Karnchanachari et al., 2024), derived from human drivers."""
 
 
 def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
     """Compute greatest and RMS acceleration, jerk and yaw rates, and whether all are within `LIMITS`.
 
-    Parameters
-    ----------
-    t_s, x_m, y_m, yaw_rad : (S,) float64, s, m and rad
-        Evenly spaced box centers without discontinuities.
+    `t_s`, `x_m`, `y_m`, `yaw_rad` (S,), s, m and rad: evenly spaced box centers without discontinuities. Returns none
+    for fewer than five rows.
 
-    Returns
-    -------
-    dict or None
-        None for fewer than five rows.
-
-    Notes
-    -----
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
     heading, lateral across it, both of the box center. Changes faster than the window are damped.
     """
@@ -196,11 +160,11 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     out = {
         "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0),
         "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
-        "lon_accel_rms_mps2": _rms_of_columns(lon_accel),
+        "lon_accel_rms_mps2": _rms(lon_accel),
         "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
-        "lat_accel_rms_mps2": _rms_of_columns(lat_accel),
+        "lat_accel_rms_mps2": _rms(lat_accel),
         "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
-        "lon_jerk_rms_mps3": _rms_of_columns(lon_jerk),
+        "lon_jerk_rms_mps3": _rms(lon_jerk),
         "jerk_max_mps3": float(np.hypot(jx, jy).max()),
         "yaw_rate_max_radps": float(np.abs(yaw_rate).max()),
         "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
@@ -236,30 +200,15 @@ def _weights(half: int, order: int, spacing_s: float) -> Array:
     )
 
 
-def _rms_of_columns(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-MAX_PAIRS = 100_000
-"""Pairs of boxes whose distance is computed at once, which bounds memory."""
-
-MIN_SPEED_MPS = 0.05
-"""Below this a vehicle stands, and what its acceleration is then is no braking."""
+MAX_PAIRS = 100_000  # pairs of boxes whose distance is computed at once, which bounds memory
+MIN_SPEED_MPS = 0.05  # below this a vehicle stands, and what its acceleration is then is no braking
 
 
 def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path: Trajectory) -> dict[str, Any]:
     """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`.
 
-    Parameters
-    ----------
-    index : int
-        Its column in `boxes`.
-    boxes : BoxTracks
-        Of all agents.
-    t_s : (S,) float64, s
-        Times of the rows of `boxes`.
-    path : Trajectory
-        Of the ego in the scenario.
+    `index`: its column in `boxes`. `boxes`: of all agents. `t_s` (S,), s: times of the rows of `boxes`. `path`: of the
+    ego in the scenario.
     """
     table = PathTable([path])
     gone_m = 0.0
@@ -425,8 +374,7 @@ def require_strict(replay: Replay, limits: Mapping[str, float] | None = None) ->
         raise CheckFailed("the replay breaks limits:\n  " + "\n  ".join(broken))
 
 
-SCENARIO_FOLLOWERS = ("pid", "exact")
-"""Drivers that follow the scenario in place and time."""
+SCENARIO_FOLLOWERS = ("pid", "exact")  # drivers that follow the scenario in place and time
 
 
 def replay_metrics(
@@ -440,14 +388,9 @@ def replay_metrics(
 ) -> dict[str, Any]:
     """Compute the metrics of `schemas/replay-1.json`, by agent and overall.
 
-    Parameters
-    ----------
-    stored : sequence of (S,) int
-        The steps of each agent's rows; of a static agent all stored steps at which it is present.
-    trajectories, errors : by id
-        Trajectories of the agents that move in the scenario, and how far they are from them.
-    source_kind : {"reconstruction", "scenario"}
-        Whose the collisions are that the boxes of the scenario have themselves.
+    `stored`: the steps of each agent's rows; of a static agent all stored steps at which it is present. `trajectories`,
+    `errors`: trajectories of the agents that move in the scenario, and how far they are from them. `source_kind`: whose
+    the collisions are that the boxes of the scenario have themselves.
     """
     ids = [a.id for a in agents]
     replayed, source = (_box_tracks(agents, stored, paths, clock) for paths in ({}, trajectories))
@@ -474,9 +417,20 @@ def replay_metrics(
     ego = {}
     if driven is not None:
         path = trajectories[ids[driven]]
-        ego["ego"] = _with_id(ego_figures(agents[driven], driven, replayed, t_s, path), ids)
+        figures = ego_figures(agents[driven], driven, replayed, t_s, path)
+        gap = figures["min_gap"]
+        ego["ego"] = {**figures, "min_gap": None if gap is None else {**gap, "agent": ids[gap["agent"]]}}
+    # Average the errors over all followers, every stored sample counting alike; 0 without followers.
+    out: dict[str, Any] = {}
+    for key, samples in (
+        ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
+    ):  # fmt: skip
+        out[key] = round(float(np.sqrt(_mean({k: e[key] ** 2 for k, e in by_agent.items()}, samples))), 6)
+    out["cross_track_max_m"] = max((e["cross_track_max_m"] for k, e in by_agent.items() if k in on_way), default=0.0)
+    out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
+    out["followers"] = len(on_time)
     return {
-        **scenario_metrics(by_agent, on_time, on_way),
+        **out,
         **ego,
         "collisions": events,
         "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
@@ -485,12 +439,6 @@ def replay_metrics(
         "conflicts": near,
         "by_agent": by_agent,
     }
-
-
-def _with_id(figures: dict[str, Any], ids: Sequence[str]) -> dict[str, Any]:
-    """Return figures of the ego with the id of the agent to which the gap was smallest, instead of its column."""
-    gap = figures["min_gap"]
-    return {**figures, "min_gap": None if gap is None else {**gap, "agent": ids[gap["agent"]]}}
 
 
 def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:

@@ -15,8 +15,8 @@ from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, rectangles_overlap, separating_axes, wrap_angle
 from log2sim.simulation.vehicles.vehicle import Columns
 
+# A step that differs from both neighboring steps by more is a discontinuity: at 20 Hz it would take 400 m/s2.
 DISCONTINUITY_M = 1.0
-"""A step that differs from both neighboring steps by more is a discontinuity: at 20 Hz it would take 400 m/s2."""
 
 RowIndex = NDArray[np.intp]
 
@@ -25,12 +25,8 @@ RowIndex = NDArray[np.intp]
 class BoxTracks:
     """Boxes of A agents at S times; between two rows a box moves straight and turns evenly.
 
-    Attributes
-    ----------
-    x_m, y_m, z_m : (S, A) float64, m
-        Box centers; NaN where an agent is absent.
-    yaw_rad, speed_mps : (S, A) float64
-    size_m : (A, 3) float64
+    `x_m`, `y_m`, `z_m` (S, A), m: box centers; NaN where an agent is absent. `yaw_rad`, `speed_mps` (S, A). `size_m`
+    (A, 3).
     """
 
     x_m: Array
@@ -123,39 +119,29 @@ def spacing_s(t_s: Array) -> float:
     return float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0
 
 
-MAX_STEPS = 64
-"""Most steps in an interval; a contact shorter than one step, 0.8 ms of 50 ms, may be missed."""
-
+MAX_STEPS = 64  # most steps in an interval; a contact shorter than one step, 0.8 ms of 50 ms, may be missed
 BISECTIONS = 8  # of the last step: 3 us of 50 ms
 
 
 @dataclass(frozen=True, eq=False)
 class RelativeMotion(Columns):
-    """Relative motion of N pairs of boxes over an interval.
+    """Relative motion of N pairs of boxes over an interval."""
 
-    Attributes
-    ----------
-    dx_m, dy_m, dz_m : (N,) float64
-        From box a to box b at the begin.
-    vx_m, vy_m, vz_m : (N,) float64
-        Change of these over the interval.
-    yaw_a_rad, yaw_b_rad : (N,) float64
-        At the begin.
-    turn_a_rad, turn_b_rad : (N,) float64
-        Change of these over the interval.
-    size_a_m, size_b_m : (3, N) float64
-    """
-
+    # dx_m, dy_m, dz_m: (N,) from box a to box b at the begin.
     dx_m: Array
     dy_m: Array
     dz_m: Array
+    # vx_m, vy_m, vz_m: (N,) change of these over the interval.
     vx_m: Array
     vy_m: Array
     vz_m: Array
+    # yaw_a_rad, yaw_b_rad: (N,) at the begin.
     yaw_a_rad: Array
     yaw_b_rad: Array
+    # turn_a_rad, turn_b_rad: (N,) change of these over the interval.
     turn_a_rad: Array
     turn_b_rad: Array
+    # size_a_m, size_b_m: (3, N)
     size_a_m: Array
     size_b_m: Array
 
@@ -205,8 +191,6 @@ class RelativeMotion(Columns):
 def first_contact(motion: RelativeMotion) -> Array:
     """Return the share of the interval (N,) after which the boxes first overlap, NaN where they do not.
 
-    Notes
-    -----
     Conservative advancement (Mirtich, 1996) with separating axes in place of a distance: every step is as long as the
     boxes certainly stay apart, but at least 1 / `MAX_STEPS`; the last step is bisected.
     """
@@ -239,39 +223,28 @@ def _gap_duration(gap: Array, rate: Array) -> Array:
     return np.where(gap < 0, 0.0, np.maximum(lasts, np.finfo(float).tiny))
 
 
-CHUNK = 20
-"""Rows in one broad phase."""
-
-BATCH = 100_000
-"""Pairs evaluated together, which bounds memory."""
-
-MAX_PAIRS = 50_000
-"""Pairs of agents whose motion over `CHUNK` rows is compared at once: a million rows."""
-
+CHUNK = 20  # rows in one broad phase
+BATCH = 100_000  # pairs evaluated together, which bounds memory
+MAX_PAIRS = 50_000  # pairs of agents whose motion over `CHUNK` rows is compared at once: a million rows
+# Contacts that are kept, some 80 MB: a thousand pairs that overlap for 100 s. More are no traffic.
 MAX_CONTACTS = 2_000_000
-"""Contacts that are kept, some 80 MB: a thousand pairs that overlap for 100 s. More are no traffic."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are closer in time form one collision
 SCENARIO_WINDOW_S = 0.5  # the scenario has a collision itself when its boxes overlap within this time of it,
 SCENARIO_MARGIN_M = 0.1  # or pass with a smaller gap than this, which is below the errors of boxes
 
+# Whose a collision is: new in the replay; or of the scenario, whose own boxes overlap, by its kind.
 REPLAY, RECONSTRUCTION, SCENARIO = "replay", "reconstruction", "scenario"
-"""Whose a collision is: new in the replay; or of the scenario, whose own boxes overlap, by its kind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts(Columns):
-    """Contacts (N,) of boxes a < b.
+    """Contacts (N,) of boxes a < b."""
 
-    Attributes
-    ----------
-    a, b : (N,) int
-    first_row, last_row : (N,) float64
-        Fractional rows of the first and last overlap within one step.
-    """
-
+    # a, b: (N,)
     a: RowIndex
     b: RowIndex
+    # first_row, last_row: (N,) fractional rows of the first and last overlap within one step.
     first_row: Array
     last_row: Array
 
@@ -279,16 +252,11 @@ class Contacts(Columns):
 def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None = None) -> Contacts:
     """Find contacts of two boxes of which at least one moves, a step at a time; `only` (A,) restricts the agents.
 
-    Notes
-    -----
     Broad phase: axis-aligned hulls of the circles about the boxes over `CHUNK` rows, sorted. Narrow phase: `first_contact`,
     forward for the first overlap and backward for the last. Where an agent does not move continuously, the boxes are compared
     at the row alone. Cost: A log A and the pairs in reach, a chunk.
 
-    Raises
-    ------
-    ScenarioError
-        For more than `MAX_CONTACTS`, of agents that lie on top of each other.
+    Raises `ScenarioError` for more than `MAX_CONTACTS`, of agents that lie on top of each other.
     """
     found, count = [Contacts(*np.zeros((2, 0), dtype=np.intp), *np.zeros((2, 0)))], 0
     for k, a, b in _in_batches(_candidates(boxes, moves, only)):

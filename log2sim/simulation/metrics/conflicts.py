@@ -15,38 +15,25 @@ from log2sim.geometry import Array, rectangles_overlap, separating_axes, wrap_an
 from log2sim.simulation.metrics.collisions import REPLAY, BoxTracks, RowIndex, spacing_s
 from log2sim.simulation.vehicles.vehicle import Columns
 
-HORIZON_S = 10.0
-"""Constant velocity is no prediction over a longer time."""
-
+HORIZON_S = 10.0  # constant velocity is no prediction over a longer time
 CHUNK = 20
-BLOCK = 256
-"""Rows and agents of one broad phase, so that its arrays stay small."""
+BLOCK = 256  # rows and agents of one broad phase, so that its arrays stay small
 
 
 @dataclass(frozen=True, eq=False)
 class TimesToCollision(Columns):
-    """Pairs a < b (N,) on a collision course.
+    """Pairs a < b (N,) on a collision course."""
 
-    Attributes
-    ----------
-    a, b : (N,) int
-    time_s : (N,) float64
-        Least time to collision.
-    row : (N,) int
-        The row at which it occurs.
-    """
-
+    # a, b: (N,)
     a: RowIndex
     b: RowIndex
-    time_s: Array
-    row: RowIndex
+    time_s: Array  # (N,) least time to collision
+    row: RowIndex  # (N,) the row at which it occurs
 
 
 def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: float) -> TimesToCollision:
     """Find the least time to collision of every pair of which at least one moves, up to `HORIZON_S`.
 
-    Notes
-    -----
     Time-to-collision of Hayward (1972) in the plane: both boxes keep their velocity and their heading; see `time_to_touch`.
     Boxes that overlap already have none. It is evaluated at every row and ignores the road: two agents that pass each other
     in a bend count as on a collision course. Cost: the pairs in reach for every `CHUNK` rows, then those on course.
@@ -68,7 +55,13 @@ def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: fl
             )  # fmt: skip
             soon = time <= HORIZON_S
             k, i, j, time = k[soon], i[soon], j[soon], time[soon]
-            found.append(_least_per_pair(np.stack([i, j, time, k])[:, _same_height(boxes, climb, i, j, k, time)]))
+            # Whether pairs (N,) are at the same height at rows k, or will be after a time, on a common slope.
+            apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
+            then_m = apart_m + time * (climb[k, j] - climb[k, i])
+            result: NDArray[np.bool_] = (
+                np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
+            )
+            found.append(_least_per_pair(np.stack([i, j, time, k])[:, result]))
     a, b, time, row = _least_per_pair(np.concatenate(found, axis=1))
     return TimesToCollision(a.astype(np.intp), b.astype(np.intp), time, row.astype(np.intp))
 
@@ -101,18 +94,6 @@ def touching(
         enter = np.maximum(enter, np.minimum(one, other))
         leave = np.minimum(leave, np.where(moves, np.maximum(one, other), -never))
     return enter, leave
-
-
-def _same_height(
-    boxes: BoxTracks, climb: Array, i: RowIndex, j: RowIndex, k: RowIndex, time_s: Array
-) -> NDArray[np.bool_]:
-    """Whether pairs (N,) are at the same height at rows k, or will be after a time, on a common slope."""
-    apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
-    then_m = apart_m + time_s * (climb[k, j] - climb[k, i])
-    result: NDArray[np.bool_] = (
-        np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
-    )
-    return result
 
 
 def _candidate_pairs(
@@ -168,36 +149,27 @@ def _least_per_pair(found: Array) -> Array:
     return found[:, new]
 
 
+# Smaller differences of headings are those of car following, which the time to collision covers.
 CROSSING_RAD = math.radians(30.0)
-"""Smaller differences of headings are those of car following, which the time to collision covers."""
 
+# Rows of the largest blocks, the factor by which blocks are divided, and the number of sizes.
 COARSE, FINER, LEVELS = 64, 4, 3
-"""Rows of the largest blocks, the factor by which blocks are divided, and the number of sizes."""
 
-BATCH = 2000
-"""Pairs whose times are refined together, which bounds memory."""
-
+BATCH = 2000  # pairs whose times are refined together, which bounds memory
+# Pairs of blocks that are divided together: each becomes up to 256 pairs of parts before its rows.
 BLOCK_PAIRS = 20_000
-"""Pairs of blocks that are divided together: each becomes up to 256 pairs of parts before its rows."""
 
-PARTS, ZOOMS = 4, 4
-"""A row is divided into so many parts so many times: 50 ms to 0.2 ms."""
+PARTS, ZOOMS = 4, 4  # a row is divided into so many parts so many times: 50 ms to 0.2 ms
 
 
 @dataclass(frozen=True, eq=False)
 class PostEncroachmentTimes(Columns):
-    """Pairs (N,) of agents on crossing paths.
+    """Pairs (N,) of agents on crossing paths."""
 
-    Attributes
-    ----------
-    first, second : (N,) int
-        The agent that was at the place first, and second.
-    left_row, came_row : (N,) float64
-        Fractional rows at which the first left and the second arrived.
-    """
-
+    # first, second: (N,) the agent that was at the place first, and second.
     first: RowIndex
     second: RowIndex
+    # left_row, came_row: (N,) fractional rows at which the first left and the second arrived.
     left_row: Array
     came_row: Array
 
@@ -227,8 +199,6 @@ class _Pairs(NamedTuple):
 def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachmentTimes:
     """Find the shortest post-encroachment time of every pair whose paths cross, up to `HORIZON_S`.
 
-    Notes
-    -----
     Allen, Shin and Cooper (1978): the time from the moment when the first road user has left the area that both cover
     until the second one reaches it. Here it is the least time between two moments at which the boxes of the first and
     of the second cover a place in common. Where two paths cross that is the same, and it is also defined in bends and

@@ -26,14 +26,11 @@ A car reaches it at 3.3 m/s2 of lateral acceleration, a third of its tires' limi
 model: a consistent model for planning feasible trajectories for autonomous vehicles?", 2017) use it up to half the limit.
 """
 
+# Beyond this speed in reverse the models with slip follow worse than the kinematic one: the steered axle trails.
 FAST_REVERSE_MPS = 3.0
-"""Beyond this speed in reverse the models with slip follow worse than the kinematic one: the steered axle trails."""
 
-LOAD_ITERATIONS = 4
-"""Passes until slips, the drag of slips and the load transfer agree."""
-
-MAX_FRICTION_USE = 0.95
-"""Share of the friction limit beyond which slips are not predicted: they grow without bound."""
+LOAD_ITERATIONS = 4  # passes until slips, the drag of slips and the load transfer agree
+MAX_FRICTION_USE = 0.95  # share of the friction limit beyond which slips are not predicted: they grow without bound
 
 
 class ModelChoice(NamedTuple):
@@ -75,8 +72,6 @@ def understeer(p: VehicleParameters) -> Array:
 def slipping_reference(reference: Reference, p: VehicleParameters, model: str, ahead_s: float) -> Reference:
     """Add slip to the reference of a vehicle (`p` of shape (1,)); its curvature column is that of `ahead_s` later.
 
-    Notes
-    -----
     Inverse dynamics of the single-track model: the forces that move the vehicle along the trajectory, the slips of these
     forces, the heading that these slips add, and the steering angle; the latter as the curvature from which the controller
     computes that angle.

@@ -14,8 +14,8 @@ import numpy as np
 from log2sim.datatypes import Agent
 from log2sim.simulation.vehicles.vehicle import VehicleParameters
 
+# Categories that move as bicycle models; all others are point masses that may also move sideways.
 WHEELED = ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle")
-"""Categories that move as bicycle models; all others are point masses that may also move sideways."""
 
 STEER_RATE_RADPS = 1.0  # at the road wheels: a full turn of the hand wheel in 0.4 s at a ratio of 16
 STEER_LAG_S = 0.10
@@ -24,27 +24,17 @@ MAX_JERK_MPS3 = 60.0
 
 
 class VehicleProportions(NamedTuple):
-    """Proportions and limits of the vehicles of a category.
+    """Proportions and limits of the vehicles of a category."""
 
-    Attributes
-    ----------
-    wheelbase, rear_axle : float
-        As shares of the length; the rear axle behind the box center.
-    cg_to_rear : float
-        Of the wheelbase: the share of the weight on the front axle.
-    cg_height : float
-        Of the height.
-    front_stiffness_1prad, rear_stiffness_1prad : float
-        Cornering stiffness over load and friction.
-    """
-
+    # wheelbase, rear_axle: as shares of the length; the rear axle behind the box center.
     wheelbase: float
     rear_axle: float
     max_steer_rad: float
     max_throttle_mps2: float
     max_brake_mps2: float
-    cg_to_rear: float
-    cg_height: float
+    cg_to_rear: float  # of the wheelbase: the share of the weight on the front axle
+    cg_height: float  # of the height
+    # front_stiffness_1prad, rear_stiffness_1prad: cornering stiffness over load and friction.
     front_stiffness_1prad: float
     rear_stiffness_1prad: float
     friction: float
@@ -69,24 +59,19 @@ _PROPORTIONS: dict[str, VehicleProportions] = {
 
 
 class PublishedVehicle(NamedTuple):
-    """A vehicle of "CommonRoad: Vehicle Models" (Althoff, Koschi & Manzinger, 2020), appendix A.
-
-    Attributes
-    ----------
-    cg_height_m : float
-        Of the sprung mass, as in the single-track model.
-    """
+    """A vehicle of "CommonRoad: Vehicle Models" (Althoff, Koschi & Manzinger, 2020), appendix A."""
 
     length_m: float
     width_m: float
     cg_to_front_m: float
     cg_to_rear_m: float
-    cg_height_m: float
+    cg_height_m: float  # of the sprung mass, as in the single-track model
     mass_kg: float
     inertia_kgm2: float
     max_steer_rad: float
 
 
+# 1 is a Ford Escort, 2 a BMW 320i, 3 a Volkswagen Vanagon.
 PUBLISHED: dict[int, PublishedVehicle] = {
     1: PublishedVehicle(4.298, 1.674, 0.88392, 1.50876, 0.59436, 1225.8878467253344, 1538.8533713561394, 0.910),
     2: PublishedVehicle(
@@ -96,7 +81,6 @@ PUBLISHED: dict[int, PublishedVehicle] = {
         4.569, 1.844, 1.1507916024, 1.3211363976, 0.804490644, 1478.8979637767998, 2473.1176915564442, 1.023
     ),
 }
-"""1 is a Ford Escort, 2 a BMW 320i, 3 a Volkswagen Vanagon."""
 
 PUBLISHED_FRICTION = 1.0489  # tire parameter p_dy1 of all three
 PUBLISHED_STIFFNESS_1PRAD = 21.92 / 1.0489  # -p_ky1 / p_dy1
@@ -117,8 +101,6 @@ def rear_axle_offset(agent: Agent) -> float:
 def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> VehicleParameters:
     """Return parameters (A,) of wheeled agents by category and size; with `published`, cars take the nearest published vehicle.
 
-    Notes
-    -----
     Yaw inertia over mass is the product of the distances from the center of gravity to the axles, which holds for the
     published vehicles within 10 %.
     """

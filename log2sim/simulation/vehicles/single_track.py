@@ -30,16 +30,14 @@ from log2sim.simulation.vehicles.vehicle import (
     sinc,
 )
 
-MAX_INNER_STEP_S = 0.01
-"""Longest step of the integrator; the error is of second order."""
-
+MAX_INNER_STEP_S = 0.01  # longest step of the integrator; the error is of second order
+# Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander,
+# 1977).
 GAMMA = 1 - math.sqrt(0.5)
-"""Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander, 1977)."""
 
 STAGE_WEIGHT = (1 - GAMMA) / GAMMA
 
-MAX_LOAD_TRANSFER_SHARE = 0.9
-"""Largest share of an axle's load that acceleration and braking may transfer."""
+MAX_LOAD_TRANSFER_SHARE = 0.9  # largest share of an axle's load that acceleration and braking may transfer
 
 
 def step_single_track(
@@ -47,8 +45,6 @@ def step_single_track(
 ) -> VehicleState:
     """Move vehicles by `dt_s` with constant commands by the published single-track model with linear tires.
 
-    Notes
-    -----
     Equations: Althoff, Koschi & Manzinger, "CommonRoad: Vehicle Models", 2020, section "Single-Track Model", with the load
     transfer of braking and driving, small angles and no limit of friction. They have the speed of the center of gravity as
     `speed_mps`, and `lateral_mps` is speed times slip angle less what the yaw rate adds at the rear axle. They are published
@@ -84,18 +80,13 @@ def step_single_track(
 
 @dataclass(frozen=True, eq=False)
 class Chassis:
-    """Lateral acceleration of the axles per lateral force and mass: of the rear by the rear, of either by the other, of the front.
+    """Lateral acceleration of the axles per lateral force and mass: of the rear by the rear, of either by the other, of the front."""
 
-    Attributes
-    ----------
-    rear, cross, front : (A,) float64
-    cg_to_front_m : (A,) float64
-    """
-
+    # rear, cross, front: (A,)
     rear: Array
     cross: Array
     front: Array
-    cg_to_front_m: Array
+    cg_to_front_m: Array  # (A,)
 
     @classmethod
     def of(cls, p: VehicleParameters) -> Chassis:
@@ -107,19 +98,13 @@ class Chassis:
 
 @dataclass(frozen=True, eq=False)
 class StepInput:
-    """Inputs of one step of the linear model.
+    """Inputs of one step of the linear model."""
 
-    Attributes
-    ----------
-    speed0_mps, speed1_mps : (A,) float64
-        At the begin and the end.
-    distance_m : (A,) float64
-    steer0_rad, mean_steer_rad, steer1_rad : (A,) float64
-    """
-
+    # speed0_mps, speed1_mps: (A,) at the begin and the end.
     speed0_mps: Array
     speed1_mps: Array
-    distance_m: Array
+    distance_m: Array  # (A,)
+    # steer0_rad, mean_steer_rad, steer1_rad: (A,)
     steer0_rad: Array
     mean_steer_rad: Array
     steer1_rad: Array
@@ -137,18 +122,14 @@ class LinearPair:
     """Two linear equations for the slips of an agent, a and b above c and d, solved by Cramer's rule.
 
     The unknowns are the slips in units of their own, which may be zero.
-
-    Attributes
-    ----------
-    a, b, c, d : (A,) float64
-    rear_factor, front_factor : (A,) float64
-        Unit over determinant.
     """
 
+    # a, b, c, d: (A,)
     a: Array
     b: Array
     c: Array
     d: Array
+    # rear_factor, front_factor: (A,) unit over determinant.
     rear_factor: Array
     front_factor: Array
 
@@ -169,8 +150,6 @@ class LinearPair:
 def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chassis, h: float) -> Slips:
     """Return the slip angles (rad, positive to the left) after a step of the published model.
 
-    Notes
-    -----
     Linear in the slips while speed and acceleration are the mean ones of the step, hence solved without iteration:
     |v| slips' = -(chassis) (stiffness) slips + (turn) (yaw rate / v) - |v| (0, steer').
     """
@@ -225,8 +204,8 @@ def inner_steps(dt_s: float) -> tuple[int, float]:
     return count, dt_s / count
 
 
+# Share of the friction limit that drive and brakes may use: wheels that do not lock keep a third of it for steering.
 ANTILOCK_SHARE = 0.95
-"""Share of the friction limit that drive and brakes may use: wheels that do not lock keep a third of it for steering."""
 
 
 def step_dynamic(
@@ -234,8 +213,6 @@ def step_dynamic(
 ) -> VehicleState:
     """Move vehicles by `dt_s` with constant commands by a single-track model whose tires saturate.
 
-    Notes
-    -----
     Angles are exact. Lateral force of an axle: the magic formula of Pacejka ("Tire and Vehicle Dynamics", 2012, chapter 4)
     with shape factor 1 and no curvature, D sin(arctan(C s)) = D C s / sqrt(1 + (C s)^2) with s the tangent of the slip
     angle: stiffness C at first, D at most. D is friction times load, less what drive and brakes take of it (friction
@@ -262,17 +239,12 @@ def step_dynamic(
 
 @dataclass(frozen=True, eq=False)
 class DriveInput:
-    """Inputs of one step of the saturating model.
+    """Inputs of one step of the saturating model."""
 
-    Attributes
-    ----------
-    pedal_mps2, gear : (A,) float64
-    bend0, mean_bend, bend1 : (A,) float64
-        Tangent of the steering angle at the begin, on average and at the end.
-    """
-
+    # pedal_mps2, gear: (A,)
     pedal_mps2: Array
     gear: Array
+    # bend0, mean_bend, bend1: (A,) tangent of the steering angle at the begin, on average and at the end.
     bend0: Array
     mean_bend: Array
     bend1: Array
@@ -280,31 +252,20 @@ class DriveInput:
 
 @dataclass(frozen=True, eq=False)
 class BodyState:
-    """State of the rear axle.
+    """State of the rear axle."""
 
-    Attributes
-    ----------
-    x_m, y_m, yaw_rad : (A,) float64
-    speed_mps : (A,) float64
-        Along the heading.
-    lateral_mps : (A,) float64
-        To the left of the heading.
-    yaw_rate_radps : (A,) float64
-    """
-
+    # x_m, y_m, yaw_rad: (A,)
     x_m: Array
     y_m: Array
     yaw_rad: Array
-    speed_mps: Array
-    lateral_mps: Array
-    yaw_rate_radps: Array
+    speed_mps: Array  # (A,) along the heading
+    lateral_mps: Array  # (A,) to the left of the heading
+    yaw_rate_radps: Array  # (A,)
 
 
 def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> BodyState:
     """Compute one step of the saturating model.
 
-    Notes
-    -----
     The unknowns are the lateral velocities at which the axles slip. Tires act by their secant stiffness, so a step of any
     length is dissipative; the stiffness is that at the middle of the step, from half a step of implicit Euler: second order.
     """

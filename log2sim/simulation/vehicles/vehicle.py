@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, cos_sin
 
-MAX_INNER_STEP_S = 0.02
-"""Longest step over which the mean steering angle is used; the error is of second order."""
-
+MAX_INNER_STEP_S = 0.02  # longest step over which the mean steering angle is used; the error is of second order
 GRAVITY_MPS2 = 9.81
 
-TINY = 1e-300
-"""Added where zero would divide: it changes no other number, and takes a third of the time of a mask."""
+TINY = 1e-300  # added where zero would divide: it changes no other number, and takes a third of the time of a mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,48 +44,28 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class VehicleState(Columns):
-    """State of vehicles: rear axle and actuators.
+    """State of vehicles: rear axle and actuators."""
 
-    Attributes
-    ----------
-    x_m, y_m : (A,) float64
-    yaw_rad : (A,) float64
-        Not wrapped.
-    speed_mps : (A,) float64
-        Negative in reverse.
-    steer_rad : (A,) float64
-    pedal_mps2 : (A,) float64
-        Throttle (positive) or brake (negative), in either gear.
-    lateral_mps, yaw_rate_radps : (A,) float64
-        Velocity of the rear axle to the left and yaw rate: states of the models with slip only.
-    """
-
+    # x_m, y_m: (A,)
     x_m: Array
     y_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    steer_rad: Array
-    pedal_mps2: Array
+    yaw_rad: Array  # (A,) not wrapped
+    speed_mps: Array  # (A,) negative in reverse
+    steer_rad: Array  # (A,)
+    pedal_mps2: Array  # (A,) throttle (positive) or brake (negative), in either gear
+    # lateral_mps, yaw_rate_radps: (A,) velocity of the rear axle to the left and yaw rate: states of the models with
+    # slip only.
     lateral_mps: Array
     yaw_rate_radps: Array
 
 
 @dataclass(frozen=True, eq=False)
 class VehicleControls(Columns):
-    """Commands of vehicles.
+    """Commands of vehicles."""
 
-    Attributes
-    ----------
-    pedal_mps2 : (A,) float64
-        Positive throttle, negative brake.
-    steer_rad : (A,) float64
-    reverse : (A,) bool
-        The gear, which engages at standstill.
-    """
-
-    pedal_mps2: Array
-    steer_rad: Array
-    reverse: NDArray[np.bool_]
+    pedal_mps2: Array  # (A,) positive throttle, negative brake
+    steer_rad: Array  # (A,)
+    reverse: NDArray[np.bool_]  # (A,) the gear, which engages at standstill
 
 
 class Actuators(NamedTuple):
@@ -102,41 +79,28 @@ class Actuators(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VehicleParameters(Columns):
-    """Size and limits of vehicles, all positive.
+    """Size and limits of vehicles, all positive."""
 
-    Attributes
-    ----------
-    wheelbase_m : (A,) float64
-    rear_axle_offset_m : (A,) float64
-        From the rear axle forward to the box center.
-    max_steer_rad, max_steer_rate_radps, steer_lag_s : (A,) float64
-    max_throttle_mps2, max_brake_mps2, max_jerk_mps3, pedal_lag_s : (A,) float64
-    cg_to_rear_m, cg_height_m : (A,) float64
-        Place of the center of gravity.
-    gyration_m2 : (A,) float64
-        Yaw inertia over mass.
-    front_stiffness_1prad, rear_stiffness_1prad : (A,) float64
-        Cornering stiffness over the friction limit.
-    friction : (A,) float64
-    understeer_s2pm2 : (A,) float64
-        For the controller: the share by which lateral acceleration widens the curve, 0 without slip.
-    """
-
-    wheelbase_m: Array
-    rear_axle_offset_m: Array
+    wheelbase_m: Array  # (A,)
+    rear_axle_offset_m: Array  # (A,) from the rear axle forward to the box center
+    # max_steer_rad, max_steer_rate_radps, steer_lag_s: (A,)
     max_steer_rad: Array
     max_steer_rate_radps: Array
     steer_lag_s: Array
+    # max_throttle_mps2, max_brake_mps2, max_jerk_mps3, pedal_lag_s: (A,)
     max_throttle_mps2: Array
     max_brake_mps2: Array
     max_jerk_mps3: Array
     pedal_lag_s: Array
+    # cg_to_rear_m, cg_height_m: (A,) place of the center of gravity.
     cg_to_rear_m: Array
     cg_height_m: Array
-    gyration_m2: Array
+    gyration_m2: Array  # (A,) yaw inertia over mass
+    # front_stiffness_1prad, rear_stiffness_1prad: (A,) cornering stiffness over the friction limit.
     front_stiffness_1prad: Array
     rear_stiffness_1prad: Array
-    friction: Array
+    friction: Array  # (A,)
+    # (A,) for the controller: the share by which lateral acceleration widens the curve, 0 without slip.
     understeer_s2pm2: Array
 
     @cached_property
@@ -157,13 +121,9 @@ class VehicleParameters(Columns):
 
 @dataclass(frozen=True, eq=False)
 class PointState(Columns):
-    """Centers of point masses and their velocities on map axes.
+    """Centers of point masses and their velocities on map axes."""
 
-    Attributes
-    ----------
-    x_m, y_m, velocity_x_mps, velocity_y_mps : (A,) float64
-    """
-
+    # x_m, y_m, velocity_x_mps, velocity_y_mps: (A,)
     x_m: Array
     y_m: Array
     velocity_x_mps: Array
@@ -186,8 +146,6 @@ def step_bicycle(
 ) -> VehicleState:
     """Move vehicles by `dt_s` with constant commands.
 
-    Notes
-    -----
     Actuators (first-order lag, rate and saturation limits) are solved in closed form, and so is the arc of the rear axle at
     the mean steering angle of the step: exact for constant steering at any acceleration, of second order in the step
     otherwise, unconditionally stable. Braking ends at standstill; to reverse, the gear must change.

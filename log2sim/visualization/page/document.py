@@ -28,7 +28,7 @@ from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.simulation.expected_motion import ends_of
 from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.plot.layers import lane_arrows, lane_outline, shown_spans
-from log2sim.visualization.plot.viewport import AgentRole, assign_roles, is_moving
+from log2sim.visualization.plot.viewport import assign_roles, is_moving
 
 # Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s; standard deviations of cm, mrad and cm/s; predictions of
 # cm and mrad.
@@ -45,8 +45,8 @@ def second_differences(values: ArrayLike, scale: float) -> list[int]:
     return list(np.diff(whole, n=2, prepend=[0, 0]).tolist())
 
 
+# Points of a line that lie so near to the line through the others are left out; a browser shows no less than 2.5 mm.
 TOLERANCE_M = 0.02
-"""Points of a line that lie so near to the line through the others are left out; a browser shows no less than 2.5 mm."""
 
 
 def feature_columns(scenario: Scenario) -> dict[str, Any]:
@@ -93,20 +93,18 @@ def _columns(points_m: Array) -> dict[str, list[int]]:
     return {key: second_differences(column, SCALES[key]) for key, column in zip(("x_m", "y_m"), kept.T)}
 
 
+# A page shows a new prediction five times a second, which looks steady and takes half as much room as one at every
+# tick.
 EVERY_TICKS = 2
-"""A page shows a new prediction five times a second, which looks steady and takes half as much room as one at every tick."""
 
-MAX_PREDICTIONS = 1_000_000
-"""Of all agents together: 30 MB of a page for 3 s each."""
+MAX_PREDICTIONS = 1_000_000  # of all agents together: 30 MB of a page for 3 s each
 
 
 def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[str, Any]]:
     """Predict agents while they move: by agent, paths relative to where it was, and the ellipse at their ends.
 
-    Raises
-    ------
-    ConfigError
-        For a horizon that predictions do not have, or more predictions than a browser can be expected to hold.
+    Raises `ConfigError` for a horizon that predictions do not have, or more predictions than a browser can be expected
+    to hold.
     """
     found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
     table, forecast = found.table, found.forecasts[DEFAULT_METHOD]
@@ -181,8 +179,7 @@ def _shrunk(image: NDArray[np.uint8], edge_px: int) -> NDArray[np.uint8]:
 
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
 SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
-MAX_ROWS = 3_000_000
-"""Waypoints of all layers together; a page with this many has about 50 MB."""
+MAX_ROWS = 3_000_000  # waypoints of all layers together; a page with this many has about 50 MB
 
 
 def page_document(
@@ -198,12 +195,8 @@ def page_document(
     With `predict_s`, s, movers of the scenario also hold where they were expected to go for as long.
     `background` is a map of the ground to show below everything, `metrics` are titles and texts.
 
-    Raises
-    ------
-    ConfigError
-        When there are more waypoints than a browser can be expected to hold, or for a horizon that predictions do not have.
-    ScenarioError
-        When the truth's map has another projection.
+    Raises `ConfigError` when there are more waypoints than a browser can be expected to hold, or for a horizon that
+    predictions do not have. Raises `ScenarioError` when the truth's map has another projection.
     """
     layers = {"scenario": list(_scenario(scenario))}
     if truth is not None:
@@ -228,11 +221,13 @@ def page_document(
             f"such as with `log2sim edit --only`"
         )
     spans = [_span(e) for name in ("scenario", "replay") for e in layers.get(name, ())]
+    m = scenario.map
+    known = m.latitude_deg is not None and m.longitude_deg is not None
     return {
         "name": scenario.name,
         "begin_s": min([0.0, *(first for first, _ in spans)]),
         "end_s": max([scenario.duration_s, *(last for _, last in spans)]),
-        "origin": _origin(scenario),
+        "origin": (f"{m.latitude_deg:.5f}°, {m.longitude_deg:.5f}°" if known else None),
         "north": scenario.map.projection is not None,
         "layers": layers,
         "features": feature_columns(scenario),
@@ -286,7 +281,7 @@ def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
         yield {
             **entry,
             **_paint(role.agent),
-            **_colors(role),
+            **({"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}),
             **_trust(role.agent),
             **(_observers(role.agent) if tell_ends else {}),
         }
@@ -299,10 +294,6 @@ def _observers(agent: Agent) -> dict[str, Any]:
     """Return the spans, s, in which each end observed an agent; nothing for one that does not tell, such as the ego."""
     spans = {end: [[round(t, 3) for t in span] for span in found] for end, found in agent.observed_by.items() if found}
     return {"observed_by": spans} if spans else {}
-
-
-def _colors(role: AgentRole) -> dict[str, Any]:
-    return {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
 
 
 def _paint(agent: Agent) -> dict[str, Any]:
@@ -384,10 +375,3 @@ def _filled(observed: NDArray[np.bool_]) -> list[int]:
 def _span(entry: dict[str, Any]) -> tuple[float, float]:
     t_s = np.cumsum(np.cumsum(entry["t_s"])) / SCALES["t_s"]
     return float(t_s[0]), float(t_s[-1])
-
-
-def _origin(scenario: Scenario) -> str | None:
-    """Format latitude and longitude of the map's origin; None when unknown."""
-    m = scenario.map
-    known = m.latitude_deg is not None and m.longitude_deg is not None
-    return f"{m.latitude_deg:.5f}°, {m.longitude_deg:.5f}°" if known else None

@@ -21,9 +21,8 @@ from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.recording import Recorded, recording_document
 
 SUFFIXES = (".html", ".htm")
-MARGIN_BYTES = 10_000
-"""Of a page, for the names and keys around pictures and points."""
-
+MARGIN_BYTES = 10_000  # of a page, for the names and keys around pictures and points
+# Parts of the script in the order of their dependencies.
 SCRIPT_FILES = (
     "track.js",
     "features.js",
@@ -50,7 +49,6 @@ SCRIPT_FILES = (
     "main.js",
     "scripting.js",
 )
-"""Parts of the script in the order of their dependencies."""
 
 
 def write_page(
@@ -104,21 +102,16 @@ def write_page(
         recorded = Recorded(localize_like(recorded, scenario.provenance))
     document = {**page_document(scenario, truth, replay, predict_s, background, metrics), "scales": SCALES}
     if recorded is not None:
-        document["recording"] = _recording(scenario, recorded, document)
+        rest = len(html_of(document).encode()) + MARGIN_BYTES
+        if rest >= recorded.max_bytes:
+            raise ConfigError(f"--max-mb: the page has {rest / 1e6:.2f} MB without any picture; give more than that")
+        document["recording"] = recording_document(scenario, recorded, recorded.max_bytes - rest)
     page = html_of(document).encode()
     if recorded is not None and len(page) > recorded.max_bytes:
         raise ConfigError(f"--max-mb: the page has {len(page) / 1e6:.2f} MB at least; give as much")
     with replaced(out_path) as temporary:
         temporary.write_bytes(page)
     return tuple(document["recording"]["notes"]) if recorded is not None else ()
-
-
-def _recording(scenario: Scenario, recorded: Recorded, document: dict[str, Any]) -> dict[str, Any]:
-    """Return the pictures and points that fit beside the rest of a document."""
-    rest = len(html_of(document).encode()) + MARGIN_BYTES
-    if rest >= recorded.max_bytes:
-        raise ConfigError(f"--max-mb: the page has {rest / 1e6:.2f} MB without any picture; give more than that")
-    return recording_document(scenario, recorded, recorded.max_bytes - rest)
 
 
 def html_of(document: dict[str, Any]) -> str:
@@ -129,21 +122,16 @@ def html_of(document: dict[str, Any]) -> str:
         f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
         "base-uri 'none'; form-action 'none'"
     )
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     parts = {
         "policy": policy,
         "title": html.escape(document["name"] or "scenario"),
         "style": style,
-        "data": _escaped_json(document),
+        "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": script,
     }
     # One pass: inserted text is not searched again, so no name in a scenario can be taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
-
-
-def _escaped_json(document: dict[str, Any]) -> str:
-    """Serialize to JSON that cannot close the element that holds it, whatever the names in it."""
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _hash(text: str) -> str:

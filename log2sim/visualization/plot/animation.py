@@ -31,11 +31,10 @@ from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.selection import FPS, MAX_REAL_TIME_S, PlotOptions, TimeRange
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, TAIL_ALPHA, TRACK_ALPHA
 from log2sim.visualization.plot.time_series import TimelineCharts
-from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, centers_xy, paint_of
+from log2sim.visualization.plot.viewport import AgentRoles, centers_xy, paint_of
 
 TAIL_S = 1.5
-REAL_TIME = 1.05
-"""Faster playing is said."""
+REAL_TIME = 1.05  # faster playing is said
 
 
 class AnimatedArtists:
@@ -59,14 +58,6 @@ class AnimatedArtists:
         self.collisions = drawing.draw_collisions(layout.ax, self.collision_xy_m, animated=True)
         driven = {a.id: a for a in overlays.replay.agents} if overlays.replay is not None else {}
         self.replayed = [(driven[r.agent.id], r) for r in roles.movers if r.agent.id in driven]
-        self._add_collections()
-        width, height = layout.figure.get_size_inches()
-        self.stamp = layout.figure.text(
-            1 - (SIDE_IN + 0.2) / width, 1 - (TOP_IN - 0.16) / height, "", ha="right", fontsize=11, color=INK,
-            family=FONT, fontweight="bold", parse_math=False, animated=True,
-        )  # fmt: skip
-
-    def _add_collections(self) -> None:
         hidden: dict[str, Any] = {"animated": True, "zorder": drawing.BOX}
         self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
         self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
@@ -82,27 +73,17 @@ class AnimatedArtists:
         ]  # fmt: skip
         for collection in self.collections:
             self.layout.ax.add_collection(collection, autolim=False)
+        width, height = layout.figure.get_size_inches()
+        self.stamp = layout.figure.text(
+            1 - (SIDE_IN + 0.2) / width, 1 - (TOP_IN - 0.16) / height, "", ha="right", fontsize=11, color=INK,
+            family=FONT, fontweight="bold", parse_math=False, animated=True,
+        )  # fmt: skip
 
     def show(self, t_s: float) -> None:
         """Draw the state at `t_s` over the static artists."""
         posed = [(role, _pose(role.agent, t_s)) for role in self.roles.movers]
         present = [(role, pose) for role, pose in posed if pose is not None]
         corners = [viewport.footprints(role.agent, pose[:2], pose[2])[0] for role, pose in present]
-        self._show_boxes(present, corners, t_s)
-        self._show_overlays(t_s)
-        for collection in self.collections:
-            self.layout.ax.draw_artist(collection)
-        self.signals.show(t_s)
-        self.labels.show([(role, c, float(pose[3])) for (role, pose), c in zip(present, corners)])
-        self.collisions.set_data(*self.collision_xy_m[self.collision_s <= t_s + 1e-6].T)
-        self.layout.ax.draw_artist(self.collisions)
-        fast = "" if 1 / REAL_TIME < self.speed_up < REAL_TIME else f"  (×{self.speed_up:.2g})"
-        self.stamp.set_text(f"t = {t_s:.1f} s{fast}")
-        self.layout.figure.draw_artist(self.stamp)
-        if self.charts is not None:
-            self.charts.show(t_s)
-
-    def _show_boxes(self, present: list[tuple[AgentRole, Array]], corners: list[Array], t_s: float) -> None:
         self.boxes.set_verts(corners)
         self.boxes.set_facecolor([to_rgba(role.color, 1.0 if role.leading else 0.6) for role, _ in present])
         self.noses.set_facecolor([paint_of(role.agent, to_rgba(PAPER, 0.85)) for role, _ in present])
@@ -111,8 +92,6 @@ class AnimatedArtists:
         self.hatches.set_segments([s for a, p in doubted for s in box_stripes(a, p[:2], p[2], self.layout.view)])
         self.tails.set_segments([_tail(role.agent, pose, t_s) for role, pose in present])
         self.tails.set_color([to_rgba(role.color, TAIL_ALPHA) for role, _ in present])
-
-    def _show_overlays(self, t_s: float) -> None:
         if self.overlays.predicted is not None:
             leading = [
                 (role, self.overlays.predicted.at(role.agent.id, t_s)) for role in self.roles.movers if role.leading
@@ -127,6 +106,17 @@ class AnimatedArtists:
             )
         if self.replayed:
             self._show_driven(t_s)
+        for collection in self.collections:
+            self.layout.ax.draw_artist(collection)
+        self.signals.show(t_s)
+        self.labels.show([(role, c, float(pose[3])) for (role, pose), c in zip(present, corners)])
+        self.collisions.set_data(*self.collision_xy_m[self.collision_s <= t_s + 1e-6].T)
+        self.layout.ax.draw_artist(self.collisions)
+        fast = "" if 1 / REAL_TIME < self.speed_up < REAL_TIME else f"  (×{self.speed_up:.2g})"
+        self.stamp.set_text(f"t = {t_s:.1f} s{fast}")
+        self.layout.figure.draw_artist(self.stamp)
+        if self.charts is not None:
+            self.charts.show(t_s)
 
     def _show_driven(self, t_s: float) -> None:
         verts, colors = [], []
@@ -157,30 +147,18 @@ def _tail(agent: Agent, pose: Array, t_s: float) -> Array:
     return np.concatenate([chosen, [pose[:2]]])
 
 
-WIDTH_PX = {".gif": 960, ".mp4": 1280, ".webm": 1280}
-"""Without a size of the user's."""
-
+WIDTH_PX = {".gif": 960, ".mp4": 1280, ".webm": 1280}  # without a size of the user's
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """How many frames an animation has and how far apart they are.
-
-    Attributes
-    ----------
-    step_s : float, s
-        Of the scenario from frame to frame.
-    start_s : float, s
-        Time of the first frame.
-    fps : float
-        Frames that are shown a second.
-    """
+    """How many frames an animation has and how far apart they are."""
 
     frames: int
-    step_s: float
-    start_s: float = 0.0
-    fps: float = FPS[".gif"]
+    step_s: float  # of the scenario from frame to frame
+    start_s: float = 0.0  # time of the first frame
+    fps: float = FPS[".gif"]  # frames that are shown a second
 
     @property
     def speed_up(self) -> float:

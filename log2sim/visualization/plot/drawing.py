@@ -26,8 +26,7 @@ from log2sim.visualization.plot.viewport import (
     paint_of,
 )
 
-BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
-"""z-order, from the bottom up."""
+BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)  # z-order, from the bottom up
 
 
 class Background(Protocol):
@@ -89,12 +88,7 @@ def draw_tracks(
 ) -> None:
     """Draw tracks as lines with arrowheads, filled gaps dashed, and time marks.
 
-    Parameters
-    ----------
-    alpha : float
-        Below 1 lines become pale ribbons under overlays.
-    faint : bool
-        Lines only, as the background of an animation.
+    `alpha`: below 1 lines become pale ribbons under overlays. `faint`: lines only, as the background of an animation.
     """
     for leading in (False, True):
         same_rank = [r for r in roles.movers if r.leading is leading]

@@ -20,48 +20,35 @@ from numpy.typing import NDArray
 from log2sim.errors import ConfigError, install_command
 from log2sim.visualization.plot.style import PAPER, TAIL_ALPHA, TRACK_ALPHA
 
-Image = NDArray[np.uint8]
-"""A frame (H, W, 3), RGB."""
-
+Image = NDArray[np.uint8]  # a frame (H, W, 3), RGB
 H264, VP9 = "libx264", "libvpx-vp9"
+# Options of the encoders: constant quality at which letters of 7 pt keep their edges. Without `mbtree`, since with it
+# x264 writes other bytes for the same frames from run to run (measured: 5 files of 12 runs).
 QUALITY: dict[str, dict[str, str]] = {
     H264: {"crf": "20", "preset": "medium", "x264-params": "mbtree=0"},
     VP9: {"crf": "32", "b": "0", "deadline": "good", "cpu-used": "4"},
 }
-"""Options of the encoders: constant quality at which letters of 7 pt keep their edges. Without `mbtree`, since with it x264
-writes other bytes for the same frames from run to run (measured: 5 files of 12 runs)."""
 
+# The same frames give the same bytes; and the index stands at the start of an .mp4, so that browsers play it while it
+# loads.
 CONTAINER: dict[str, dict[str, str]] = {
     H264: {"fflags": "+bitexact", "movflags": "+faststart"},
     VP9: {"fflags": "+bitexact"},
 }
-"""The same frames give the same bytes; and the index stands at the start of an .mp4, so that browsers play it while it loads."""
 
-MAX_DENOMINATOR = 1001
-"""Of frame rates as fractions; broadcast rates such as 29.97 have it."""
-
-CLEAR = 255
-"""Palette index of transparent pixels in a .gif; the lower ones are colors."""
-
-SWATCH_PX = 100
-"""Width of the swatches of agent colors that the palette is chosen with."""
+MAX_DENOMINATOR = 1001  # of frame rates as fractions; broadcast rates such as 29.97 have it
+CLEAR = 255  # palette index of transparent pixels in a .gif; the lower ones are colors
+SWATCH_PX = 100  # width of the swatches of agent colors that the palette is chosen with
 
 
 @dataclass(frozen=True)
 class FilmFile:
-    """Where a film goes and how it is written.
-
-    Attributes
-    ----------
-    write : callable or None
-        Takes frames, the path of the file and the frames a second; None for a .gif or a still picture.
-    note : str or None
-        What is other than it was asked for.
-    """
+    """Where a film goes and how it is written."""
 
     path: Path
+    # Takes frames, the path of the file and the frames a second; None for a .gif or a still picture.
     write: Callable[[Iterator[Image], Path, float], None] | None = None
-    note: str | None = None
+    note: str | None = None  # what is other than it was asked for
 
 
 def choose_film_file(requested: Path) -> FilmFile:
@@ -112,10 +99,7 @@ def write_with_av(frames: Iterator[Image], path: Path, fps: float, codec: str, c
 def write_with_opencv(frames: Iterator[Image], path: Path, fps: float) -> None:
     """Write a .webm with OpenCV.
 
-    Raises
-    ------
-    ConfigError
-        When this OpenCV has no such encoder.
+    Raises `ConfigError` when this OpenCV has no such encoder.
     """
     import cv2
 
@@ -210,8 +194,6 @@ def _silent_stderr() -> Iterator[None]:
 def _replace_track_number(path: Path) -> None:
     """Replace the random number by which a Matroska file names its track, so that the same frames give the same bytes.
 
-    Notes
-    -----
     RFC 9559: TrackUID has the id 73 C5 and TagTrackUID 63 C5, both followed here by 88, a length of 8 bytes. They are written
     before the first cluster (1F 43 B6 75), so nothing of the film itself can be mistaken for them.
     """

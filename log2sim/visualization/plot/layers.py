@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -52,11 +52,8 @@ from log2sim.visualization.plot.style import (
 )
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy
 
-STEP_S = 0.1
-"""Between the points of a line: ends observe at the rate of their LiDARs."""
-
-WIDTH_PT, BESIDE_PT = 1.3, 3.4
-"""Width of a line, and how far to the right of the track it is."""
+STEP_S = 0.1  # between the points of a line: ends observe at the rate of their LiDARs
+WIDTH_PT, BESIDE_PT = 1.3, 3.4  # width of a line, and how far to the right of the track it is
 
 
 def tells_ends(scenario: Scenario) -> bool:
@@ -100,20 +97,13 @@ def _within(t_s: Array, spans: tuple[Span, ...]) -> np.ndarray[tuple[int, ...], 
 
 LINE: dict[str, Any] = {"color": WARNING, "lw": 1.2, "ls": (0, (4.0, 2.5)), "marker": "o", "ms": 3.5, "mfc": "none"}
 
-TEXT_PT = -9.0
-"""How far above the middle of the line its text is."""
+TEXT_PT = -9.0  # how far above the middle of the line its text is
 
 
 class WarnedPlace(NamedTuple):
-    """A warning to draw.
+    """A warning to draw."""
 
-    Attributes
-    ----------
-    ends_m : (2, 2) float64, m
-        Centers of the warned vehicle and of the agent.
-    """
-
-    ends_m: Array
+    ends_m: Array  # (2, 2) centers of the warned vehicle and of the agent
     text: str
 
 
@@ -176,18 +166,10 @@ _CIRCLE = np.exp(2j * np.pi * np.arange(36) / 36)
 
 
 class Expected(NamedTuple):
-    """A prediction to draw.
+    """A prediction to draw."""
 
-    Attributes
-    ----------
-    path_m : (H + 1, 2) float64, m
-        From where the agent is to where it is expected to be.
-    ellipse_m : (V, 2) float64, m
-        One standard deviation about the end.
-    """
-
-    path_m: Array
-    ellipse_m: Array
+    path_m: Array  # (H + 1, 2) from where the agent is to where it is expected to be
+    ellipse_m: Array  # (V, 2) one standard deviation about the end
 
 
 class PredictedPaths:
@@ -268,28 +250,14 @@ def prediction_row(horizon_s: float) -> tuple[Line2D, str]:
 
 @dataclass(frozen=True, eq=False)
 class Overlays:
-    """What a picture shows besides the scenario, and the options that concern how.
+    """What a picture shows besides the scenario, and the options that concern how."""
 
-    Attributes
-    ----------
-    replay : log2sim.simulation.result.Replay or None
-        Drawn over the scenario, with charts below the map.
-    truth : Scenario or None
-        In the time and map of the scenario.
-    background : BirdsEyeView or None
-        A picture of the ground, drawn below everything.
-    title : str or None
-        None for the name of the scenario.
-    span : Span or None
-        Range of time that is shown; None for the whole scenario.
-    """
-
-    replay: Any = None
-    truth: Scenario | None = None
-    background: Background | None = None
+    replay: Any = None  # drawn over the scenario, with charts below the map
+    truth: Scenario | None = None  # in the time and map of the scenario
+    background: Background | None = None  # A picture of the ground, drawn below everything
     predicted: PredictedPaths | None = None
-    title: str | None = None
-    span: TimeRange | None = None
+    title: str | None = None  # none for the name of the scenario
+    span: TimeRange | None = None  # range of time that is shown; None for the whole scenario
     options: PlotOptions = NO_OPTIONS
 
     def span_of(self, scenario: Scenario) -> TimeRange:
@@ -300,19 +268,11 @@ class Overlays:
 NO_OVERLAYS = Overlays()
 
 
-MAX_NAMED = 5
-"""Doubtful agents whose reasons are in the legend."""
-
-LINE_LETTERS, MAX_LINES = 34, 3
-"""Letters that fit into a line of the legend, and lines of one reason."""
-
-MIN_SHOWN_S = 0.5
-"""A doubt about less time is shown for as much, so that it can be seen."""
-
-"""Spacing at which the doubtful part of a track is followed."""
-
-STRIPES_PT, STRIPE_PT = 3.0, 0.9
-"""Spacing and width of the stripes in boxes."""
+MAX_NAMED = 5  # doubtful agents whose reasons are in the legend
+LINE_LETTERS, MAX_LINES = 34, 3  # letters that fit into a line of the legend, and lines of one reason
+# Spacing at which the doubtful part of a track is followed.
+MIN_SHOWN_S = 0.5  # a doubt about less time is shown for as much, so that it can be seen
+STRIPES_PT, STRIPE_PT = 3.0, 0.9  # spacing and width of the stripes in boxes
 
 
 def shown_spans(agent: Agent) -> list[tuple[float, float]]:
@@ -401,36 +361,16 @@ def _hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge:
     )
 
 
-LANES, LINES = BACKGROUND + 0.2, BACKGROUND + 0.4
-"""z-order: above a picture of the ground, below what stands."""
-
+LANES, LINES = BACKGROUND + 0.2, BACKGROUND + 0.4  # z-order: above a picture of the ground, below what stands
 MIN_LINE_PT, BORDER_PT = 0.9, 0.8
 DASHES = (0, (4.0, 3.0))
-ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)
-"""Arrows along lanes: distance from one to the next, length and half width."""
+ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)  # arrows along lanes: distance from one to the next, length and half width
 
 
 def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: bool) -> None:
     """Draw the map features of a scenario; the faces of lanes not over a picture of the ground, which they would hide."""
-    draw_sensors(ax, scenario.sensors)
-    features = scenario.map_features
-    if features is None:
-        return
-    if not over_picture:
-        faces = [lane_outline(lane) for lane in features.lanes]
-        ax.add_collection(PolyCollection(faces, facecolors=LANE_FACE, edgecolors="none", zorder=LANES), autolim=False)
-    arrows = [arrow for lane in features.lanes for arrow in lane_arrows(lane)]
-    ax.add_collection(PolyCollection(arrows, facecolors=LANE_ARROW, zorder=LANES + 0.1), autolim=False)
-    borders = [border.points_m[:, :2] for border in features.borders]
-    ax.add_collection(
-        LineCollection(borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1), autolim=False
-    )
-    _draw_markings(ax, features.markings, view)
-
-
-def draw_sensors(ax: Axes, sensors: Sequence[Mapping[str, Any]]) -> None:
-    """Draw sensors that are fixed in the map with their fields of view; of those that look all around only the range."""
-    for sensor in sensors:
+    # Draw sensors that are fixed in the map with their fields of view; of those that look all around only the range.
+    for sensor in scenario.sensors:
         half = min(np.rad2deg(sensor["fov_rad"]) / 2, 180.0)
         yaw, place = np.rad2deg(sensor["yaw_rad"]), (sensor["x_m"], sensor["y_m"])
         face = "none" if half > 179.9 else to_rgba(SENSOR_COLOR, 0.05)
@@ -450,6 +390,19 @@ def draw_sensors(ax: Axes, sensors: Sequence[Mapping[str, Any]]) -> None:
             scalex=False,
             scaley=False,
         )
+    features = scenario.map_features
+    if features is None:
+        return
+    if not over_picture:
+        faces = [lane_outline(lane) for lane in features.lanes]
+        ax.add_collection(PolyCollection(faces, facecolors=LANE_FACE, edgecolors="none", zorder=LANES), autolim=False)
+    arrows = [arrow for lane in features.lanes for arrow in lane_arrows(lane)]
+    ax.add_collection(PolyCollection(arrows, facecolors=LANE_ARROW, zorder=LANES + 0.1), autolim=False)
+    borders = [border.points_m[:, :2] for border in features.borders]
+    ax.add_collection(
+        LineCollection(borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1), autolim=False
+    )
+    _draw_markings(ax, features.markings, view)
 
 
 def _draw_markings(ax: Axes, markings: Sequence[Marking], view: Viewport) -> None:

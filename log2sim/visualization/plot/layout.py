@@ -38,63 +38,40 @@ from log2sim.visualization.plot.style import (
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, nice_step
 
 LABEL_Z = 8.0
+# Mean width of a bold letter of the font and half the height of a line, of its size.
 LETTER_WIDTH, LETTER_HALF_HEIGHT = 0.68, 0.55
-"""Mean width of a bold letter of the font and half the height of a line, of its size."""
 
+# Where a label may be beside its box, the best first.
 SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0))
-"""Where a label may be beside its box, the best first."""
 
-RINGS_PT = (0.0, 6.0)
-"""How far from the box it may be."""
-
-FAR_RINGS_PT = (0.0, 6.0, 14.0)
-"""The same for a short label that has no room closer to its track than to any other."""
-
-ALONG_TRACK = (0.75, 0.5, 0.25, 0.0)
-"""Shares of a track at which a label may be when there is no room at its end."""
-
-MAX_TRACK_POINTS = 40
-"""Points of a track that labels keep clear of; for 500 agents more would take seconds."""
-
+RINGS_PT = (0.0, 6.0)  # how far from the box it may be
+FAR_RINGS_PT = (0.0, 6.0, 14.0)  # the same for a short label that has no room closer to its track than to any other
+ALONG_TRACK = (0.75, 0.5, 0.25, 0.0)  # shares of a track at which a label may be when there is no room at its end
+MAX_TRACK_POINTS = 40  # points of a track that labels keep clear of; for 500 agents more would take seconds
 MOVER_PT, DETAIL_PT = 7.0, 6.0
 MAX_ID_LETTERS, MAX_REASON_LETTERS = 20, 44
 
-Bounds = tuple[float, float, float, float]
-"""Of a rectangle: least x and y, greatest x and y, m."""
-
-Anchor = tuple[Array, Array]
-"""What a label is beside: its place (2,) and half its extents (2,), m."""
+Bounds = tuple[float, float, float, float]  # of a rectangle: least x and y, greatest x and y, m
+Anchor = tuple[Array, Array]  # what a label is beside: its place (2,) and half its extents (2,), m
 
 
 @dataclass(frozen=True, eq=False)
 class MapLabel:
-    """A label at its place.
-
-    Attributes
-    ----------
-    place_m : (2,) float64, m
-        Middle of the text.
-    """
+    """A label at its place."""
 
     text: str
     color: str
-    place_m: Array
+    place_m: Array  # (2,) middle of the text
     size_pt: float
     bold: bool
 
 
 @dataclass(eq=False)
 class Placed:
-    """Labels of a picture.
-
-    Attributes
-    ----------
-    told : set of str
-        Ids of the agents of which the map says all that the legend would.
-    """
+    """Labels of a picture."""
 
     labels: list[MapLabel] = field(default_factory=list)
-    told: set[str] = field(default_factory=set)
+    told: set[str] = field(default_factory=set)  # ids of the agents of which the map says all that the legend would
 
 
 def short_label(role: AgentRole) -> str:
@@ -125,8 +102,6 @@ def place_labels(
 
     Labels keep clear of `sensors`, those of a scenario.
 
-    Notes
-    -----
     Short labels of all movers get their places before any is replaced by the full one, so that the long texts of some do not
     take the room of the others.
     """
@@ -307,11 +282,11 @@ def _bounds(agent: Agent, k: int) -> Bounds:
     return (*corners.min(axis=0), *corners.max(axis=0))
 
 
+# With more leading movers their speeds are in the legend: longer labels would cover the boxes of others.
 MAX_NAMED = 8
-"""With more leading movers their speeds are in the legend: longer labels would cover the boxes of others."""
 
+# Where a label may be beside its box, the best first.
 MOVING_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
-"""Where a label may be beside its box, the best first."""
 
 GAP_PT = 2.0
 
@@ -375,29 +350,19 @@ WIDTH_IN = 10.0
 LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
 MIN_MAP_IN, MAX_MAP_IN = 3.4, 8.4
 ROW_IN = 0.178
+# Below the map: a chart, the gap below it, the time axis, and the heading of the charts.
 CHART_IN, CHART_GAP_IN, TIME_IN, HEAD_IN = 0.56, 0.12, 0.36, 0.26
-"""Below the map: a chart, the gap below it, the time axis, and the heading of the charts."""
 
 
 @dataclass(frozen=True, eq=False)
 class FigureLayout:
-    """A figure and its parts.
-
-    Attributes
-    ----------
-    ax : Axes
-        Of the map.
-    view : Viewport
-        What the map shows.
-    foot_in : float, inch
-        Height below the map for charts.
-    """
+    """A figure and its parts."""
 
     figure: Figure
     canvas: FigureCanvasAgg
-    ax: Axes
-    view: Viewport
-    foot_in: float = 0.0
+    ax: Axes  # of the map
+    view: Viewport  # what the map shows
+    foot_in: float = 0.0  # inch, height below the map for charts
 
     @property
     def width_in(self) -> float:
@@ -436,7 +401,20 @@ def make_layout(
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
-    _axes_style(ax, fitted, projected)
+    names = ("east", "north") if projected else ("map x", "map y")
+    ax.set_axisbelow(True)
+    ax.grid(True, color=GRID, lw=0.7)
+    step_m = nice_step(max(fitted.width_m, fitted.height_m) / 5)
+    for axis, name, low in zip((ax.xaxis, ax.yaxis), names, (fitted.x0, fitted.y0)):
+        # Seven-digit tick labels are unreadable; their common part goes into the axis label.
+        base_m = float(np.floor(low / 1000) * 1000) if abs(low) >= 1e5 else 0.0
+        axis.set_major_locator(MultipleLocator(step_m))
+        axis.set_major_formatter(FuncFormatter(lambda v, _, base_m=base_m: f"{v - base_m:.6g}".replace("-", "−")))
+        since = f" − {base_m:.0f}" if base_m > 0 else f" + {-base_m:.0f}" if base_m < 0 else ""
+        axis.set_label_text(f"{name}{since} (m)", fontsize=7.5, color=MUTED, family=FONT)
+    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
+    for spine in ax.spines.values():
+        spine.set(color=FRAME, linewidth=0.8)
     return FigureLayout(figure, canvas, ax, fitted, foot_in)
 
 
@@ -526,23 +504,6 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
         column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=INK, ec=INK, lw=0.8))
         column.add_patch(Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=PAPER, ec=INK, lw=0.8))
         column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
-
-
-def _axes_style(ax: Axes, view: Viewport, projected: bool) -> None:
-    names = ("east", "north") if projected else ("map x", "map y")
-    ax.set_axisbelow(True)
-    ax.grid(True, color=GRID, lw=0.7)
-    step_m = nice_step(max(view.width_m, view.height_m) / 5)
-    for axis, name, low in zip((ax.xaxis, ax.yaxis), names, (view.x0, view.y0)):
-        # Seven-digit tick labels are unreadable; their common part goes into the axis label.
-        base_m = float(np.floor(low / 1000) * 1000) if abs(low) >= 1e5 else 0.0
-        axis.set_major_locator(MultipleLocator(step_m))
-        axis.set_major_formatter(FuncFormatter(lambda v, _, base_m=base_m: f"{v - base_m:.6g}".replace("-", "−")))
-        since = f" − {base_m:.0f}" if base_m > 0 else f" + {-base_m:.0f}" if base_m < 0 else ""
-        axis.set_label_text(f"{name}{since} (m)", fontsize=7.5, color=MUTED, family=FONT)
-    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
 
 
 def _reading_order(role: AgentRole) -> tuple[bool, str, int, str]:

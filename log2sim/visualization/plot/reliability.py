@@ -14,46 +14,32 @@ from log2sim.files.documents import replaced
 from log2sim.visualization.plot.style import FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, printable
 
 SIDE_IN = 3.4
+# Area of the mark of the bin with the most boxes; the others in proportion, which shows what they weigh.
 MAX_MARK_PT2 = 120.0
-"""Area of the mark of the bin with the most boxes; the others in proportion, which shows what they weigh."""
 
 MIN_MARK_PT2 = 9.0
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """One diagram.
-
-    Attributes
-    ----------
-    noun : str
-        What is counted, in the plural: "boxes", "ticks".
-    error : float
-        Expected calibration error.
-    bins : tuple of (int, float, float)
-        Count, mean confidence and share of right ones of each bin that is not empty.
-    """
+    """One diagram."""
 
     name: str
-    noun: str
-    error: float
+    noun: str  # what is counted, in the plural: "boxes", "ticks"
+    error: float  # expected calibration error
+    # Float), count, mean confidence and share of right ones of each bin that is not empty.
     bins: tuple[tuple[int, float, float], ...]
 
 
 def write_reliability(diagrams: Sequence[Reliability], path: Path, *, dpi: int = 150) -> None:
     """Write diagrams side by side into a PNG, atomically."""
-    figure = draw_reliability(diagrams)
-    with replaced(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
-
-
-def draw_reliability(diagrams: Sequence[Reliability]) -> Figure:
-    """Draw diagrams side by side."""
+    # Draw diagrams side by side.
     figure = Figure(figsize=(SIDE_IN * max(len(diagrams), 1), SIDE_IN + 0.3), facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
     for k, diagram in enumerate(diagrams, start=1):
         _draw(figure.add_subplot(1, len(diagrams), k), diagram)
-    return figure
+    with replaced(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
 
 
 def _draw(axes: Axes, diagram: Reliability) -> None:

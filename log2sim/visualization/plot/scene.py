@@ -48,28 +48,17 @@ from log2sim.visualization.plot.viewport import (
     time_step_s,
 )
 
-Rows = list[tuple[Any, str]]
-"""Handles and texts of a legend."""
+Rows = list[tuple[Any, str]]  # handles and texts of a legend
 
 
 @dataclass(frozen=True, eq=False)
 class PictureBase:
-    """What stills and animations share.
-
-    Attributes
-    ----------
-    step_s : float, s
-        Between time marks.
-    charts : TimelineCharts or None
-        Of the replay; None without a driven agent.
-    labels : tuple of MapLabel
-        Of a still picture, not drawn yet.
-    """
+    """What stills and animations share."""
 
     layout: FigureLayout
-    step_s: float
-    charts: TimelineCharts | None
-    labels: tuple[MapLabel, ...] = ()
+    step_s: float  # between time marks
+    charts: TimelineCharts | None  # of the replay; None without a driven agent
+    labels: tuple[MapLabel, ...] = ()  # of a still picture, not drawn yet
 
 
 def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, moving: bool = False) -> PictureBase:
@@ -88,14 +77,9 @@ def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, movi
         )  # fmt: skip
 
     layout, rows, labels = _fit_labels(scenario, roles, overlays, lay_out, None if moving else step_s)
-    if overlays.background is not None:
-        drawing.draw_background(layout.ax, overlays.background)
-    draw_road(layout.ax, scenario, layout.view, over_picture=overlays.background is not None)
-    if not moving:
-        draw_signals(layout.ax, scenario.signals, span.stop_s)
+    signals_s = None if moving else span.stop_s
+    draw_standing(layout.ax, scenario, roles, layout.view, overlays.background, signals_s=signals_s)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
-    drawing.draw_stationary(layout.ax, roles.stationary, layout.view)
-    layers.hatch_stationary(layout.ax, roles, layout.view, drawing.STATIONARY + 0.1)
     draw_legend(layout, rows)
     draw_scale_and_north(layout, projected=projected)
     write_title(layout, overlays.title or scenario.name or "scenario", _subtitle(scenario, roles, span))
@@ -103,6 +87,42 @@ def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, movi
     if timeline is not None:
         charts = draw_charts(layout, timeline, (span.start_s, span.stop_s), moving=moving)
     return PictureBase(layout, step_s, charts, labels)
+
+
+def draw_standing(
+    ax: Axes, scenario: Scenario, roles: AgentRoles, view: Viewport, background: Any, *, signals_s: float | None
+) -> None:
+    """Draw what stands: the ground, the road with its traffic lights at a time, if any, and the agents that never move."""
+    if background is not None:
+        drawing.draw_background(ax, background)
+    draw_road(ax, scenario, view, over_picture=background is not None)
+    if signals_s is not None:
+        draw_signals(ax, scenario.signals, signals_s)
+    drawing.draw_stationary(ax, roles.stationary, view)
+    layers.hatch_stationary(ax, roles, view, drawing.STATIONARY + 0.1)
+
+
+def draw_moving(
+    ax: Axes,
+    roles: AgentRoles,
+    view: Viewport,
+    step_s: float,
+    truth: Scenario | None,
+    replay: Any,
+    *,
+    ghosts: bool = False,
+) -> None:
+    """Draw the tracks of agents, pale where truth or replay lie over them; with `ghosts` also boxes along those."""
+    overlaid = truth is not None or replay is not None
+    drawing.draw_tracks(ax, roles, view, step_s, alpha=0.45 if overlaid else 1.0)
+    crowded = overlaid or not ghosts or drawing.view_is_crowded(roles)
+    drawing.draw_ends(ax, roles, view, ghosts_step_s=None if crowded else step_s)
+    layers.hatch_movers(ax, roles, view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
+    if truth is not None:
+        drawing.draw_truth(ax, truth)
+    if replay is not None:
+        drawing.draw_replay(ax, replay, roles)
+        drawing.draw_collisions(ax, new_collisions(replay)[1])
 
 
 def _view_of(roles: AgentRoles, options: PlotOptions) -> Viewport:
@@ -141,7 +161,9 @@ def _legend(
     scenario: Scenario, roles: AgentRoles, overlays: Overlays, mark_step_s: float | None, told: set[str]
 ) -> Rows:
     """List the rows of the legend; `told` agents are labeled on the map, and `mark_step_s` is None in animations."""
-    outside = _outside(roles, _view_of(roles, overlays.options))
+    view = _view_of(roles, overlays.options)
+    agents = [r.agent for r in roles.movers] + list(roles.stationary)
+    outside = sum(not view.contains(centers_xy(a)).any() for a in agents)
     shown = {"truth": overlays.truth is not None, "replay": overlays.replay is not None}
     collisions = len(new_collisions(overlays.replay)[0])
     rows = legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
@@ -167,12 +189,6 @@ def _subtitle(scenario: Scenario, roles: AgentRoles, span: TimeRange) -> str:
     if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
         parts.append(f"origin {scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°")
     return " · ".join(parts)
-
-
-def _outside(roles: AgentRoles, view: Viewport) -> int:
-    """Count the agents whose trajectories lie outside the view."""
-    agents = [r.agent for r in roles.movers] + list(roles.stationary)
-    return sum(not view.contains(centers_xy(a)).any() for a in agents)
 
 
 def _typical_speed(roles: AgentRoles) -> float:
@@ -225,20 +241,8 @@ def plot(
     roles = assign_roles(scenario)
     view = _set_view(ax, roles)
     step_s = time_step_s(scenario.duration_s, len(roles.movers), _usual_speed(roles), view.m_per_pt)
-    if background is not None:
-        drawing.draw_background(ax, background)
-    draw_road(ax, scenario, view, over_picture=background is not None)
-    draw_signals(ax, scenario.signals, scenario.duration_s)
-    drawing.draw_stationary(ax, roles.stationary, view)
-    layers.hatch_stationary(ax, roles, view, drawing.STATIONARY + 0.1)
-    drawing.draw_tracks(ax, roles, view, step_s, alpha=1.0 if replay is None and truth is None else 0.45)
-    drawing.draw_ends(ax, roles, view, ghosts_step_s=None)
-    layers.hatch_movers(ax, roles, view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
-    if aligned is not None:
-        drawing.draw_truth(ax, aligned)
-    if replay is not None:
-        drawing.draw_replay(ax, replay, roles)
-        drawing.draw_collisions(ax, new_collisions(replay)[1])
+    draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
+    draw_moving(ax, roles, view, step_s, aligned, replay)
     placed = place_labels(roles, view, step_s, sensors=scenario.sensors)
     draw_labels(ax, placed.labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))

@@ -14,18 +14,16 @@ from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 
 STILL, MOVING = (".png", ".svg", ".pdf"), (".gif", ".mp4", ".webm")
-IN_PIXELS = (".png", *MOVING)
-"""Kinds of pictures that have pixels."""
-
+IN_PIXELS = (".png", *MOVING)  # kinds of pictures that have pixels
+# A .gif of more frames is large; films at the rate of the logs would jerk, and states between waypoints are known.
 FPS = {".gif": 10.0, ".mp4": 25.0, ".webm": 25.0}
-"""A .gif of more frames is large; films at the rate of the logs would jerk, and states between waypoints are known."""
 
 MIN_FPS = 1.0
+# A .gif states the time of a frame in hundredths of a second, and browsers slow down those of one hundredth.
 MAX_FPS = {".gif": 50.0, ".mp4": 120.0, ".webm": 120.0}
-"""A .gif states the time of a frame in hundredths of a second, and browsers slow down those of one hundredth."""
 
+# What lasts longer is shown faster than real time unless the speed is given, and the picture says so.
 MAX_REAL_TIME_S = {".gif": 30.0, ".mp4": 60.0, ".webm": 60.0}
-"""What lasts longer is shown faster than real time unless the speed is given, and the picture says so."""
 
 MIN_SIDE_PX, MAX_SIDE_PX = 240, 7680
 MAX_SPEED = 1000.0
@@ -34,34 +32,19 @@ MIN_EXTENT_M = 1.0
 
 @dataclass(frozen=True)
 class PlotOptions:
-    """What a picture shows and how; None stands for a choice that fits the scenario.
+    """What a picture shows and how; None stands for a choice that fits the scenario."""
 
-    Attributes
-    ----------
-    size_px : (width, height) or None
-        Of pictures that have pixels.
-    fps : float or None
-        Frames of a film a second.
-    speed : float or None
-        How many times faster than real time a film plays.
-    start_s, stop_s : float or None, s
-        Range of the scenario's time.
-    extent_m : (x0, y0, x1, y1) or None, m
-        Two opposite corners of the part of the map, map frame. A picture of other proportions shows more of the map.
-    agents : tuple of str or None
-        Ids of the agents that are shown; None for all.
-    label_static : bool
-        Whether static agents have labels too; those that are doubtful always have.
-    """
-
-    size_px: tuple[int, int] | None = None
-    fps: float | None = None
-    speed: float | None = None
+    size_px: tuple[int, int] | None = None  # (width, height) of pictures that have pixels
+    fps: float | None = None  # frames of a film a second
+    speed: float | None = None  # how many times faster than real time a film plays
+    # start_s, stop_s: range of the scenario's time.
     start_s: float | None = None
     stop_s: float | None = None
+    # (x0, y0, x1, y1) or None, m two opposite corners of the part of the map, map frame. A picture of other
+    # proportions shows more of the map.
     extent_m: tuple[float, float, float, float] | None = None
-    agents: tuple[str, ...] | None = None
-    label_static: bool = False
+    agents: tuple[str, ...] | None = None  # ids of the agents that are shown; None for all
+    label_static: bool = False  # whether static agents have labels too; those that are doubtful always have
 
     def require_fits(self, suffix: str, name: str) -> None:
         """Raise `ConfigError` when a file with this suffix and name has no such options, or a value is out of its limits."""
@@ -76,7 +59,13 @@ class PlotOptions:
         if self.speed is not None and not 1 / MAX_SPEED <= self.speed <= MAX_SPEED:
             raise ConfigError(f"speed: {self.speed:g}, expected {1 / MAX_SPEED:g} to {MAX_SPEED:g} times real time")
         if self.size_px is not None:
-            self._require_size(suffix, name)
+            width, height = self.size_px or (0, 0)
+            if suffix not in IN_PIXELS:
+                raise ConfigError(f"size: {name} has no pixels; choose a name that ends in {_listed(IN_PIXELS)}")
+            if not (MIN_SIDE_PX <= width <= MAX_SIDE_PX and MIN_SIDE_PX <= height <= MAX_SIDE_PX):
+                raise ConfigError(f"size: {width}x{height}, expected sides of {MIN_SIDE_PX} to {MAX_SIDE_PX} px")
+            if suffix in (".mp4", ".webm") and (width % 2 or height % 2):
+                raise ConfigError(f"size: {width}x{height}, expected even sides, which films have")
         if self.extent_m is not None:
             x0, y0, x1, y1 = self.extent_m
             if not (abs(x1 - x0) >= MIN_EXTENT_M and abs(y1 - y0) >= MIN_EXTENT_M):
@@ -85,15 +74,6 @@ class PlotOptions:
                     f"extent: {shown}, expected two corners X0,Y0,X1,Y1 at least {MIN_EXTENT_M:g} m apart in x and y"
                 )
 
-    def _require_size(self, suffix: str, name: str) -> None:
-        width, height = self.size_px or (0, 0)
-        if suffix not in IN_PIXELS:
-            raise ConfigError(f"size: {name} has no pixels; choose a name that ends in {_listed(IN_PIXELS)}")
-        if not (MIN_SIDE_PX <= width <= MAX_SIDE_PX and MIN_SIDE_PX <= height <= MAX_SIDE_PX):
-            raise ConfigError(f"size: {width}x{height}, expected sides of {MIN_SIDE_PX} to {MAX_SIDE_PX} px")
-        if suffix in (".mp4", ".webm") and (width % 2 or height % 2):
-            raise ConfigError(f"size: {width}x{height}, expected even sides, which films have")
-
 
 NO_OPTIONS = PlotOptions()
 
@@ -101,10 +81,7 @@ NO_OPTIONS = PlotOptions()
 def parse_size(text: str | None) -> tuple[int, int] | None:
     """Read a size such as "1280x720"; None stays None.
 
-    Raises
-    ------
-    ConfigError
-        For anything but two whole numbers with an x between them.
+    Raises `ConfigError` for anything but two whole numbers with an x between them.
     """
     if text is None:
         return None
@@ -117,10 +94,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
     """Read two corners such as "-20,-10,60,40"; None stays None.
 
-    Raises
-    ------
-    ConfigError
-        For anything but four finite numbers.
+    Raises `ConfigError` for anything but four finite numbers.
     """
     if text is None:
         return None
@@ -136,10 +110,7 @@ def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
 def parse_ids(text: str | None) -> tuple[str, ...] | None:
     """Read ids separated by commas; None stays None.
 
-    Raises
-    ------
-    ConfigError
-        When it names nobody.
+    Raises `ConfigError` when it names nobody.
     """
     if text is None:
         return None
@@ -158,12 +129,7 @@ SAME_TIME_S = 1e-6
 
 @dataclass(frozen=True)
 class TimeRange:
-    """A range of a scenario's time.
-
-    Attributes
-    ----------
-    start_s, stop_s : float, s
-    """
+    """A range of a scenario's time."""
 
     start_s: float
     stop_s: float
@@ -182,10 +148,7 @@ class TimeRange:
 def choose_span(scenario: Scenario, options: PlotOptions) -> TimeRange:
     """Return the range of time that the options ask for.
 
-    Raises
-    ------
-    ConfigError
-        When it is empty or none of it is in the scenario.
+    Raises `ConfigError` when it is empty or none of it is in the scenario.
     """
     start = 0.0 if options.start_s is None else options.start_s
     stop = scenario.duration_s if options.stop_s is None else min(options.stop_s, scenario.duration_s)
@@ -200,10 +163,7 @@ def choose_span(scenario: Scenario, options: PlotOptions) -> TimeRange:
 def select_shown(scenario: Scenario, replay: Any, options: PlotOptions) -> tuple[Scenario, Any]:
     """Return the scenario and its replay with the agents that the options name alone.
 
-    Raises
-    ------
-    ConfigError
-        For an id that no agent has.
+    Raises `ConfigError` for an id that no agent has.
     """
     if options.agents is None:
         return scenario, replay

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from log2sim.datatypes import Scenario
@@ -33,53 +31,34 @@ KMH = 3.6
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One curve of a chart.
-
-    Attributes
-    ----------
-    t_s, values : (T,) float64
-    style : {"thin", "ribbon", "muted"}
-        A ribbon is the reference of the thin line over it; muted curves are secondary.
-    """
+    """One curve of a chart."""
 
     label: str
+    # t_s, values: (T,)
     t_s: Array
     values: Array
+    # {"thin", "ribbon", "muted"}, a ribbon is the reference of the thin line over it; muted curves are secondary.
     style: str = "thin"
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Curves that share axes.
-
-    Attributes
-    ----------
-    min_span : float
-        Smallest range of the value axis, in `unit`.
-    lines : tuple of Curve
-        An animation shows the present value of the last one.
-    """
+    """Curves that share axes."""
 
     name: str
     unit: str
-    min_span: float
-    lines: tuple[Curve, ...]
+    min_span: float  # smallest range of the value axis, in `unit`
+    lines: tuple[Curve, ...]  # an animation shows the present value of the last one
 
 
 @dataclass(frozen=True, eq=False)
 class AgentTimeline:
-    """What the charts show of one agent.
-
-    Attributes
-    ----------
-    collisions_s : tuple of float, s
-        Start of its collisions that belong to the replay.
-    """
+    """What the charts show of one agent."""
 
     role: AgentRole
     driver: str
     charts: tuple[Chart, ...]
-    collisions_s: tuple[float, ...] = ()
+    collisions_s: tuple[float, ...] = ()  # start of its collisions that belong to the replay
 
 
 def timeline_of(replay: Any, scenario: Scenario, roles: AgentRoles) -> AgentTimeline | None:
@@ -129,19 +108,11 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
 
 @dataclass(frozen=True, eq=False)
 class TimelineCharts:
-    """Charts that were drawn.
-
-    Attributes
-    ----------
-    axes : tuple of Axes
-        From the top, one for each chart.
-    moving : list
-        Artists of an animation.
-    """
+    """Charts that were drawn."""
 
     timeline: AgentTimeline
-    axes: tuple[Axes, ...]
-    moving: list[Any] = field(default_factory=list)
+    axes: tuple[Axes, ...]  # from the top, one for each chart
+    moving: list[Any] = field(default_factory=list)  # artists of an animation
 
     def start(self) -> None:
         """Create the artists that move."""
@@ -214,7 +185,14 @@ def _draw_strip(
         ax.axvline(t, color=ALARM, lw=1.0, zorder=2)
     handles = [ax.plot(line.t_s, line.values, zorder=3, **styles[line.style])[0] for line in chart.lines]
     _style(ax, last=last)
-    _legend(ax, chart, handles, [line.label if moving else _with_largest(line, chart) for line in chart.lines])
+    labels = [line.label if moving else _with_largest(line, chart) for line in chart.lines]
+    legend = ax.legend(
+        handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
+        loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
+        prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
+        handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
+    )  # fmt: skip
+    legend.get_title().set_color(INK)
 
 
 def _style(ax: Axes, *, last: bool) -> None:
@@ -228,16 +206,6 @@ def _style(ax: Axes, *, last: bool) -> None:
         ax.set_xlabel("time (s)", fontsize=7.5, color=MUTED, family=FONT)
     for spine in ax.spines.values():
         spine.set(color=FRAME, linewidth=0.8)
-
-
-def _legend(ax: Axes, chart: Chart, handles: Sequence[Line2D], labels: Sequence[str]) -> None:
-    legend = ax.legend(
-        handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
-        loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
-        prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
-        handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
-    )  # fmt: skip
-    legend.get_title().set_color(INK)
 
 
 def _read_out(ax: Axes, text: str, **style: Any) -> Any:

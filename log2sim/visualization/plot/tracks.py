@@ -10,7 +10,7 @@ import matplotlib
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
-from log2sim.visualization.plot import drawing, layers
+from log2sim.visualization.plot import drawing
 from log2sim.visualization.plot.encoding import FilmFile, choose_film_file
 from log2sim.visualization.plot.layers import (
     NO_OVERLAYS,
@@ -19,12 +19,11 @@ from log2sim.visualization.plot.layers import (
     draw_observers,
     draw_predictions,
     draw_warnings,
-    new_collisions,
     tells_ends,
     warned_places,
 )
 from log2sim.visualization.plot.layout import FigureLayout, draw_labels
-from log2sim.visualization.plot.scene import draw_base
+from log2sim.visualization.plot.scene import draw_base, draw_moving
 from log2sim.visualization.plot.selection import (
     MOVING,
     NO_OPTIONS,
@@ -54,36 +53,15 @@ def plot_tracks(
 ) -> Path:
     """Draw a scenario from above into a file: a still for .png, .svg and .pdf, an animation for .gif, .mp4 and .webm.
 
-    Parameters
-    ----------
-    replay : log2sim.simulation.result.Replay or None
-        Drawn over the scenario; charts below the map show commands and errors of the ego, else of the agent farthest from
-        its path.
-    truth : Scenario or None
-        Brought to the scenario's start and map.
-    background : BirdsEyeView or None
-        A picture of the ground in the map frame, drawn below everything.
-    predict_s : float, s, or None
-        For how long predictions of the leading movers are drawn.
-    options : PlotOptions
-        Size, range of time, part of the map, agents, and the frames of a film.
-    dpi : int
-        Dots per inch of a .png without a size, which is 10 inches wide then.
-    progress : callable
-        `progress(stage, done, total)` is called for every frame of an animation.
-
-    Returns
-    -------
-    Path
-        The file that was written: a .webm where an .mp4 was asked for and H.264 is not installed.
-
-    Raises
-    ------
-    ConfigError
-        When the name has another suffix, an option does not fit, `predict_s` is no horizon of predictions, the file exists and
-        `overwrite` is False, or it cannot be written.
-    ScenarioError
-        When the truth's map has another projection.
+    `replay`: drawn over the scenario; charts below the map show commands and errors of the ego, else of the agent
+    farthest from its path. `truth`: brought to the scenario's start and map. `background`: a picture of the ground in
+    the map frame, drawn below everything. `predict_s`: for how long predictions of the leading movers are drawn.
+    `options`: size, range of time, part of the map, agents, and the frames of a film. `dpi`: dots per inch of a .png
+    without a size, which is 10 inches wide then. `progress`: `progress(stage, done, total)` is called for every frame
+    of an animation. Returns the file that was written: a .webm where an .mp4 was asked for and H.264 is not installed.
+    Raises `ConfigError` when the name has another suffix, an option does not fit, `predict_s` is no horizon of
+    predictions, the file exists and `overwrite` is False, or it cannot be written. Raises `ScenarioError` when the
+    truth's map has another projection.
     """
     film = resolve_picture(Path(out_path))
     suffix = film.path.suffix.lower()
@@ -117,16 +95,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
     """Draw a still picture."""
     base = draw_base(scenario, roles, overlays)
     layout, ax, replay = base.layout, base.layout.ax, overlays.replay
-    overlaid = overlays.truth is not None or replay is not None
-    drawing.draw_tracks(ax, roles, layout.view, base.step_s, alpha=0.45 if overlaid else 1.0)
-    ghosts = None if overlaid or drawing.view_is_crowded(roles) else base.step_s
-    drawing.draw_ends(ax, roles, layout.view, ghosts_step_s=ghosts)
-    layers.hatch_movers(ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
-    if overlays.truth is not None:
-        drawing.draw_truth(ax, overlays.truth)
-    if replay is not None:
-        drawing.draw_replay(ax, replay, roles)
-        drawing.draw_collisions(ax, new_collisions(replay)[1])
+    draw_moving(ax, roles, layout.view, base.step_s, overlays.truth, replay, ghosts=True)
     if tells_ends(scenario):
         draw_observers(ax, roles, layout.view)
     draw_warnings(ax, warned_places(replay))
@@ -141,10 +110,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
 def resolve_picture(requested: Path) -> FilmFile:
     """Tell which file is written for a name, and for an animation how.
 
-    Raises
-    ------
-    ConfigError
-        When no picture ends in its suffix.
+    Raises `ConfigError` when no picture ends in its suffix.
     """
     suffix = requested.suffix.lower()
     if suffix not in STILL + MOVING:

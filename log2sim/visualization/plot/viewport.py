@@ -13,23 +13,16 @@ from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.visualization.plot.style import CROWD_COLOR, INK, PALETTE
 
-MIN_MOVING_M = 1.0
-"""An agent is stationary when the bounding box of its trajectory has a shorter diagonal."""
+MIN_MOVING_M = 1.0  # an agent is stationary when the bounding box of its trajectory has a shorter diagonal
 
 
 @dataclass(frozen=True, eq=False)
 class AgentRole:
-    """A moving agent as the pictures show it.
-
-    Attributes
-    ----------
-    leading : bool
-        Whether it has its own color, a label and a line in the legend.
-    """
+    """A moving agent as the pictures show it."""
 
     agent: Agent
     color: str
-    leading: bool
+    leading: bool  # whether it has its own color, a label and a line in the legend
 
     @property
     def is_ego(self) -> bool:
@@ -98,33 +91,21 @@ def paint_of(agent: Agent, otherwise: Any) -> Any:
 
 MIN_SIDE_M = 20.0
 MARGIN_M = 4.0
-REACH_M = 60.0
-"""Movers closer than this to the ego's trajectory are always in view."""
-
-MAX_UNCROWDED_MOVERS = 12
-"""With more movers there are fewer time marks, and the view keeps to where most of them are."""
-
-STATIONARY_REACH_M = 25.0
-"""Stationary agents closer than this to the ego's trajectory are in view."""
+REACH_M = 60.0  # movers closer than this to the ego's trajectory are always in view
+MAX_UNCROWDED_MOVERS = 12  # with more movers there are fewer time marks, and the view keeps to where most of them are
+STATIONARY_REACH_M = 25.0  # stationary agents closer than this to the ego's trajectory are in view
 
 
 @dataclass(frozen=True)
 class Viewport:
-    """A rectangle of the map.
+    """A rectangle of the map."""
 
-    Attributes
-    ----------
-    x0, x1, y0, y1 : float, m
-        Map frame.
-    m_per_pt : float
-        Meters for each point (1/72 inch) of the figure.
-    """
-
+    # x0, x1, y0, y1: m, map frame.
     x0: float
     x1: float
     y0: float
     y1: float
-    m_per_pt: float = 0.1
+    m_per_pt: float = 0.1  # meters for each point (1/72 inch) of the figure
 
     @property
     def width_m(self) -> float:
@@ -157,8 +138,6 @@ class Viewport:
 def choose_viewport(roles: AgentRoles) -> Viewport:
     """Choose the smallest view of the ego's trajectory, all movers but far outliers, and stationary agents near them.
 
-    Notes
-    -----
     Points of movers are outliers when they are farther from the core than `REACH_M` and than three times the upper quartile
     of all movers' distances, or twice the median of many movers. The core is the ego's trajectory or, without an ego, the
     median of all movers.
