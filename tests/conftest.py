@@ -14,18 +14,21 @@ from pathlib import Path
 import pytest
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave the first case of each test marked `matrix` to the default suite, and put files with slow tests first.
+    """Leave the first case of each test marked `matrix` to the default suite, and none of those of recorded logs.
 
-    Then no process is left with a long one at the end.
+    Files with slow tests come first, so that no process is left with a long one at the end.
     """
     first = set[str]()
     for item in items:
         function = f"{item.path}::{item.originalname}" if isinstance(item, pytest.Function) else item.nodeid
-        if item.get_closest_marker("matrix") and function in first:
+        if "real_data" in getattr(item, "fixturenames", ()) or (
+            item.get_closest_marker("matrix") and function in first
+        ):
             item.add_marker(pytest.mark.slow)
         first.add(function)
     slow = {item.path for item in items if item.get_closest_marker("slow")}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.datatypes import Agent, Lidar, Log, Scenario, Stream, Sweep, Waypoints
-from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform, undistort
+from log2sim.geometry import Array, Camera, PoseTrack, apply, rotation_from_rpy, transform, undistort
 
 SLOPE = 0.05
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
@@ -125,8 +125,3 @@ def _sweeps(lidar: Lidar, ego: PoseTrack, world: World, scale: float) -> Callabl
         return Sweep(int(ego.t_ns[i]), xyz.astype(np.float32), "lidar", None, None, strength.astype(np.float32))
 
     return read
-
-
-def moved(map_T_ego: Array, xyz: Array) -> Array:
-    """Points of the map in an ego frame."""
-    return apply(inverse(map_T_ego), xyz)

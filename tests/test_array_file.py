@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -34,22 +33,6 @@ def test_arrays_come_back_as_they_were(kinds: list[Any], memory_bytes: int) -> N
     in_memory = sum(item.nbytes for item in kept.items if isinstance(item, np.ndarray))
     assert in_memory <= memory_bytes
     assert in_memory == sum(a.nbytes for a in arrays) or any(isinstance(item, StoredArray) for item in kept.items)
-
-
-def test_parts_of_an_array_are_kept_without_the_rest() -> None:
-    whole = np.arange(12.0).reshape(4, 3)
-    kept = ArrayFile(0).keep(whole[:, 1])
-    assert isinstance(kept, StoredArray)
-    assert kept.read().tolist() == [1.0, 4.0, 7.0, 10.0]
-
-
-def test_threads_keep_and_read_at_once() -> None:
-    file = ArrayFile(1000)
-    with ThreadPoolExecutor(4) as pool:
-        kept = ArrayList(pool.map(lambda k: file.keep(np.full(50 + k, k)), range(64)))
-        assert list(pool.map(lambda k: (len(kept[k]), set(kept[k].tolist())), range(64))) == [
-            (50 + k, {k}) for k in range(64)
-        ]
 
 
 def test_rows_are_taken_and_joined_unread() -> None:
@@ -99,13 +82,6 @@ def test_obstacles_come_back_as_they_were(memory_bytes: int, with_rays: bool) ->
         assert (other.free is None) is (one.free is None)
         for name in ("end", "t_s", "sensor", "position", "velocity_mps") if with_rays else ():
             np.testing.assert_array_equal(getattr(one.free, name), getattr(other.free, name))
-
-
-def test_points_near_a_place_are_those_of_the_square() -> None:
-    xyz = np.random.default_rng(0).uniform(-10, 10, (500, 3)).astype(np.float32)
-    cloud = Obstacles(0, np.array([100.0, 50.0, 0.0]), xyz, xyz[:, 0], np.zeros(3, np.float32))
-    inside = np.all(np.abs(xyz[:, :2] - [3.0, -2.0]) <= 2.5, axis=1)
-    assert cloud.near(np.array([103.0, 48.0]), 2.5).tolist() == np.flatnonzero(inside).tolist()
 
 
 @pytest.mark.parametrize("memory_bytes", [0, 10_000])

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import Ran, names, run
-from worlds import PARKED, tiny_toml
 
 Change = Callable[[Path], Any]
 
@@ -161,16 +156,6 @@ def test_a_bad_log_or_setting_is_one_clear_line_and_writes_nothing(log_folder: P
     assert all(word in message for word in words), message
 
 
-def test_a_missing_folder_says_what_to_give(log_folder: Path) -> None:
-    ran = reconstruct(log_folder, log=log_folder / "none")
-    assert ran.code == 3
-    assert "none: no such folder; give the folder of a log" in ran.line
-    for command in ("inspect", "validate"):
-        ran = run(command, log_folder / "none")
-        assert ran.code == 3
-        assert "none" in ran.line
-
-
 def report_of(folder: Path) -> dict[str, Any]:
     return json.loads((folder.parent / "out/r.json").read_text())
 
@@ -206,22 +191,6 @@ def test_one_bad_record_is_counted_and_the_run_goes_on(log_folder: Path, fault: 
     assert all(word in problems.err for word in words if "finite" not in word)
 
 
-@pytest.mark.slow
-def test_scattered_nan_points_are_left_out_without_a_word(log_folder: Path, tiny_scenario: Path) -> None:
-    for file in (log_folder / "top").glob("*.npz"):
-        data = dict(np.load(file))
-        extra = np.full((5, 3), np.nan, dtype=np.float32)
-        np.savez(
-            file,
-            xyz_m=np.concatenate([data["xyz_m"], extra]),
-            t_offset_ns=np.concatenate([data["t_offset_ns"], np.zeros(5, data["t_offset_ns"].dtype)]),
-        )
-    assert reconstruct(log_folder).code == 0
-    assert report_of(log_folder)["unreadable"] == {}
-    found = json.loads((log_folder.parent / "out/s.json").read_text())
-    assert found["agents"] == json.loads(tiny_scenario.read_text())["agents"]
-
-
 @pytest.mark.matrix
 @pytest.mark.parametrize(
     ("stamp", "words"),
@@ -236,17 +205,6 @@ def test_a_stamp_out_of_order_is_put_in_place_and_told(log_folder: Path, stamp: 
     assert all("boxes in images of 'front' are at stamps of no frame" in line for line in boxes)
     assert f"note: {note}" in ran.out
     assert run("validate", log_folder).code == 3
-
-
-@pytest.mark.slow
-def test_frames_without_ego_pose_are_told(log_folder: Path) -> None:
-    poses = log_folder / "ego/poses.csv"
-    poses.write_text("\n".join(poses.read_text().split("\n")[:40]) + "\n")  # the header and 39 poses, 10 ms apart
-    ran = reconstruct(log_folder)
-    assert ran.code == 0
-    # Poses end at 0.38 s and hold for 0.2 s more: the frames at 0.03 to 0.53 s have one.
-    assert report_of(log_folder)["without_pose"] == {"front": 4}
-    assert "note: front: 4 frames skipped" in ran.out
 
 
 def agent(change: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
@@ -290,15 +248,6 @@ def test_a_bad_scenario_is_one_clear_line_in_every_command(tmp_path: Path, tiny_
         assert names(tmp_path) == ["s.json"]
 
 
-@pytest.mark.parametrize("content", [b"", b'{"a', b"\xff\xfe\0", b"[]", b"[" * 100_000])
-def test_a_file_that_is_no_scenario_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "s.json").write_bytes(content)
-    for command in ("replay", "validate"):
-        ran = run(command, tmp_path / "s.json")
-        assert ran.code == 3
-        assert "s.json" in ran.line
-
-
 def test_outputs_that_cannot_be_written_are_refused_before_the_work(log_folder: Path, tiny_scenario: Path) -> None:
     base = log_folder.parent
     (base / "file").write_text("mine")
@@ -329,24 +278,6 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(log_folder: 
     assert long.code in (2, 3)
     assert "name too long" in long.line
     assert names(base) == before
-
-
-@pytest.mark.slow
-def test_a_failing_last_step_leaves_what_was_there(
-    log_folder: Path, monkeypatch: pytest.MonkeyPatch, tiny_scenario: Path
-) -> None:
-    def full(source: object, target: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    out = log_folder.parent / "s.json"
-    out.write_text("good")
-    before = names(log_folder.parent)
-    monkeypatch.setattr("os.replace", full)
-    ran = run("reconstruct", log_folder, "--out", out, "--detector", "labels", "--overwrite", "--quiet")
-    assert ran.code == 2
-    assert "No space left" in ran.line
-    assert out.read_text() == "good"
-    assert names(log_folder.parent) == before
 
 
 @pytest.mark.parametrize(
@@ -383,35 +314,3 @@ def test_a_wrong_argument_is_one_clear_line(
 def test_a_traceback_only_with_debug(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="no such folder"):
         run("--debug", "inspect", tmp_path / "none")
-
-
-def test_an_error_of_ours_inside_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("log2sim.config.Config.to_toml", lambda self, **_: 1 / 0)
-    ran = run("config")
-    assert ran.code == 1
-    assert (
-        ran.err
-        == "log2sim: internal error: ZeroDivisionError: division by zero; run again with --debug for the place\n"
-    )
-
-
-@pytest.mark.slow
-def test_interrupting_leaves_nothing(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(tiny_toml(agents=[PARKED], duration_s=20.0))
-    (tmp_path / "work").mkdir()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "log2sim", "synth", str(scene), "--out", str(tmp_path / "work/log"), "--quiet"],
-        stderr=subprocess.PIPE,
-        text=True,
-        # A suite that runs in the background of a shell would hand down that SIGINT is ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    deadline = time.monotonic() + 30
-    while not any((tmp_path / "work").rglob("*.jpg")) and time.monotonic() < deadline:  # it is in the middle of writing
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert err == "log2sim: interrupted; no incomplete file was left\n"
-    assert names(tmp_path / "work") == []

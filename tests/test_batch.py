@@ -12,21 +12,16 @@ import numpy as np
 import pytest
 from batch_logs import FAST, damage, install_reader, lay_out_logs, tell
 from command_line import names, run
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
 from log2sim import reconstruct_all
 from log2sim.batch import run as cluster
-from log2sim.batch.discovery import FoundLog, find_logs
+from log2sim.batch.discovery import find_logs
 from log2sim.batch.evaluation import pool
-from log2sim.batch.folder import MAX_NAME_CHARS, BatchFolder, BatchSettings, Row, html_of, make_jobs, write_parquet
-from log2sim.cli import batch as command
+from log2sim.batch.folder import BatchFolder, BatchSettings, Row, html_of, make_jobs, write_parquet
 from log2sim.config import Config
-from log2sim.errors import ConfigError, LogError, PluginError
+from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import check
 from log2sim.files.inputs import following_links
-from log2sim.files.stages import usable_threads
-from log2sim.perception.run_detectors import check_detectors
 
 EVIL = "<script>alert('{{root}}')</script>&\"'"
 
@@ -71,21 +66,6 @@ def test_logs_of_all_formats_and_depths_are_found_once(many_formats: Path) -> No
     ]
 
 
-def test_a_format_and_a_folder_left_out_narrow_the_search(many_formats: Path) -> None:
-    assert ids(many_formats, format="pandaset") == [("pandaset", "pandaset/002")]
-    left = ids(many_formats, leave_out=many_formats / "group")
-    assert ("log2sim", "group/a") not in left
-    assert ("log2sim", "a") in left
-
-
-def test_a_log_is_found_at_itself_and_a_root_without_any_is_an_error(many_formats: Path) -> None:
-    assert ids(many_formats / "group" / "a") == [("log2sim", "a")]
-    with pytest.raises(LogError, match="holds no log of any format"):
-        find_logs(many_formats / "notes")
-    with pytest.raises(LogError, match="no such folder"):
-        find_logs(many_formats / "missing")
-
-
 def test_links_are_followed_only_when_asked_for_and_loops_end(many_formats: Path) -> None:
     root = many_formats / "linked"
     root.mkdir()
@@ -95,19 +75,6 @@ def test_links_are_followed_only_when_asked_for_and_loops_end(many_formats: Path
         find_logs(root)
     with following_links():
         assert ids(root) == [("log2sim", "other/a"), ("log2sim", "other/deeper/b")]
-
-
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.lists(st.text("aAbB/. \n\udcff\u00e4-_", min_size=1, max_size=9), min_size=1, max_size=8, unique=True))
-@example(["a" * 81, "b" + "a" * 80, "..", "/", "a/b", "a_b"])
-def test_names_of_folders_are_safe_and_differ(texts: list[str]) -> None:
-    jobs = make_jobs([FoundLog(text, Path("p"), "log2sim", "s") for text in texts], Path("out"), "t")
-    found = [job.name for job in jobs]
-    assert len({name.lower() for name in found}) == len(texts)
-    for name in found:
-        assert set(name) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._-")
-        assert not name.startswith(".")
-        assert len(name) <= MAX_NAME_CHARS + 9
 
 
 def test_a_batch_of_other_settings_is_refused_and_overwritten(tmp_path: Path) -> None:
@@ -125,29 +92,6 @@ def test_a_batch_of_other_settings_is_refused_and_overwritten(tmp_path: Path) ->
     assert again.read_row("a") is None
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
-    touch(tmp_path / "out" / "thesis.tex")
-    wanted = BatchSettings.create(tmp_path / "root", "auto", False, Config())
-    for overwrite in (False, True):
-        with pytest.raises(ConfigError, match="holds something else"):
-            BatchFolder.start(tmp_path / "out", wanted, overwrite=overwrite)
-    assert names(tmp_path / "out") == ["thesis.tex"]
-
-
-def test_a_row_that_is_damaged_or_of_another_log_counts_as_missing(tmp_path: Path) -> None:
-    folder = BatchFolder.start(
-        tmp_path / "out", BatchSettings.create(tmp_path, "auto", False, Config()), overwrite=False
-    )
-    folder.write_failure(row("a"), "text")
-    assert folder.read_row("a") == row("a")
-    file = folder.log_folder("a") / "row.json"
-    for change in ({"ticks": "many"}, {"unknown": 1}, {"name": "b"}, {"status": "fine"}):
-        file.write_text(json.dumps(row("a").model_dump() | change))
-        assert folder.read_row("a") is None
-    file.write_text("{")
-    assert folder.read_row("a") is None
-
-
 def test_the_page_escapes_names_and_errors() -> None:
     rows = [
         row("a", log=EVIL, format=EVIL, ticks=3),
@@ -158,12 +102,6 @@ def test_the_page_escapes_names_and_errors() -> None:
     assert page.count("<script>") == 1  # its own
     assert "alert(" not in page.replace("&lt;script&gt;alert(", "")
     assert "{{root}}" in page  # of the name: what is inserted is not searched again
-
-
-def test_the_page_says_what_was_not_run_yet() -> None:
-    made = BatchSettings.create(Path("/r"), "auto", False, Config())
-    assert "<dt>not run yet</dt><dd>3</dd>" in html_of([row("a")], made, 4)
-    assert "not run yet" not in html_of([row("a")], made, 1)
 
 
 def test_the_parquet_file_holds_the_rows(tmp_path: Path) -> None:
@@ -194,14 +132,6 @@ def test_figures_are_pooled_over_the_ticks_of_all_logs() -> None:
     assert total["speed_rmse_mps"] is None
     assert total["median_of_logs"]["position_median_m"] == pytest.approx(2.25)
     assert pool([])["recall"] is None
-
-
-def test_threads_are_limited_by_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    cores = usable_threads()
-    for text, count in (("1", 1), ("100000", cores), ("0", cores), ("many", cores), ("", cores)):
-        monkeypatch.setenv("OMP_NUM_THREADS", text)
-        assert usable_threads() == count
 
 
 @pytest.fixture
@@ -280,56 +210,3 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
             e["coverage"][key] for e in document["logs"] if "error" not in e
         )
     assert max(map(len, run("evaluate", out, "--truth", root, "-v").out.splitlines())) <= 100
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "words"),
-    [
-        (("--detector", "ssd-mobilnet-v2"), 2, "unknown detector 'ssd-mobilnet-v2' (did you mean 'ssd-mobilenet-v2'?)"),
-        (("--detector", "lidar:vehicles"), 2, "unknown LiDAR detector 'vehicles' (did you mean 'vehicle'?)"),
-        (("--detector", "labels+lidar:no.onnx"), 2, "no.onnx"),
-        (("--detector", "labels", "--set", "detect.layout=yolox"), 2, "layout 'yolox'"),
-        (("--set", "track.birth_scor=0.3"), 2, "track.birth_scor"),
-    ],
-)
-def test_settings_with_which_no_log_could_be_reconstructed_stop_the_batch_before_the_first(
-    options: tuple[str, ...], code: int, words: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def start(count: int) -> None:
-        raise AssertionError("workers were started")
-
-    monkeypatch.setattr(cluster, "local_workers", start)
-    root = lay_out_logs(tmp_path / "root", tiny_folder, "a", "b")
-    ran = run("batch", root, "--out", tmp_path / "out", *options)
-    assert (ran.code, words in ran.line) == (code, True), ran.err
-    assert not (tmp_path / "out").exists()
-    assert run("reconstruct", root / "a", "--out", tmp_path / "s.json", *options).code == code
-
-
-def test_detectors_of_other_packages_are_left_to_the_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are made for a log, and may look at it."""
-    (tmp_path / "picky.py").write_text(
-        "def create(log, *rest, **settings):\n    raise ValueError(log.cameras['front'])\n"
-    )
-    info = tmp_path / "picky-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: picky\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[log2sim.detector]\npicky = picky:create\nlost = picky:lost\n[log2sim.lidar_detector]\npicky = picky:create\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    check_detectors(Config.load(detect={"name": "picky+lidar:picky"}))
-    with pytest.raises(PluginError, match="lost"):
-        check_detectors(Config.load(detect={"name": "lost"}))
-    with pytest.raises(ConfigError, match="begins with 'lidar:'"):
-        check_detectors(Config.load(cooperation={"road_detector": "picky"}))
-
-
-def test_options_that_exclude_each_other_and_wrong_addresses_are_refused(tiny_folder: Path, tmp_path: Path) -> None:
-    ran = run("batch", tiny_folder, "--out", tmp_path / "out", "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1")
-    assert (ran.code, "--jobs" in ran.line) == (2, True)
-    ran = run("batch", tiny_folder, "--out", tmp_path / "out", "--scheduler", "localhost:8786")
-    assert (ran.code, "expected tcp://" in ran.line) == (2, True)
-    ran = run("batch", tiny_folder, "--out", tiny_folder.parent)
-    assert (ran.code, "holds the logs" in ran.line) == (2, True)
-    assert command.batch.__doc__

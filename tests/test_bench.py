@@ -5,50 +5,41 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
 from command_line import names, run
 from worlds import tiny_log
 
-from log2sim.config import Config, Section, TopdownConfig
-from log2sim.datatypes import Agent, Detections, Frame, Log, Measurements, Scenario, Waypoints
-from log2sim.errors import ConfigError, LogError
-from log2sim.evaluation.bench.benchmark import Benchmark, bench, document, format_table, short_name
+from log2sim.config import Config
+from log2sim.datatypes import Agent, Detections, Frame, Log, Scenario, Waypoints
+from log2sim.errors import LogError
+from log2sim.evaluation.bench.benchmark import Benchmark, bench, document, format_table
 from log2sim.evaluation.bench.runs import BenchContext, detect_once, make_context
 from log2sim.evaluation.bench.runs import timed_first_pass as run_first_pass
 from log2sim.evaluation.bench.scores import (
     CUTOFF_M,
-    Scope,
-    at_tick,
     jitter,
     score_homographies,
-    score_measurements,
     score_scenario,
     split_holdout,
     true_positions,
 )
 from log2sim.evaluation.bench.settings import (
     Point,
-    choices,
-    confidence_not_worse,
-    default_settings,
-    error_interval,
-    error_of,
     make_grid,
     pareto_front,
     recommend,
 )
 from log2sim.files.documents import check
-from log2sim.geometry import Array, Camera, apply_homography
+from log2sim.geometry import Array, apply_homography
 from log2sim.perception.detect.layouts import COCO_80, LAYOUTS, InputSpec
 from log2sim.perception.detect.onnx_detector import OnnxDetector, OnnxModel
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
 from log2sim.perception.sync import schedule_of
-from log2sim.plan import choose_detector, select_sensors
+from log2sim.plan import select_sensors
 
 FirstPass = tuple[BenchContext, Observations, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})
@@ -83,23 +74,6 @@ def test_the_front_is_what_nothing_beats() -> None:
     assert pareto_front(cost, error).tolist() == [True, True, False, False, True, False, False]
 
 
-def test_equal_points_are_both_on_the_front_and_nothing_has_no_front() -> None:
-    assert pareto_front([1.0, 1.0], [2.0, 2.0]).tolist() == [True, True]
-    assert pareto_front([], []).tolist() == []
-    assert pareto_front([1.0], [np.nan]).tolist() == [False]
-
-
-def test_the_front_agrees_with_a_sweep_over_sorted_points() -> None:
-    rng = np.random.default_rng(3)
-    cost, error = rng.random(200), rng.random(200)
-    lowest, expected = np.inf, set()
-    for k in np.argsort(cost):
-        if error[k] < lowest:
-            lowest = error[k]
-            expected.add(int(k))
-    assert set(np.flatnonzero(pareto_front(cost, error)).tolist()) == expected
-
-
 def point(name: str, ms: float, error: float | None, *, present: bool = False, spread: float = 0.0) -> Point:
     """A point of ten objects that have the same error, or ones that scatter about it by a factor."""
     factors = 1 + spread * np.linspace(-1, 1, 10)
@@ -113,41 +87,6 @@ def test_less_error_wins_and_of_equal_errors_the_cheaper() -> None:
     assert recommend([now, point("cheaper", 1.0, 1.02)], "m", 100.0).supported == "cheaper"
     assert recommend([now, point("a", 30.0, 0.5), point("b", 20.0, 0.51)], "m", 100.0).supported == "b"
     assert recommend([now, point("worse", 1.0, 2.0)], "m", 100.0).agrees
-
-
-def test_a_gain_that_nobody_notices_changes_nothing() -> None:
-    now = point("now", 10.0, 1.0, present=True)
-    assert recommend([now, point("cheaper", 6.0, 1.0)], "m", 100.0).agrees
-    assert recommend([now, point("better", 10.0, 0.98)], "m", 100.0).agrees
-
-
-def test_chance_replaces_nothing() -> None:
-    now = point("now", 10.0, 1.0, present=True)
-    other = replace(now, setting="other", present=False, error=0.8)
-    lucky = replace(other, by_object={str(k): ((4.0 if k % 2 else 0.04), 1.0) for k in range(10)})
-    recommendation = recommend([now, lucky], "m", 100.0)
-    assert recommendation.agrees
-    assert "may be better or not" in recommendation.reason
-    assert (
-        recommend([now, replace(other, by_object={str(k): (0.64, 1.0) for k in range(10)})], "m", 100.0).supported
-        == "other"
-    )
-
-
-def test_without_an_error_there_is_no_verdict() -> None:
-    recommendation = recommend([point("now", 1.0, None, present=True), point("other", 1.0, 1.0)], "m", 1.0)
-    assert recommendation.supported is None
-    assert not recommendation.agrees
-
-
-def test_resampling_knows_sure_and_unsure() -> None:
-    ones, twos = {str(k): (1.0, 1.0) for k in range(10)}, {str(k): (4.0, 1.0) for k in range(10)}
-    assert confidence_not_worse(ones, twos, 0.0) == 1.0
-    assert confidence_not_worse(twos, ones, 0.0) == 0.0
-    assert confidence_not_worse(twos, ones, 1.01) == 1.0  # twice the error is within an allowance of 101 %
-    mixed = {str(k): ((0.0 if k % 2 else 2.0), 1.0) for k in range(10)}
-    assert 0.3 < confidence_not_worse(mixed, ones, 0.0) < 0.8
-    assert confidence_not_worse(dict(list(ones.items())[:4]), dict(list(twos.items())[:4]), 0.0) == 0.0
 
 
 # Figures
@@ -186,13 +125,6 @@ def test_the_error_counts_distance_misses_and_false_objects() -> None:
     assert lost["error_m"] == pytest.approx(np.sqrt(CUTOFF_M**2 * 20 / (20 + 20)))
 
 
-def test_the_parts_of_objects_make_up_the_error() -> None:
-    score = score_scenario(world((0, 0.5), (0, 10.0), (0.3, 0.0)), world((0, 0), (0, 0), (0, 0)), 0.1)
-    assert error_of(score.by_object["error_m"]) == pytest.approx(score.figures["error_m"])
-    assert len(score.by_object["error_m"]) == 4
-    assert error_of({}) is None
-
-
 def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
     t = np.arange(400) * 0.1
     smooth = np.column_stack([3 * t + 1.5 * t**2, 0 * t])
@@ -213,83 +145,6 @@ def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
     columns = {name: getattr(whole, name)[kept] for name in Waypoints.FLOATS} | {"observed": whole.observed[kept]}
     thinned = replace(moving("a", smooth), waypoints=Waypoints(**{**columns, "speed_mps": 3 + 3 * t[kept]}))
     assert of(thinned) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(
-    tiny: tuple[Log, Scenario], first_pass: FirstPass
-) -> None:
-    (log, truth), (context, seen, stages_s) = tiny, first_pass
-    known = true_positions(log, context.schedule, seen, truth)
-    good = score_measurements(seen, known).figures
-    assert good["objects"] >= 20
-    assert good["error_m"] < 0.4
-    assert {"sync", "detect", "cloud", "measure"} <= set(stages_s)
-    assert "decode" not in stages_s  # boxes come from the log
-    far = replace(seen, measurements=[replace(m, center_m=m.center_m + 50.0) for m in seen.measurements])
-    assert score_measurements(far, known).figures["error_m"] == pytest.approx(CUTOFF_M)
-    lost = replace(seen, measurements=[replace(m, center_m=m.center_m * np.nan) for m in seen.measurements])
-    figures = score_measurements(lost, known).figures
-    assert figures["error_m"] == pytest.approx(CUTOFF_M)
-    assert figures["placed_share"] == 0.0
-
-
-def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(
-    tiny: tuple[Log, Scenario], first_pass: FirstPass
-) -> None:
-    (log, truth), (context, seen, _) = tiny, first_pass
-    later = replace(seen, measurements=[replace(m, t_ns=m.t_ns + 100_000_000) for m in seen.measurements])
-    for when, expected_m in (("measured", 0.4), ("imaged", 0.0)):
-        before, after = (true_positions(log, context.schedule, s, truth, when=when) for s in (seen, later))  # type: ignore[arg-type]
-        moved = np.concatenate([np.hypot(*(a.xy - b.xy).T) for a, b in zip(after, before, strict=True)])
-        assert np.nanmax(moved) == pytest.approx(expected_m, abs=0.01)  # the car drives at 4 m/s
-        assert np.nanmin(moved) == pytest.approx(0.0, abs=1e-9)  # the other one is parked
-
-
-def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
-    (log, truth), (context, seen, _) = tiny, first_pass
-    m = seen.measurements[5]
-    shifted = replace(m, box_px=m.box_px + np.array([3.0, 0.0, 3.0, 0.0]))
-    both = replace(seen, measurements=[*seen.measurements[:5], Measurements.join([m, shifted]), *seen.measurements[6:]])
-    known = true_positions(log, context.schedule, both, truth)[5]
-    alone = true_positions(log, context.schedule, seen, truth)[5]
-    np.testing.assert_array_equal(known.object_id, np.r_[alone.object_id, np.full(len(m), -1)])
-    assert (alone.object_id >= 0).sum() >= 2
-    people = replace(m, category=np.full(len(m), "pedestrian", dtype="<U16"))
-    other = replace(seen, measurements=[*seen.measurements[:5], people, *seen.measurements[6:]])
-    who = true_positions(log, context.schedule, other, truth)[5].object_id
-    assert (who[m.category == "car"] == -1).all()
-
-
-def test_only_whole_boxes_with_enough_points_are_set_aside(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
-    (log, truth), (context, seen, _) = tiny, first_pass
-    known = true_positions(log, context.schedule, seen, truth, when="imaged")
-    spoils: list[dict[str, Any]] = [{"truncated": True}, {"points": 5}, {"source": "topdown"}]
-    for spoil in spoils:
-        spoiled = [replace(m, **{k: np.full(len(m), v) for k, v in spoil.items()}) for m in seen.measurements]
-        holdout = split_holdout(
-            log, context.schedule, replace(seen, measurements=spoiled), known, np.random.default_rng(0)
-        )
-        assert len(holdout) == 0, spoil
-
-
-def test_names_in_the_picture_say_their_stage_only_where_they_must() -> None:
-    named = ["detect: no tiles", "homography: min-frame", "smooth: off", "smooth: spline", "present settings", "paper"]
-    shown = ["no tiles", "min-frame", "smooth: off", "smooth: spline", "present settings", "paper"]
-    assert [short_name(name) for name in named] == shown
-
-
-def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
-    (log, truth), (context, seen, _) = tiny, first_pass
-    known = true_positions(log, context.schedule, seen, truth, when="imaged")
-    holdout = split_holdout(log, context.schedule, seen, known, np.random.default_rng(0))
-    before = sum(len(f.uv) for parts in seen.feet.values() for f in parts)
-    after = sum(len(f.uv) for parts in holdout.observations.feet.values() for f in parts)
-    aside = sum(len(f.uv) for parts in holdout.feet.values() for f in parts)
-    assert aside == len(holdout) > 0
-    assert after == before - aside
-    assert all(
-        (m.source == "").all() and np.isnan(m.center_m).all() for rows in holdout.obstacles.values() for m in rows
-    )
 
 
 def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
@@ -315,63 +170,7 @@ def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
     assert score(0.0)["center_error_m"] < score(1.5)["center_error_m"] <= CUTOFF_M
 
 
-def test_a_tick_has_its_own_homography_or_none() -> None:
-    each = np.stack([np.eye(3), np.full((3, 3), np.nan)])
-    fit = HomographyFit(True, "", 5 * np.eye(3), np.ones(4, bool), 0.1, 1.0, np.array([3, 4]), each)
-    ground = CameraHomography(Camera("c", 10, 10, np.eye(3), "ego", np.eye(4)), fit, "obstacles")
-    assert at_tick(ground, 3).fit.ground_H_image[0, 0] == 1.0
-    assert not at_tick(ground, 4).fit.ok
-    assert not at_tick(ground, 9).fit.ok
-    assert at_tick(replace(ground, fit=replace(fit, per_tick=None)), 9).fit.ground_H_image[0, 0] == 5.0
-
-
-def test_a_setting_that_places_hardly_anything_never_replaces_the_present_one() -> None:
-    objects = {str(k): (4.0, 1.0) for k in range(20)}
-    fewer = {str(k): (2.0, 1.0) for k in range(20)}
-
-    def point(name: str, present: bool, error: float, sums: Any, **figures: float) -> Point:
-        return Point(name, present, 10.0, error, figures, sums)
-
-    for key in ("placed_share", "recall"):
-        present = point("present", True, 2.0, objects, **{key: 0.9})
-        hardly = point("hardly", False, 1.4, fewer, **{key: 0.03})
-        as_many = point("as many", False, 1.4, fewer, **{key: 0.88})
-        assert recommend([present, hardly], "m", 100.0).supported == "present"
-        assert recommend([present, hardly, as_many], "m", 100.0).supported == "as many"
-
-
-def test_the_interval_of_an_error_is_that_of_the_mean_of_its_objects() -> None:
-    rng = np.random.default_rng(4)
-    squares = rng.gamma(4.0, 0.25, 400)
-    low, high = error_interval({str(k): (float(s), 1.0) for k, s in enumerate(squares)}) or (0.0, 0.0)
-    sigma = squares.std() / np.sqrt(len(squares))
-    # The 5 and 95 % quantiles of a normal distribution.
-    expected = np.sqrt(squares.mean() + np.array([-1.645, 1.645]) * sigma)
-    assert np.allclose([low, high], expected, atol=0.15 * sigma)
-    assert error_interval({"a": (1.0, 1.0)}) is None
-
-
-def test_the_default_of_reconstruct_is_a_row_of_its_own_where_it_searches_sweeps(tiny: tuple[Log, Scenario]) -> None:
-    [default] = default_settings(tiny[0], Config())
-    assert default.present
-    assert default.config.detect.name == choose_detector(tiny[0], Config()).detect.name
-    assert default.config.detect.in_sweeps
-    assert default_settings(tiny[0], LABELS) == ()
-    assert default_settings(tiny[0].changed(lidars={}), Config()) == ()
-
-
 # Settings and shared work
-
-
-def test_the_settings_are_those_that_exist(tiny: tuple[Log, Scenario]) -> None:
-    grid = make_grid(tiny[0], Config.load(detect={"name": "labels"}, measure={"mode": "paper"}))
-    assert {s.name for s in grid.homography} == set(TopdownConfig.choices("method")) - {"off"}
-    assert [s.name for s in grid.measure] == ["paper", "robust"]
-    assert [s.config.measure.mode for s in grid.measure] == ["paper", "robust"]
-    assert [s.present for s in grid.measure] == [True, False]
-    assert "off" in [s.name for s in grid.smooth]
-    assert not all(s.config.smooth.enabled for s in grid.smooth)
-    assert [s.name for s in grid.detect] == ["labels"]
 
 
 @pytest.mark.parametrize("present", ["apart", "together"])
@@ -386,19 +185,6 @@ def test_several_cameras_are_fitted_together_and_apart(tiny: tuple[Log, Scenario
     assert {rig for name, rig in rigs.items() if name not in ("time-aware", f"cameras {other}")} == {"apart"}
     alone = make_grid(tiny[0], LABELS)
     assert not any("cameras" in s.name for s in alone.homography)
-
-
-def test_a_method_that_is_off_is_compared_all_the_same(tiny: tuple[Log, Scenario]) -> None:
-    grid = make_grid(tiny[0], Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
-    assert grid.homography[0].config.topdown.method == TopdownConfig().method
-    assert "off" not in [s.name for s in grid.homography]
-
-
-def test_new_choices_appear_by_themselves() -> None:
-    class Other(Section):
-        kind: Literal["a", "b", "c", "off"] = "b"
-
-    assert choices(Other(), "kind") == ["b", "a", "c"]
 
 
 def test_tiles_and_input_sizes_are_those_that_change_something(
@@ -474,27 +260,6 @@ def test_every_frame_is_decoded_and_detected_once(tiny: tuple[Log, Scenario]) ->
     assert len(found["a"].detect(Frame(log.cameras["front"], 1, fail))) == 0
 
 
-def test_unreadable_frames_have_no_detections_and_none_at_all_is_an_error(tiny: tuple[Log, Scenario]) -> None:
-    from log2sim.errors import RecordError
-
-    log = tiny[0]
-    stream = log.streams["front"]
-
-    def broken(limit: int) -> Log:
-        def read(k: int) -> Any:
-            if k < limit:
-                raise RecordError(f"front: frame {k} is broken")
-            return stream.read(k)
-
-        return replace(log, streams={**log.streams, "front": replace(stream, read=read)})
-
-    schedule = schedule_of(log, select_sensors(log, LABELS).cameras, LABELS)
-    found, _ = detect_once(broken(3), schedule, {"a": Counting()}, decode=True, progress=lambda done, total: None)
-    assert len(found["a"].found) == len(schedule) - 3
-    with pytest.raises(LogError, match="none of the 10 records asked for can be read"):
-        detect_once(broken(99), schedule, {"a": Counting()}, decode=True, progress=lambda done, total: None)
-
-
 # The whole
 
 
@@ -553,31 +318,6 @@ def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) ->
     assert "What the figures support:" in lines
 
 
-@pytest.fixture
-def no_labels(log_folder: Path) -> Path:
-    (log_folder / "truth.json").unlink()
-    manifest = json.loads((log_folder / "log.json").read_text())
-    manifest["labels"] = {"boxes_2d": manifest["labels"]["boxes_2d"]}
-    (log_folder / "log.json").write_text(json.dumps(manifest))
-    return log_folder
-
-
-@pytest.mark.slow
-def test_without_truth_only_steadiness_is_told_and_said_so(no_labels: Path, tmp_path: Path) -> None:
-    ran = run("bench", no_labels, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0.5")
-    assert ran.code == 0, ran.err
-    assert "note: no truth" in ran.out
-    out = json.loads((tmp_path / "b/bench.json").read_text())
-    panels = {p["stage"]: p for p in out["panels"]}
-    assert out["truth"] is None
-    assert panels["whole run"]["error"]["figure"] == "jitter_m"
-    assert {s: p["supports"]["setting"] for s, p in panels.items() if s != "homography"} == dict.fromkeys(
-        ("detect", "measure", "smooth", "whole run")
-    )
-    assert panels["homography"]["supports"]["setting"] is not None  # LiDAR tells where the obstacles are
-    assert "recall" not in panels["whole run"]["points"][0]["figures"]
-
-
 @pytest.mark.slow
 def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: Path, tmp_path: Path) -> None:
     import cv2
@@ -599,17 +339,6 @@ def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: 
     assert json.loads((tmp_path / "b/bench.json").read_text())["ticks"] == 3
 
 
-@pytest.mark.slow
-def test_one_tick_is_enough_to_run(tiny_folder: Path, tmp_path: Path) -> None:
-    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0")
-    assert ran.code == 0, ran.err
-    out = json.loads((tmp_path / "b/bench.json").read_text())
-    assert out["ticks"] == 1
-    whole = out["panels"][-1]
-    assert whole["stage"] == "whole run"
-    assert whole["supports"]["setting"] is None
-
-
 def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_path: Path) -> None:
     wrong = {
         3: (tmp_path / "none", "--out", tmp_path / "b"),
@@ -622,35 +351,3 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_pa
     (tmp_path / "file").write_text("")
     assert "is a file and not a folder" in run("bench", tiny_folder, "--out", tmp_path / "file").line
     assert names(tmp_path) == ["file"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [(("--categories", "cra"), "did you mean 'car'"), (("--range", "-5"), "it must be greater than 0")],
-)
-def test_a_wrong_scope_is_told_before_any_work(
-    options: tuple[str, str], message: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("log2sim.evaluation.bench.runs.detect_once", None)
-    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", *options)
-    assert ran.code == 2
-    assert message in ran.line
-
-
-def test_the_scope_narrows_what_is_compared(tiny: tuple[Log, Scenario]) -> None:
-    truth = tiny[1]
-    assert score_scenario(truth, truth, 0.1, Scope(categories=("car",))).figures["error_m"] == 0.0
-    assert score_scenario(truth, truth, 0.1, Scope(max_range_m=1.0)).figures["error_m"] is None
-    with pytest.raises(ConfigError, match="give --truth"):
-        make_context(tiny[0], make_grid(tiny[0], LABELS), None, silent, Scope(max_range_m=1.0))
-
-
-def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*arguments: Any, **options: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("log2sim.evaluation.bench.runs.infer_scenario", interrupted)
-    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--quiet")
-    assert ran.code == 130
-    assert "interrupted" in ran.err
-    assert names(tmp_path) == []

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from worlds import scan, standing
 
-from log2sim.perception.boxes import align_to, extents, fit_yaw, rotate, subsample
+from log2sim.perception.boxes import correct_yaws, extents, fit_yaw, rotate
+from log2sim.perception.lidar.cloud import AzimuthIndex
 
 QUARTER = np.pi / 2
-FAR_M = np.array([5e5, 5e6])
 
 
 def l_shape(length_m=4.4, width_m=1.85, count=120, noise_m=0.02, seed=0):
@@ -39,6 +40,7 @@ def test_yaw_of_a_rectangle_is_found_whatever_sides_are_seen(yaw_deg, sides):
     assert contrast > 0.3
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_the_fit_turns_with_the_points(seed):
     rng = np.random.default_rng(seed)
@@ -49,46 +51,9 @@ def test_the_fit_turns_with_the_points(seed):
         assert apart(error, first) < np.deg2rad(1.0)
 
 
-def test_the_fit_does_not_depend_on_where_the_points_are():
-    xy = rotate(l_shape(), 0.3)
-    there, contrast = fit_yaw(xy + FAR_M)
-    here, same = fit_yaw(xy)
-    assert there == pytest.approx(here, abs=1e-6)
-    assert contrast == pytest.approx(same, abs=1e-5)
-
-
-def test_the_fit_does_not_depend_on_the_order_of_few_points():
-    xy = rotate(l_shape(count=100), 0.5)
-    assert fit_yaw(xy[np.random.default_rng(0).permutation(100)])[0] == pytest.approx(fit_yaw(xy)[0], abs=1e-6)
-
-
 def test_one_stray_point_does_not_turn_the_box():
     xy = rotate(np.vstack([l_shape(), [[-1.5, 3.5]]]), 0.4)
     assert apart(fit_yaw(xy)[0], 0.4) < np.deg2rad(1.5)
-
-
-def test_a_round_cluster_has_less_contrast_than_a_box():
-    angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)
-    ring = 0.35 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    assert fit_yaw(ring)[1] < 0.1 < fit_yaw(l_shape())[1]
-
-
-@pytest.mark.parametrize(
-    "xy",
-    [np.zeros((1, 2)), np.zeros((40, 2)), np.array([[0.0, 0], [1, 1]]), np.full((5, 2), 1e7)],
-    ids=["one", "coincident", "two", "far"],
-)
-def test_points_that_say_nothing_still_give_a_yaw_in_range(xy):
-    yaw, contrast = fit_yaw(xy)
-    assert 0 <= yaw < QUARTER
-    assert np.isfinite(contrast)
-
-
-@pytest.mark.parametrize("yaw_deg", [0.0, 20.0, 65.0])
-def test_a_straight_line_gives_its_own_direction(yaw_deg):
-    line = np.stack([np.linspace(0, 4, 30), np.zeros(30)], 1)
-    yaw, _ = fit_yaw(rotate(line, np.deg2rad(yaw_deg)) + FAR_M)
-    assert apart(yaw, np.deg2rad(yaw_deg)) < np.deg2rad(1.5)
 
 
 def test_extents_without_trim_are_the_exact_ends_along_and_across():
@@ -98,34 +63,79 @@ def test_extents_without_trim_are_the_exact_ends_along_and_across():
     np.testing.assert_allclose(high, [4, 2], atol=1e-12)
 
 
-def test_trimmed_extents_ignore_a_few_stray_points():
-    xy = np.random.default_rng(0).uniform([0, 0], [4, 2], (2000, 2))
-    low, high = extents(np.vstack([xy, [[40.0, 40.0]] * 10]), 0.0)
-    assert np.all(np.abs(low) < 0.1)
-    assert np.all(np.abs(high - [4, 2]) < 0.1)
+SENSOR = np.array([0.0, 0.0, 1.9], dtype=np.float32)
 
 
-def test_rotation_is_counter_clockwise_and_undone_by_its_opposite():
-    np.testing.assert_allclose(rotate(np.array([[1.0, 0.0]]), QUARTER), [[0.0, 1.0]], atol=1e-15)
-    xy = np.random.default_rng(0).normal(size=(7, 2))
-    np.testing.assert_allclose(rotate(rotate(xy, 1.1), -1.1), xy, atol=1e-14)
+def ends_of(solids, of=0, only=None, **options):
+    """Right and left end of one solid's points (or of those that `only` picks), as the index tells."""
+    xyz, owner = scan(solids, **options)
+    members = np.flatnonzero((owner == of) & (xyz[:, 2] > 0.2))
+    if only is not None:
+        members = members[only(xyz[members])]
+    assert len(members) > 20
+    index = AzimuthIndex.of(xyz.astype(np.float32), SENSOR, owner == -1)
+    return index.ends_visible([members])[0].tolist()
 
 
-def test_subsample_keeps_the_ends_the_order_and_small_sets_as_they_are():
-    rows = np.arange(1000)[:, None]
-    few = subsample(rows, 7)
-    assert few.shape == (7, 1)
-    assert (few[0, 0], few[-1, 0]) == (0, 999)
-    assert (np.diff(few[:, 0]) > 0).all()
-    assert subsample(rows[:7], 7) is not None
-    np.testing.assert_array_equal(subsample(rows[:7], 7), rows[:7])
+WALL = standing(30.0, 0.0, 0.0, (0.5, 60.0, 4.0))
 
 
-@pytest.mark.parametrize("period", [np.pi, QUARTER, 2 * np.pi])
-def test_aligned_angles_differ_by_whole_periods_and_are_the_nearest_to_the_wanted_one(period):
-    rng = np.random.default_rng(0)
-    for yaw, toward in rng.uniform(-9, 9, (200, 2)):
-        found = align_to(yaw, toward, period)
-        assert -np.pi <= found < np.pi
-        assert apart(found, yaw, period) < 1e-9
-        assert apart(found, toward, 2 * np.pi) <= period / 2 + 1e-9
+@pytest.mark.parametrize("behind", [[], [WALL]], ids=["ground behind", "wall behind"])
+@pytest.mark.parametrize(("x", "y", "yaw"), [(12, 0, 0), (12, 4, 30), (20, -5, 90), (8, 3, -60)])
+def test_both_ends_of_a_free_car_are_seen(x, y, yaw, behind):
+    assert ends_of([standing(x, y, yaw), *behind]) == [True, True]
+
+
+def test_a_car_straight_behind_is_as_one_ahead():
+    assert ends_of([standing(-12, 0, 10)], azimuth_deg=(135, 225)) == [True, True]
+    pole = standing(-7, -0.9, 0, (0.6, 0.6, 3.0))
+    # Seen from the sensor that looks back, -y is on the left.
+    assert ends_of([standing(-12, 0, 10), pole], azimuth_deg=(135, 225)) == [True, False]
+
+
+def test_the_turned_world_shows_the_same_ends():
+    xyz, owner = scan([standing(12, 3, 40), standing(7, 2.4, 0, (0.5, 0.5, 3.0))])
+    members = np.flatnonzero((owner == 0) & (xyz[:, 2] > 0.2))
+    found = []
+    for angle in np.linspace(-np.pi, np.pi, 13):
+        c, s = np.cos(angle), np.sin(angle)
+        turned = xyz @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        found.append(tuple(AzimuthIndex.of(turned.astype(np.float32), SENSOR, owner == -1).ends_visible([members])[0]))
+    assert len(set(found)) == 1
+    assert found[0] == (True, False)
+
+
+def test_clusters_are_judged_alike_alone_and_together():
+    """Clusters of very different sizes, one across the azimuth at which a turn begins, and two that share points."""
+    pole = standing(-7, 1.6, 0, (0.4, 0.4, 3.0))
+    occluder = standing(7, 0.9, 0, (1.0, 0.8, 3.0))
+    solids = [standing(-12, 0, 10), pole, standing(14, 0, 90), occluder, standing(14, -9, 90), WALL]
+    xyz, owner = scan(solids, azimuth_deg=(-180, 180))
+    members = [np.flatnonzero((owner == k) & (xyz[:, 2] > 0.2)) for k in range(len(solids))]
+    members = [one for one in [*members, np.union1d(members[0], members[1])] if len(one)]
+    assert len(members) >= 5
+    index = AzimuthIndex.of(xyz.astype(np.float32), SENSOR, owner == -1)
+    alone = [index.ends_visible([one])[0].tolist() for one in members]
+    assert index.ends_visible(members).tolist() == alone
+    assert [True, True] in alone
+    assert any(ends != [True, True] for ends in alone)
+
+
+LENGTH_M, WIDTH_M, NOISE_M = 4.4, 1.85, 0.02
+
+
+def side_points(rng, count, yaw_rad):
+    """Points on the long and the short side of a rectangle far from the origin."""
+    along = rng.random(count) < LENGTH_M / (LENGTH_M + WIDTH_M)
+    x, y = rng.uniform(0, LENGTH_M, count) * along, rng.uniform(0, WIDTH_M, count) * ~along
+    return rotate(np.stack([x, y], axis=1) + rng.normal(0, NOISE_M, (count, 2)), yaw_rad) + rng.uniform(-80, 80, 2)
+
+
+def test_rough_yaws_are_corrected_where_enough_points_show_the_sides():
+    rng = np.random.default_rng(4)
+    yaw = np.array([0.3, -2.0, 1.1, 2.9])
+    count = np.array([200, 400, 29, 90])
+    points = np.concatenate([side_points(rng, n, angle) for n, angle in zip(count, yaw)])
+    corrected = correct_yaws(points, count, yaw + 0.1)
+    assert np.abs(corrected - yaw)[[0, 1, 3]].max() < np.deg2rad(1.5)
+    assert corrected[2] == yaw[2] + 0.1

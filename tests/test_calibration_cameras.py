@@ -25,22 +25,14 @@ from log2sim.geometry import (
     rotation_from_rpy,
     transform,
 )
-from log2sim.localization import edges
 from log2sim.localization.clocks import turn_mount
 from log2sim.localization.edges import (
     SYSTEMATIC_RAD,
-    DepthEdges,
     EdgeView,
-    EdgeViews,
     YawEstimate,
-    choose_moments,
     estimate_yaw,
     find_depth_edges,
-    find_image_edges,
-    keep_standing,
     points_in_mount,
-    read_depth_edges,
-    read_gray,
     score_angles,
 )
 from log2sim.localization.mounts import FlowPair, check_cameras, find_exchanged, flow_agreement
@@ -77,19 +69,6 @@ def test_edges_are_where_a_panel_before_a_wall_ends() -> None:
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 10.0)
     np.testing.assert_allclose(azimuth[left], 3.0, atol=1e-9)
     np.testing.assert_allclose(azimuth[~left], -2.0, atol=1e-9)
-
-
-def test_a_panel_close_to_the_wall_has_no_edges() -> None:
-    assert len(find_depth_edges(scan((-0.05, 0.05), 19.5, 20.0))[0]) == 0
-
-
-def test_edges_that_are_elsewhere_in_the_next_sweep_are_left_out() -> None:
-    xyz, left = np.array([[10.0, 0.0, 1.0], [20.0, 3.0, 1.0], [15.0, -4.0, 0.0]]), np.array([True, True, False])
-    later = xyz + np.array([[0.05, 0.0, 0.3], [0.8, 0.0, 0.0], [0.0, 0.1, 0.0]])
-    kept = keep_standing(DepthEdges(xyz, np.linalg.norm(xyz, axis=1), left), DepthEdges(later, np.ones(3), left))
-    assert kept.points_map.tolist() == xyz[[0, 2]].tolist()
-    others = DepthEdges(later, np.ones(3), ~left)
-    assert len(keep_standing(DepthEdges(xyz, np.ones(3), left), others).left) == 0
 
 
 # Alignment in a world of posts
@@ -134,13 +113,6 @@ def test_the_yaw_that_a_mount_lacks_is_found(degrees: float) -> None:
     assert np.degrees(found.yaw_rad) == pytest.approx(-degrees, abs=0.06)
 
 
-def test_surfaces_that_go_on_beyond_their_last_point_turn_no_camera() -> None:
-    views = world(CAMERA, np.random.default_rng(4), frames=14, overhang_rad=0.0044, left_share=0.75)
-    found = estimated(CAMERA, views)
-    assert found is not None
-    assert abs(np.degrees(found.yaw_rad)) < 0.08
-
-
 def test_errors_are_as_large_as_the_scatter_between_parts_of_the_log() -> None:
     errors, scatter = [], []
     for seed in range(8):
@@ -157,26 +129,6 @@ def test_pictures_of_another_place_give_no_yaw() -> None:
         pictures, points = (world(CAMERA, np.random.default_rng(k)) for k in (seed, 100 + seed))
         mixed = [replace(picture, points_mount=p.points_mount, left=p.left) for picture, p in zip(pictures, points)]
         assert estimated(CAMERA, mixed) is None
-
-
-def test_few_frames_do_not_decide() -> None:
-    views = world(CAMERA, np.random.default_rng(0))
-    dark = [replace(view, gray=np.zeros_like(view.gray)) for view in views[1:]]
-    assert estimated(CAMERA, [views[0], *dark]) is None
-    assert estimated(CAMERA, views[:1]) is None
-    shown = {0, 4, 8}
-    dark = [replace(view, gray=np.zeros_like(view.gray)) for view in views]
-    assert estimated(CAMERA, [views[k] if k in shown else dark[k] for k in range(10)]) is None
-    assert estimated(CAMERA, [views[k] if k in shown | {2, 6} else dark[k] for k in range(10)]) is not None
-
-
-def test_a_camera_that_lies_on_its_side_has_its_upright_edges_along_the_rows() -> None:
-    gray = np.full((90, 120), 50, np.uint8)
-    gray[:, 60:] = 150
-    assert find_image_edges(gray, sideways=False)[45, 60] > 3
-    assert find_image_edges(gray, sideways=True)[45, 60] == 0
-    lying = find_image_edges(gray.T.copy(), sideways=True)
-    np.testing.assert_allclose(lying, find_image_edges(gray, sideways=False).T, atol=1e-4)
 
 
 # Motion in images
@@ -218,24 +170,6 @@ def test_points_move_as_the_own_mount_says_and_exchanged_mounts_show() -> None:
     assert flow_agreement(rig["left"], pairs["left"][:2]) is None
 
 
-@pytest.mark.slow
-def test_exchanged_mounts_are_told_without_a_lidar(sample: Log) -> None:
-    blind = sample.changed(lidars={})
-    assert checked(blind) == (blind, ())
-    left, right = sample.cameras["front_left"], sample.cameras["front_right"]
-    swapped = with_cameras(
-        blind, replace(left, mount_T_cam=right.mount_T_cam), replace(right, mount_T_cam=left.mount_T_cam)
-    )
-    _, faults = checked(swapped)
-    assert [(f.kind, f.sensor, f.treatment) for f in faults] == [
-        ("swapped_cameras", "front_left", "kept"),
-        ("swapped_cameras", "front_right", "kept"),
-    ]
-    assert sample.ego is not None
-    standing = replace(sample.ego, map_T_ego=np.repeat(sample.ego.map_T_ego[:1], len(sample.ego.t_ns), axis=0))
-    assert checked(swapped.changed(ego=standing))[1] == ()
-
-
 # The sample
 
 
@@ -253,16 +187,6 @@ def checked(log: Log, *, fix: bool = False, of_lidars: tuple[Fault, ...] = ()) -
         log, Config().changed(calibration={"fix_mounts": fix}, detect={"name": "ssd-mobilenet-v2"})
     )
     return check_cameras(log, config, select_sensors(log, config), of_lidars=of_lidars, progress=lambda *_: None)
-
-
-def test_only_edges_that_stand_are_looked_at(sample: Log) -> None:
-    moments = choose_moments(sample, "lidar_top", "front", None)
-    views = EdgeViews(sample, moments, lambda *_: None).of_camera("front")
-    for view, row in zip(views, moments.sweeps.tolist(), strict=True):
-        all_edges, later = (read_depth_edges(sample, "lidar_top", k) for k in (row, row + 1))
-        assert all_edges is not None
-        assert later is not None
-        assert len(view.left) == len(keep_standing(all_edges, later).left) < len(all_edges.left)
 
 
 def test_nothing_is_said_of_the_sample(sample: Log) -> None:
@@ -284,22 +208,6 @@ def test_a_turned_camera_is_told_and_corrected(sample: Log) -> None:
     assert mended.cameras["front_left"] is sample.cameras["front_left"]
 
 
-def test_only_frames_of_cameras_that_may_be_turned_are_all_looked_at(
-    sample: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: list[tuple[str, int]] = []
-
-    def note(stream: Any, index: int, camera: Camera) -> Any:
-        read.append((camera.name, index))
-        return read_gray(stream, index, camera)
-
-    monkeypatch.setattr(edges, "read_gray", note)
-    checked(with_cameras(sample, yawed(sample.cameras["front"], 1.0)))
-    counts = {name: sum(name == other for other, _ in read) for name in ("front", "front_right")}
-    assert counts == {"front": edges.MAX_FRAMES, "front_right": edges.MAX_FRAMES // 2}
-    assert len(set(read)) == len(read)
-
-
 def test_exchanged_mounts_are_told_by_name_and_given_back(sample: Log) -> None:
     left, right = sample.cameras["front_left"], sample.cameras["front_right"]
     swapped = with_cameras(
@@ -315,21 +223,6 @@ def test_exchanged_mounts_are_told_by_name_and_given_back(sample: Log) -> None:
     assert {f.treatment for f in faults} == {"corrected"}
     for name in ("front_left", "front_right"):
         np.testing.assert_array_equal(mended.cameras[name].mount_T_cam, sample.cameras[name].mount_T_cam)
-
-
-def test_a_camera_whose_mount_is_another_ones_is_named_without_its_own_pictures(sample: Log) -> None:
-    left, right = sample.cameras["front_left"], sample.cameras["front_right"]
-    stream = sample.streams["front_left"]
-    dark = replace(stream, read=lambda i: stream.read(i) // 40, encoded=None)
-    swapped = with_cameras(
-        sample, replace(left, mount_T_cam=right.mount_T_cam), replace(right, mount_T_cam=left.mount_T_cam)
-    ).changed(streams={**sample.streams, "front_left": dark})
-    _, faults = checked(swapped)
-    assert [(f.kind, f.sensor, f.treatment) for f in faults] == [
-        ("swapped_cameras", "front_right", "left_out"),
-        ("swapped_cameras", "front_left", "left_out"),
-    ]
-    assert faults[1].message.startswith("its mount is that of front_right")
 
 
 def test_a_camera_that_is_turned_far_is_found_from_there(sample: Log) -> None:
@@ -350,32 +243,12 @@ def test_slips_of_one_mount_are_told_and_mended(sample: Log) -> None:
         np.testing.assert_allclose(mended.cameras[name].mount_T_cam, sample.cameras[name].mount_T_cam, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_a_turn_of_all_cameras_is_one_of_the_lidar(sample: Log) -> None:
-    turned = with_cameras(sample, *(yawed(camera, -1.2) for camera in sample.cameras.values()))
-    _, (fault,) = checked(turned)
-    assert (fault.kind, fault.sensor) == ("lidar_rotation", "lidar_top")
-    assert abs(fault.values["yaw_deg"] - 1.2) < 0.2
-    known = Fault("lidar_rotation", "lidar_top", "", "kept")
-    assert checked(turned, of_lidars=(known,))[1] == ()
-
-
 def test_dark_pictures_say_nothing(sample: Log) -> None:
     stream = sample.streams["front"]
     dark = replace(stream, read=lambda i: stream.read(i) // 40, encoded=None)
     turned = with_cameras(sample, yawed(sample.cameras["front"], 1.0))
     dark_log = turned.changed(streams={**sample.streams, "front": dark})
     assert [fault.kind for fault in checked(dark_log, fix=True)[1]] == ["unknown_rotation"]
-
-
-def test_boxes_of_the_log_need_no_picture(sample: Log) -> None:
-    def read(i: int) -> None:
-        raise AssertionError("a picture was read")
-
-    blind = {name: replace(sample.streams[name], read=read, encoded=None) for name in sample.cameras}
-    log = sample.changed(streams={**sample.streams, **blind})
-    config = Config().changed(detect={"name": "labels"})
-    assert check_cameras(log, config, select_sensors(log, config), progress=lambda *_: None)[1] == ()
 
 
 def test_a_run_goes_on_without_cameras_that_are_left_out(sample: Log, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -411,13 +284,3 @@ def test_points_are_where_they_are_when_their_line_is_exposed(direction: Literal
     still = points_in_mount(log, replace(camera, rolling_shutter=None), 1_000_000_000, points)
     assert still is not None
     assert np.abs(found - still)[:, 0].max() > 0.1
-
-
-def test_gray_images_are_the_same_from_bytes_and_from_pictures(sample: Log) -> None:
-    stream, camera = sample.streams["front"], sample.cameras["front"]
-    by_bytes, by_picture = (read_gray(s, 3, camera) for s in (stream, replace(stream, encoded=None)))
-    assert by_bytes is not None
-    assert by_picture is not None
-    assert by_bytes.shape == by_picture.shape == (520, 896)
-    assert np.abs(by_bytes.astype(int) - by_picture).mean() < 1.5
-    assert read_gray(stream, 3, replace(camera, width_px=900)) is not None  # `read` decides about its size

@@ -11,7 +11,6 @@ from localization_worlds import HOUSES, drive
 
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Stream
-from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, PoseTrack, apply, inverse, rotation_from_rpy
 from log2sim.localization.clocks import OFFSET, PITCH, YAW, check_lidars, fit_clock_and_mount, turn_mount
 from log2sim.localization.replaced import shift_stream
@@ -22,7 +21,6 @@ TOP = "top"
 LIDAR = {"channels": 20, "azimuth_step_deg": 1.5}
 # Speeds up, turns left, and goes on straight.
 LIVELY = [[-30.0, 0.0, 1.5], [-16.0, 0.0, 6.0], [-4.0, 3.0, 7.0], [10.0, 10.0, 4.0], [22.0, 12.0, 3.0]]
-STEADY = [[-30.0, 0.0, 8.0], [60.0, 0.0, 8.0]]
 PLAIN = Config()
 
 
@@ -35,11 +33,6 @@ def lively() -> Log:
 @pytest.fixture(scope="module")
 def seen_lively(lively: Log) -> SweepPairs:
     return seen_in(lively)
-
-
-@pytest.fixture(scope="module")
-def steady() -> Log:
-    return drive(HOUSES, STEADY, duration_s=4.0, lidar=LIDAR)[0]
 
 
 def late(log: Log, offset_s: float) -> Log:
@@ -104,20 +97,6 @@ def test_a_turned_mount_is_found(seen_lively: SweepPairs, yaw_deg: float, pitch_
     assert abs(found.values[OFFSET]) < 0.004
 
 
-def test_both_are_found_together_in_the_sweeps(lively: Log) -> None:
-    found = fit_clock_and_mount(seen_in(turned(late(lively, 0.08), yaw_deg=3.0)))
-    assert found.values[OFFSET] == pytest.approx(-0.08, abs=0.006)
-    assert np.degrees(found.values[YAW]) == pytest.approx(-3.0, abs=0.15)
-
-
-@pytest.mark.slow
-def test_at_constant_speed_straight_on_the_offset_is_not_seen_and_the_yaw_is(steady: Log) -> None:
-    found = fit_clock_and_mount(wrong(seen_in(steady), offset_s=0.1, yaw_deg=1.0))
-    assert not found.shows_offset
-    assert found.values[OFFSET] == pytest.approx(0.0, abs=0.01)
-    assert np.degrees(found.values[YAW]) == pytest.approx(-1.0, abs=0.1)
-
-
 def test_standard_deviations_tell_how_wrong_estimates_are(seen_lively: SweepPairs) -> None:
     exact = seen_lively.track
     found = [fit_clock_and_mount(replace(seen_lively, track=noisy(exact, seed))) for seed in range(12)]
@@ -137,17 +116,6 @@ def test_a_sound_log_tells_nothing_even_if_corrections_are_asked_for(lively: Log
     log, faults = check(lively, fix_time=True, fix_mounts=True)
     assert faults == ()
     assert log is lively
-
-
-def test_late_stamps_are_told_and_stay(lively: Log) -> None:
-    shifted = late(lively, 0.1)
-    log, (fault,) = check(shifted)
-    assert (fault.kind, fault.sensor, fault.treatment) == ("time_offset", TOP, "kept")
-    assert fault.values["offset_s"] == pytest.approx(0.1, abs=0.004)
-    assert fault.values["offset_sigma_s"] < 0.01
-    assert "ms late" in fault.message
-    assert "--fix-time" in fault.message
-    assert log is shifted
 
 
 def test_late_stamps_are_corrected_with_those_of_the_points(lively: Log) -> None:
@@ -179,10 +147,6 @@ def test_a_turned_mount_is_corrected_about_the_axes_that_are_certain(lively: Log
     assert (mount[:3, 3] == true[:3, 3]).all()
 
 
-def test_what_the_motion_does_not_show_is_said_to_who_asks_for_it(steady: Log) -> None:
-    assert [f.kind for f in check(steady, fix_time=True, fix_mounts=True)[1]] == ["unknown_offset"]
-
-
 def test_a_heading_by_which_the_ego_drives_askew_is_named(lively: Log) -> None:
     assert lively.ego is not None
     askew = exp_of(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.radians(2.0)]))
@@ -204,16 +168,6 @@ def test_a_mount_at_another_place_is_found_where_the_ego_turns(lively: Log) -> N
     assert log.lidars[TOP].mount_T_lidar == pytest.approx(true.mount_T_lidar, abs=0.15)
 
 
-def test_each_lidar_is_checked_for_itself(lively: Log) -> None:
-    second = replace(lively.lidars[TOP], name="second")
-    streams = {TOP: lively.streams[TOP], "second": replace(late(lively, 0.1).streams[TOP], name="second")}
-    two = lively.changed(lidars={TOP: lively.lidars[TOP], "second": second}, streams=streams)
-    log, (fault,) = check(two, fix_time=True)
-    assert fault.sensor == "second"
-    assert log.streams[TOP] is two.streams[TOP]
-    assert np.abs(log.streams["second"].t_ns - log.streams[TOP].t_ns).max() < 0.004 * NS_PER_S
-
-
 # --- where there is nothing to see
 
 
@@ -233,39 +187,10 @@ def test_a_standing_ego_costs_no_sweep(lively: Log) -> None:
     assert [f.kind for f in check(log, fix_time=True, fix_mounts=True)[1]] == ["unknown_offset", "unknown_rotation"]
 
 
-def test_sensors_in_the_map_and_logs_without_poses_cost_no_sweep(lively: Log) -> None:
-    in_map = unread(lively, lidars={TOP: replace(lively.lidars[TOP], mount="map")})
-    assert check(in_map, fix_time=True)[1] == ()
-    assert check(unread(lively, ego=None), fix_time=True)[1] == ()
-
-
-def test_poses_from_the_sweeps_themselves_are_not_checked_by_them(lively: Log) -> None:
-    config = PLAIN.changed(poses={"source": "lidar"})
-    assert check_lidars(unread(lively), config, Sensors((), (TOP,)), progress=lambda *_: None)[1] == ()
-
-
-def test_points_in_the_map_tell_nothing_about_clocks(lively: Log) -> None:
-    old = lively.streams[TOP]
-    in_map = Stream(TOP, old.t_ns, lambda i: replace(old.read(i), frame="map"))
-    assert check(lively.changed(streams={TOP: in_map}))[1] == ()
-
-
 def test_sweeps_that_do_not_belong_to_the_poses_are_blamed_for_nothing(lively: Log) -> None:
     assert lively.ego is not None
     other = replace(lively.ego, map_T_ego=lively.ego.map_T_ego[::-1])
     assert check(lively.changed(ego=other))[1] == ()
-
-
-def test_sweeps_that_cannot_be_read_are_passed_over(lively: Log) -> None:
-    old = late(lively, 0.1).streams[TOP]
-
-    def read(i: int) -> Any:
-        if i % 5 == 0:
-            raise RecordError(TOP, int(old.t_ns[i]), "cut off")
-        return old.read(i)
-
-    _, (fault,) = check(lively.changed(streams={TOP: Stream(TOP, old.t_ns, read)}))
-    assert fault.values["offset_s"] == pytest.approx(0.1, abs=0.006)
 
 
 def test_of_a_long_log_a_few_sweeps_are_looked_at_where_the_ego_turns() -> None:

@@ -18,15 +18,13 @@ from typing import Any
 import numpy as np
 import pytest
 from carla_courses import SIZES, agent, left_turn, of
-from command_line import run
 
 from log2sim.datatypes import CATEGORIES, Agent, Scenario
-from log2sim.errors import ConfigError
 from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
 from log2sim.simulation import follower
 from log2sim.simulation.carla.data import BY_CATEGORY, controller_data, nearest_assets
-from log2sim.simulation.carla.player import CarlaActor, SampledTrajectory, VehicleController, main, size_table
+from log2sim.simulation.carla.player import CarlaActor, SampledTrajectory, VehicleController, main
 from log2sim.simulation.vehicles.parameters import parameters_for
 from log2sim.simulation.vehicles.vehicle import VehicleState
 
@@ -61,19 +59,6 @@ def test_data_are_in_the_left_handed_frame_in_degrees(scenario: Scenario, tmp_pa
             assert abs(wrap_angle(-math.radians(yaw_deg) - w.yaw_rad[k])) < 1e-5
 
 
-def test_positions_are_near_the_origin_and_the_offset_leads_back(tmp_path: Path) -> None:
-    """carla#2383: float32 is coarse far from the origin."""
-    _, near = written(of(left_turn()), tmp_path / "near")
-    _, far = written(of(left_turn(at=(4.6e5, 5.41e6))), tmp_path / "far")
-    ox, oy, _ = far["offset_m"]
-    for column, base, offset in (("x_m", 4.6e5, ox), ("y_m", -5.41e6, oy)):
-        values = np.array(far["agents"][0]["exact"][column])
-        assert np.abs(values).max() < 8192
-        np.testing.assert_array_equal(np.float32(values) - values, np.float32(values) - values.astype(np.float64))
-        expected = np.array(near["agents"][0]["exact"][column]) + base
-        np.testing.assert_allclose(values + offset, expected, atol=2e-4)
-
-
 def test_every_category_has_assets_and_the_nearest_comes_first() -> None:
     for category in CATEGORIES:
         for size in ((0.7, 0.7, 1.8), (4.2, 1.8, 1.5), (9.0, 2.6, 3.2)):
@@ -84,40 +69,6 @@ def test_every_category_has_assets_and_the_nearest_comes_first() -> None:
             assert distances[0] == min(math.dist(s, size) for s in BY_CATEGORY[category].values())
             for a in assets:
                 np.testing.assert_allclose(np.array(a.size_m) - size, a.error_m, atol=6e-4)
-
-
-def test_walkers_of_one_size_do_not_all_look_the_same() -> None:
-    pedestrian = replace(left_turn(), category="pedestrian", size_m=(0.6, 0.6, 1.8))
-    looks = {nearest_assets(pedestrian, turn=k)[0].blueprint for k in range(10)}
-    assert len(looks) == 10
-
-
-def test_the_size_error_of_every_agent_is_in_the_table(scenario: Scenario, tmp_path: Path) -> None:
-    _, data = written(scenario, tmp_path)
-    lines = size_table(data).splitlines()[1:]
-    assert [line.split()[0] for line in lines] == [a.id for a in scenario.agents]
-    for line, logged in zip(lines, scenario.agents):
-        numbers, asset = [float(v) for v in line.split()[1:7]], line.split()[7]
-        np.testing.assert_allclose(np.array(SIZES[asset]) - logged.size_m, numbers[3:], atol=0.0051)
-
-
-def test_ids_stay_data(tmp_path: Path) -> None:
-    odd = '"); import os; print("'
-    path, _ = written(of(left_turn(odd)), tmp_path)
-    plain = (tmp_path / "replay_carla.py").read_bytes()
-    assert odd.encode() not in plain
-    written(of(left_turn("ego")), tmp_path)
-    assert (tmp_path / "replay_carla.py").read_bytes() == plain
-    assert path.exists()
-
-
-def test_an_unknown_mode_lists_the_known(tmp_path: Path) -> None:
-    ran = run("export", SAMPLE, "--to", "carla", "--out", tmp_path / "out", "--mode", "pit")
-    assert ran.code == 2
-    assert ran.line == "log2sim: --mode: 'pit', expected one of exact, pid"
-    with pytest.raises(ConfigError):
-        export(of(left_turn()), "carla", tmp_path / "out", Options(revision="1.0"))
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_script_runs_without_log2sim_and_without_the_client(scenario: Scenario, tmp_path: Path) -> None:
@@ -169,19 +120,6 @@ def test_the_script_follows_as_the_shim_does() -> None:
         assert pedal == pytest.approx(controls.pedal_mps2[0], abs=1e-9)
         assert math.atan(wheelbase * curvature) == pytest.approx(controls.steer_rad[0], abs=1e-9)
         assert reverse == controls.reverse[0]
-
-
-def test_following_is_the_same_in_a_mirror() -> None:
-    """The controller runs in CARLA's left-handed frame, where left and right are exchanged."""
-    rng = np.random.default_rng(4)
-    one, other = VehicleController(GAINS, 6.0, 10.0, 0.3), VehicleController(GAINS, 6.0, 10.0, 0.3)
-    for _ in range(100):
-        x, y, yaw, wx, wy, wyaw, speed, course_speed, accel, curvature = rng.normal(0, 1, 10)
-        pedal, bend, _ = one.step((wx, wy, wyaw, course_speed, accel, curvature, 1.0, 0.0), (x, y, yaw), speed, 0.05)
-        same, mirrored, _ = other.step(
-            (wx, -wy, -wyaw, course_speed, accel, -curvature, 1.0, 0.0), (x, -y, -yaw), speed, 0.05
-        )
-        assert (pedal, bend) == pytest.approx((same, -mirrored), abs=1e-12)
 
 
 # ---- the conversation, with the client's own types
@@ -236,23 +174,6 @@ def test_exact_agents_are_where_the_log_has_them_at_every_tick(play: Any, scenar
             assert abs(wrap_angle(-seen[role][3] - state.yaw_rad[0])) < 2e-3
 
 
-def test_driven_agents_stay_near_the_log(play: Any, scenario: Scenario) -> None:
-    """carla#1425: corrected by control and never teleported; cross-track error of at most 0.3 m."""
-    code, client = play(scenario, "--mode", "pid")
-    assert code == 0
-    for logged in scenario.agents:
-        assert drift_m(client, logged, "hero" if logged.id == "ego" else logged.id, 0.05).max() < 0.3
-    placed = [r for k, r, c in client.orders if type(c).__name__ == "ApplyTransform" and k > 0]
-    assert placed == []
-
-
-@pytest.mark.parametrize("dt_s", [0.01, 0.033, 0.1])
-def test_driving_does_not_depend_on_the_tick(play: Any, dt_s: float) -> None:
-    turning = left_turn()
-    _, client = play(of(turning), "--mode", "pid", "--dt", str(dt_s))
-    assert drift_m(client, turning, "hero", dt_s).max() < 0.3
-
-
 def test_a_left_turn_of_the_log_is_a_left_turn_in_carla(play: Any) -> None:
     """scenario_runner#418, #1047: steering to the left is negative, and yaw falls."""
     _, client = play(of(left_turn()), "--mode", "pid")
@@ -261,29 +182,6 @@ def test_a_left_turn_of_the_log_is_a_left_turn_in_carla(play: Any) -> None:
     assert max(steer) < 0.1
     yaw = [seen["hero"][3] for seen in client.world.seen]
     assert math.degrees(yaw[-1] - yaw[0]) == pytest.approx(-90, abs=3)
-
-
-def test_exact_wheels_turn_and_velocities_are_told(play: Any, carla: ModuleType) -> None:
-    """carla#2204, #7767 and PufferDrive#392: a replay that only sets poses has stiff wheels and no speed."""
-    turning = left_turn()
-    shown: list[float] = []
-
-    def watch(client: Any) -> None:
-        tick = client.world.tick
-
-        def ticking() -> int:
-            wheel = carla.VehicleWheelLocation.FL_Wheel
-            shown.extend(a.shown_steer_deg.get(wheel, 0.0) for a in client.world.actors.values())
-            return int(tick())
-
-        client.world.tick = ticking
-
-    _, client = play(of(turning), prepare=watch)
-    velocities = [c.velocity for _, _, c in client.orders if type(c).__name__ == "ApplyTargetVelocity"]
-    assert [math.hypot(v.x, v.y) for v in velocities] == pytest.approx([6.0] * len(velocities), abs=0.25)
-    wheelbase = 0.6 * SIZES["vehicle.toyota.prius"][0]
-    assert min(shown) == pytest.approx(-math.degrees(math.atan(wheelbase / 12.0)), abs=1.0)
-    assert max(shown) < 1.0
 
 
 def test_with_physics_on_velocities_are_seen_and_poses_still_exact(play: Any) -> None:
@@ -305,14 +203,6 @@ def test_with_physics_on_velocities_are_seen_and_poses_still_exact(play: Any) ->
     assert drift_m(client, turning, "hero", 0.05).max() < 0.05
 
 
-def test_agents_come_and_go_with_the_log(play: Any) -> None:
-    late = agent("late", [2.0, 3.0], [0.0, 5.0], 30.0, 0.0, 5.0)
-    _, client = play(of(left_turn(), late))
-    present = [k * 0.05 for k, seen in enumerate(client.world.seen) if "late" in seen]
-    assert (present[0], present[-1]) == pytest.approx((2.0, 3.0))
-    assert client.world.actors == {}
-
-
 def test_a_leap_of_the_log_is_not_driven(play: Any) -> None:
     t = np.arange(0.0, 4.01, 0.1)
     leaping = agent("ego", t, 5.0 * t + 40.0 * (t >= 2.0), 0.0, 0.0, 5.0)
@@ -323,53 +213,6 @@ def test_a_leap_of_the_log_is_not_driven(play: Any) -> None:
         assert np.abs(at - beside).max() < 0.1
         velocities = [c.velocity.x for _, _, c in client.orders if type(c).__name__ == "ApplyTargetVelocity"]
         assert max(velocities) < 5.5
-
-
-def test_reversing_and_stopping(play: Any) -> None:
-    t = np.arange(0.0, 8.01, 0.1)
-    speed = np.where(t < 1, 0.0, np.where(t < 4, -2.0 * np.sin((t - 1) * np.pi / 3), 0.0))
-    x = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t))])
-    parking = agent("ego", t, x, 0.0, 0.0, speed)
-    _, client = play(of(parking), "--mode", "pid", "--dt", "0.02")
-    assert drift_m(client, parking, "hero", 0.02).max() < 0.3
-    at = np.array([seen["hero"][0] for seen in client.world.seen])
-    assert np.ptp(at[at.size * 3 // 4 :]) < 0.01
-    back = [c.control.reverse for _, _, c in client.orders if type(c).__name__ == "ApplyVehicleControl"]
-    assert any(back)
-
-
-@pytest.mark.parametrize("spacing_s", [0.02, 0.1, 0.5])
-def test_denser_waypoints_do_not_make_it_worse(play: Any, spacing_s: float) -> None:
-    """scenario_runner#966, #1011, #938: goes straight or cuts the corner of a left turn, and more so with more waypoints."""
-    turning = left_turn(spacing_s=spacing_s)
-    _, client = play(of(turning), "--mode", "pid")
-    assert drift_m(client, left_turn(spacing_s=0.01), "hero", 0.05).max() < 0.3
-
-
-@pytest.mark.parametrize("mode", ["exact", "pid"])
-def test_a_standing_car_does_not_spin(play: Any, mode: str) -> None:
-    """esmini#199: headings are those of the log and not of positions that jitter."""
-    rng = np.random.default_rng(5)
-    t = np.arange(0.0, 4.01, 0.1)
-    standing = agent("ego", t, rng.normal(0, 0.03, len(t)), rng.normal(0, 0.03, len(t)), 0.7, 0.0)
-    _, client = play(of(standing), "--mode", mode)
-    yaw = np.array([seen["hero"][3] for seen in client.world.seen])
-    assert np.abs(np.degrees(yaw) + math.degrees(0.7)).max() < 1.0
-
-
-def test_axles_are_measured_even_if_the_server_knows_them_only_after_a_tick(carla: ModuleType) -> None:
-    from carla_server import Actor, Blueprint
-
-    size_m, spawned = (4.0, 1.8, 1.5), carla.Transform(carla.Location(30.0, -7.0, 0.3), carla.Rotation(yaw=75.0))
-    actor = Actor(1, Blueprint("vehicle.audi.a2"), size_m, spawned)
-    body = CarlaActor(carla, {}, actor, spawned)
-    assert (body.wheelbase_m, body.axle_m) == pytest.approx((0.6 * 4.0, 0.3 * 4.0))
-    actor.advance(0.05)
-    actor.velocity = (0.02, 0.01)  # at rest, as far as physics ever is
-    body.pose()
-    assert (body.wheelbase_m, body.axle_m) == pytest.approx((actor.wheelbase, 0.05 - actor.rear_x), abs=1e-4)
-    assert body.max_steer_rad == pytest.approx(math.radians(70.0))
-    assert body.pose()[4] == 0.0
 
 
 def test_inputs_are_shares_of_full_pedal_and_of_the_lock_that_is_left_at_speed(carla: ModuleType) -> None:
@@ -390,31 +233,6 @@ def test_inputs_are_shares_of_full_pedal_and_of_the_lock_that_is_left_at_speed(c
         assert control.brake == pytest.approx(min(max(-pedal / 10.0, 0.0), 1.0))
         assert control.reverse == (speed < 0)
     assert body.control(1.0, 0.0, 0.0, True).reverse
-
-
-def test_an_asset_of_another_size_than_expected_is_noted(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    grown = {**SIZES, "vehicle.toyota.prius": (5.0, 2.0, 1.5)}
-    play(of(left_turn()), prepare=lambda client: setattr(client.world.library, "sizes", grown))
-    assert "note: agent 'ego': vehicle.toyota.prius is 5.00 x 2.00 x 1.50 m on this server" in capsys.readouterr().out
-
-
-def test_colors_are_painted_where_the_asset_takes_them(play: Any) -> None:
-    red = replace(left_turn("red"), color={"rgb": [200, 10, 20], "name": "red"})
-    walker = replace(agent("walker", [0.0, 1.0], [0.0, 1.0], 9.0, 0.0, 1.0), category="pedestrian", color=red.color)
-    spawned: dict[str, dict[str, str]] = {}
-
-    def watch(client: Any) -> None:
-        spawn = client.world.try_spawn_actor
-
-        def spawning(blueprint: Any, at: Any) -> Any:
-            spawned[blueprint.settings["role_name"]] = dict(blueprint.settings)
-            return spawn(blueprint, at)
-
-        client.world.try_spawn_actor = spawning
-
-    play(of(red, walker), prepare=watch)
-    assert spawned["red"]["color"] == "200,10,20"
-    assert "color" not in spawned["walker"]
 
 
 def test_walkers_walk(play: Any, scenario: Scenario) -> None:
@@ -440,20 +258,6 @@ def test_settings_are_restored_and_actors_gone_after_ctrl_c(
     assert "stopped; the agents are removed" in capsys.readouterr().err
 
 
-def test_something_in_the_way_does_not_keep_an_agent_out(play: Any) -> None:
-    turning = left_turn()
-    code, client = play(of(turning), prepare=lambda client: setattr(client.world, "blocked_below_m", 8.0))
-    assert code == 0
-    assert drift_m(client, turning, "hero", 0.05).max() < 0.01
-
-
-def test_an_agent_that_cannot_be_spawned_is_named(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    code, client = play(of(left_turn()), prepare=lambda client: setattr(client.world, "blocked_below_m", 1e6))
-    assert code == 4
-    assert "agent 'ego': CARLA could not spawn vehicle.toyota.prius" in capsys.readouterr().err
-    assert client.world.applied[-1] == (False, None)
-
-
 def test_a_server_without_the_asset_gets_the_next_one_or_a_clear_error(
     play: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -466,19 +270,6 @@ def test_a_server_without_the_asset_gets_the_next_one_or_a_clear_error(
     code, _ = play(of(left_turn()), prepare=lambda client: setattr(client.world.library, "sizes", {}))
     assert code == 4
     assert "agent 'ego': this server has none of vehicle.toyota.prius" in capsys.readouterr().err
-
-
-def test_versions_that_differ_are_noted(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _ = play(of(left_turn()), prepare=lambda client: setattr(client, "get_server_version", lambda: "0.9.15"))
-    assert code == 0
-    assert "note: the server is CARLA 0.9.15, this client 0.9.16" in capsys.readouterr().out
-
-
-def test_the_spectator_is_behind_the_ego(play: Any) -> None:
-    _, client = play(of(left_turn()))
-    at = client.world.spectator.at
-    assert at.rotation.yaw == pytest.approx(-90, abs=1)
-    assert at.location.y == pytest.approx(client.world.seen[-1]["hero"][1] + 9.0, abs=0.5)
 
 
 def test_no_server_is_said_in_one_line(carla: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -531,44 +322,6 @@ def test_a_world_is_made_from_opendrive_and_heights_are_its_roads(play: Any, tmp
     )
 
 
-def test_a_map_elsewhere_is_said(play: Any, carla: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    code, client = play(
-        of(along_the_road(400.0)), "--map", "Town03", "--mode", "pid", ground="map", road=carla.Map("line", ROAD)
-    )
-    assert client.loaded == ["Town03"]
-    assert code == 2
-    assert "agent 'ego': no road within 30 m of its place" in capsys.readouterr().err
-    assert client.world.applied[-1] == (False, None)
-
-
-def test_what_stands_off_the_map_stays_at_its_height(play: Any, carla: ModuleType) -> None:
-    parked = replace(along_the_road(80.0), id="parked", static=True)
-    code, client = play(of(along_the_road(), parked), "--mode", "pid", ground="map", road=carla.Map("line", ROAD))
-    assert code == 0
-    assert client.world.seen[0]["parked"][2] == pytest.approx(parked.waypoints.z_m[0] - 0.8, abs=1e-3)
-
-
-def test_a_car_without_a_road_below_is_named(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """metadrive#716: instead of cars that sink without a word."""
-
-    def drop(client: Any) -> None:
-        tick = client.world.tick
-
-        def ticking() -> int:
-            count = int(tick())
-            for actor in client.world.actors.values():
-                x, y, z, yaw = actor.pose
-                actor.pose = (x, y, z - 0.3 * count, yaw)
-            return count
-
-        client.world.tick = ticking
-
-    code, client = play(of(left_turn()), "--mode", "pid", prepare=drop)
-    assert code == 4
-    assert "agent 'ego' fell" in capsys.readouterr().err
-    assert client.world.applied[-1] == (False, None)
-
-
 def test_positions_of_the_data_are_those_of_carlas_own_map(carla: ModuleType, tmp_path: Path) -> None:
     """The lane's center, as CARLA reads OpenDRIVE, runs through the boxes of a car that drives on it: frames agree."""
     _, data = written(of(along_the_road()), tmp_path)
@@ -603,15 +356,3 @@ def assert_on_a_lane(carla: ModuleType, data: dict[str, Any], road_path: Path) -
         turned = math.remainder(math.radians(lane.rotation.yaw) - yaw, 2 * math.pi)
         # The box's center does not move along its heading in a turn; where roads cross, the nearest lane may be the other road's.
         assert abs(turned) < 0.3 or there.is_junction
-
-
-@pytest.mark.parametrize("mode", ["exact", "pid"])
-def test_the_exported_road_carries_the_exported_agents(
-    play: Any, scenario: Scenario, mode: str, tmp_path: Path
-) -> None:
-    """carla#5190: one export, one command, and a log is replayed on a road that was not there before."""
-    code, client = play(scenario, "--opendrive", "ROAD", "--mode", mode, ground="map")
-    assert client.loaded == [(tmp_path / "out" / "road.xodr").read_text(encoding="utf-8")]
-    assert code == 0
-    for logged in scenario.agents:
-        assert drift_m(client, logged, "hero" if logged.id == "ego" else logged.id, 0.05).max() < 0.3

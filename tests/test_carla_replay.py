@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +10,9 @@ import numpy as np
 import pytest
 from carla_courses import SIZES, agent, left_turn, of
 from command_line import run
-from plain_settings import AGENTS_ALONE
 
-from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Scenario
-from log2sim.errors import ConfigError, MissingExtra
+from log2sim.errors import ConfigError
 from log2sim.export.exporters import export
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
@@ -28,7 +24,6 @@ import carla
 import carla_server
 from carla_server import Client
 
-from log2sim.simulation.carla import player
 from log2sim.simulation.carla.simulator import CarlaServer, CarlaSimulator
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
@@ -77,17 +72,6 @@ def test_vehicles_follow_in_carla_as_in_the_shim(server: Client) -> None:
         np.testing.assert_array_equal(one.z_m, other.z_m)
 
 
-@pytest.mark.slow
-@pytest.mark.real
-@pytest.mark.parametrize("log", ["sample", "pandaset", "kitti_tracking"])
-def test_reconstructed_logs_are_followed_in_carla(log: str, server: Client, request: pytest.FixtureRequest) -> None:
-    folder = SAMPLE.parent if log == "sample" else request.getfixturevalue("real_data") / log
-    made = reconstruct(open_log(folder), Config.load(detect={"name": "labels"}, **AGENTS_ALONE)).scenario
-    metrics = in_carla(made).metrics
-    assert metrics["cross_track_max_m"] < 0.3
-    assert metrics["cross_track_rms_m"] < 0.05
-
-
 def test_what_is_stored_is_what_carla_shows(server: Client) -> None:
     sample = Scenario.load(SAMPLE)
     replayed = in_carla(sample)
@@ -103,16 +87,6 @@ def test_what_is_stored_is_what_carla_shows(server: Client) -> None:
                 math.remainder(one.yaw_rad[row] + yaw, 2 * math.pi) == pytest.approx(0, abs=1e-5)
                 or one.model == "point"
             )
-
-
-def test_exact_agents_are_shown_where_they_are_stored(server: Client) -> None:
-    sample = Scenario.load(SAMPLE)
-    replayed = in_carla(sample, mode="exact")
-    assert replayed.metrics["cross_track_max_m"] < 1e-6
-    for one in replayed.agents:
-        for row in range(1, len(one) - 1) if one.driver == "exact" else ():
-            x, y, *_ = server.world.seen[row - 1]["hero" if one.id == "ego" else one.id]
-            assert math.hypot(one.x_m[row] - x, one.y_m[row] + y) < 0.003
 
 
 def test_a_push_in_carla_is_noticed_and_driven_back(server: Client) -> None:
@@ -132,59 +106,6 @@ def test_a_push_in_carla_is_noticed_and_driven_back(server: Client) -> None:
     (ego,) = in_carla(of(agent("ego", t, 8.0 * t, 0.0, 0.0, 8.0))).agents
     assert ego.y_m[40] == pytest.approx(-1.0, abs=0.05)
     assert np.abs(ego.y_m[-20:]).max() < 0.2
-
-
-@pytest.mark.parametrize("change", [{"ACCEL_MPS2": 2.5}, {"BRAKE_MPS2": 18.0}, {"LAG_S": 0.3}, {"DRAG_1PM": 0.02}])
-def test_pedals_and_lags_need_not_be_as_assumed(
-    server: Client, change: dict[str, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in change.items():
-        monkeypatch.setattr(carla_server, name, value)
-    metrics = in_carla(Scenario.load(SAMPLE)).metrics
-    assert metrics["cross_track_max_m"] < 0.3
-    assert metrics["along_track_rms_m"] < 0.3
-
-
-def test_left_is_left(server: Client) -> None:
-    (ego,) = in_carla(of(left_turn())).agents
-    assert ego.steer_rad.max() > 0.1
-    steer = [c.control.steer for _, _, c in server.orders if type(c).__name__ == "ApplyVehicleControl"]
-    assert min(steer) < -0.1
-    assert max(steer) < 0.1
-
-
-def test_steering_is_a_share_of_full_lock_and_pedals_of_full_pedal(server: Client) -> None:
-    """What arrives at the wheels of CARLA's bicycle is the curvature that was asked for, whatever the asset's wheelbase."""
-    turning = left_turn()
-    in_carla(of(replace(turning, size_m=(3.9, 1.8, 1.6))))
-    late = [c.control for k, _, c in server.orders if type(c).__name__ == "ApplyVehicleControl" and k > 70]
-    wheelbase = 0.6 * SIZES["vehicle.citroen.c3"][0]
-    share = 0.9 - 0.1 * (6.0 * 3.6 - 20.0) / 40.0  # of the steering curve, at 21.6 km/h
-    wheels = [-c.steer * share * math.radians(70.0) for c in late[:15]]
-    assert np.median(wheels) == pytest.approx(math.atan(wheelbase / 12.0), rel=0.05)
-    assert all(c.throttle == 0 or c.brake == 0 for c in late)
-
-
-def test_agents_come_go_and_leap(server: Client) -> None:
-    t = np.arange(0.0, 14.01, 0.1)
-    leaping = agent("leaping", t, 5.0 * t + 40.0 * (t >= 5.0), 0.0, 0.0, 5.0)
-    late = agent("late", [11.5, 12.0, 13.0], [0.0, 2.5, 7.5], 30.0, 0.0, 5.0)
-    early = agent("early", [0.0, 1.0], [0.0, 1.3], 60.0, 0.0, 1.3, category="pedestrian", size_m=(0.6, 0.6, 1.8))
-    replayed = in_carla(of(leaping, late, early))
-    assert replayed.metrics["cross_track_max_m"] < 0.3
-    assert replayed.metrics["along_track_rms_m"] < 0.3
-    for one in (leaping, late, early):
-        at = [(k + 1) * 0.05 for k, seen in enumerate(server.world.seen) if one.id in seen]
-        assert (at[0], at[-1]) == pytest.approx((one.waypoints.t_s[0] + 0.05, one.waypoints.t_s[-1]))
-    assert server.world.actors == {}
-
-
-def test_far_from_the_origin_is_the_same(server: Client) -> None:
-    parked = agent("parked", [0.0, 6.0], 4.6e5 + 20.0, 5.41e6, 0.5, 0.0, static=True)
-    near, far = in_carla(of(left_turn())), in_carla(of(left_turn(at=(4.6e5, 5.41e6)), parked))
-    np.testing.assert_allclose(far.agents[0].x_m - 4.6e5, near.agents[0].x_m, atol=1e-3)
-    np.testing.assert_allclose(far.agents[0].y_m - 5.41e6, near.agents[0].y_m, atol=1e-3)
-    assert max(abs(v) for seen in server.world.seen for at in seen.values() for v in at[:2]) < 1000
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (4.6e5, 300.0), (4.6e5, 5.41e6)])
@@ -208,21 +129,6 @@ def test_a_policy_drives_the_ego_in_carla(server: Client) -> None:
     assert np.hypot(driven.x_m[-1] - driven.x_m[0], driven.y_m[-1] - driven.y_m[0]) < 1.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["pid", "exact"])
-def test_reactive_agents_react_in_carla(server: Client, mode: str) -> None:
-    """carla#8637: who follows an ego that stops does not drive into it, and is shown where it is stored."""
-    t = np.arange(0.0, 8.01, 0.1)
-    ego, behind = (agent(name, t, x + 6.0 * t, 0.0, 0.0, 6.0) for name, x in (("ego", 15.0), ("behind", 0.0)))
-    replayed = in_carla(of(ego, behind), ego=lambda seen: Controls(-4.0, 0.0), agents="reactive", mode=mode)
-    assert replayed.metrics["collisions"] == []
-    last = replayed.agent("behind")
-    assert last.driver == "reactive"
-    assert last.x_m[-1] < replayed.agent("ego").x_m[-1]
-    for row in range(1, len(last)):
-        assert server.world.seen[row - 1]["behind"][0] == pytest.approx(last.x_m[row], abs=0.02)
-
-
 @pytest.mark.parametrize("problem", [KeyboardInterrupt, RuntimeError("time-out of 60000ms")])
 def test_the_world_is_left_as_it_was(server: Client, problem: Any) -> None:
     tick = server.world.tick
@@ -239,21 +145,9 @@ def test_the_world_is_left_as_it_was(server: Client, problem: Any) -> None:
     assert server.world.applied == [(True, pytest.approx(0.05)), (False, None)]
 
 
-def test_a_long_step_is_refused(server: Client) -> None:
-    with pytest.raises(ConfigError, match=r"dt: 0\.2 s, carla takes at most 0\.1 s"):
-        in_carla(of(left_turn()), dt_s=0.2)
-    assert server.world.applied == []
-
-
 def test_no_server_is_said_with_what_to_do() -> None:
     with pytest.raises(ConfigError, match=r"CARLA: no CARLA server answers at 127\.0\.0\.1:1 within 0\.5 s"):
         in_carla(of(left_turn()), host=CarlaSimulator(CarlaServer(port=1, timeout_s=0.5)))
-
-
-def test_without_the_client_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "carla", None)
-    with pytest.raises(MissingExtra, match="a replay in CARLA needs the extra 'carla'"):
-        in_carla(of(left_turn()))
 
 
 def test_the_command_replays_in_carla(server: Client, tmp_path: Path) -> None:
@@ -264,26 +158,6 @@ def test_the_command_replays_in_carla(server: Client, tmp_path: Path) -> None:
     assert server.address == ("far", 2003)
     assert server.loaded == ["Town04"]
     assert Replay.load(tmp_path / "replay.json").model == "carla"
-
-
-@pytest.mark.parametrize("words", [("--host", "far"), ("--port", "2003"), ("--map", "Town04")])
-def test_options_of_carla_without_it_are_refused(words: tuple[str, str]) -> None:
-    ran = run("replay", SAMPLE, *words)
-    assert (ran.code, ran.out) == (2, "")
-    assert "are for --simulator carla" in ran.line
-
-
-def test_a_server_gets_a_moment_to_answer_and_then_its_time_to_work(server: Client) -> None:
-    assert player.connect(carla, "127.0.0.1", 2000, 60.0).timeout_s == 60.0
-
-
-def test_an_unknown_simulator_lists_the_known(tmp_path: Path) -> None:
-    assert run("replay", SAMPLE, "--simulator", "carlo").line == (
-        "log2sim: unknown simulator 'carlo' (did you mean 'carla'?); known: own, carla"
-    )
-    ran = run("replay", SAMPLE, "--simulator", "carla", "--map", tmp_path / "no.xodr")
-    assert ran.code == 2
-    assert ran.line.endswith("no.xodr: no such file")
 
 
 # A road so wide that all of the sample stands on it.

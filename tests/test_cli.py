@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import json
-import shutil
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+import tifffile
 from command_line import names, run
+from localization_worlds import BEND, HOUSES, LIDAR, drive
+from test_first_pass_cache import PART, TICKS, Seeing, entries, folder, made
 from typer.testing import CliRunner
 from worlds import tiny_toml
 
 import log2sim
-from log2sim import Scenario
+from log2sim import Scenario, errors
 from log2sim.cli import entry
-from log2sim.errors import LogError, install_command
+from log2sim.errors import LogError, MissingExtra, install_command
 from log2sim.files.documents import check
 from log2sim.files.plugins import BUILT_IN
+from log2sim.logs.native.writer import write_log
 
 COMMANDS = (
     "reconstruct",
@@ -34,6 +40,8 @@ COMMANDS = (
     "cache",
     "config",
 )
+
+
 PNG, GIF = b"\x89PNG", b"GIF8"
 
 
@@ -96,68 +104,12 @@ def test_the_same_seed_gives_the_same_bytes(tiny_folder: Path, tmp_path: Path) -
     assert (tmp_path / "a.replay").read_bytes() == (tmp_path / "b.replay").read_bytes()
 
 
-@pytest.mark.slow
-def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text('seed = 5\n[measure]\nmode = "paper"\nmax_range_m = 30.0\n')
-    ran = run(
-        "reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--report", tmp_path / "r.json",
-        "--config", tmp_path / "c.toml", "--set", "measure.max_range_m=40", "--set", "topdown.method=off",
-        "--detector", "labels", "--start", "0.2", "--stop", "0.7", "--cameras", "front", "--format", "log2sim",
-        "--sequence", tiny_folder.name, "--quiet",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    config = read(tmp_path / "s.json")["provenance"]["config"]
-    assert config["seed"] == 5
-    assert config["measure"] == {"mode": "paper", "max_range_m": 40.0}
-    assert config["detect"]["name"] == "labels"
-    assert config["cameras"] == ["front"]
-    report = read(tmp_path / "r.json")
-    assert report["ticks"] == 6
-    assert report["homography"] == {}
-    homography = next(p for p in report["plan"] if p["stage"] == "homography")
-    assert not homography["kept"]
-    assert "topdown.method=off" in homography["reason"]
-    decoding = next(p for p in report["plan"] if p["stage"] == "image decoding")
-    assert not decoding["kept"]
-
-
-@pytest.mark.slow
-def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> None:
-    import cv2
-
-    run(
-        "reconstruct",
-        tiny_folder,
-        "--out",
-        tmp_path / "s.json",
-        "--detector",
-        "labels",
-        "--topdown",
-        tmp_path / "t.png",
-    )
-    picture = cv2.imread(str(tmp_path / "t.png"), cv2.IMREAD_UNCHANGED)
-    assert picture.ndim == 3
-    assert (picture[..., 3] > 0).mean() > 0.02  # part of the ground was seen, and it is not one color
-    assert picture[picture[..., 3] > 0][:, :3].std() > 5
-
-
 @pytest.mark.matrix
 @pytest.mark.parametrize(("name", "magic"), [("t.png", PNG), ("t.gif", GIF), ("t.svg", b"<?xml"), ("t.pdf", b"%PDF")])
 def test_plot_writes_what_the_suffix_says(tiny_scenario: Path, tmp_path: Path, name: str, magic: bytes) -> None:
     assert run("plot", tiny_scenario, "--out", tmp_path / name).code == 0
     assert (tmp_path / name).read_bytes().startswith(magic)
     assert names(tmp_path) == [name]
-
-
-@pytest.mark.slow
-def test_plot_takes_the_cameras_as_background(tiny_scenario: Path, tiny_folder: Path, tmp_path: Path) -> None:
-    assert run("plot", tiny_scenario, "--out", tmp_path / "plain.png").code == 0
-    assert run("plot", tiny_scenario, "--out", tmp_path / "t.png", "--background", tiny_folder).code == 0
-    assert (tmp_path / "t.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
-    document = read(tiny_scenario) | {"cameras": []}  # truth names no cameras: all of the log paint
-    (tmp_path / "truth.json").write_text(json.dumps(document))
-    assert run("plot", tmp_path / "truth.json", "--out", tmp_path / "b.png", "--background", tiny_folder).code == 0
-    assert (tmp_path / "b.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
 
 
 def test_replay_prints_errors_and_exact_has_none(tiny_scenario: Path, tmp_path: Path) -> None:
@@ -222,17 +174,6 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     assert read(tmp_path / "d.json")["position_rmse_m"] == 0.0
 
 
-def test_evaluate_takes_labels_where_a_log_has_no_truth_file(
-    log_folder: Path, tiny_scenario: Path, tmp_path: Path
-) -> None:
-    (log_folder / "truth.json").unlink()
-    ran = run("evaluate", tiny_scenario, "--truth", log_folder, "--out", tmp_path / "m.json")
-    assert ran.code == 0, ran.err
-    metrics = read(tmp_path / "m.json")
-    assert metrics["recall"] == 1.0
-    assert metrics["position_rmse_m"] < 0.4
-
-
 def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
     log_folder: Path, tiny_scenario: Path, tmp_path: Path
 ) -> None:
@@ -257,24 +198,6 @@ def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
     assert metrics["coverage"]["hit"] >= metrics["coverage"]["counted"] > 0
     truth = log_folder / "truth.json"
     assert run("evaluate", tiny_scenario, "--truth", truth, "--labels", tmp_path / "cars.csv").code == 2
-
-
-def test_inspect_prints_json(tiny_folder: Path) -> None:
-    document = json.loads(run("inspect", tiny_folder, "--json").out)
-    assert document["format"] == "log2sim"
-    assert document["cameras"]["front"]["records"] == 10
-    assert document["cameras"]["front"]["rate_hz"] == 10.0
-    assert list(document["lidars"]) == ["top"]
-    assert document["labels"]["tracks"] == 3
-
-
-def test_config_prints_toml_that_it_reads_again(tmp_path: Path) -> None:
-    first = run("config", "--set", "measure.mode=paper", "--set", "seed=9")
-    assert "seed = 9" in first.out
-    assert 'mode = "paper"' in first.out
-    (tmp_path / "c.toml").write_text(first.out)
-    assert run("config", "--config", tmp_path / "c.toml").out == first.out
-    assert run("config").out != first.out
 
 
 @pytest.mark.slow
@@ -362,54 +285,6 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
 
-@pytest.mark.slow
-def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
-    source = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
-    arguments = ("edit", source, "--lateral", "ego=3.5", "--overwrite", "--out", tmp_path / "e.json")
-    ran = run(*arguments)
-    assert ran.code == 0
-    assert "warning: agents 'ego' and 'bus_1' collide at" in ran.out
-    strict = run(*arguments, "--strict", "--quiet")
-    assert strict.code == 6
-    assert "'ego' and 'bus_1' collide" in strict.err
-    replayed = run("replay", tmp_path / "e.json", "--out", tmp_path / "r.json")
-    assert replayed.code == 0, replayed.err
-    assert run("validate", tmp_path / "r.json").code == 0
-
-
-def test_a_replay_never_replaces_its_scenario(tiny_scenario: Path) -> None:
-    before = tiny_scenario.read_bytes()
-    ran = run("replay", tiny_scenario, "--out", tiny_scenario, "--overwrite")
-    assert ran.code == 2
-    assert "is the scenario itself" in ran.err
-    assert tiny_scenario.read_bytes() == before
-
-
-def test_who_reacts_is_named_by_ids_even_if_they_hold_a_comma(tiny_scenario: Path, tmp_path: Path) -> None:
-    document = read(tiny_scenario)
-    movers = [a for a in document["agents"] if not a["static"]]
-    movers[-1]["id"] = "a, b"
-    (tmp_path / "s.json").write_text(json.dumps(document))
-    ran = run("replay", tmp_path / "s.json", "--react", "a, b", "--out", tmp_path / "r.json", "--quiet")
-    assert (ran.code, ran.err) == (0, "")
-    drivers = {a["id"]: a["driver"] for a in read(tmp_path / "r.json")["agents"]}
-    assert [k for k, v in drivers.items() if v == "reactive"] == ["a, b"]
-
-
-@pytest.mark.slow
-def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Path, tmp_path: Path) -> None:
-    other = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
-    run("replay", other, "--mode", "exact", "--out", tmp_path / "r.json")
-    for command, name in (("plot", "p.png"), ("view", "v.html")):
-        ran = run(command, tiny_scenario, "--replay", tmp_path / "r.json", "--out", tmp_path / name)
-        assert ran.code == 0
-        assert "r.json replays 'crossing', not 'tiny'" in ran.out
-        assert "warning" not in run(command, other, "--replay", tmp_path / "r.json", "--out", tmp_path / f"o{name}").out
-        run("edit", other, "--remove", "bus_1", "--out", tmp_path / "e.json", "--overwrite")
-        fewer = run(command, tmp_path / "e.json", "--replay", tmp_path / "r.json", "--out", tmp_path / f"e{name}")
-        assert "another version of 'crossing': 1 of its 11 agents is not in it" in fewer.out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -472,30 +347,151 @@ def test_every_command_names_the_files_it_wrote(
         assert [name for name in new if name not in ran.out] == [], command
 
 
-def test_files_are_replaced_where_the_command_or_the_environment_says_so(
-    tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+__all__ = ["folder", "made"]  # fixtures
+
+
+QUICK = ["map.lanes=false", "appearance.colors=false", "calibration.check=false", "stop_s=0.55"]
+
+
+def reconstruct(log: Path, out: Path, *options: str) -> tuple[str, dict[str, int | None]]:
+    """What a run prints, and what its report says of the cache."""
+    changes = [part for change in QUICK for part in ("--set", change)]
+    report = out.with_suffix(".report.json")
+    ran = run("reconstruct", log, "--out", out, "--report", report, "--detector", "seeing", *changes, *options)
+    assert ran.code == 0, ran.err
+    return ran.out, json.loads(report.read_text())["detection_cache"]
+
+
+def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
+    tiny_folder: Path, folder: Path, made: list[Seeing], tmp_path: Path
 ) -> None:
-    export = ("export", tiny_scenario, "--to", "csv", "-o", tmp_path / "csv", "-q")
-    assert run(*export).code == 0
-    assert run(*export).code == 2
-    assert run(*export, "-f").code == 0
-    monkeypatch.setenv("LOG2SIM_OVERWRITE", "1")
-    assert run(*export).code == 0
-    monkeypatch.setenv("LOG2SIM_OVERWRITE", "0")
-    assert run(*export).code == 2
+    assert run("cache").code == 0  # nothing is there yet
+    out, cached = reconstruct(tiny_folder, tmp_path / "a.json", "--no-cache")
+    assert cached is None
+    assert not folder.exists()
+    out, cached = reconstruct(tiny_folder, tmp_path / "b.json")
+    assert "earlier runs" not in out
+    assert cached == {"found": 0, "kept": TICKS, "problem": None}
+    out, cached = reconstruct(tiny_folder, tmp_path / "c.json")
+    assert f"{TICKS} ticks known from earlier runs" in out
+    assert (tmp_path / "c.json").read_bytes() == (tmp_path / "a.json").read_bytes()
+    shown = json.loads(run("cache", "--json").out)
+    size = sum(path.stat().st_size for path in entries(folder))
+    assert shown == {
+        "folder": str(folder),
+        "max_mb": 2048,
+        "bytes": size,
+        "parts": TICKS // PART,
+        "detectors": [{"name": "seeing", "parts": TICKS // PART, "bytes": size}],
+        "last_run": {"found": TICKS, "kept": 0},
+    }
+    assert f"{TICKS // PART} by seeing" in run("cache").out
+    assert run("cache", "--clear").out == f"{folder}: {TICKS // PART} parts removed\n"
+    assert entries(folder) == []
 
 
-def test_a_folder_of_logs_is_told_from_a_folder_without_any(tiny_folder: Path, tmp_path: Path) -> None:
-    for name in ("a/x/y/z", "b/x/y/z", "c/x/y/z"):
-        (tmp_path / name).parent.mkdir(parents=True)
-        shutil.copytree(tiny_folder, tmp_path / name)
-    ran = run("inspect", tmp_path)
-    assert (ran.code, "3 logs below: `log2sim batch`" in ran.line) == (3, True)
-    assert str(tmp_path / "b/x/y/z") in ran.line
+def test_a_png_comes_with_its_place_and_says_what_is_left_out(tiny_folder: Path, tmp_path: Path) -> None:
+    ran = run("map", tiny_folder, "--out", tmp_path / "m.png", "--cell", "0.1")
+    assert ran.code == 0, ran.err
+    assert names(tmp_path) == ["m.pgw", "m.png"]
+    picture = cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED)
+    assert picture[picture[..., 3] > 0][:, :3].std() > 5
+    assert "without --scenario only agents with labels are left out" in ran.out
+    assert "m.png: " in ran.out
 
 
-def test_an_unknown_detector_is_told_before_the_log_is_opened_with_all_there_are(tmp_path: Path) -> None:
-    ran = run("reconstruct", tmp_path / "no log", "--detector", "lidr:vehicle", "-o", tmp_path / "s.json")
-    assert ran.code == 2
-    for name in (*BUILT_IN["detector"], *(f"lidar:{name}" for name in BUILT_IN["lidar_detector"])):
-        assert name in ran.line
+def test_heights_as_geotiff_with_a_scenario(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
+    out = tmp_path / "h.tif"
+    ran = run("map", tiny_folder, "--scenario", tiny_scenario, "--out", out, "--layer", "height", "--cell", "0.2")
+    assert ran.code == 0, ran.err
+    assert names(tmp_path) == ["h.tif"]
+    heights = tifffile.imread(out)
+    assert abs(float(np.nanmedian(heights))) < 0.05
+    assert "without --scenario" not in ran.out
+
+
+SPARSE = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive whose GNSS is off by 0.4 m, with labels."""
+    log, _ = drive(HOUSES, BEND, duration_s=1.2, sigma_m=0.4, angle_deg=0.3, seed=3, lidars=[SPARSE], observe=True)
+    folder = tmp_path_factory.mktemp("noisy") / "drive"
+    write_log(log, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def by_lidar(noisy: Path) -> Path:
+    out = noisy.parent / "lidar.json"
+    ran = run(
+        "reconstruct", noisy, "--detector", "lidar:labels", "--poses", "lidar", "--out", out, "--report",
+        noisy.parent / "report.json",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    assert "poses: lidar (as requested)\n" in ran.out
+    return out
+
+
+def test_the_report_says_where_the_poses_come_from(noisy: Path, by_lidar: Path) -> None:
+    report = json.loads((noisy.parent / "report.json").read_text())
+    check(report, "report-1", LogError)
+    assert report["poses"]["source"] == "lidar"
+    assert report["poses"]["estimate"]["lidar"] == "top"
+    assert report["poses"]["estimate"]["poses"] == 12
+    assert Scenario.load(by_lidar).ego.quality["source"] == "LiDAR odometry"
+
+
+def test_evaluate_places_the_labels_by_the_poses_of_the_scenario(noisy: Path, by_lidar: Path) -> None:
+    out = noisy.parent / "metrics.json"
+    assert run("evaluate", by_lidar, "--truth", noisy, "--out", out, "--overwrite").code == 0
+    same = json.loads(out.read_text())
+    assert run("evaluate", by_lidar, "--truth", noisy, "--poses", "given", "--out", out, "--overwrite").code == 0
+    other = json.loads(out.read_text())
+    assert same["ego"]["position_rmse_m"] < 0.1 < other["ego"]["position_rmse_m"]
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Installed:
+    """An installed distribution of which pip noted this origin."""
+
+    def __init__(self, origin: dict[str, object] | None) -> None:
+        self.origin = origin
+
+    def read_text(self, name: str) -> str | None:
+        return json.dumps(self.origin) if name == "direct_url.json" and self.origin is not None else None
+
+
+def installed_from(origin: dict[str, object] | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "site-packages/log2sim/errors.py"))
+    monkeypatch.setattr(metadata, "distribution", lambda name: Installed(origin))
+
+
+def test_in_a_checkout_the_advice_names_the_checkout() -> None:
+    assert install_command("osi") == f"pip install --editable '{ROOT}[osi]'"
+    assert str(MissingExtra("export to OSI", "osi")).endswith(f": {install_command('osi')}")
+
+
+@pytest.mark.parametrize(
+    ("origin", "command"),
+    [
+        (None, "pip install 'log2sim[osi]'"),
+        ({"url": "file:///a%20b/log2sim", "dir_info": {}}, "pip install '/a b/log2sim[osi]'"),
+        (
+            {"url": "https://x.org/log2sim.git", "vcs_info": {"vcs": "git", "commit_id": "1"}},
+            "pip install 'log2sim[osi] @ git+https://x.org/log2sim.git'",
+        ),
+        (
+            {"url": "file:///w/log2sim-1.whl", "archive_info": {}},
+            "pip install 'log2sim[osi] @ file:///w/log2sim-1.whl'",
+        ),
+    ],
+)
+def test_elsewhere_the_advice_names_the_origin_of_the_installation(
+    origin: dict[str, object] | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    installed_from(origin, monkeypatch, tmp_path)
+    assert install_command("osi") == command

@@ -24,19 +24,20 @@ from log2sim.agents.confidence import (
     Evidence,
     confidence_of,
     evidence_of,
-    position_terms,
     rate_agents,
-    speed_terms,
-    with_systematic_errors,
-    yaw_terms,
 )
 from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
-from log2sim.datatypes import MIN_TRUSTED_CONFIDENCE, TYPICAL_SIZE_M, Doubt, Track
+from log2sim.datatypes import Doubt, Track
+from log2sim.datatypes.log_odds import log_odds_of, probability_of
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
+
+
 DARK = [None] * len(TIMELINE.t_ns)
+
+
 NAMES = [f.name for f in fields(Evidence)]
 
 
@@ -82,28 +83,6 @@ def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more, lid
     assert MIN_CONFIDENCE <= low <= high <= MAX_CONFIDENCE
 
 
-def by_camera(height_px_m: float) -> AgentCandidate:
-    """A parked car that a camera alone shows, whose boxes span a height where they are placed."""
-    candidate = parked(20)
-    m = candidate.track.measurements
-    n, none = len(m), np.full((len(m), 2), np.nan)
-    bare = replace(
-        m, points=np.zeros(n, dtype=np.int64), low_m=none, high_m=none, source=np.full(n, "topdown", dtype="<U16"),
-        camera=np.full(n, "front"), yaw_rad=np.full(n, np.nan), score=np.full(n, 0.95),
-        height_px_m=np.full(n, height_px_m),
-    )  # fmt: skip
-    return replace(candidate, track=replace(candidate.track, measurements=bare))
-
-
-def test_without_lidar_the_height_in_the_image_separates_right_from_wrong_places():
-    height = TYPICAL_SIZE_M["car"][2]
-    fits, half, twice = (
-        rate_agents([by_camera(share * height)], TIMELINE, lidar=False)[0].agent.confidence for share in (1.0, 0.6, 1.7)
-    )
-    assert fits > MIN_TRUSTED_CONFIDENCE > max(half, twice)
-    assert rate_agents([by_camera(height)], TIMELINE, lidar=True)[0].agent.confidence < fits
-
-
 @pytest.mark.parametrize("make", [parked, driving])
 def test_ratings_are_those_of_a_map_that_is_shifted_and_turned(make):
     candidate = make()
@@ -130,15 +109,6 @@ def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
     assert rated(part).agent.waypoints.sigma_xy_m[0] > 1.1 * rated(candidate).agent.waypoints.sigma_xy_m[0]
 
 
-def test_more_ticks_do_not_average_systematic_errors_away():
-    few, many = driving(6), driving(30)
-    given_share = np.median(many.agent.waypoints.sigma_xy_m) / np.median(few.agent.waypoints.sigma_xy_m)
-    evidence = evidence_of(few, TIMELINE)
-    sigmas = [np.median(with_systematic_errors(c, evidence, 0.8, TIMELINE).sigma_xy_m) for c in (few, many)]
-    assert sigmas[1] / sigmas[0] > given_share
-    assert sigmas[1] > 0.05
-
-
 def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     candidate = parked(3)
     m = candidate.track.measurements
@@ -151,25 +121,7 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     assert (found.hidden, found.blind) == (1.0, 1.0)
 
 
-def test_columns_that_are_unknown_stay_unknown():
-    candidate = parked()
-    w = replace(candidate.agent.waypoints, sigma_yaw_rad=None, sigma_speed_mps=None)
-    w = rated(replace(candidate, agent=replace(candidate.agent, waypoints=w))).agent.waypoints
-    assert w.sigma_yaw_rad is None
-    assert w.sigma_speed_mps is None
-
-
-def test_every_term_of_a_variance_has_a_weight_and_none_is_negative():
-    candidate = driving()
-    evidence, w, size = (
-        evidence_of(candidate, TIMELINE),
-        candidate.agent.waypoints,
-        candidate.agent.size_m,
-    )
-    for terms, weights in (
-        (position_terms(w, size, np.array([0.5, 1.0]), evidence, 0.7), POSITION_VARIANCE),
-        (yaw_terms(w, 0.7), YAW_VARIANCE),
-        (speed_terms(w, evidence, 0.7), SPEED_VARIANCE),
-    ):
-        assert set(terms) == set(weights)
-        assert all(values.shape == w.t_s.shape and values.min() >= 0 for values in terms.values())
+@given(st.floats(1e-6, 1 - 1e-6))
+def test_one_undoes_the_other_and_a_complement_has_the_opposite_sign(p: float) -> None:
+    assert probability_of(log_odds_of(p)) == pytest.approx(p, rel=1e-9)
+    assert log_odds_of(1 - p) == pytest.approx(-log_odds_of(p), abs=1e-9)

@@ -14,8 +14,7 @@ from log_encoders.world import make_world, world_log
 from plain_settings import AGENTS_ALONE
 
 from log2sim.config import Config
-from log2sim.datatypes import Log, Scenario, Stream
-from log2sim.errors import ConfigError
+from log2sim.datatypes import Log, Scenario
 from log2sim.logs.excerpt import RECORD_MARGIN_NS, cut_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.validation import validate_log
@@ -71,19 +70,6 @@ def test_a_converted_log_gives_the_same_scenario(tmp_path: Path, encode: Callabl
     assert {n: s.t_ns.tolist() for n, s in back.streams.items()} == {n: s.t_ns.tolist() for n, s in log.streams.items()}
     for name in log.cameras:
         assert back.streams[name].encoded(2) == log.streams[name].encoded(2)
-
-
-@pytest.mark.slow
-def test_a_part_gives_what_reconstruction_makes_of_that_part(tmp_path: Path) -> None:
-    path = native.encode(make_world(camera=TWO_CAMERAS), tmp_path)
-    ran = run("convert", path, "--out", tmp_path / "part", "--start", "0.2", "--stop", "0.7", "--cameras", "front")
-    assert ran.code == 0, ran.err
-    part = open_log(tmp_path / "part")
-    assert list(part.cameras) == ["front"]
-    assert len(part.streams["front"].t_ns) == 6
-    assert set(part.image_labels) == {"front"}
-    assert not (tmp_path / "part" / "left").exists()
-    assert_same(scenario_of(tmp_path / "part"), scenario_of(path, start_s=0.2, stop_s=0.7, cameras=("front",)), 0.005)
 
 
 def test_what_surrounds_a_part_is_kept_for_interpolation() -> None:
@@ -166,35 +152,3 @@ def test_nothing_is_lost_or_left_behind(log_folder: Path, tmp_path: Path, monkey
     ran = run("convert", log_folder, "--out", tmp_path / "to")
     assert ran.code == 130
     assert names(tmp_path) == before
-
-
-def test_a_damaged_record_is_left_out_and_said(log_folder: Path, tmp_path: Path) -> None:
-    sweeps = sorted(log_folder.glob("top/*.npz"))
-    sweeps[2].write_bytes(b"torn")
-    ran = run("convert", log_folder, "--out", tmp_path / "to")
-    assert ran.code == 0
-    assert f"left out: stream 'top': {sweeps[2]}" in ran.out
-    assert len(open_log(tmp_path / "to").streams["top"].t_ns) == len(sweeps) - 1
-
-
-def test_a_sensor_without_records_in_the_part_is_left_out() -> None:
-    log = world_log()
-    late = replace(log, streams={**log.streams, "top": Stream("top", log.streams["top"].t_ns + 10**11, lambda i: None)})
-    part = cut_log(late, start_s=0.0, stop_s=0.5)
-    assert list(part.lidars) == []
-    assert "top: no record from --start to --stop" in part.notes
-    with pytest.raises(ConfigError, match="leave no record of 'top'"):
-        cut_log(replace(log, cameras={}), start_s=7.0)
-
-
-@pytest.mark.slow
-@pytest.mark.real
-@pytest.mark.parametrize("path", ["kitti_tracking", "pandaset/002"])
-def test_a_part_of_a_recorded_log_gives_the_same_scenario(real_data: Path, tmp_path: Path, path: str) -> None:
-    cameras = {"kitti_tracking": ("image_02",), "pandaset/002": ("front_camera",)}[path]
-    arguments = ("--start", 1, "--stop", 2.5, "--cameras", *cameras)
-    ran = run("convert", real_data / path, "--out", tmp_path / "to", *arguments)
-    assert ran.code == 0, ran.err
-    assert validate_log(tmp_path / "to") == []
-    theirs = scenario_of(real_data / path, start_s=1.0, stop_s=2.5, cameras=cameras)
-    assert_same(scenario_of(tmp_path / "to"), theirs, atol_m=0.02)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,43 +11,29 @@ from hypothesis import strategies as st
 from plain_settings import AGENTS_ALONE
 from worlds import rows_at, tiny_log, tiny_table
 
-from log2sim.agents.size import Ends, _better_ends
-from log2sim.config import Config, LidarConfig, TrackConfig
+from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Measurements, Track
-from log2sim.errors import LogError
-from log2sim.evaluation.bench.benchmark import bench, document
 from log2sim.evaluation.detection.detect_log import without_ego
-from log2sim.geometry import rectangle_iou, rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import wrap_angle
 from log2sim.perception.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative import (
-    METHODS,
     BoxErrors,
-    EndsDetector,
     SeenBoxes,
-    create_for_ends,
-    detector_by_mounting,
-    estimate_errors,
-    fuse_boxes,
     match_by_covariance,
-    match_by_overlap,
     merge_by_covariance,
     take_off_offset,
 )
-from log2sim.perception.detect3d.detectors import open_shipped
-from log2sim.perception.detect3d.network import level_points, viewpoints_xy
 from log2sim.perception.first_pass import obstacles_of
 from log2sim.perception.lidar.cloud import (
     Cloud,
     CloudSensor,
-    assemble_cloud,
     assemble_views,
-    group_by_viewpoint,
     join_parts,
 )
 from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
-from log2sim.tracking.tracker import merge_tracks, track_ends, velocities
+from log2sim.tracking.tracker import merge_tracks
 
 POST = {
     "name": "post",
@@ -91,26 +75,6 @@ def test_each_side_comes_from_whoever_sees_it() -> None:
     assert merged.boxes.points[0] == 100
 
 
-def test_sides_known_alike_are_averaged() -> None:
-    a, b = seen(boxes_at(CAR)), seen(boxes_at((0.04, 0.02, 0.8, 4.6, 1.9, 1.6, 0.02)))
-    merged = merge_by_covariance(a, b)
-    # The road's share is less, as its pose may be off.
-    assert 0 < merged.boxes.center_m[0, 0] < 0.02
-    assert merged.boxes.size_m[0, :2] == pytest.approx([4.55, 1.85], abs=0.01)
-    assert merged.boxes.yaw_rad[0] == pytest.approx(0.01)
-
-
-def test_a_box_turned_round_is_the_same_box() -> None:
-    a = seen(boxes_at(CAR), [[[0.05, 0.3], [0.1, 0.2]]])
-    turned = seen(boxes_at((*CAR[:6], np.pi)), [[[0.3, 0.05], [0.2, 0.1]]])
-    merged, same = merge_by_covariance(a, turned), merge_by_covariance(a, a)
-    assert merged.boxes.center_m == pytest.approx(same.boxes.center_m)
-    assert merged.boxes.size_m == pytest.approx(same.boxes.size_m)
-    assert merged.errors.side_m == pytest.approx(same.errors.side_m)
-    # Who is equally sure of opposite headings knows none.
-    assert merged.boxes.heading_score[0] == pytest.approx(0.5)
-
-
 def test_what_moves_between_the_times_of_both_ends_is_put_at_one() -> None:
     # At 15 m/s, with sweeps 0.1 s apart.
     a = seen(boxes_at(CAR, t_ns=0, points=100))
@@ -125,14 +89,6 @@ def test_what_moves_between_the_times_of_both_ends_is_put_at_one() -> None:
     # Boxes of one time are as far apart by mistake; none is between them.
     still = seen(boxes_at((1.5, *CAR[1:]), t_ns=0, points=100))
     assert abs(merge_by_covariance(a, still).boxes.size_m[0, 0] - 4.5) < 0.2
-
-
-def test_boxes_that_contradict_each_other_are_not_mixed() -> None:
-    a, across = seen(boxes_at(CAR), 0.05), seen(boxes_at((*CAR[:6], np.pi / 2)), 0.2)
-    assert merge_by_covariance(a, across).boxes.size_m[0].tolist() == [4.5, 1.8, 1.6]
-    assert merge_by_covariance(a, across).boxes.yaw_rad[0] == 0.0
-    bus = seen(boxes_at((3.0, 0, 1.5, 11.0, 2.5, 3.0, 0)), 0.1)
-    assert merge_by_covariance(a, bus).boxes.size_m[0, 0] in (4.5, 11.0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -154,62 +110,11 @@ def test_merging_turns_and_moves_with_the_world(turn, shift, dx, dy, dyaw, sigma
     assert wrap_angle(merged.yaw_rad - plain.yaw_rad - turn) == pytest.approx(0, abs=1e-9)
 
 
-def test_small_objects_match_though_they_hardly_overlap() -> None:
-    one, other = (seen(boxes_at((x, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.15) for x in (0.0, 0.45))
-    assert [v.tolist() for v in match_by_covariance(one, other)] == [[0], [0]]
-    assert [v.tolist() for v in match_by_overlap(one, other)] == [[], []]
-    far = seen(boxes_at((1.0, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.5)
-    assert [v.tolist() for v in match_by_covariance(one, far)] == [[], []]
-
-
 def test_neighbors_are_matched_with_their_own() -> None:
     parked = boxes_at(*((0.0, 2.4 * k, 0.8, 4.5, 1.8, 1.6, 0) for k in range(4)))
     moved = replace(parked, center_m=parked.center_m + np.array([0.2, 0.3, 0]))
     i, j = match_by_covariance(seen(parked), seen(moved.take([2, 0, 3])))
     assert dict(zip(i.tolist(), j.tolist())) == {2: 0, 0: 1, 3: 2}
-
-
-def test_other_kinds_of_objects_do_not_match() -> None:
-    walker = boxes_at((0, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian")
-    for match in (match_by_covariance, match_by_overlap):
-        assert not len(match(seen(boxes_at(CAR)), seen(walker))[0])
-    truck = boxes_at(CAR, category="truck")
-    assert len(match_by_covariance(seen(boxes_at(CAR)), seen(truck))[0]) == 1
-    assert not len(match_by_overlap(seen(boxes_at(CAR)), seen(truck))[0])
-
-
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-def test_what_one_end_alone_sees_stays(method) -> None:
-    a = seen(boxes_at(CAR, (20, 0, 0.8, 4.5, 1.8, 1.6, 0.3)))
-    b = seen(boxes_at((0.1, 0, 0.8, 4.5, 1.8, 1.6, 0), (0, 30, 0.8, 4.5, 1.8, 1.6, 0.3)))
-    fused = fuse_boxes(a, b, method).boxes
-    assert len(fused) == 3
-    alone = fused.take(fused.points == 50)
-    assert sorted(map(tuple, alone.center_m[:, :2].tolist())) == [(0, 30), (20, 0)]
-    nothing = seen(Boxes3D.empty())
-    assert fuse_boxes(a, nothing, method) is a
-    assert fuse_boxes(nothing, b, method) is b
-
-
-def test_near_sides_are_better_known_than_far_ones() -> None:
-    errors = estimate_errors(boxes_at(CAR), np.array([-10.0, 4.0, 2.0]))
-    (rear, front), (right, left) = errors.side_m[0]
-    assert rear < front
-    assert left < right
-    assert errors.yaw_rad[0] < 0.2
-    few = estimate_errors(boxes_at(CAR, points=5), np.array([-10.0, 4.0, 2.0]))
-    assert (few.side_m > errors.side_m).all()
-
-
-def test_pose_noise_of_the_road_costs_little() -> None:
-    # Rear from the one, front from the other, and the road 0.3 m off: neither end is much worse than alone.
-    rear = seen(boxes_at((-0.25, 0, 0.8, 4.0, 1.8, 1.6, 0)), [[[0.05, 0.4], [0.05, 0.15]]])
-    for angle in np.linspace(0, 2 * np.pi, 9):
-        off = 0.3 * np.array([np.cos(angle), np.sin(angle)])
-        front = seen(boxes_at((0.2 + off[0], off[1], 0.8, 4.1, 1.8, 1.6, 0)), [[[0.4, 0.05], [0.15, 0.05]]])
-        ious = [rectangle_iou([CAR[:2] + CAR[3:5] + CAR[6:]], s.rectangles)[0] for s in (rear, front)]
-        fused = rectangle_iou([CAR[:2] + CAR[3:5] + CAR[6:]], merge_by_covariance(rear, front).rectangles)[0]
-        assert fused >= np.mean(ious)
 
 
 @pytest.fixture(scope="module")
@@ -240,28 +145,6 @@ def test_clouds_of_both_ends_keep_their_viewpoints(both_ends) -> None:
     assert [(view.end, rows.tolist()) for view, rows in split] == [
         ("road", [0, len(cloud.views[1].xyz) - 1]), ("vehicle", [0]),
     ]  # fmt: skip
-
-
-def test_a_cloud_of_one_end_is_made_as_before() -> None:
-    log, _ = tiny_log()
-    options = {"origin": np.zeros(3), "ground_z": 0.0, "max_range_m": 80.0}
-    one, other = assemble_views(log, sweeps_at(log), **options), assemble_cloud(log, sweeps_at(log), **options)
-    for name in ("xyz", "t_s", "sensor", "ground", "height"):
-        assert np.array_equal(getattr(one, name), getattr(other, name))
-    assert one.parts == ()
-
-
-def test_lidars_of_the_road_are_grouped_by_their_places(both_ends) -> None:
-    lidars = dict(both_ends.lidars)
-    post = lidars["post"]
-    for name, x in (("beside", 33.0), ("far", 90.0)):
-        pose = post.mount_T_lidar.copy()
-        pose[0, 3] = x
-        lidars[name] = replace(post, name=name, mount_T_lidar=pose)
-    log = both_ends.changed(lidars=lidars)
-    assert group_by_viewpoint(log, list(lidars)) == [["top"], ["post", "beside"], ["far"]]
-    road = log.changed(lidars={k: v for k, v in lidars.items() if k != "top"})
-    assert group_by_viewpoint(road, list(road.lidars)) == [["post", "beside", "far"]]
 
 
 @pytest.mark.slow
@@ -297,21 +180,6 @@ def test_levels_fall_back_where_an_end_has_no_lidar(both_ends) -> None:
     assert "no LiDAR of vehicle" in choice.reason
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
     assert fusion_level(vehicle, config).reason == ""
-
-
-def test_the_road_has_a_detector_that_fits_its_mounting(both_ends) -> None:
-    assert detector_by_mounting(both_ends, "lidar:vehicle") == "lidar:vehicle"
-    assert detector_by_mounting(both_ends, "lidar:mine.onnx") == "lidar:mine.onnx"
-    post = both_ends.lidars["post"]
-    down = post.mount_T_lidar @ transform(rotation_from_rpy(0.0, np.deg2rad(31.0), 0.0), np.zeros(3))
-    tilted = both_ends.changed(lidars={**both_ends.lidars, "post": replace(post, mount_T_lidar=down)})
-    assert detector_by_mounting(tilted, "lidar:vehicle") == "lidar:roadside"
-    config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
-    detector = create_for_ends(tilted, config)
-    assert isinstance(detector, EndsDetector)
-    assert detector.name == "lidar:vehicle|lidar:roadside"
-    points = config.changed(cooperation={"fusion": "points"})
-    assert create_for_ends(tilted, points).name == "lidar:vehicle"
 
 
 def track_of(ticks, xy, *, late_s=0.0, end=0, category="car"):
@@ -356,25 +224,6 @@ def test_the_road_joins_two_tracks_of_a_hidden_object() -> None:
     assert len(merge_tracks([a[0], twin], b)) == 2
 
 
-def test_velocities_are_those_of_the_measurements() -> None:
-    ticks = range(12)
-    assert velocities(track_of(ticks, line(ticks, 7.0))) == pytest.approx(np.tile([7.0, 0.0], (12, 1)))
-    assert velocities(track_of([3], [[1.0, 2.0]])).tolist() == [[0, 0]]
-
-
-def test_both_ends_share_the_life_of_a_short_track() -> None:
-    ticks = np.arange(12)
-    empty = rows_at(np.zeros((0, 2)))
-
-    def by_tick(track):
-        return [track.measurements.take(track.tick == k) if k in track.tick else empty for k in ticks]
-
-    a, b = track_of([2, 3, 4], line([2, 3, 4], 5.0)), track_of([5, 6, 7], line([5, 6, 7], 5.0), end=1)
-    config = TrackConfig(birth_score=0.4, max_gap_s=1.0, min_life_s=0.5)
-    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), config)
-    assert found.tick.tolist() == [2, 3, 4, 5, 6, 7]
-
-
 def test_a_row_keeps_the_view_of_the_other_end(both_ends) -> None:
     cloud = assemble_views(both_ends, sweeps_at(both_ends), origin=np.zeros(3), ground_z=0.0, max_range_m=80.0)
     rows = measure([], boxes_at((14.0, -4.0, 0.75, 4.2, 1.8, 1.5, np.deg2rad(10))), cloud)
@@ -390,23 +239,6 @@ def test_a_row_keeps_the_view_of_the_other_end(both_ends) -> None:
     joined = Measurements.join([rows_at([[0, 0]]), rows])
     assert joined.others == (None, other)
     assert rows_at([[0, 0]]).take([0]).others == ()
-
-
-@pytest.mark.slow
-def test_bench_compares_the_ends_and_their_levels(both_ends) -> None:
-    log = both_ends.changed(cameras={}, reference_camera=None)
-    truth = tiny_log(lidar=[tiny_table()["lidar"][0], POST])[1]
-    chosen = Config.load(detect={"name": "lidar:labels"}, cooperation={"fusion": "boxes", "register_road": False})
-    result = bench(log, chosen, truth=truth)
-    (panel,) = result.panels
-    names = [point.setting for point in panel.points]
-    assert names[0] == "both, boxes"
-    assert sorted(names) == ["both, boxes", "both, points", "both, tracks", "road alone", "vehicle alone"]
-    error = {point.setting: point.error for point in panel.points}
-    assert error["both, boxes"] < error["vehicle alone"] <= error["road alone"]
-    assert document(result)["panels"][0]["stage"] == "ends"
-    with pytest.raises(LogError, match="compares methods for images"):
-        bench(log.changed(lidars={"top": log.lidars["top"]}), chosen)
 
 
 def outline_points(x, y, length=4.5, width=1.8, step=0.1):
@@ -453,21 +285,6 @@ def test_what_a_viewpoint_sees_is_judged_from_there() -> None:
     assert starts == {(-15, -5, 2), (20, 5, 3)}
 
 
-def test_the_grid_reaches_around_every_viewpoint() -> None:
-    places = ([0, 0, 2], [70, 10, 4])
-    cloud = join_parts([view_of(outline_points(p[0] + dx, p[1]), p) for p in places for dx in (-30, 30)])
-    xyz, index = level_points(cloud, 40.0)
-    assert len(index) == len(cloud.xyz)
-    detector = open_shipped("vehicle", LidarConfig())
-    center, reach_m = detector._square_around(viewpoints_xy(cloud))
-    assert (np.abs(xyz[:, :2] - center) <= reach_m).all()
-    one = detector._square_around(viewpoints_xy(cloud.parts[0]))
-    assert (one[0].tolist(), one[1]) == ([0, 0], 40.0)
-    # Nothing that is out of range of all of them.
-    far = join_parts([view_of(outline_points(45, 0), [0, 0, 2]), view_of(outline_points(70, 10), [70, 70, 4])])
-    assert len(level_points(far, 40.0)[1]) == 0
-
-
 def test_points_of_a_moving_car_are_put_to_one_time() -> None:
     # 15 m/s; the vehicle sees its rear, the road its front 0.05 s later. Beside it stands another.
     outline = outline_points(0.0, 0.0)
@@ -512,23 +329,6 @@ def test_only_what_drives_along_its_axis_is_moved() -> None:
     assert speed_of(1.5, 0.0, category=np.array(["truck"])) == []
 
 
-def test_an_end_is_taken_from_the_view_that_knows_it_better() -> None:
-    def ends(low, high, real_low, real_high, gap_m=0.1):
-        real = np.array([[[real_low, real_high]] * 2])
-        return Ends(np.full((1, 2), float(low)), np.full((1, 2), float(high)), real, np.full((1, 2, 2), gap_m))
-
-    facing, beside = ends(-2.0, 1.0, 2, 0), ends(-1.7, 2.3, 1, 1)
-    for better in (_better_ends(facing, beside), _better_ends(beside, facing)):
-        assert (better.low[0, 0], better.high[0, 0]) == (-2.0, 2.3)
-        assert better.real[0, 0].tolist() == [2, 1]
-    # Of ends that nobody knows, what reaches farther.
-    unknown = _better_ends(ends(-2.0, 1.0, 0, 0), ends(-1.0, 1.5, 0, 0))
-    assert (unknown.low[0, 0], unknown.high[0, 0]) == (-2.0, 1.5)
-    # Of two that are known alike, the one where rays are closer together.
-    close = _better_ends(ends(-2.0, 1.0, 1, 1), ends(-2.1, 1.1, 1, 1, gap_m=0.02))
-    assert (close.low[0, 0], close.high[0, 0]) == (-2.1, 1.1)
-
-
 def street(count=8):
     """Vehicles in both directions along two streets, as x, y, z, length, width, height, yaw."""
     along = [(8.0 * k - 20, 3.0 * (-1) ** k, 0.8, 4.5, 1.8, 1.6, np.pi * (k % 2)) for k in range(count)]
@@ -559,28 +359,6 @@ def test_what_many_pairs_agree_on_is_taken_off() -> None:
     assert np.hypot(*(one.center_m - off.center_m)[0, :2]) < 0.7 * np.hypot(*(off.center_m - true.center_m)[0, :2])
     assert take_off_offset(a.take([]), b.take([]), b) is b
     assert take_off_offset(a, seen(off), seen(off)).boxes is off
-
-
-def test_boxes_that_the_road_alone_sees_are_moved_with_the_others() -> None:
-    true, pivot = boxes_at(*street()), np.array([10.0, 5.0, 4.0])
-    off = turned(true, pivot, [0.3, 0.1], np.deg2rad(-1.0))
-    a, b = seen(true.take(np.arange(15))), replace(seen(off), sensor_m=pivot)
-    fused = fuse_boxes(a, b, METHODS["covariance"]).boxes
-    assert len(fused) == len(true)
-    alone = fused.center_m[np.argmin(np.hypot(*(fused.center_m - true.center_m[15])[:, :2].T))]
-    assert np.hypot(*(alone - true.center_m[15])[:2]) < 0.3 * np.hypot(*(off.center_m - true.center_m)[15, :2])
-    as_they_are = fuse_boxes(a, b, METHODS["overlap"]).boxes.center_m
-    assert np.hypot(*(as_they_are - off.center_m[15])[:, :2].T).min() == 0.0
-
-
-def test_the_scale_of_errors_is_found_by_their_likelihood() -> None:
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-    from fits.box_errors import fit_sigma
-
-    rng = np.random.default_rng(0)
-    terms = np.column_stack([np.ones(4000), rng.uniform(0, 5, 4000)])
-    error = rng.standard_t(4, 4000) * np.exp(terms @ [-1.0, -0.3])
-    assert fit_sigma(terms, error) == pytest.approx([-1.0, -0.3], abs=0.06)
 
 
 def test_the_ego_that_the_road_sees_is_no_detection(both_ends) -> None:

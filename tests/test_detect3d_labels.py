@@ -10,10 +10,9 @@ from test_detect_labels import CAR, SECOND, log_with
 
 from log2sim.config import Config, LidarConfig
 from log2sim.datatypes import Boxes3D, Log
-from log2sim.errors import ConfigError
 from log2sim.files import plugins
-from log2sim.geometry import Array, box_corners_bev, points_in_box
-from log2sim.perception.detect3d.box_points import bounding_reach, most_points, points_of_boxes
+from log2sim.geometry import Array, points_in_box
+from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
 
@@ -41,11 +40,6 @@ def test_a_label_with_points_becomes_a_box_and_one_without_does_not() -> None:
     assert (found.category.tolist(), found.t_ns.tolist()) == (["car"], [0])
 
 
-def test_ground_under_a_label_is_not_counted() -> None:
-    log = log_with((0, "car", (1010.0, 2000.0, 30.75), CAR))
-    assert len(detect(log, cloud_of([[1010.0, 2000.0, 30.1], [1010.0, 2000.0, 30.0]]))) == 0
-
-
 def test_labels_move_to_the_stamp_of_the_cloud() -> None:
     log = log_with((0, "car", (1010.0, 2000.0, 30.75), CAR), (SECOND // 10, "car", (1011.0, 2000.0, 30.75), CAR))
     found = detect(log, cloud_of([[1010.5, 2000.0, 31.0]], stamp_ns=SECOND // 20))
@@ -58,26 +52,6 @@ def test_the_object_with_most_points_comes_first_and_far_ones_are_left_out() -> 
     cloud = cloud_of([[1010.0, 2000.0, 31.0], [1020.0, 2000.0, 31.0], [1020.5, 2000.0, 31.0], [1060.0, 2000.0, 31.0]])
     assert detect(log, cloud).center_m[:, 0].tolist() == [1020.0, 1010.0, 1060.0]
     assert detect(log, cloud, range_m=59.0).center_m[:, 0].tolist() == [1020.0, 1010.0]
-
-
-def test_what_is_no_road_user_and_a_cloud_without_points_give_nothing() -> None:
-    log = log_with((0, "building", (1010.0, 2000.0, 31.0), CAR))
-    assert len(detect(log, cloud_of([[1010.0, 2000.0, 31.0]]))) == 0
-    assert len(detect(log_with((0, "car", (1010.0, 2000.0, 31.0), CAR)), cloud_of(np.zeros((0, 3))))) == 0
-
-
-def test_a_log_without_labels_names_other_detectors() -> None:
-    with pytest.raises(ConfigError, match=r"log 'made' \(log2sim\) has no labeled 3D boxes; choose another") as caught:
-        create_lidar_detector("lidar:labels", Log("made", "log2sim", {}, {}, {}), LidarConfig())
-    assert caught.value.exit_code == 2
-
-
-def test_an_unknown_name_lists_the_known_ones() -> None:
-    log = log_with((0, "car", (0.0, 0.0, 0.0), CAR))
-    with pytest.raises(ConfigError, match=r"unknown LiDAR detector 'label' \(did you mean 'labels'\?\); known: .*onnx"):
-        create_lidar_detector("lidar:label", log, LidarConfig())
-    with pytest.raises(ConfigError, match=r"'labels': expected a name that begins with 'lidar:'"):
-        create_lidar_detector("labels", log, LidarConfig())
 
 
 def test_a_plug_in_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,26 +83,3 @@ def test_points_of_boxes_are_those_of_each_box_alone(scale: float) -> None:
     assert some.count.tolist() == [-(-len(e) // max(-(-len(e) // 10), 1)) for e in expected]
     assert set(zip(some.box.tolist(), some.point.tolist())) <= set(zip(found.box.tolist(), found.point.tolist()))
     np.testing.assert_allclose(z, [xyz[e, 2].mean(dtype=float) if len(e) else 0.0 for e in expected], atol=1e-5 * scale)
-
-
-def test_no_box_holds_more_points_than_the_cells_that_it_touches() -> None:
-    rng = np.random.default_rng(8)
-    center, size, yaw = random_boxes(rng, 50)
-    xyz = (rng.uniform(-40, 40, (20_000, 3)) * [1, 1, 0.1]).astype(np.float32)
-    counts, *_ = np.histogram2d(xyz[:, 0], xyz[:, 1], bins=(80, 70), range=((-20, 20), (-10, 25)))
-    reach = bounding_reach(size, yaw)
-    most = most_points(counts.astype(np.float32), np.array([-20.0, -10.0]), 0.5, center[:, :2], reach)
-    inside = (xyz[:, 0] >= -20) & (xyz[:, 0] < 20) & (xyz[:, 1] >= -10) & (xyz[:, 1] < 25)
-    assert np.all(most >= points_of_boxes(xyz[inside], center, size, yaw).count)
-    low, high = center[:, :2] - reach - 0.5, center[:, :2] + reach + 0.5
-    around = [int((np.all((xyz[inside, :2] >= a) & (xyz[inside, :2] <= b), axis=1)).sum()) for a, b in zip(low, high)]
-    assert np.all(most <= around)
-    np.testing.assert_allclose(2 * reach, np.ptp(box_corners_bev(center[:, :2], *size[:, :2].T, yaw), axis=1))
-
-
-def test_without_boxes_or_points_there_are_no_pairs() -> None:
-    box, all_three = (np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1)), np.ones(3, bool)
-    assert points_of_boxes(np.zeros((0, 3), np.float32), *box, all_three[:0]).count.tolist() == [0]
-    assert points_of_boxes(np.zeros((3, 3), np.float32), *(b[:0] for b in box), all_three).count.tolist() == []
-    assert points_of_boxes(np.full((3, 3), np.nan, np.float32), *box, all_three).count.tolist() == [0]
-    assert points_of_boxes(np.zeros((3, 3), np.float32), *box, all_three).count.tolist() == [3]

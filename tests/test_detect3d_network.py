@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,9 +17,8 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.perception.detect3d import detectors, network
-from log2sim.perception.detect3d import network as level_points
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, create_lidar_detector
-from log2sim.perception.detect3d.network import Network, NetworkInfo
+from log2sim.perception.detect3d.network import NetworkInfo
 from log2sim.perception.lidar.cloud import Cloud
 
 ORIGIN = np.array([5000.0, -300.0, 12.0])
@@ -95,40 +92,12 @@ def test_a_box_lands_in_the_map_with_its_points_and_their_time(
     assert found.heading_score[0] == pytest.approx(1.0, abs=1e-4)
 
 
-def test_on_a_slope_the_box_stands_on_the_ground_under_its_center(monkeypatch: pytest.MonkeyPatch) -> None:
-    level = solid(10, 6, yaw=0.6)
-    # Only the near end is seen.
-    level = level[(level[:, 2] == 0) | (level[:, 0] < 9.5)]
-    found = fixed(monkeypatch, ("car", BOX)).detect(cloud_of(level, slope=(0.1, -0.05)))
-    assert found.center_m[0, 2] == pytest.approx(ORIGIN[2] + 0.1 * 10 - 0.05 * 6 + 0.75, abs=0.01)
-
-
 def test_boxes_without_points_and_below_the_least_score_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud, empty = cloud_of(solid(10, 6, yaw=0.6)), (20.0, -6.0, *BOX[2:])
     assert len(fixed(monkeypatch, ("car", BOX), ("car", empty)).detect(cloud)) == 1
     strict = info(min_score={"vehicle": 0.99, "two_wheeler": 0.0, "pedestrian": 0.0})
     assert len(fixed(monkeypatch, ("car", BOX), info=strict).detect(cloud)) == 0
     assert len(fixed(monkeypatch, ("car", BOX), info=strict, min_score=0.5).detect(cloud)) == 1
-
-
-def test_score_grows_with_points_as_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
-    weights = {g: [-4.0, 0.0, 0.0, 1.0, -0.1] for g in INFO["groups"]}
-    detector = fixed(monkeypatch, ("car", BOX), info=info(calibration=weights), min_score=0.0)
-    found = detector.detect(cloud_of(solid(10, 6, yaw=0.6)))
-    expected = 1 / (1 + np.exp(4 - np.log(321) + 0.1 * np.hypot(10, 6) / 10))
-    assert found.score[0] == pytest.approx(expected, abs=1e-6)
-
-
-def test_a_person_in_a_car_that_proves_weak_by_range_does_not_take_the_car_away(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    weights = {"vehicle": [0, 1, 0, 0, 0], "two_wheeler": [0, 1, 0, 0, 0], "pedestrian": [2, 1, 0, 0, -5]}
-    person = (11.1, 6.5, 0.75, 0.8, 0.8, 1.5, 0.0)
-    detector = fixed(monkeypatch, ("car", BOX), ("pedestrian", person), info=info(calibration=weights), min_score=0.0)
-    cloud = cloud_of(solid(10, 6, yaw=0.6))
-    assert detector.candidates(cloud).inside.count.min() > 0
-    assert detector.candidates(cloud).terms[1].tolist() == pytest.approx([4.0, 4.0])
-    assert detector.detect(cloud).category.tolist() == ["car"]
 
 
 @pytest.mark.parametrize("per_point", [0.5, -0.5])
@@ -146,18 +115,6 @@ def test_boxes_that_cannot_reach_the_least_score_are_left_out_early_and_no_other
     good = np.flatnonzero((everything.inside.count > 0) & (score >= 0.6))
     assert len(good) < len(detector.candidates(cloud, weak=False).boxes) < len(everything.boxes)
     np.testing.assert_allclose(found.score, np.sort(score[good])[::-1])
-
-
-def test_earlier_clouds_are_in_the_grid_but_not_among_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    cloud, shift = cloud_of(solid(10, 6, yaw=0.6)), np.array([3.0, -2.0, 5.0])
-    again = cloud_of(solid(10, 6, yaw=0.6) - np.array([3.0, -2.0, 0]), origin=ORIGIN + shift)
-    detector = fixed(monkeypatch, ("car", BOX))
-    one, two = detector.detect(cloud), detector.detect(cloud, [again])
-    first, second = detector.network.seen  # type: ignore[attr-defined]
-    assert one.points.tolist() == two.points.tolist()
-    assert np.array_equal(first[3] > 0, second[3] > 0)
-    np.testing.assert_allclose(np.expm1(3 * second[3]), 2 * np.expm1(3 * first[3]), rtol=1e-4)
-    np.testing.assert_allclose(second[0], first[0], atol=1e-5)
 
 
 def taller_is_hotter(folder: Path, **changes: Any) -> Path:
@@ -217,11 +174,6 @@ def test_range_and_score_follow_the_settings(tmp_path: Path) -> None:
     assert len(sure) == 2
 
 
-def test_points_of_nan_change_nothing(detector: LidarDetector) -> None:
-    level = np.insert(poles(), [3, 20, 40], np.nan, axis=0)
-    assert detector.detect(cloud_of(level)).points.tolist() == [12, 12, 12]
-
-
 @pytest.mark.parametrize(
     "level",
     [
@@ -240,34 +192,6 @@ def test_clouds_without_anything_to_find_give_no_boxes(level: Array, decode: str
     chosen = create_lidar_detector(f"lidar:{taller_is_hotter(tmp_path)}", LOG, LidarConfig(decode=decode))  # type: ignore[arg-type]
     assert len(chosen.detect(cloud_of(level))) == 0
     assert len(chosen.detect(cloud_of(level), [cloud_of(level)])) == 0
-
-
-def test_a_sensor_that_is_nowhere_is_taken_to_be_at_the_origin(detector: LidarDetector) -> None:
-    cloud = cloud_of(poles(), sensor=np.full(3, np.nan, np.float32))
-    assert len(detector.detect(cloud)) == 3
-
-
-@pytest.mark.slow
-def test_five_million_points_are_thinned_out(detector: LidarDetector) -> None:
-    rng = np.random.default_rng(0)
-    level = rng.uniform(-60, 60, (5_000_000, 3)).astype(np.float32) * np.array([1, 1, 0.01], np.float32)
-    cloud = cloud_of(level)
-    xyz, index = level_points.level_points(cloud, 40.0)
-    assert 0.4 * level_points.MAX_POINTS < len(xyz) <= level_points.MAX_POINTS
-    assert np.array_equal(xyz[:, :2], level[index, :2])
-    start = time.process_time()
-    detector.detect(cloud)
-    assert time.process_time() - start < 5.0
-
-
-def test_many_peaks_on_a_noisy_map_are_decoded_quickly(tmp_path: Path) -> None:
-    path = taller_is_hotter(tmp_path, min_score=dict.fromkeys(INFO["groups"], 0.0))
-    rng = np.random.default_rng(0)
-    level = rng.uniform(-40, 40, (100_000, 3)) * [1, 1, 0.04]
-    chosen = create_lidar_detector(f"lidar:{path}", LOG, LidarConfig())
-    start = time.process_time()
-    assert 50 < len(chosen.detect(cloud_of(level))) <= 300
-    assert time.process_time() - start < 2.0
 
 
 def without(key: str) -> dict[str, Any]:
@@ -303,29 +227,6 @@ def test_metadata_that_cannot_be_are_one_clear_line(metadata: Any, message: str,
     assert "\n" not in str(caught.value)
 
 
-def test_metadata_without_end_are_not_read(tmp_path: Path) -> None:
-    path = write_network(tmp_path / "bad.onnx", json.dumps(INFO) + " " * network.METADATA_LIMIT_CHARS)
-    with pytest.raises(ConfigError, match="characters; expected at most"):
-        network.load_network(path)
-
-
-@pytest.mark.parametrize(
-    ("made", "message"),
-    [
-        ({"inputs": (1, 8, "h", "w")}, "'grid' has 8 channels; expected 12"),
-        ({"inputs": (1, 12, 64, 64)}, "export it with free height and width"),
-        ({"names": ("image", "maps")}, r"inputs 'image'.*not a network for clouds; expected one input 'grid'"),
-        ({"names": ("grid", "boxes")}, r"outputs boxes: not a network for clouds"),
-        ({"key": "names"}, "no entry"),
-    ],
-    ids=["channels", "fixed", "input", "output", "key"],
-)
-def test_networks_of_another_kind_are_one_clear_line(made: dict[str, Any], message: str, tmp_path: Path) -> None:
-    path = write_network(tmp_path / "other.onnx", INFO, **made)
-    with pytest.raises(ConfigError, match=message):
-        network.load_network(path)
-
-
 def test_files_that_are_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "file.onnx"
     with pytest.raises(ConfigError, match="no such file"):
@@ -339,33 +240,3 @@ def test_files_that_are_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(network, "MAX_FILE_BYTES", 5)
     with pytest.raises(ConfigError, match="13 bytes; expected an ONNX network for clouds of 1 to 5 bytes"):
         network.load_network(path)
-
-
-def test_a_2d_detector_is_no_lidar_detector(yolox_model: Path) -> None:
-    with pytest.raises(ConfigError, match=r"inputs 'images' .*not a network for clouds"):
-        create_lidar_detector(f"lidar:{yolox_model}", LOG, LidarConfig())
-
-
-def test_a_range_that_no_grid_covers_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError, match=r"lidar\.range_m 200: .*cells of 0\.25 m, with which a grid covers up to 128 m"
-    ):
-        create_lidar_detector(f"lidar:{taller_is_hotter(tmp_path)}", LOG, LidarConfig(range_m=200.0))
-
-
-@pytest.mark.parametrize("name", ["vehicle", "roadside"])
-def test_missing_weights_are_one_clear_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(detectors, "WEIGHTS", tmp_path)
-    with pytest.raises(ConfigError, match=rf"detector 'lidar:{name}': its network .*{name}\.onnx is missing"):
-        create_lidar_detector(f"lidar:{name}", LOG, LidarConfig())
-    taller_is_hotter(tmp_path).rename(tmp_path / f"{name}.onnx")
-    assert create_lidar_detector(f"lidar:{name}", LOG, LidarConfig()).name == f"lidar:{name}"
-
-
-def test_maps_that_change_their_shape_are_noticed() -> None:
-    class Session:
-        def run(self, *_: Any) -> list[NDArray[np.float32]]:
-            return [np.zeros((1, 25, 3, 3), np.float32)]
-
-    with pytest.raises(ConfigError, match=r"some\.onnx: output 'maps' is float32 \(1, 25, 3, 3\)"):
-        Network(Path("some.onnx"), info(), Session()).run(np.zeros((12, 64, 64), np.float32))

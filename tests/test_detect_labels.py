@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from log2sim.datatypes import Detections, Frame, ImageLabels, Labels, Log
-from log2sim.errors import ConfigError
 from log2sim.geometry import Camera, transform
 from log2sim.perception.detect.detectors import (
-    LabelBoxes,
     create_detector,
-    drop_repeated_objects,
-    interpolate_boxes,
-    mutual_nearest,
 )
 
 # Looks along map x from the origin, 1000 px focal length.
@@ -75,16 +69,6 @@ def test_boxes_out_of_sight_are_dropped(center: tuple[float, float, float], size
     assert len(detect(log_with((0, "car", center, size)))) == 0
 
 
-def test_hidden_box_stays_and_nearest_comes_first() -> None:
-    rows = [(0, "car", (40.0, 0, 0), CAR), (0, "truck", (10.0, 0, 0), (4.0, 3.0, 3.0))]
-    assert detect(log_with(*rows)).category.tolist() == ["truck", "car"]
-
-
-def test_boxes_that_the_log_calls_invisible_are_left_out() -> None:
-    rows = [(0, "car", (20.0, -4.0, 0), CAR), (0, "bus", (20.0, 4.0, 0), CAR)]
-    assert detect(log_with(*rows, visible=np.array([True, False]))).category.tolist() == ["car"]
-
-
 def test_box_moves_to_the_stamp_of_the_frame_without_ids() -> None:
     # Two cars in opposite directions, in another order at the second stamp, and one that is new there.
     rows = [
@@ -102,21 +86,6 @@ def test_box_moves_to_the_stamp_of_the_frame_without_ids() -> None:
     assert found.box_px[1, 2] == pytest.approx(500 + 1000 * 4 / 29.6)
 
 
-def test_labels_too_far_in_time_are_not_used() -> None:
-    assert len(detect(log_with((0, "car", (22.0, 0, 0), CAR)), SECOND)) == 0
-    assert len(detect(log_with((0, "car", (22.0, 0, 0), CAR)), SECOND // 20)) == 1
-    between = [(0, "car", (22.0, 0, 0), CAR), (5 * SECOND, "car", (22.0, 0, 0), CAR)]
-    assert len(detect(log_with(*between), SECOND)) == 0
-
-
-def test_yaw_is_interpolated_across_pi() -> None:
-    stamps = np.array([0, SECOND // 10])
-    yaw = np.array([np.pi - 0.1, -np.pi + 0.3])
-    boxes = LabelBoxes(stamps, np.array(["car", "car"]), np.zeros((2, 3)), np.ones((2, 3)), yaw)
-    moved = interpolate_boxes(boxes, SECOND // 20, SECOND // 10)
-    assert moved.yaw_rad == pytest.approx([-np.pi + 0.1])
-
-
 @pytest.mark.parametrize("speed_mps", [0.0, 30.0])
 def test_boxes_with_a_stamp_each_come_once_and_at_the_time_of_the_frame(speed_mps: float) -> None:
     rng = np.random.default_rng(3)
@@ -132,59 +101,9 @@ def test_boxes_with_a_stamp_each_come_once_and_at_the_time_of_the_frame(speed_mp
     assert lowest == pytest.approx(np.full(4, 300 + 1000 * 0.75 / rear_m), abs=1e-3)
 
 
-def cars(t_ns: list[int], x_m: list[float]) -> LabelBoxes:
-    count = len(x_m)
-    center = np.stack([x_m, np.zeros(count), np.zeros(count)], axis=1)
-    return LabelBoxes(np.array(t_ns), np.full(count, "car"), center, np.tile(CAR, (count, 1)), np.zeros(count))
-
-
-def test_one_object_at_two_stamps_counts_once_and_two_at_one_stamp_twice() -> None:
-    boxes = cars([0, 0, 50_000_000], [0.0, 3.0, 1.0])
-    assert drop_repeated_objects(boxes, np.array([2, 1, 0])).tolist() == [2]
-    assert drop_repeated_objects(boxes, np.array([1, 0, 2])).tolist() == [1, 0]
-    assert drop_repeated_objects(cars([0, 50_000_000], [0.0, 4.5]), np.array([0, 1])).tolist() == [0, 1]
-
-
-def test_partner_is_the_nearest_of_both_sides_within_reach() -> None:
-    before, after = cars([0, 0, 0], [0.0, 3.0, 90.0]), cars([SECOND // 10] * 2, [3.5, 100.0])
-    own, partner = mutual_nearest(before, after)
-    assert (own.tolist(), partner.tolist()) == ([1], [0])  # the last pair would need 100 m/s
-
-
 def test_boxes_of_the_frame_come_before_projected_ones() -> None:
     labels = ImageLabels(np.array([0, 0, SECOND]), np.array([[1.0, 2, 30, 40], [5, 5, 7, 50], [9, 9, 99, 99]]),
                          np.array(["cyclist", "car", "car"]))  # fmt: skip
     log = log_with((0, "bus", (20.0, 4.0, 0), CAR), image_labels={"front": labels})
     found = detect(log)
     assert (found.category.tolist(), found.box_px.tolist()) == (["cyclist"], [[1, 2, 30, 40]])
-
-
-def test_unknown_pose_gives_no_boxes() -> None:
-    camera = Camera("front", 1000, 600, K, "ego", np.eye(4))
-    log = log_with((0, "car", (22.0, 0, 0), CAR))
-    log = Log("made", "log2sim", {"front": camera}, {}, {}, labels=log.labels)
-    assert len(create_detector("labels", log).detect(Frame(camera, 0, no_image))) == 0
-
-
-def test_2d_labels_are_those_of_the_frame_whatever_their_order() -> None:
-    stamps = np.array([5, 1, 3, 1, 5, 1]) * SECOND + np.array([0, 900_000, 0, -900_000, 0, 1_100_000])
-    box = np.array([[0, 0, 10 + k, 10] for k in range(6)], dtype=np.float64)
-    category = np.array(["car", "car", "tree", "truck", "bus", "car"])
-    labels = ImageLabels(stamps, box, category)
-    log = log_with(image_labels={"front": labels})
-    assert {k: sorted(detect(log, k * SECOND).box_px[:, 2]) for k in range(7)} == {
-        0: [], 1: [11, 13], 2: [], 3: [], 4: [], 5: [10, 14], 6: [],
-    }  # fmt: skip
-    assert detect(log, 5 * SECOND).category.tolist() == ["car", "bus"]
-    small = log_with(image_labels={"front": replace(labels, box_px=box / 2)})
-    assert detect(small, 5 * SECOND).box_px.size == 0
-
-
-def test_log_without_labels_names_the_other_detectors() -> None:
-    with pytest.raises(ConfigError, match=r"log 'bare'.*no labeled boxes.*ssd-mobilenet-v2.*ONNX file"):
-        create_detector("labels", Log("bare", "kitti", {}, {}, {}))
-
-
-def test_layout_is_only_for_onnx_files() -> None:
-    with pytest.raises(ConfigError, match="layout 'yolox'"):
-        create_detector("labels", log_with((0, "car", (22.0, 0, 0), CAR)), layout="yolox")

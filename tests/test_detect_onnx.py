@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Detections, Frame, Log
+from log2sim.datatypes import Frame, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera
 from log2sim.perception.detect.detectors import create_detector, detect_all
@@ -140,72 +139,6 @@ def test_layout_is_recognized_and_decodes_to_the_known_box(case: str, tmp_path: 
     assert found[0][2] == pytest.approx(BOX, abs=1e-3)
 
 
-def picky_model(path: Path, output: NDArray[np.float32], side: int) -> Path:
-    """A model that says it takes any size and fails for all but one."""
-    helper, array = onnx.helper, onnx.numpy_helper.from_array
-    constants = {"c": output, "same": np.zeros((1, 3, side, side), np.float32), "zero": np.zeros(1, np.float32)}
-    nodes = [helper.make_node("Constant", [], [name], value=array(value)) for name, value in constants.items()]
-    nodes += [
-        helper.make_node("Add", ["images", "same"], ["sum"]),
-        helper.make_node("ReduceMean", ["sum"], ["mean"], keepdims=0),
-        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
-        helper.make_node("Add", ["c", "nothing"], ["output"]),
-    ]
-    infos = [
-        helper.make_tensor_value_info(n, 1, v) for n, v in (("images", (1, 3, None, None)), ("output", output.shape))
-    ]
-    graph = helper.make_graph(nodes, "picky", infos[:1], infos[1:])
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
-    return path
-
-
-def test_a_model_that_refuses_the_sizes_of_other_families_is_recognized(tmp_path: Path) -> None:
-    path = picky_model(tmp_path / "m.onnx", zeros(3549, 85), 416)
-    assert create_detector(str(path), LOG).layout.name == "yolox"  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError, match=r"m\.onnx: the model fails on an image \(1, 3, 320, 320\)"):
-        create_detector(str(path), LOG, input_px=320)
-    with pytest.raises(ConfigError, match=r"n\.onnx: the model fails on an image"):
-        create_detector(str(picky_model(tmp_path / "n.onnx", zeros(5, 7), 77)), LOG)
-
-
-@pytest.mark.parametrize(("side", "expected"), [(96, (64.0, 48.0, 128.0, 80.0)), (192, (32.0, 8.0, 64.0, 24.0))])
-def test_a_model_of_any_size_takes_the_one_asked_for(side: int, expected: tuple[float, ...], tmp_path: Path) -> None:
-    output = zeros(84, 10)
-    output[0, :4, 7], output[0, 4 + CAR, 7] = (48.0, 48.0, 32.0, 16.0), SCORE  # px of the input, bars above and below
-    path = save_model(tmp_path / "m.onnx", {"output0": output}, shape=(1, 3, None, None))
-    [(_, _, box)] = detect(path, layout="yolov8", input_px=side)
-    assert box == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_model_of_one_size_takes_no_other(tmp_path: Path) -> None:
-    path = save_model(tmp_path / "m.onnx", {"output0": yolov8()})
-    with pytest.raises(ConfigError, match=r"input_px 320: the model takes 96 x 64 px and nothing else"):
-        create_detector(str(path), LOG, input_px=320)
-    with pytest.raises(ConfigError, match="only a detector given as the path of an ONNX file"):
-        create_detector("labels", LOG, input_px=320)
-
-
-def test_detr_logits_and_boxes_apart_decode_the_same(tmp_path: Path) -> None:
-    merged = rt_detr()
-    logits = np.full((1, 300, 80), -20, np.float32)
-    logits[0, 3, CAR] = np.log(SCORE / (1 - SCORE))
-    path = save_model(tmp_path / "m.onnx", {"logits": logits, "pred_boxes": merged[:, :, :4]})
-    [(category, score, box)] = detect(path)
-    assert (category, score) == ("car", pytest.approx(SCORE, abs=1e-6))
-    assert box == pytest.approx(BOX, abs=1e-3)
-
-
-def test_decoded_yolox_is_not_taken_for_undecoded(tmp_path: Path) -> None:
-    decoded = yolo_rows(CELLS)
-    decoded[0, :, :2] += 40
-    decoded[0, 7, :2] = CENTER_SIZE[:2]
-    path = save_model(tmp_path / "m.onnx", {"output": decoded})
-    with pytest.raises(ConfigError, match=r"'output' \(1, 126, 85\).*yolox-decoded"):
-        create_detector(str(path), LOG)
-    [(_, _, box)] = detect(path, layout="yolox-decoded")
-    assert box == pytest.approx(BOX, abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("layout", "output", "shift"),
     [("yolox", yolox(), (0.0, 0.0)), ("yolov8", yolov8(), (0.0, 16.0))],
@@ -221,17 +154,6 @@ def test_letterbox_is_undone(
     assert box == pytest.approx(expected, abs=1e-3)
 
 
-def test_class_names_of_the_model_are_used(tmp_path: Path) -> None:
-    path = save_model(tmp_path / "m.onnx", {"o": yolov8(3)}, names="{0: 'tree', 1: 'Car', 2: 'person'}")
-    assert [f[0] for f in detect(path)] == ["pedestrian"]
-
-
-def test_min_score_is_a_floor(tmp_path: Path) -> None:
-    path = save_model(tmp_path / "m.onnx", {"o": yolov8()})
-    assert len(detect(path, min_score=SCORE - 0.01)) == 1
-    assert len(detect(path, min_score=SCORE + 0.01)) == 0
-
-
 def test_boxes_that_are_not_finite_or_empty_are_dropped(tmp_path: Path) -> None:
     output = yolov8()
     output[0, :4, 8], output[0, 4 + CAR, 8] = (np.nan, 20, 30, 30), 0.9
@@ -240,17 +162,6 @@ def test_boxes_that_are_not_finite_or_empty_are_dropped(tmp_path: Path) -> None:
     output[0, :4, 11], output[0, 4 + CAR, 11] = (-90, 40, 30, 30), 0.9
     found = detect(save_model(tmp_path / "m.onnx", {"o": output}))
     assert [f[2] for f in found] == [pytest.approx(BOX, abs=1e-3)]
-
-
-def test_threads_get_the_same_boxes(tmp_path: Path) -> None:
-    path = save_model(tmp_path / "m.onnx", {"o": yolov8()})
-    detector = create_detector(str(path), LOG, tiles=1)
-    camera = Camera("front", 192, 128, np.eye(3), "ego", np.eye(4))
-    frame = Frame(camera, 0, lambda: IMAGE)
-    with ThreadPoolExecutor(4) as pool:
-        boxes = [d.box_px.tolist() for d in pool.map(lambda _: detector.detect(frame), range(16))]
-    assert all(b == boxes[0] for b in boxes)
-    assert len(boxes[0]) == 1
 
 
 def save_brightness_model(path: Path) -> Path:
@@ -283,18 +194,6 @@ def test_frames_that_are_searched_together_have_the_boxes_of_each_alone(tiles: i
     assert len({float(one.score[0]) for one in alone}) == len(frames)
 
 
-def test_detectors_of_single_frames_are_asked_one_after_the_other() -> None:
-    class Single:
-        name, default_min_score = "single", 0.5
-
-        def detect(self, frame: Frame) -> Detections:
-            return Detections(np.array([[0.0, 0.0, float(frame.t_ns), 1.0]]), np.ones(1), np.array(["car"]))
-
-    camera = Camera("c", 4, 4, np.eye(3), "ego", np.eye(4))
-    found = detect_all(Single(), [Frame(camera, t_ns, lambda: IMAGE) for t_ns in (3, 1, 2)])
-    assert [float(boxes.box_px[0, 2]) for boxes in found] == [3.0, 1.0, 2.0]
-
-
 BAD_MODELS = {
     "class count": ({"o": yolov8(7)}, {}, r"7 classes without names; expected 80"),
     "no road users": ({"o": yolov8(3)}, {"names": "['tree', 'dog', 'sky']"}, r"none of its classes.*tree, dog"),
@@ -316,32 +215,29 @@ def test_unusable_models_are_refused_with_file_and_reason(case: str, tmp_path: P
     assert "bad.onnx" in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"no model at all", None], ids=["empty", "garbage", "missing"])
-def test_files_that_are_no_model_are_refused(content: bytes | None, tmp_path: Path) -> None:
-    path = tmp_path / "broken.onnx"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"broken\.onnx"):
-        create_detector(str(path), LOG)
+def picky_model(path: Path, output: NDArray[np.float32], side: int) -> Path:
+    """A model that says it takes any size and fails for all but one."""
+    helper, array = onnx.helper, onnx.numpy_helper.from_array
+    constants = {"c": output, "same": np.zeros((1, 3, side, side), np.float32), "zero": np.zeros(1, np.float32)}
+    nodes = [helper.make_node("Constant", [], [name], value=array(value)) for name, value in constants.items()]
+    nodes += [
+        helper.make_node("Add", ["images", "same"], ["sum"]),
+        helper.make_node("ReduceMean", ["sum"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["c", "nothing"], ["output"]),
+    ]
+    infos = [
+        helper.make_tensor_value_info(n, 1, v) for n, v in (("images", (1, 3, None, None)), ("output", output.shape))
+    ]
+    graph = helper.make_graph(nodes, "picky", infos[:1], infos[1:])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return path
 
 
-def test_wrong_layout_for_a_model_is_refused(tmp_path: Path) -> None:
-    path = save_model(tmp_path / "m.onnx", {"o": yolov8()})
-    for layout in ("tf-od", "tf-od-raw", "yolox"):
-        with pytest.raises(ConfigError, match=r"expected|no output|do not fit|without names"):
-            create_detector(str(path), LOG, layout=layout)
-    with pytest.raises(ConfigError, match=r"unknown layout 'yolo'; known: tf-od"):
-        create_detector(str(path), LOG, layout="yolo")
-
-
-def test_unknown_detector_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=r"did you mean 'labels'.*ssd-mobilenet-v2.*ONNX file"):
-        create_detector("label", LOG)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"min_score": 1.5}, {"max_overlap": 0}, {"tiles": 0}, {"tiles": "many"}, {"tiles": True}]
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(settings))):
-        create_detector("labels", LOG, **settings)
+def test_a_model_that_refuses_the_sizes_of_other_families_is_recognized(tmp_path: Path) -> None:
+    path = picky_model(tmp_path / "m.onnx", zeros(3549, 85), 416)
+    assert create_detector(str(path), LOG).layout.name == "yolox"  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"m\.onnx: the model fails on an image \(1, 3, 320, 320\)"):
+        create_detector(str(path), LOG, input_px=320)
+    with pytest.raises(ConfigError, match=r"n\.onnx: the model fails on an image"):
+        create_detector(str(picky_model(tmp_path / "n.onnx", zeros(5, 7), 77)), LOG)

@@ -70,6 +70,7 @@ def test_convolutions_are_folded_with_what_follows_them() -> None:
     }
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_a_quantized_network_differs_by_steps_of_its_levels(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -88,69 +89,6 @@ def test_a_quantized_network_differs_by_steps_of_its_levels(seed: int) -> None:
     assert model.SerializeToString(deterministic=True) == before
     assert {"QuantizeLinear", "Conv"} <= {node.op_type for node in small.graph.node}
     assert "Clip" not in {node.op_type for node in small.graph.node}
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_heads_lose_nothing_but_the_rounding_of_their_weights(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    model, picture = network(rng), rng.integers(0, 256, (1, SIDE, SIDE, 3), dtype=np.uint8)
-    small = quantize(model, {"c2": (-30.0, 30.0), BLOCK: (-30.0, 30.0)})
-    box, block, logits = run(small, picture)
-    constants = {i.name: onnx.numpy_helper.to_array(i) for i in model.graph.initializer}
-    bordered = np.pad(block[0], ((0, 0), (1, 1), (1, 1)))
-    windows = np.lib.stride_tricks.sliding_window_view(bordered, (3, 3), axis=(1, 2))
-    for name, found, seen in (
-        ("BoxEncodingPredictor", box, windows[..., 1:2, 1:2]),
-        ("ClassPredictor", logits, windows),
-    ):
-        weights = constants[f"{name}/w"]
-        scale = np.abs(weights).max(axis=(1, 2, 3), keepdims=True) / 127
-        sums = np.einsum("cyxvu,mcvu->myx", seen, np.rint(weights / scale) * scale)
-        expected = sums + constants.get(f"{name}/b", np.zeros((1, 1, 1, 1)))[0]
-        np.testing.assert_allclose(found[0], expected, atol=1e-4)
-
-
-def test_bytes_of_a_picture_keep_all_their_levels() -> None:
-    rng = np.random.default_rng(0)
-    model = network(rng)
-    picture = rng.integers(0, 256, (1, SIDE, SIDE, 3), dtype=np.uint8)
-    # Weights of whole 127ths lose nothing themselves.
-    weights = (rng.integers(-127, 127, (2, 3, 3, 3)) / 127).astype(np.float32)
-    weights[:, 0, 0, 0] = 1
-    model.graph.initializer.append(onnx.numpy_helper.from_array(weights, "picture/w"))
-    head = onnx.helper.make_node("Conv", ["picture_nchw", "picture/w"], ["ClassPredictor/2"], auto_pad="SAME_UPPER")
-    model.graph.node.append(head)
-    model.graph.output.append(onnx.helper.make_tensor_value_info("ClassPredictor/2", 1, (1, 2, SIDE, SIDE)))
-    small = quantize(model, {"c2": (-30.0, 30.0), BLOCK: (-30.0, 30.0)})
-    found, floats = run(small, picture)[3], run(model, picture)[3]
-    np.testing.assert_allclose(found[..., 1:-1, 1:-1], floats[..., 1:-1, 1:-1], atol=1e-4)
-    # Around the picture the byte 128 stands for 0: half a level, as often as the kernel is outside.
-    assert np.abs(found - floats).max() < 0.5 * 2 / 255 * np.abs(weights).sum(axis=(1, 2, 3)).max()
-
-
-def test_a_value_without_a_range_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"'c2' has no range"):
-        quantize(network(np.random.default_rng(0)), {BLOCK: (-9.0, 9.0)})
-
-
-@pytest.mark.parametrize(
-    ("text", "exact"),
-    [
-        ("processor: 0\nflags\t\t: fpu avx2 avx512_vnni\nflags: fpu\n", True),
-        ("flags\t\t: fpu avx2 avx512f\n", False),
-        ("Features : fp asimd asimddp\n", True),
-        ("nothing of the kind\n", False),
-        (None, False),
-    ],
-)
-def test_processors_that_saturate_get_floats(
-    text: str | None, exact: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "cpuinfo"
-    if text is not None:
-        path.write_text(text)
-    monkeypatch.setattr(ssd_mobilenet, "PROCESSOR", path)
-    assert ssd_mobilenet.adds_byte_products_exactly() is exact
 
 
 @pytest.mark.slow

@@ -21,13 +21,12 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
-from log2sim.evaluation.detection.truth import LabelTracks, labeled_sweeps, truth_of_sweeps
+from log2sim.evaluation.detection.truth import labeled_sweeps, truth_of_sweeps
 from log2sim.files.documents import check
 from log2sim.geometry import points_in_box
 from log2sim.perception.lidar.cloud import sweep_to_map
 
 NS = 1_000_000_000
-T0_NS = 1_700_000_000 * NS
 LABELS = Config().changed(detect={"name": "lidar:labels"}, stop_s=0.75)
 """Labels end before the last sweeps do."""
 
@@ -157,23 +156,6 @@ def test_truth_counts_points_and_ranges_as_one_would_by_hand(tiny: Log) -> None:
     np.testing.assert_allclose(truth.boxes.range_m[rows], np.hypot(*(truth.boxes.box[rows, :2] - ego).T))
 
 
-def test_labels_are_moved_to_the_moment_at_which_the_lidar_saw_them(tiny: Log) -> None:
-    # The car drives at 4 m/s along x; labels have the camera's stamps, points their own.
-    t_ns = tiny.streams["top"].t_ns
-    truth = truth_of_sweeps(tiny, t_ns)
-    car = np.flatnonzero(tiny.labels.track_id == "car")[0]
-    start_m = tiny.labels.center_m[car, 0] - 4.0 * (tiny.labels.t_ns[car] - T0_NS) / NS
-    for sweep in (3, 6):
-        box = truth.boxes.box[(truth.boxes.scene == sweep) & (np.abs(truth.boxes.box[:, 1] - 2.0) < 1e-6)]
-        assert box.shape == (1, 7)
-        read = tiny.streams["top"].read(sweep)
-        mapped = sweep_to_map(tiny, "top", read, compensate=True)
-        assert mapped is not None
-        inside = points_in_box(mapped[0], box[0, :3], box[0, 3:6], box[0, 6]) & (mapped[0][:, 2] > 0.2)
-        seen_s = (read.t_ns[inside].mean() - T0_NS) / NS
-        assert box[0, 0] == pytest.approx(start_m + 4.0 * seen_s, abs=0.01)
-
-
 def labels_at(*stamps_s: float, track: str = "a", mps: float = 10.0) -> Labels:
     t_s, n = np.array(stamps_s), len(stamps_s)
     center = np.stack([mps * t_s, np.zeros(n), np.ones(n)], axis=1)
@@ -181,26 +163,6 @@ def labels_at(*stamps_s: float, track: str = "a", mps: float = 10.0) -> Labels:
     return Labels(
         np.round(t_s * NS).astype(np.int64), np.full(n, track), np.full(n, "car"), center, np.ones((n, 3)), yaw
     )
-
-
-def test_tracks_are_followed_between_labels_and_not_over_gaps() -> None:
-    tracks = LabelTracks.of(labels_at(0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.9, 1.0))
-    assert tracks.period_s == pytest.approx(0.1)
-    asked = np.array([-0.07, -0.05, 0.25, 0.54, 0.7, 0.86, 1.05, 1.07])
-    moment, track = tracks.present(np.round(asked * NS).astype(np.int64))
-    assert asked[moment].tolist() == [-0.05, 0.25, 0.54, 0.86, 1.05]
-    pose, row = tracks.at(track, np.round(asked[moment] * NS).astype(np.int64))
-    np.testing.assert_allclose(pose[:, 0], 10 * asked[moment], atol=1e-6)
-    assert row.tolist() == [0, 2, 5, 6, 7]
-    turned, _ = tracks.at(np.zeros(1, dtype=np.int64), np.array([450_000_000]))
-    assert abs(abs(turned[0, 3]) - np.pi) < 1e-6
-
-
-def test_a_single_label_holds_for_a_moment() -> None:
-    tracks = LabelTracks.of(labels_at(1.0))
-    moment, track = tracks.present(np.array([930, 950, 1050, 1070]) * 1_000_000)
-    assert moment.tolist() == [1, 2]
-    assert tracks.at(track, np.array([950, 1050]) * 1_000_000)[0][:, 0].tolist() == [10.0, 10.0]
 
 
 def test_sweeps_between_labels_of_every_sweep_are_labeled_and_those_between_sparse_ones_are_not() -> None:
@@ -237,12 +199,6 @@ def test_labels_as_detector_are_found_again_by_every_protocol(tiny: Log) -> None
 def moved(found: DetectedBoxes, by_m: float) -> DetectedBoxes:
     boxes = tuple(replace(b, center_m=b.center_m + np.array([by_m, 0, 0])) for b in found.boxes)
     return replace(found, boxes=boxes)
-
-
-def test_distances_of_centers_decide_as_stated(tiny: Log) -> None:
-    found = moved(detect_log(tiny, LABELS).found, 0.9)
-    rows = evaluate_boxes(found, tiny, Options("center"))["classes"]["vehicle"]["figures"]
-    assert {r["match"]["limit"]: r["recall"] for r in rows} == {0.5: 0, 1.0: 1, 2.0: 1, 4.0: 1}
 
 
 def test_what_is_out_of_range_counts_for_nothing(tiny: Log) -> None:
@@ -283,16 +239,27 @@ def test_where_nothing_was_labeled_nothing_is_false(tiny: Log) -> None:
     assert rows[1]["false_positives"] == 0
 
 
-def test_kinds_of_the_log_are_ignored_where_the_protocol_says_so(tiny: Log) -> None:
-    found = detect_log(tiny, LABELS).found
-    labels = tiny.labels
-    kind = np.where(labels.track_id == "parked", "Van", "Car")
-    result = evaluate_boxes(found, replace(tiny, labels=replace(labels, kind=kind)), Options("kitti"))
-    row = result["classes"]["car"]["figures"][0]
-    plain = evaluate_boxes(found, tiny, Options("kitti"))["classes"]["car"]["figures"][0]
-    assert row["truths"] < plain["truths"]
-    assert not result["occlusion_known"]
-    assert row["false_positives"] == 0
+def test_detect_and_evaluate_as_commands(tiny_folder: Path, tmp_path: Path) -> None:
+    boxes, metrics, picture = (tmp_path / n for n in ("boxes.json", "metrics.json", "scores.png"))
+    ran = run("detect", tiny_folder, "--detector", "lidar:labels", "--start", 0.3, "--stop", 0.6, "--out", boxes)
+    assert ran.code == 0, ran.err
+    assert "in 4 sweeps by lidar:labels" in ran.out
+    assert run("validate", boxes).code == 0
+    ran = run(
+        "evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture, "-v"
+    )
+    assert ran.code == 0, ran.err
+    assert "IoU 3D > 0.5" in ran.out
+    assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
+    brief = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair").out
+    assert ran.out.startswith(brief.rstrip("\n"))
+    assert "100 % of" in brief
+    assert "expected calibration error of the scores 0.000" in ran.out
+    assert run("validate", metrics).code == 0
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert names(tmp_path) == ["boxes.json", "metrics.json", "scores.png"]
+    assert run("evaluate", boxes, "--truth", tiny_folder, "--quiet").out == ""
+    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes).code == 2
 
 
 def test_a_log_of_another_time_and_one_without_labels_are_refused(tiny: Log) -> None:
@@ -318,59 +285,3 @@ def test_options_name_what_is_wrong() -> None:
     with pytest.raises(ConfigError, match="has no 'truck'"):
         Options("kitti", classes=["truck"]).chosen()
     assert [c.name for c in Options("center", classes=["two_wheeler", "bus"]).chosen()] == ["two_wheeler", "bus"]
-
-
-def test_detect_and_evaluate_as_commands(tiny_folder: Path, tmp_path: Path) -> None:
-    boxes, metrics, picture = (tmp_path / n for n in ("boxes.json", "metrics.json", "scores.png"))
-    ran = run("detect", tiny_folder, "--detector", "lidar:labels", "--start", 0.3, "--stop", 0.6, "--out", boxes)
-    assert ran.code == 0, ran.err
-    assert "in 4 sweeps by lidar:labels" in ran.out
-    assert run("validate", boxes).code == 0
-    ran = run(
-        "evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture, "-v"
-    )
-    assert ran.code == 0, ran.err
-    assert "IoU 3D > 0.5" in ran.out
-    assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
-    brief = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair").out
-    assert ran.out.startswith(brief.rstrip("\n"))
-    assert "100 % of" in brief
-    assert "expected calibration error of the scores 0.000" in ran.out
-    assert run("validate", metrics).code == 0
-    assert picture.read_bytes()[:4] == b"\x89PNG"
-    assert names(tmp_path) == ["boxes.json", "metrics.json", "scores.png"]
-    assert run("evaluate", boxes, "--truth", tiny_folder, "--quiet").out == ""
-    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes).code == 2
-
-
-def test_commands_say_in_a_line_what_they_cannot_do(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
-    boxes = tmp_path / "boxes.json"
-    for detector in ("labels", "ssd-mobilenet-v2+lidar:labels"):
-        ran = run("detect", tiny_folder, "--detector", detector, "--out", boxes)
-        assert ran.code == 2
-        assert "begins with 'lidar:'" in ran.line
-    assert (
-        "unknown LiDAR detector 'lables' (did you mean 'labels'?)"
-        in run("detect", tiny_folder, "--detector", "lidar:lables", "--out", boxes).line
-    )
-    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--start", 99, "--out", boxes).code == 2
-    assert names(tmp_path) == []
-    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes, "--quiet").out == ""
-    assert "--protocol: unknown protocol" in run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "coco").line
-    assert "is a file and no log" in run("evaluate", boxes, "--truth", boxes).line
-    ran = run("evaluate", tiny_scenario, "--truth", tiny_folder, "--score", 0.4)
-    assert ran.code == 2
-    assert "--score: is for boxes" in ran.line
-
-
-def test_a_log_without_lidar_is_refused(tiny: Log) -> None:
-    with pytest.raises(LogError, match="no LiDAR"):
-        detect_log(replace(tiny, lidars={}), LABELS)
-
-
-def test_truth_of_a_log_without_sweeps_knows_no_points(tiny: Log) -> None:
-    found = detect_log(tiny, LABELS).found
-    result = evaluate_boxes(found, replace(tiny, lidars={}), Options("dair"))
-    assert result["min_points"] is None
-    assert result["classes"]["vehicle"]["by_points"] is None
-    assert result["classes"]["vehicle"]["figures"][0]["recall"] > 0.9

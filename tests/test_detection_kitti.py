@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import ImageRegions, Log
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.evaluation import ClassBoxes, class_figures, overall, precision_recall
+from log2sim.evaluation.detection.evaluation import ClassBoxes, class_figures, precision_recall
 from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS, Criterion, candidate_pairs, match
 from log2sim.evaluation.detection.truth import ImageViews, image_views
 from log2sim.geometry import Camera, transform
@@ -65,83 +65,6 @@ def test_each_difficulty_counts_the_labels_that_it_admits():
     )
     assert [counts(figures(boxes, name))[:3] for name in NAMES] == [(1, 1, 0), (4, 4, 0), (6, 6, 0)]
     assert counts(figures(boxes, "all")) == (8, 8, 0, 0)
-
-
-def test_a_found_box_that_is_too_low_is_neither_false_nor_takes_a_label():
-    truth, found = row_of([0.0]), row_of([0.0, 0.1, 50.0], score=[0.9, 0.8, 0.7])
-    boxes = ClassBoxes(
-        found, truth, none(found), none(found), views([39.9, 45, 30]), views([50]), np.zeros(1, dtype=np.int64)
-    )
-    # The first is ignored, the second takes the label; the third is false where it is high enough.
-    assert counts(figures(boxes, "easy")) == (1, 1, 0, 0)
-    # At 25 px the first takes the label and the second is a double.
-    assert counts(figures(boxes, "moderate")) == (1, 1, 2, 0)
-
-
-def test_ignored_labels_excuse_what_is_found_there():
-    truth = row_of([0.0, 20.0], ignored=[False, True])
-    found = row_of([0.0, 20.0, 40.0], score=0.9)
-    unlabeled = np.array([False, False, True])
-    boxes = ClassBoxes(found, truth, none(found), unlabeled, views([60] * 3), views([60] * 2), np.zeros(2, np.int64))
-    assert counts(figures(boxes, "easy")) == (1, 1, 0, 0)
-    # The published program has no 3D boxes of regions without labels: there the third one is false, at the same score.
-    assert figures(boxes, "easy")["ap_r40"] == 1
-    assert figures(boxes, "easy")["ap_r11_published"] == pytest.approx((1 / 2) / 11)
-
-
-def test_figures_by_range_and_by_points_count_false_boxes_where_they_are():
-    truth = row_of([10.0, 20.0, 60.0], points=[60, 12, 4])
-    found = row_of([10.0, 20.0, 40.0, 60.0], score=0.9, points=[55, 8, 7, 3])
-    result = class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5)
-    by_range = {r["objects"]: counts(r) for r in result["by_range"]}
-    assert by_range == {
-        "0-15 m": (1, 1, 0, 0), "15-30 m": (1, 1, 0, 0), "30-50 m": (0, 0, 1, 0), "50+ m": (0, 0, 0, 0),
-    }  # fmt: skip
-    by_points = {r["objects"]: counts(r) for r in result["by_points"]}
-    assert by_points == {
-        "5-9 points": (0, 0, 1, 0), "10-19 points": (1, 1, 0, 0), "20-49 points": (0, 0, 0, 0), "50+ points": (1, 1, 0, 0),
-        "20+ points": (1, 1, 0, 0),
-    }  # fmt: skip
-    assert [row["objects"] for row in result["figures"]] == ["all"] * 4
-    assert class_figures(
-        ClassBoxes(found, replace(truth, points=None), none(found), none(found)), CAR, 0.5
-    )["by_points"] is None  # fmt: skip
-
-
-def test_classes_are_added_up_and_categories_of_a_group_count_once():
-    truth = row_of([10.0, 20.0], points=[60, 12])
-    found = row_of([10.0, 40.0], score=0.9, points=[55, 30])
-    vehicles = class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5)
-    people = {
-        **class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5),
-        "categories": ["pedestrian"],
-    }
-    group = {**vehicles, "categories": ["car", "truck"]}
-    rows = {r["objects"]: r for r in overall({"vehicle": group, "pedestrian": people, "car": vehicles})}
-    assert counts(rows["all"]) == (4, 2, 2, 2)
-    assert rows["all"]["f1"] == 0.5
-    assert rows["all"]["precision_times_recall"] == 0.25
-    assert counts(rows["20+ points"]) == (2, 2, 2, 0)
-    assert counts(rows["15-30 m"]) == (2, 0, 0, 2)
-
-
-def test_scores_are_compared_with_the_share_of_right_boxes():
-    # 10 boxes of score .85, of which 8 are right, and 10 of .15 of which 4 are; one ignored.
-    x_m = np.arange(21) * 10.0
-    right = np.r_[np.arange(10) < 8, np.arange(10) < 4, True]
-    truth = row_of(x_m[right], ignored=x_m[right] == 200.0)
-    found = row_of(x_m, score=np.r_[np.full(10, 0.85), np.full(10, 0.15), 0.5])
-    table = class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5)["calibration"]
-    assert table["boxes"] == 20
-    assert table["expected_calibration_error"] == pytest.approx((0.05 + 0.25) / 2)
-    assert [(b["boxes"], b["precision"]) for b in table["bins"] if b["boxes"]] == [(10, 0.4), (10, 0.8)]
-
-
-def test_headings_off_by_more_than_a_right_angle_are_counted():
-    truth, found = row_of(np.arange(4) * 10.0), row_of(np.arange(5) * 10.0, score=0.9)
-    found.box[:, 6] = [np.pi, 3 * np.pi + 0.1, 0.1, 2 * np.pi, np.pi]
-    row = class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5)["figures"][0]
-    assert row["heading_over_90_deg"] == 0.5
 
 
 def facing_camera(distortion=0.0):
@@ -239,24 +162,6 @@ def test_the_sampled_average_is_that_of_the_published_rules(limit, recall_points
     expected = devkit(found, truth, found.ignored, truth.ignored, limit, recall_points)
     curve = precision_recall(found, match(found, truth, Criterion("iou_3d", limit)))
     assert curve.sampled_average(recall_points) == pytest.approx(expected)
-
-
-@given(seed=st.integers(0, 10_000))
-@settings(max_examples=10, deadline=None)
-def test_with_ignored_found_boxes_the_published_rules_differ_little(seed):
-    found, truth = detector_world(seed, truths=200, scenes=20)
-    expected = devkit(found, truth, found.ignored, truth.ignored, 0.7, 40)
-    curve = precision_recall(found, match(found, truth, Criterion("iou_3d", 0.7)))
-    assert curve.sampled_average(40) == pytest.approx(expected, abs=0.03)
-    assert curve.average(40) == pytest.approx(expected, abs=0.05)
-
-
-def test_with_few_labels_sampling_costs_a_perfect_detector_most_of_its_average():
-    found, truth = row_of([0.0, 10.0], score=[0.9, 0.8]), row_of([0.0, 10.0])
-    curve = precision_recall(found, match(found, truth, Criterion("iou_3d", 0.7)))
-    assert curve.average(40) == 1
-    assert curve.sampled_average(40) == pytest.approx(1 / 40)
-    assert curve.sampled_average(11) == pytest.approx(1 / 11)
 
 
 def level_views(box_px, truncated=0.0):

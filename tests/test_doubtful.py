@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import json
+import ast
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,19 +10,34 @@ import numpy as np
 import pytest
 from command_line import run
 from export_worlds import straight, world
+from test_layers import ROOT
 
-from log2sim.datatypes import Agent, Doubt, Scenario, list_doubtful, why_doubtful
+from log2sim.agents.moving import motion_doubts, sideways_doubts
+from log2sim.agents.smooth.motion_model import PHRASES
+from log2sim.cli.reconstruct import doubt_lines
+from log2sim.datatypes import (
+    CATEGORIES,
+    FLAGS,
+    MAX_SPEED_MPS,
+    Agent,
+    Detections,
+    Doubt,
+    Measurements,
+    Scenario,
+    Waypoints,
+)
 from log2sim.edit.apply import edit
 from log2sim.edit.edits import DropDoubtful, Lateral, Only, Shift, Speed
-from log2sim.errors import ConfigError, ScenarioError
+from log2sim.errors import ConfigError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.export.exporters import Options, export, formats, with_doubtful
 from log2sim.export.openscenario.read import load
-from log2sim.simulation.metrics.all_metrics import summarize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
 THROUGH = Doubt("passes_through", "passes through parked at 1.2 s", 1.0, 1.5)
+
+
 NARROW = Doubt("unlikely_size", "2.8 m wide")
 
 
@@ -47,33 +61,6 @@ def test_doubtful_agents_are_left_out_but_for_the_ego() -> None:
     assert [a.id for a in scenario.doubtful] == ["ego", "phantom", "unsure"]
     assert ids(scenario.without_doubtful()) == ["ego", "sure"]
     assert ids(world(unsure(0.5)).without_doubtful()) == ["unsure"]
-
-
-def test_a_confidence_is_asked_for_by_its_value_alone() -> None:
-    scenario = doubted()
-    assert ids(scenario.trusted(0.499)) == ids(scenario)
-    assert ids(scenario.trusted(0.5)) == ["ego", "sure", "phantom"]
-    assert ids(replace(scenario, agents=(replace(scenario.agents[0], confidence=0.1),)).trusted(1.0)) == ["ego"]
-    for wrong in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ConfigError, match="expected a number from 0 to 1"):
-            scenario.trusted(wrong)
-
-
-def test_why_an_agent_is_doubtful_is_said_in_words() -> None:
-    _, sure, phantom, low = doubted().agents
-    assert why_doubtful(sure) == ""
-    assert why_doubtful(phantom) == "passes through parked at 1.2 s, 2.8 m wide"
-    assert why_doubtful(low) == "confidence 0.49"  # not 0.50, which would be no reason
-    assert list_doubtful([low] * 7).endswith("unsure (confidence 0.49) and 2 more")
-    assert list_doubtful([low, phantom]).startswith("phantom (passes through parked at 1.2 s, 2.8 m wide), unsure")
-
-
-def test_beside_another_scenario_doubts_have_its_time() -> None:
-    scenario = doubted()
-    aligned = scenario.aligned_to(replace(scenario, t0_ns=scenario.t0_ns - 2_000_000_000))
-    first, second = aligned.agents[2].doubts
-    assert (first.start_s, first.end_s) == (3.0, 3.5)
-    assert second == NARROW
 
 
 def test_dropping_is_an_edit_that_the_history_keeps() -> None:
@@ -107,47 +94,6 @@ def test_doubts_move_in_time_with_their_agent() -> None:
     assert (fast.doubts[0].start_s, fast.doubts[0].end_s) == (3.0, 4.0)  # from its first waypoint on
 
 
-def test_a_reason_says_that_its_time_is_the_old_one() -> None:
-    after = edit(doubted(), [Speed("phantom", 2.0), Shift("phantom", 1.0)]).scenario
-    assert [d.reason for d in after.agents[2].doubts] == [
-        "passes through parked at 1.2 s, before it was moved in time", "2.8 m wide",
-    ]  # fmt: skip
-
-
-def test_the_command_edits_without_them(tmp_path: Path) -> None:
-    doubted().save(tmp_path / "s.json")
-    ran = run("edit", tmp_path / "s.json", "--drop-doubtful", "--shift", "sure=1", "--out", tmp_path / "out.json")
-    assert ran.code == 0
-    assert "left out as doubtful: phantom (passes through parked at 1.2 s, 2.8 m wide), unsure (conf" in ran.out
-    assert "out.json: 2 edits, 1 agent and the ego" in ran.out
-    assert ids(Scenario.load(tmp_path / "out.json")) == ["ego", "sure"]
-    again = run("edit", tmp_path / "out.json", "--drop-doubtful", "--out", tmp_path / "again.json")
-    assert "left out as doubtful: none" in again.out
-
-
-def test_the_command_replays_without_them(tmp_path: Path) -> None:
-    doubted().save(tmp_path / "s.json")
-    arguments = ("replay", tmp_path / "s.json", "--dt", "0.1", "--mode", "exact")
-    ran = run(*arguments, "--confidence", "0.5", "--out", tmp_path / "r.json")
-    assert ran.code == 0
-    assert "1 of 3 agents left out: unsure (confidence 0.49)" in ran.out
-    loaded = Replay.load(tmp_path / "r.json")
-    assert [a.id for a in loaded.agents] == ["ego", "sure", "phantom"]
-    assert loaded.left_out == {"unsure": "confidence 0.49"}
-    both = run(*arguments, "--confidence", "0.5", "--drop-doubtful")
-    assert "2 of 3 agents left out: unsure (confidence 0.49), phantom (passes through parked at 1.2 s" in both.out
-    assert "left out" not in run(*arguments).out
-    assert run(*arguments, "--confidence", "2").code == 2
-
-
-def test_a_replay_file_without_the_field_reads_as_nobody_left_out() -> None:
-    document = replay(doubted(), mode="exact", dt_s=0.1).to_dict()
-    assert document.pop("left_out") == {}
-    read = Replay.from_dict(document)
-    assert read.left_out == {}
-    assert "left out" not in summarize(read)
-
-
 @pytest.mark.parametrize("to", [f for f in formats() if f not in ("mcap", "osi", "rerun")])
 def test_an_export_keeps_or_drops_them_and_says_how_many(to: str, tmp_path: Path) -> None:
     doubted().save(tmp_path / "s.json")
@@ -167,27 +113,6 @@ def test_an_export_keeps_or_drops_them_and_says_how_many(to: str, tmp_path: Path
     assert "sure" in dropped
 
 
-def test_another_choice_is_refused() -> None:
-    with pytest.raises(ConfigError, match="--doubtful: 'maybe', expected keep, drop, all"):
-        with_doubtful(doubted(), "maybe")
-
-
-def test_the_table_has_sigmas_and_doubts_at_their_times(tmp_path: Path) -> None:
-    scenario = doubted()
-    phantom = scenario.agents[2]
-    w = replace(phantom.waypoints, sigma_speed_mps=np.linspace(0.1, 0.7, len(phantom.waypoints)))
-    agents = (*scenario.agents[:2], replace(phantom, waypoints=w))
-    (file,) = export(replace(scenario, agents=agents), "csv", tmp_path)
-    with file.open(newline="", encoding="utf-8") as opened:
-        rows = [row for row in csv.DictReader(opened) if row["id"] in ("sure", "phantom")]
-    sure, own = ([row for row in rows if row["id"] == name] for name in ("sure", "phantom"))
-    np.testing.assert_array_equal([float(row["sigma_speed_mps"]) for row in own], w.sigma_speed_mps)
-    assert {(row["sigma_yaw_rad"], row["sigma_speed_mps"], row["doubts"]) for row in sure} == {("", "", "")}
-    flags = ["passes_through unlikely_size" if 1.0 <= t <= 1.5 else "unlikely_size" for t in w.t_s]
-    assert [row["doubts"] for row in own] == flags
-    assert len(set(flags)) == 2
-
-
 @pytest.mark.parametrize("revision", ["1.0", "1.2"])
 def test_openscenario_brings_them_back(revision: str, tmp_path: Path) -> None:
     scenario = doubted()
@@ -203,32 +128,6 @@ def test_openscenario_brings_them_back(revision: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(after.waypoints.sigma_yaw_rad, w.sigma_yaw_rad, atol=1e-4)
     np.testing.assert_allclose(after.waypoints.sigma_speed_mps, w.sigma_speed_mps, atol=1e-4)
     assert ego.waypoints.sigma_yaw_rad is None
-
-
-@pytest.mark.parametrize("spoiled", ["nonsense", "{}", "[{}]"])
-def test_spoiled_doubts_in_openscenario_are_refused(spoiled: str, tmp_path: Path) -> None:
-    export(doubted(), "openscenario", tmp_path)
-    file = tmp_path / "scenario.xosc"
-    text = file.read_text(encoding="utf-8")
-    begin = text.index('value="', text.index("log2sim.doubts")) + len('value="')
-    file.write_text(text[:begin] + spoiled + text[text.index('"', begin) :], encoding="utf-8")
-    with pytest.raises(ScenarioError, match="doubts"):
-        load(file)
-
-
-def test_viewers_say_why_agents_are_doubtful(tmp_path: Path) -> None:
-    reader = pytest.importorskip("mcap.reader")
-    decoder = pytest.importorskip("mcap_protobuf.decoder")
-    (file,) = export(doubted(), "mcap", tmp_path)
-    with file.open("rb") as opened:
-        about = next(iter(reader.make_reader(opened).iter_metadata())).metadata
-    assert json.loads(about["doubtful"])["unsure"] == "confidence 0.49"
-    with file.open("rb") as opened:
-        read = reader.make_reader(opened, decoder_factories=[decoder.DecoderFactory()])
-        _, _, _, update = next(iter(read.iter_decoded_messages(topics=["/agents"])))
-    told = {entity.id: {pair.key: pair.value for pair in entity.metadata}.get("doubtful") for entity in update.entities}
-    assert told["phantom"] == "passes through parked at 1.2 s, 2.8 m wide"
-    assert told["sure"] is None
 
 
 def test_quarantined_agents_stay_in_the_file_and_out_of_replays_and_exports(tmp_path: Path) -> None:
@@ -248,3 +147,97 @@ def test_quarantined_agents_stay_in_the_file_and_out_of_replays_and_exports(tmp_
     assert ids(with_doubtful(scenario, "all")) == ids(scenario)
     assert evaluate(scenario, scenario.active)["precision"] == 1.0
     assert evaluate(scenario, scenario.active)["quarantined"] == ["unsure"]
+
+
+PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4)
+
+
+def agent(name: str, *doubts: Doubt, confidence: float = 0.9) -> Agent:
+    return replace(straight(name), doubts=doubts, confidence=confidence)
+
+
+def test_the_agents_are_counted_and_named_with_their_reasons() -> None:
+    (line,) = doubt_lines(world(agent("ego"), agent("car-19", confidence=0.2), agent("car-18", PASSES), agent("car-1")))
+    assert line == "2 of 3 agents: car-18 (passes through car-22 at 1.2 s), car-19 (confidence 0.20)"
+
+
+def test_every_flag_that_is_given_is_listed_and_every_listed_one_is_given() -> None:
+    given = set(PHRASES)
+    for file in (ROOT / "log2sim" / "agents").rglob("*.py"):
+        for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if (
+                isinstance(call, ast.Call)
+                and isinstance(call.func, ast.Name)
+                and call.func.id.lower().strip("_s") == "doubt"
+            ):
+                texts = [a.value for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+                given |= {text for text in texts if text.isidentifier()}
+    assert given == set(FLAGS)
+
+
+def moving(speed_mps: np.ndarray, sigma_mps: float | None = None, rate_hz: float = 10.0) -> Waypoints:
+    n = len(speed_mps)
+    t, zero = np.arange(n) / rate_hz, np.zeros(n)
+    x = np.concatenate([[0.0], np.cumsum((speed_mps[1:] + speed_mps[:-1]) / 2 / rate_hz)])
+    sigma = None if sigma_mps is None else zero + sigma_mps
+    return Waypoints(t, x, zero, zero, zero, speed_mps, zero == 0, zero + 0.1, sigma_speed_mps=sigma)
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_what_is_faster_than_its_category_is_doubted_while_it_is(category):
+    limit = MAX_SPEED_MPS[category]
+    assert motion_doubts(category, moving(np.full(20, 0.9 * limit))) == ()
+    w = moving(np.where(np.arange(20) < 5, 1.2, 0.9) * limit)
+    (doubt,) = motion_doubts(category, w)
+    assert doubt.flag == "speed"
+    assert doubt.holds(w.t_s).sum() == 5
+    assert doubt.reason == f"moves at {1.2 * limit:.0f} m/s from 0.0 to 0.4 s"
+    assert motion_doubts(category, moving(w.speed_mps, sigma_mps=0.2 * limit)) == ()
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 10.0, 20.0])
+def test_reversing_out_of_a_driveway_is_driving_and_reversing_fast_or_far_is_not(rate_hz):
+    def after(seconds: float, speed: float) -> Waypoints:
+        t = np.arange(0, 30, 1 / rate_hz)
+        return moving(np.where(t < seconds, -speed, 0.0), 0.1, rate_hz)
+
+    assert motion_doubts("car", after(8.0, 2.0)) == ()
+    (fast,) = motion_doubts("car", after(3.0, 7.4))
+    assert (fast.flag, fast.start_s) == ("reversing", 0.0)
+    assert fast.reason.startswith("reverses at up to 7.4 m/s from 0.0 to ")
+    assert fast.end_s == pytest.approx(3.0, abs=1.01 / rate_hz)
+    (far,) = motion_doubts("cyclist", after(25.0, 2.0))
+    assert far.flag == "reversing"
+    assert motion_doubts("pedestrian", after(3.0, 4.0)) == ()
+
+
+@pytest.mark.parametrize("length_m", [2.0, 6.0])
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 90.0, 160.0, 180.0])
+def test_a_long_side_across_the_way_slides(length_m, turned_deg):
+    """A side that may be the width of a vehicle says nothing."""
+    t = np.arange(10) / 10
+    found = Detections(np.zeros((10, 4)), np.ones(10), np.full(10, "truck"))
+    m = replace(
+        Measurements.unplaced(found, t_ns=0, camera="", sensor_m=np.zeros(3)),
+        yaw_rad=np.full(10, 0.4 + np.deg2rad(turned_deg)),
+        low_m=np.zeros((10, 2)),
+        high_m=np.tile([length_m, 1.5], (10, 1)),
+    )
+    doubts = sideways_doubts(m, t, np.full(10, 0.4), np.full(10, 3.6))
+    assert [doubt.flag for doubt in doubts] == (["sideways"] if length_m == 6.0 and turned_deg == 90.0 else [])
+    assert sideways_doubts(m, t, np.full(10, 0.4), np.full(10, 0.5)) == ()
+
+
+def test_the_command_replays_without_them(tmp_path: Path) -> None:
+    doubted().save(tmp_path / "s.json")
+    arguments = ("replay", tmp_path / "s.json", "--dt", "0.1", "--mode", "exact")
+    ran = run(*arguments, "--confidence", "0.5", "--out", tmp_path / "r.json")
+    assert ran.code == 0
+    assert "1 of 3 agents left out: unsure (confidence 0.49)" in ran.out
+    loaded = Replay.load(tmp_path / "r.json")
+    assert [a.id for a in loaded.agents] == ["ego", "sure", "phantom"]
+    assert loaded.left_out == {"unsure": "confidence 0.49"}
+    both = run(*arguments, "--confidence", "0.5", "--drop-doubtful")
+    assert "2 of 3 agents left out: unsure (confidence 0.49), phantom (passes through parked at 1.2 s" in both.out
+    assert "left out" not in run(*arguments).out
+    assert run(*arguments, "--confidence", "2").code == 2

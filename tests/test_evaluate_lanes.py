@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from worlds import CAR, PARKED, tiny_log, tiny_scene
+from worlds import CAR, PARKED, tiny_log
 
 from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.table import format_table
-from log2sim.evaluation.road import Area, map_figures, sampled, signal_figures
-from log2sim.files.documents import check
-from log2sim.synth.truth import map_features_of
+from log2sim.evaluation.road import Area, map_figures, signal_figures
 
 ROAD = {"line": [[-60.0, 0.0], [80.0, 0.0]], "width_m": 8.0, "marking": "solid", "color": "white"}
 
@@ -45,24 +41,6 @@ def lane_lines(scenario: Scenario, truth: Scenario) -> dict[str, Any]:
     return dict(figures["lane_lines"])
 
 
-def test_the_truth_is_perfect_against_itself(truth: Scenario) -> None:
-    result = evaluate(truth, truth)
-    check(json.loads(json.dumps(result)), "metrics-1", ScenarioError)
-    figures = result["map_features"]
-    lines = figures["lane_lines"]
-    assert (lines["precision"], lines["recall"], lines["kind_accuracy"], lines["color_accuracy"]) == (1, 1, 1, 1)
-    assert lines["lateral_p95_m"] == pytest.approx(0, abs=1e-9)
-    assert figures["borders"]["recall"] == 1
-    for kind in ("stop_lines", "crosswalks", "others"):
-        assert figures[kind] == {"true": 1, "found": 1, "false": 0, "partly_seen": 0}
-    assert (figures["lanes"]["precision"], figures["lanes"]["recall"]) == (1, 1)
-    assert result["colors"]["accuracy"] == 1
-    assert result["signals"] is None
-    table = format_table(result)
-    assert "lane lines: precision 1.00, recall 1.00 (1.00 within 20 m), off by 0.00 m" in table
-    assert "1 of 1 stop lines, 1 of 1 crosswalks" in table
-
-
 def test_shares_and_errors_follow_from_lengths_and_offsets(truth: Scenario) -> None:
     # The ego's middle drives 3 m from x = 1.4, so lines count over 83 m near it: x from -38.6 to 44.4 on its own line.
     found = with_markings(
@@ -80,25 +58,6 @@ def test_shares_and_errors_follow_from_lengths_and_offsets(truth: Scenario) -> N
     assert figures["kind_accuracy"] == 1
     assert figures["color_accuracy"] == 0
     assert figures["false_m_per_100_m"] == pytest.approx(100 * 51.5 / 3, rel=0.02)
-
-
-def test_a_shift_of_both_maps_and_another_order_change_nothing(truth: Scenario) -> None:
-    features = map_features_of(tiny_scene([], road=[ROAD]))
-    rng = np.random.default_rng(0)
-    off = features.moved(lambda p: p + np.array([0.03, 0.05, 0.0]))
-    found = replace(truth, map_features=off)
-    plain = map_figures(found, truth)
-    mixed = replace(off, markings=tuple(off.markings[k] for k in rng.permutation(len(off.markings))))
-    assert map_figures(replace(truth, map_features=mixed), truth) == plain
-    # The truth's map lies 500 m elsewhere, and its coordinates say so.
-    far = replace(truth, map=replace(truth.map, offset_m=(500.0, -200.0, 10.0)))
-    moved = truth.aligned_to(far)
-    assert moved.map.offset_m == (500.0, -200.0, 10.0)
-    again = map_figures(found, moved)
-    assert plain is not None
-    assert again is not None
-    for key, value in plain["lane_lines"].items():
-        assert again["lane_lines"][key] == pytest.approx(value, abs=1e-6), key
 
 
 def test_what_no_sensor_saw_is_not_missed_but_what_is_found_there_counts(truth: Scenario) -> None:
@@ -187,15 +146,3 @@ def test_signals_are_judged_by_where_they_are_and_what_they_say_when(truth: Scen
     missing = signal_figures(replace(world, signals=()), world)
     assert missing is not None
     assert (missing["found"], missing["state_right"]) == (0, None)
-
-
-def test_samples_lie_on_the_line_and_stand_for_all_of_it() -> None:
-    points = np.array([[0.0, 0.0], [0.0, 0.0], [3.0, 0.0], [3.0, 4.0]])
-    xy, heading, length = sampled(points)
-    assert length * len(xy) == pytest.approx(7.0)
-    assert length <= 0.1
-    assert set(np.round(heading, 6)) == {0.0, round(np.pi / 2, 6)}
-    assert np.all((xy[:, 1] == 0) | (xy[:, 0] == 3))
-    assert len(sampled(points[:2])[0]) == 0
-    with pytest.raises(ScenarioError, match="too long"):
-        sampled(np.array([[0.0, 0.0], [1e7, 0.0]]))

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,8 +12,7 @@ import pytest
 from export_worlds import ROOT, circling, straight, world
 from peer_checks import commonroad_finds, overlaps
 
-from log2sim.datatypes import CATEGORIES, MapFrame, Scenario
-from log2sim.errors import ScenarioError
+from log2sim.datatypes import Scenario
 from log2sim.export.exporters import export
 from log2sim.geometry import wrap_angle
 
@@ -38,55 +35,6 @@ def test_ids_lead_back_to_the_agents(tmp_path: Path) -> None:
     assert {e.get("id") for e in root.iter() if "bstacle" in e.tag} <= {row["commonroad_id"] for row in rows.values()}
 
 
-def test_no_category_is_dropped(tmp_path: Path) -> None:
-    moving = [straight(f"{c} moving", c, start=(0.0, 5.0 * k + 5)) for k, c in enumerate(CATEGORIES)]
-    still = [
-        replace(straight(f"{c} still", c, start=(0.0, -5.0 * k - 5), speed=0.0), static=True)
-        for k, c in enumerate(CATEGORIES)
-    ]
-    root, rows = written(world(straight("ego"), *moving, *still), tmp_path)
-    types = {name: root.findtext(f"*[@id='{row['commonroad_id']}']/type") for name, row in rows.items()}
-    assert types["cyclist moving"] == types["bicycle moving"] == types["cyclist still"] == "bicycle"
-    assert types["truck moving"] == "truck"
-    assert types["truck still"] == "parkedVehicle"
-    assert types["pedestrian still"] == "pedestrian"
-    assert types["other moving"] == types["other still"] == "unknown"
-
-
-def test_who_enters_late_is_not_there_before(tmp_path: Path) -> None:
-    late = straight("late", start=(0.0, 9.0), t_s=np.array([1.0, 1.5, 2.0]))
-    short = straight("short", start=(0.0, 9.0), t_s=np.array([0.53, 0.56]))
-    early = straight("early", start=(0.0, 9.0), t_s=np.array([0.0, 0.1]))
-    root, rows = written(world(straight("ego", t_s=np.array([0.4, 1.0, 2.0])), late, short, early), tmp_path)
-    steps = {
-        name: [int(t.text or "") for t in root.findall(f"*[@id='{row['commonroad_id']}']//time/exact")]
-        for name, row in rows.items()
-    }
-    assert steps["late"] == list(range(6, 17))
-    assert steps["short"] == [1, 2]
-    assert rows["early"]["role"] == "left out: not alive at any step"
-
-
-def test_the_date_is_that_of_the_recording(tmp_path: Path) -> None:
-    root, _ = written(world(straight("ego")), tmp_path)
-    assert root.get("date") == "2023-11-14"
-
-
-def test_the_way_to_projected_coordinates_is_stored(tmp_path: Path) -> None:
-    frame = MapFrame(49.0, 8.4, 110.0, "+proj=utm +zone=32", (456_000.0, 5_428_000.0, 0.0))
-    root, _ = written(replace(world(straight("ego")), map=frame), tmp_path)
-    assert root.findtext("location/geoTransformation/geoReference") == "+proj=utm +zone=32"
-    assert root.findtext("location/geoTransformation/additionalTransformation/xTranslation") == "-456000"
-    assert root.findtext("location/gpsLatitude") == "49"
-
-
-def test_numbers_have_no_exponent(tmp_path: Path) -> None:
-    root, _ = written(world(straight("ego", speed=1e-7, start=(1e-8, 1e9))), tmp_path)
-    values = [e.text or "" for e in root.iter() if e.tag in ("x", "y", "z", "exact")]
-    assert all(re.fullmatch(r"-?\d+(\.\d+)?", value) for value in values)
-    assert {"1000000000", "0.00000001"} <= set(values)
-
-
 def test_lanes_keep_their_height(tmp_path: Path) -> None:
     """Flat maps out of sloping recordings: CommonRoad/commonroad-scenario-designer#34."""
     ego = straight("ego", speed=10.0, t_s=np.linspace(0.0, 3.0, 31))
@@ -99,15 +47,6 @@ def test_lanes_keep_their_height(tmp_path: Path) -> None:
     ]
     x, z = np.array([(x, z) for x, z in points if 1.0 < x < 29.0]).T
     np.testing.assert_allclose(z, 5.0 + 0.1 * x, atol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("agent", "complaint"),
-    [(straight("car-1"), "no agent 'ego'"), (straight("ego", t_s=np.array([0.0, 0.05])), "agent 'ego': lives 0.05 s")],
-)
-def test_what_makes_no_planning_problem_is_refused(agent: Any, complaint: str, tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=complaint):
-        export(world(agent), "commonroad", tmp_path / "out")
 
 
 @pytest.mark.peers

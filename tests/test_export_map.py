@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from export_paths import agent, line, scenario
 from test_export_scenarionet import described
-from test_lane_graph import cross
+from test_lanes import cross
 
 from log2sim.datatypes import MapFeatures, Marking, RoadBorder, Scenario, Signal
 from log2sim.export.exporters import export

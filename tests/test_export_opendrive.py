@@ -8,15 +8,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from command_line import names
 from export_paths import UTM, agent, bend, line, scenario
 from export_readers import Sampled, distance, play, roads
 
 from log2sim.datatypes import Agent, MapFrame, Scenario
-from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import Options, export
-from log2sim.export.roads.opendrive import require_roads
-from log2sim.export.roads.reference_line import ReferenceLine, fit, straight
+from log2sim.export.roads.reference_line import fit
 from log2sim.geometry import Array
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
@@ -102,34 +99,6 @@ def test_the_ego_drives_within_1_cm_of_the_reference_line_and_of_the_middle_of_i
         assert apart.max() > 0 or name in ("standing", "one waypoint")  # the walker and the fit are not the same code
 
 
-def test_no_geometry_is_degenerate(driven: tuple[str, Path]) -> None:
-    for road in ElementTree.parse(driven[1] / "road.xodr").getroot().iterfind("road"):
-        pieces = road.findall("planView/geometry")
-        s, length = (np.array([float(p.attrib[k]) for p in pieces]) for k in ("s", "length"))
-        assert s[0] == 0
-        assert length.min() > 0.01
-        np.testing.assert_allclose(np.diff(s), length[:-1], atol=2e-8)
-        assert float(road.attrib["length"]) == pytest.approx(length.sum(), abs=1e-6)
-        assert float(road.attrib["length"]) >= 1.0
-        curvature = [abs(float(p.find("arc").attrib["curvature"])) for p in pieces if p.find("arc") is not None]
-        assert all(1e-9 < c < 0.5 for c in curvature)
-
-
-def test_pieces_join_without_gap_or_kink(driven: tuple[str, Path]) -> None:
-    for road in ElementTree.parse(driven[1] / "road.xodr").getroot().iterfind("road"):
-        end = None
-        for piece in road.iterfind("planView/geometry"):
-            x, y, h, length = (float(piece.attrib[k]) for k in ("x", "y", "hdg", "length"))
-            if end is not None:
-                np.testing.assert_allclose([x, y], end[:2], atol=1e-6)
-                assert abs(h - end[2]) < 1e-4
-            c = float(piece.find("arc").attrib["curvature"]) if piece.find("arc") is not None else 0.0
-            # The closed form by complex numbers, where the writer uses chords.
-            ahead = length if c == 0 else (np.exp(1j * c * length) - 1) / (1j * c)
-            z = ahead * np.exp(1j * h)
-            end = (x + z.real, y + z.imag, h + c * length)
-
-
 def test_a_circle_becomes_arcs_of_its_curvature() -> None:
     """But for the ends, where a smoothing spline has data on one side only."""
     found, stations = fit(bend(15.0, np.pi / 2, 200))
@@ -138,74 +107,11 @@ def test_a_circle_becomes_arcs_of_its_curvature() -> None:
     np.testing.assert_allclose(stations, np.linspace(0, found.length_m, 200), atol=0.01)
 
 
-def test_a_straight_path_is_one_line_with_what_is_before_and_after_it(tmp_path: Path) -> None:
-    (road,) = network(tmp_path, scenario(agent(line())))
-    (piece,) = road.road.findall("planView/geometry")
-    assert piece.find("line") is not None
-    assert [float(piece.attrib[k]) for k in ("x", "y", "hdg", "length")] == pytest.approx([-10.0, 0.0, 0.0, 50.0])
-
-
-@pytest.mark.parametrize("heading_deg", [0.0, 60.0, 135.0, 180.0, -90.0, -10.0])
-def test_a_path_straight_but_for_millimeters_is_one_line(heading_deg: float) -> None:
-    along = np.linspace(0.0, 40.0, 81)
-    aside = np.random.default_rng(3).uniform(-0.005, 0.005, 81)
-    turn = np.deg2rad(heading_deg)
-    xy = np.column_stack([along * np.cos(turn) - aside * np.sin(turn), along * np.sin(turn) + aside * np.cos(turn)])
-    found, stations = fit(xy)
-    (piece,) = found.pieces
-    assert np.abs(np.angle(np.exp(1j * (piece.heading_rad - turn)))) < 1e-3
-    np.testing.assert_allclose(stations, along, atol=1e-3)
-
-
-def test_a_spline_that_swings_out_between_two_points_is_not_taken() -> None:
-    """FITPACK's smoothing of this path of corners passes near every point and bulges between two of them."""
-    rng = np.random.default_rng(73)
-    count = int(rng.integers(3, 12))
-    steps = rng.uniform(0.05, 8.0, (count, 1))
-    turns = np.cumsum(rng.uniform(-1.2, 1.2, count))
-    xy = np.cumsum(steps * np.column_stack([np.cos(turns), np.sin(turns)]), axis=0)
-    found, stations = fit(xy)
-    assert found.length_m == pytest.approx(np.hypot(*np.diff(xy, axis=0).T).sum(), rel=0.01)
-    assert np.hypot(*(found.at(stations)[:, :2] - xy).T).max() <= 0.01
-
-
-def test_a_reference_line_gives_points_at_stations_in_any_order() -> None:
-    found = straight(1.0, 2.0, np.pi / 2, 4.0)
-    np.testing.assert_allclose(
-        found.at(np.array([3.0, 0.0])), [[1.0, 3.0, np.pi / 2], [1.0, 0.0, np.pi / 2]], atol=1e-12
-    )
-    assert isinstance(found, ReferenceLine)
-
-
 def test_the_road_rises_with_the_ground_under_the_ego(tmp_path: Path) -> None:
     z = 100.0 + 2.0 * np.sin(np.linspace(0.0, 60.0, 121) / 20.0)
     (road,) = network(tmp_path, scenario(agent(line(60.0, 121), ground_m=z)))
     on = (road.line[:, 0] >= 0) & (road.line[:, 0] <= 60)
     np.testing.assert_allclose(road.line[on, 2], 100.0 + 2.0 * np.sin(road.line[on, 0] / 20.0), atol=0.03)
-
-
-def test_flat_ground_is_one_elevation(tmp_path: Path) -> None:
-    (road,) = network(tmp_path, scenario(agent(line(), ground_m=7.0)))
-    assert [e.attrib["a"] for e in road.road.iterfind("elevationProfile/elevation")] == ["7"]
-
-
-def test_a_slope_is_one_elevation_and_goes_on_beyond_the_path(tmp_path: Path) -> None:
-    (road,) = network(tmp_path, scenario(agent(line(), ground_m=7.0 + 0.05 * np.linspace(0.0, 30.0, 31))))
-    (cubic,) = road.road.findall("elevationProfile/elevation")
-    assert [float(cubic.attrib[k]) for k in "abcd"] == pytest.approx([6.5, 0.05, 0.0, 0.0], abs=1e-9)
-
-
-def test_noise_of_heights_makes_no_bumps(tmp_path: Path) -> None:
-    z = np.random.default_rng(0).normal(0.0, 0.01, 121)
-    (road,) = network(tmp_path, scenario(agent(line(60.0, 121), ground_m=z)))
-    assert np.abs(np.gradient(road.line[:, 2], 0.05)).max() < 0.02
-
-
-def test_a_lane_is_wide_enough_for_who_drives_it(tmp_path: Path) -> None:
-    for width_m, lane_m in ((1.9, 3.5), (3.2, 4.0)):
-        (road,) = network(tmp_path, scenario(agent(line(), size_m=(8.0, width_m, 3.0))))
-        lane = road.road.find("lanes/laneSection/right/lane[@id='-1']/width")
-        assert float(lane.attrib["a"]) == pytest.approx(lane_m)
 
 
 def test_who_drives_beside_the_ego_has_a_lane_of_the_same_road(tmp_path: Path) -> None:
@@ -231,16 +137,6 @@ def test_who_turns_off_makes_a_junction_and_is_within_its_lanes(tmp_path: Path) 
     assert len(junction.findall("connection")) == 2
     path = path_of(leaving, tmp_path)
     assert np.min([distance(path, r.centers[-1][:, :2]) for r in found], axis=0).max() <= 0.3
-
-
-def test_lanes_that_cross_make_a_junction(tmp_path: Path) -> None:
-    network(tmp_path, scenario(agent(line(60.0, 61)), agent(line(40.0, 41, np.pi / 2, (30.0, -20.0)), "crossing")))
-    root = ElementTree.parse(tmp_path / "road.xodr").getroot()
-    (junction,) = root.findall("junction")
-    assert len({c.attrib["incomingRoad"] for c in junction.iterfind("connection")}) == 2
-    assert sorted(road.attrib["junction"] == junction.attrib["id"] for road in root.iterfind("road")) == 4 * [
-        False
-    ] + 2 * [True]
 
 
 def link_of(road: ElementTree.Element, tag: str) -> dict[str, str]:
@@ -298,14 +194,6 @@ def test_lanes_that_lead_opposite_ways_are_one_road_where_both_are(tmp_path: Pat
         assert linked == {ahead: True, -ahead: False}
 
 
-def test_lanes_of_left_hand_traffic_stay_roads_of_their_own(tmp_path: Path) -> None:
-    """The line of a road lies to the left of the lanes along it, where in left-hand traffic the edge of the road is."""
-    back = agent(line(30.0, 31, np.pi, (45.0, -3.6)), "back")
-    for r in network(tmp_path, scenario(agent(line(90.0, 91)), back)):
-        assert set(r.centers) == {-1}
-        assert all(float(w.attrib["a"]) > 2 for w in r.road.iter("width"))
-
-
 def test_the_sample_s_two_way_roads_have_their_lanes_in_one_road_and_lose_no_link(tmp_path: Path) -> None:
     """Every link of the scenario's lanes is in the file: from road to road, or through a connecting road."""
     world = Scenario.load(SAMPLE)
@@ -327,37 +215,7 @@ def test_the_sample_s_two_way_roads_have_their_lanes_in_one_road_and_lose_no_lin
     assert links == sum(len(a.predecessors) + len(a.successors) for a in world.map_features.lanes if a.junction)
 
 
-def test_a_road_leads_the_way_that_a_reversing_ego_faces(tmp_path: Path) -> None:
-    (road,) = network(tmp_path, scenario(agent(line(), yaw_rad=np.pi)))
-    assert abs(float(road.road.find("planView/geometry").attrib["hdg"])) == pytest.approx(np.pi)
-    assert road.line[0, 0] == pytest.approx(40.0)
-
-
-def test_neither_pedestrians_nor_parked_cars_make_roads(tmp_path: Path) -> None:
-    walker = agent(line(20.0, 21, 1.0, (0.0, 30.0)), "walker", category="pedestrian")
-    parked = agent(np.full((5, 2), [5.0, 20.0]), "parked", yaw_rad=1.0, static=True)
-    assert len(network(tmp_path, scenario(agent(line()), walker, parked))) == 1
-
-
-def test_a_scenario_without_an_ego_has_the_road_of_who_goes_farthest(tmp_path: Path) -> None:
-    found = network(
-        tmp_path, scenario(agent(line(5.0, 6, start=(0.0, 30.0)), "near"), agent(line(50.0, 51, 1.0), "far"))
-    )
-    assert [len(r.line) > 800 for r in found] == [True, False]
-    assert len(network(tmp_path, scenario(agent(line(5.0, 6), "walker", category="pedestrian")))) == 1
-
-
 # What users of OpenDRIVE players complain about, by the issue that tells it.
-
-
-def test_sumo_8445_local_plus_offset_are_coordinates_of_the_projection(tmp_path: Path) -> None:
-    """eclipse-sumo/sumo#8445, #12802; esmini#189; carla#2383: where the local origin lies has to be in the file."""
-    export(scenario(agent(bend() + np.array([25_300.0, 0.0]))), "openscenario", tmp_path)
-    header = ElementTree.parse(tmp_path / "road.xodr").find("header")
-    offset = [float(header.find("offset").attrib[k]) for k in "xyz"]
-    assert offset == [456000.0 + 25000.0, 5428000.0, 100.0]
-    (road,) = roads(tmp_path / "road.xodr")
-    assert road.line[0, 0] == pytest.approx(290.0, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -391,22 +249,6 @@ def test_the_geo_reference_gives_latitude_and_longitude_in_the_words_of_esmini(p
     assert abs(own[1]) > 1
 
 
-def test_scenarionet_103_the_shift_is_in_the_files_and_undone_by_an_import(tmp_path: Path) -> None:
-    from log2sim.export.openscenario.read import load
-
-    world = scenario(agent(bend() + np.array([25_300.0, 7e6])))
-    export(world, "openscenario", tmp_path)
-    back = load(tmp_path / "scenario.xosc").agents[0].waypoints
-    np.testing.assert_allclose(back.y_m, world.agents[0].waypoints.y_m, atol=1e-6)
-
-
-def test_a_local_map_claims_no_place_on_earth(tmp_path: Path) -> None:
-    export(scenario(agent(line()), map=MapFrame(37.8, -122.4, 3.0)), "openscenario", tmp_path)
-    header = ElementTree.parse(tmp_path / "road.xodr").find("header")
-    assert header.find("geoReference") is None
-    assert header.find("offset") is None
-
-
 def users_map(folder: Path, world: Scenario, projection: str | None, offset: tuple[float, float, float] | None) -> Path:
     """A road that another tool could have made."""
     export(world, "openscenario", folder)
@@ -420,25 +262,6 @@ def users_map(folder: Path, world: Scenario, projection: str | None, offset: tup
         ElementTree.SubElement(header, "offset", {**dict(zip("xyz", map(str, offset))), "hdg": "0"})
     tree.write(folder / "mine.xodr", encoding="utf-8")
     return folder / "mine.xodr"
-
-
-def test_the_user_s_map_is_copied_as_it_is(tmp_path: Path) -> None:
-    mine = users_map(tmp_path / "a", scenario(agent(line())), None, None)
-    files = export(scenario(agent(bend())), "openscenario", tmp_path / "b", Options(map=mine))
-    assert (tmp_path / "b" / "road.xodr").read_bytes() == mine.read_bytes()
-    assert [f.name for f in files] == ["road.xodr", "scenario.xosc"]
-    logic = ElementTree.parse(tmp_path / "b" / "scenario.xosc").find("RoadNetwork/LogicFile")
-    assert logic.attrib == {"filepath": "road.xodr"}
-
-
-def test_on_the_user_s_map_agents_have_its_coordinates(tmp_path: Path) -> None:
-    world = scenario(agent(bend(), rear_axle_offset_m=0.0))
-    mine = users_map(tmp_path / "a", world, UTM.projection, (455_000.0, 5_428_000.0, 90.0))
-    export(world, "openscenario", tmp_path / "b", Options(map=mine))
-    vertices = play(tmp_path / "b" / "scenario.xosc")["ego"].vertices
-    np.testing.assert_allclose(
-        vertices[:, 1:4], np.column_stack([bend() + np.array([1000.0, 0.0]), np.full(60, 10.0)]), atol=1e-5
-    )
 
 
 def test_a_map_in_another_projection_has_the_agents_where_they_are_on_earth(tmp_path: Path) -> None:
@@ -461,77 +284,6 @@ def test_a_map_in_another_projection_has_the_agents_where_they_are_on_earth(tmp_
     np.testing.assert_allclose(played.vertices[2:-2, 4], np.unwrap(np.arctan2(*direction.T[::-1]))[2:-2], atol=2e-3)
     back = load(tmp_path / "b" / "scenario.xosc").agents[0].waypoints
     np.testing.assert_allclose(np.column_stack([back.x_m, back.y_m]), bend(), atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        ("<OpenDRIVE/>", "expected <OpenDRIVE> with a <header>"),
-        ("<OpenDRIVE><header/></OpenDRIVE>", "has no roads"),
-        ("no xml", "not valid XML"),
-        ("<!DOCTYPE x [<!ENTITY a 'b'>]><OpenDRIVE/>", "document type declaration"),
-    ],
-)
-def test_a_map_that_is_none_is_refused_and_nothing_stays(spoil: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "mine.xodr").write_text(spoil)
-    with pytest.raises(ScenarioError, match=message):
-        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=tmp_path / "mine.xodr"))
-    assert names(tmp_path) == ["mine.xodr"]
-
-
-def test_where_both_name_the_same_projection_nobody_has_to_know_it(tmp_path: Path) -> None:
-    world = scenario(
-        agent(bend(), rear_axle_offset_m=0.0), map=MapFrame(projection="+proj=ours +k=1", offset_m=(500.0, 0.0, 0.0))
-    )
-    mine = users_map(tmp_path / "a", world, "+k=1 +proj=ours +no_defs", (100.0, 0.0, 0.0))
-    export(world, "openscenario", tmp_path / "b", Options(map=mine))
-    vertices = play(tmp_path / "b" / "scenario.xosc")["ego"].vertices
-    np.testing.assert_allclose(vertices[:, 1:3], bend() + np.array([400.0, 0.0]), atol=1e-6)
-
-
-def test_a_map_whose_projection_is_not_one_is_refused(tmp_path: Path) -> None:
-    for text, message in (("+proj=nonsense", "is no projection"), ("EPSG:32632", "is no PROJ string")):
-        mine = users_map(tmp_path / text[:6], scenario(agent(line())), text, None)
-        with pytest.raises(ConfigError, match=message):
-            export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
-
-
-def test_scenario_runner_1047_a_map_of_another_place_is_refused(tmp_path: Path) -> None:
-    mine = users_map(tmp_path / "a", scenario(agent(line())), UTM.projection, (0.0, 0.0, 0.0))
-    with pytest.raises(ConfigError, match="its roads are 5447 km away from all agents"):
-        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
-
-
-def test_a_turned_map_is_refused(tmp_path: Path) -> None:
-    mine = users_map(tmp_path / "a", scenario(agent(line())), UTM.projection, (0.0, 0.0, 0.0))
-    mine.write_text(
-        mine.read_text()
-        .replace('hdg="0" />\n  </header>', 'hdg="0.1" /></header>')
-        .replace('z="0.0" hdg="0"', 'z="0.0" hdg="0.1"')
-    )
-    with pytest.raises(ConfigError, match="offset turns the map"):
-        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
-
-
-@pytest.mark.parametrize(
-    ("find", "attribute", "value", "message"),
-    [
-        ("planView/geometry[2]", "s", "1", "geometry at s=1"),
-        ("planView/geometry[1]", "length", "0", "with length 0"),
-        ("planView/geometry[1]", "length", "nan", "expected a finite number"),
-        (".", "length", "7", "but its geometry ends at"),
-        ("elevationProfile/elevation[2]", "s", "0", "expected stations in order"),
-        ("lanes/laneSection/right/lane/width", "sOffset", "2", "lane -1 has no width"),
-    ],
-)
-def test_a_road_out_of_order_is_named(find: str, attribute: str, value: str, message: str, tmp_path: Path) -> None:
-    export(scenario(agent(bend(), ground_m=np.linspace(0, 2, 60))), "openscenario", tmp_path)
-    root = ElementTree.parse(tmp_path / "road.xodr").getroot()
-    require_roads(root, "road.xodr")
-    root.find("road").find(find).set(attribute, value)
-    with pytest.raises(Exception, match=message) as raised:
-        require_roads(root, "road.xodr")
-    assert "road.xodr: road '1'" in str(raised.value)
 
 
 def test_the_sample_s_roads_hold_every_vehicle_that_moves(tmp_path: Path) -> None:

@@ -54,14 +54,6 @@ def test_a_picture_on_a_wall_a_fence_or_a_pole_is_no_body():
         assert all(len(rows.cluster[k]) > 0 for k in np.flatnonzero(rows.source == "lidar"))
 
 
-def test_points_at_a_depth_where_the_box_is_no_person_are_left_out():
-    # A low wall at a third of the distance covers the lower half of the box.
-    person, wall = standing(27, 0, 0, PERSON), standing(9, 0, 0, (0.2, 0.3, 1.2))
-    after, count = measured([person, wall], [0], noise_m=0.01)
-    assert count[0] >= 2
-    assert after.center_m[0, 0] == pytest.approx(27.0, abs=0.5)
-
-
 def test_people_side_by_side_hide_no_one_as_a_wall_does():
     people = [standing(24, y, 0, PERSON) for y in (-0.9, 0.0, 0.9)]
     after, count = measured(people, range(3), noise_m=0.01)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.files import documents
-from log2sim.files.documents import read_json, refuse_existing, replaced, rounded, write_json
+from log2sim.files.documents import read_json, refuse_existing, replaced, write_json
 
 
 def test_a_file_appears_whole(tmp_path: Path) -> None:
@@ -25,37 +25,6 @@ def test_a_file_appears_whole(tmp_path: Path) -> None:
         temporary.write_text("whole")
     assert target.read_text() == "whole"
     assert os.listdir(target.parent) == ["result.json"]
-
-
-def write_half(target: Path, problem: BaseException) -> None:
-    with replaced(target) as temporary:
-        temporary.write_text("half")
-        raise problem
-
-
-@pytest.mark.parametrize("problem", [RuntimeError(), KeyboardInterrupt()])
-def test_what_was_there_stays_when_writing_breaks_off(tmp_path: Path, problem: BaseException) -> None:
-    target = tmp_path / "result.json"
-    target.write_text("before")
-    with pytest.raises(type(problem)):
-        write_half(target, problem)
-    assert target.read_text() == "before"
-    assert os.listdir(tmp_path) == ["result.json"]
-
-
-def test_a_full_disk_is_one_clear_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"result\.json: cannot be written: No space left"):
-        write_half(tmp_path / "result.json", OSError(28, "No space left on device"))
-    assert os.listdir(tmp_path) == []
-
-
-def test_nothing_is_written_where_a_folder_or_a_file_stands(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(ConfigError, match="is a folder"), replaced(tmp_path):
-        pytest.fail("the block must not run")
-    with pytest.raises(ConfigError, match="cannot be created as a folder"), replaced(tmp_path / "file" / "result.json"):
-        pytest.fail("the block must not run")
-    assert os.listdir(tmp_path) == ["file"]
 
 
 def test_two_writers_do_not_meet(tmp_path: Path) -> None:
@@ -76,13 +45,6 @@ def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
     refuse_existing(tmp_path / "new.json", overwrite=False)
 
 
-def test_json_comes_back_as_it_was(tmp_path: Path) -> None:
-    value = {"ü": [1, 0.1, 1e-300, None, True, "a\nb"], "t_ns": 1_700_000_000_123_456_789}
-    write_json(tmp_path / "a.json", value)
-    assert read_json(tmp_path / "a.json") == value
-    assert (tmp_path / "a.json").read_text(encoding="utf-8").endswith("\n")
-
-
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 DOCUMENTS = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats(allow_nan=False, allow_infinity=False) | TEXTS,
@@ -99,13 +61,6 @@ def test_any_document_is_read_as_it_was_written(tmp_path: Path, value: object) -
     assert read == value
     assert repr(read) == repr(value)  # not 1 for 1.0 or True, not 0.0 for -0.0
     assert os.listdir(tmp_path) == ["a.json"]
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), object()])
-def test_json_that_cannot_be_written_leaves_nothing(tmp_path: Path, value: object) -> None:
-    with pytest.raises((ValueError, TypeError)):
-        write_json(tmp_path / "a.json", {"a": [1, value]})
-    assert os.listdir(tmp_path) == []
 
 
 def test_too_large_a_file_is_not_even_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,22 +108,6 @@ def test_what_is_wrong_with_a_json_file_is_named(tmp_path: Path, content: bytes,
         read_json(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert len(str(caught.value)) < 400 + len(str(path))
-
-
-def test_half_a_surrogate_pair_is_refused_where_it_is_read(tmp_path: Path) -> None:
-    """It could not be written again, nor shown."""
-    path = tmp_path / "a.json"
-    path.write_text(r'{"whole": "\ud83d\ude97", "escaped": "\\ud83d"}')
-    assert read_json(path) == {"whole": "\U0001f697", "escaped": "\\ud83d"}
-    path.write_text(r'{"name": ["a\uD83Db"]}')
-    with pytest.raises(ScenarioError, match=r"has '\\ud83d', an unpaired surrogate"):
-        read_json(path, ScenarioError)
-
-
-def test_rounded_numbers_for_json() -> None:
-    assert rounded(1.23456, 2) == 1.23
-    assert rounded(float("nan"), 2) is None
-    assert rounded(float("-inf"), 2) is None
 
 
 @pytest.mark.parametrize(

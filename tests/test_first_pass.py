@@ -2,34 +2,50 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from worlds import camera_ahead, outline_px, scan, standing
 
 from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
-from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import observe
-from log2sim.perception.frames import RecordReader
+from log2sim.perception.frames import AHEAD, RecordReader, look_again, work_ahead
 from log2sim.perception.fusion import fuse
-from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, sample_rays
 from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan, select_sensors
 
 T0_NS = 1_700_000_000_000_000_000
+
+
 STEP_NS = 100_000_000
+
+
 TICKS = 4
+
+
 SPEED_MPS = 5.0
+
+
 SOLIDS = (standing(16.0, 3.0, 30.0), standing(12.0, -4.0, 0.0, (0.7, 0.7, 1.75)))
+
+
 CATEGORIES = ("car", "pedestrian")
+
+
 EGO_T_LIDAR = transform(np.eye(3), np.array([0.0, 0.0, 1.9]))
+
+
 STAMPS = T0_NS + np.arange(TICKS) * STEP_NS
 
 
@@ -133,25 +149,6 @@ def test_obstacles_are_the_points_above_the_ground_at_their_places():
         assert world[:, 2].min() > 0.1
 
 
-def test_obstacles_are_thinned_evenly_and_nothing_is_lost_of_an_object():
-    log, _ = driving_log()
-    out, _ = run(log)
-    world = out.obstacles[0].xyz + out.obstacles[0].origin
-    gap = np.linalg.norm(world[:, None] - world[None], axis=2) + np.eye(len(world))
-    full, owner = scan(SOLIDS, noise_m=0.01, seed=0)
-    full = full[(owner >= 0) & (full[:, 2] > 0.25)]
-    assert len(world) < 0.8 * len(full)
-    assert np.linalg.norm(full[:, None] - world[None], axis=2).min(axis=1).max() < 0.12 * np.sqrt(3) + 1e-3
-    assert np.median(gap.min(axis=1)) > 0.03
-
-
-def test_what_is_out_of_range_is_left_out():
-    log, _ = driving_log()
-    out, _ = run(log, max_range_m=14.0)
-    # The car is 16.3 m away at first and comes within 14 m after half a second; the person is 12.6 m away.
-    assert [m.category[m.source == "lidar"].tolist() for m in out.measurements] == [["pedestrian"]] * TICKS
-
-
 def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     log, reads = driving_log(cameras=("front", "left"))
     detector = Truth(log)
@@ -164,37 +161,6 @@ def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     log, reads = driving_log(cameras=("front", "left"))
     run(log, Truth(log, looks=True), reads=reads)
     assert reads == {(s, i): 1 for s in ("front", "left", "top") for i in range(TICKS)}
-
-
-def test_cameras_that_are_searched_now_and_then_take_turns_and_say_nothing_in_between():
-    log, reads = driving_log(cameras=("front", "left"))
-    sensors = select_sensors(log, Config())
-    schedule = synchronize(log, sensors.cameras)
-    plan = replace(make_plan(log, Config.load(), sensors, schedule.t_ns), picture_stride=2, detector_stride=1)
-    detector = Truth(log, looks=True)
-    reads.clear()
-    out = observe(
-        log, schedule, detector, plan, mode="robust", max_range_m=80.0, clock=StageClock(), progress=lambda *_: None
-    )
-    asked = [("left" if i % 2 else "front", int(STAMPS[i])) for i in range(TICKS)]
-    assert detector.frames == asked
-    assert {name: sorted(i for n, i in reads if n == name) for name in ("front", "left")} == {
-        "front": [0, 2],
-        "left": [1, 3],
-    }
-    assert [set(m.camera.tolist()) for m in out.measurements] == [{"front"}, {"left"}, {"front"}, {"left"}]
-    assert out.unseen == {"front": [1, 3], "left": [0, 2]}
-    assert (out.frames_detected, out.frames_skipped) == (TICKS, {"front": 2, "left": 2})
-    assert out.recorded(schedule)["front"].tolist() == [True, False, True, False]
-
-
-def test_what_only_one_of_two_cameras_sees_is_kept():
-    log, _ = driving_log(cameras=("front", "left"))
-    detector, every = Truth(log), Truth(log)
-    detector.detect = lambda frame: every.detect(frame).take([0] if frame.camera.name == "front" else [1])
-    out, _ = run(log, detector)
-    for m in out.measurements:
-        assert sorted(zip(m.camera.tolist(), m.category.tolist())) == [("front", "car"), ("left", "pedestrian")]
 
 
 def test_one_torn_image_and_one_torn_sweep_are_counted_and_cost_only_their_tick():
@@ -210,39 +176,6 @@ def test_one_torn_image_and_one_torn_sweep_are_counted_and_cost_only_their_tick(
         "front": {"count": 1, "first": "front 1: torn"},
         "top": {"count": 1, "first": "top 2: torn"},
     }
-
-
-def test_an_empty_sweep_counts_as_one_that_cannot_be_read():
-    log, _ = driving_log(empty={("top", 1)})
-    out, _ = run(log)
-    assert out.records.summary()["top"]["count"] == 1
-    assert str(STAMPS[1]) in out.records.summary()["top"]["first"]
-    assert out.obstacles[1] is None
-
-
-@pytest.mark.parametrize("stream", ["front", "left"])
-def test_a_stream_of_which_nothing_can_be_read_is_an_error_that_names_it(stream):
-    log, _ = driving_log(broken={(stream, i) for i in range(TICKS)}, cameras=("front", "left"))
-    with pytest.raises(LogError, match=f"stream '{stream}': none of the {TICKS} records asked for can be read.*torn"):
-        run(log, Truth(log, looks=True))
-
-
-def test_records_count_what_was_read_and_what_was_not():
-    log, _ = driving_log(broken={("top", 0)})
-    records = RecordReader(log)
-    assert records.get("top", 0) is None
-    with pytest.raises(LogError, match="stream 'top'"):
-        records.require_some()
-    assert isinstance(records.get("top", 1), Sweep)
-    records.require_some()
-    assert (records.read, records.failed) == ({"top": 1}, {"top": ["top 0: torn"]})
-
-
-def test_a_log_without_lidar_gives_rows_without_a_place():
-    log, _ = driving_log()
-    out, _ = run(replace(log, lidars={}))
-    assert [m.source.tolist() for m in out.measurements] == [["", ""]] * TICKS
-    assert list(out.obstacles) == [None] * TICKS
 
 
 def roadside(log):
@@ -269,13 +202,6 @@ def test_sensors_on_a_post_need_no_ego():
     origin, ground = cloud_origin(log, T0_NS)
     np.testing.assert_allclose(origin, [0.0, 0.0, (1.9 + 1.6) / 2])
     assert ground == 0.0
-
-
-def test_ticks_at_which_the_ego_is_not_known_have_no_measurements():
-    log, _ = driving_log()
-    known = PoseTrack(log.ego.t_ns[:3], log.ego.map_T_ego[:3], extrapolate_s=0.0)
-    out, _ = run(replace(log, ego=known))
-    assert [len(m) for m in out.measurements] == [2, 0, 0, 0]
 
 
 def test_the_ground_under_the_ego_turns_with_its_pitch():
@@ -330,15 +256,6 @@ def test_a_repeated_sweep_counts_as_not_recorded_and_is_told():
     ]
 
 
-def test_pictures_that_repeat_while_the_ego_drives_are_not_used_and_told():
-    log, _ = driving_log()
-    picture = np.random.default_rng(0).integers(0, 255, (60, 120, 3), dtype=np.uint8).repeat(10, 0).repeat(10, 1)
-    out, _ = run(with_records(log, front=lambda i: picture))
-    assert out.unseen == {"front": [1, 2, 3]}
-    assert [len(m) for m in out.measurements] == [2, 0, 0, 0]
-    assert [(f.kind, f.sensor, f.values["count"]) for f in out.faults] == [("frozen_images", "front", 3)]
-
-
 @pytest.mark.parametrize("finds", [True, False])
 def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
     log, _ = driving_log()
@@ -350,8 +267,138 @@ def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
     assert [f.kind for f in out.faults] == ([] if finds else ["black_images"])
 
 
-def test_with_boxes_from_the_log_no_picture_is_looked_at():
-    log, _ = driving_log()
-    out, _ = run(log, labels=True)
-    assert out.unseen == {}
-    assert out.faults == ()
+SIZE = (64, 48)
+
+
+K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1.0]])
+
+
+class Wants:
+    """Takes note of what comes."""
+
+    def __init__(self, **frames: list[int]) -> None:
+        self.wanted = {name: np.array(index, dtype=np.int64) for name, index in frames.items()}
+        self.got: list[tuple[str, int, int]] = []
+
+    def frames(self) -> dict[str, NDArray[np.int64]]:
+        return self.wanted
+
+    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
+        self.got.append((camera, index, int(image_bgr[0, 0, 0])))
+
+
+def log_of(reads: list[tuple[str, int]], *, black: int = -1, broken: int = -1) -> Log:
+    """Two cameras with 5 frames each, the second 50 ms later; the first pixel of a frame is its index."""
+
+    def read(name: str, i: int) -> NDArray[np.uint8]:
+        reads.append((name, i))
+        if i == broken:
+            raise RecordError("broken")
+        blocks = np.random.default_rng([i, len(name)]).integers(0, 255, (6, 8, 3)).astype(np.uint8)
+        image = blocks.repeat(8, axis=0).repeat(8, axis=1)
+        image[0, 0] = i
+        return np.zeros_like(image) if i == black else image
+
+    cameras = {n: Camera(n, *SIZE, K, "map", np.eye(4)) for n in ("left", "right2")}
+    streams = {
+        name: Stream(name, np.arange(5, dtype=np.int64) * 10**8 + k * 5 * 10**7, lambda i, n=name: read(n, i))
+        for k, name in enumerate(cameras)
+    }
+    return Log("l", "synthetic", cameras, {}, streams)
+
+
+def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
+    reads: list[tuple[str, int]] = []
+    log = log_of(reads)
+    first, second = Wants(left=[3, 1, 1], right2=[1]), Wants(left=[3, 4])
+    steps: list[tuple[int, int]] = []
+    assert look_again(log, RecordReader(log), [first, second], lambda *step: steps.append(step)) == 4
+    assert first.got == [("left", 1, 1), ("right2", 1, 1), ("left", 3, 3)]
+    assert second.got == [("left", 3, 3), ("left", 4, 4)]
+    assert sorted(reads) == [("left", 1), ("left", 3), ("left", 4), ("right2", 1)]
+    assert steps == [(k + 1, 4) for k in range(4)]
+
+
+PATIENCE_S = 20.0
+
+
+def test_no_more_is_made_ahead_than_asked_for() -> None:
+    begun: list[int] = []
+    results = work_ahead(begun.append, range(100), ahead=3)
+    next(results)
+    assert len(begun) <= 5
+    results.close()
+
+
+def test_an_error_comes_with_the_item_that_caused_it() -> None:
+    results = work_ahead(lambda n: 6 // n, [3, 2, 0, 1])
+    assert [next(results), next(results)] == [2, 3]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_closing_an_iterator_does_not_wait_for_its_work() -> None:
+    """The garbage collector may close it under a lock that the working threads need to end."""
+    started, held, closed = threading.Event(), threading.Event(), threading.Event()
+
+    def work(n: int) -> int:
+        if n:
+            started.set()
+            held.wait(PATIENCE_S)
+        return n
+
+    results = work_ahead(work, range(2 * AHEAD), ahead=1)
+    assert next(results) == 0
+    assert started.wait(PATIENCE_S)
+
+    def close() -> None:
+        results.close()
+        closed.set()
+
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
+    in_time = closed.wait(PATIENCE_S / 4)
+    held.set()
+    closing.join()
+    assert in_time
+
+
+def cloud_of(xyz, *, height=None, sensors=(), t_s=None):
+    n = len(xyz)
+    height = xyz[:, 2] if height is None else height
+    t_s = np.zeros(n) if t_s is None else t_s
+    return Cloud(
+        10**18, np.array([1e5, 2e6, 3.0]), xyz.astype(np.float32), t_s.astype(np.float32),
+        np.array([0, 0, 2.0], np.float32), np.abs(height) < 0.1, height.astype(np.float32), tuple(sensors),
+    )  # fmt: skip
+
+
+def directions(rays):
+    to = rays.end - rays.start
+    return np.arctan2(to[:, 1], to[:, 0]), to[:, 2] / np.hypot(to[:, 0], to[:, 1])
+
+
+def test_near_and_far_points_keep_their_share() -> None:
+    # A wall at 5 m on one half and one at 40 m on the other, both with a ray every 0.1 degrees.
+    azimuth, slope = (
+        a.ravel() for a in np.meshgrid(np.deg2rad(np.arange(-80, 80, 0.1)), np.deg2rad(np.arange(-2, 2, 0.1)))
+    )
+    reach = np.where(azimuth < 0, 5.0, 40.0)
+    rays = sample_rays(cloud_of(np.column_stack([reach * np.cos(azimuth), reach * np.sin(azimuth), 2 + reach * slope])))
+    near = np.hypot(rays.end[:, 0], rays.end[:, 1]) < 6
+    assert near.sum() == pytest.approx((~near).sum(), rel=0.02)
+    assert len(rays) == pytest.approx(160 / 0.5 * 4 / 0.5, rel=0.15)
+    found_azimuth, found_slope = directions(rays)
+    assert np.ptp(found_azimuth) == pytest.approx(np.deg2rad(160), abs=2 * CELL_RAD)
+    assert np.ptp(found_slope) == pytest.approx(np.deg2rad(4), abs=2 * CELL_RAD)
+
+
+def test_each_ray_starts_where_its_sensor_was() -> None:
+    sensors = [
+        CloudSensor(2, np.array([1.0, 0, 2]), np.array([10.0, 0, 0])),
+        CloudSensor(1, np.array([-1.0, 3, 1]), np.zeros(3)),
+    ]
+    xyz = np.array([[20.0, 0, 1], [0, 20, 1], [-20, 0, 1]])
+    rays = sample_rays(cloud_of(xyz, sensors=sensors, t_s=np.array([0.0, -0.1, 0.05])))
+    start_of = {tuple(e): s for e, s in zip(rays.end.round(3).tolist(), rays.start.round(3).tolist())}
+    assert start_of == {(20, 0, 1): [1, 0, 2], (0, 20, 1): [0, 0, 2], (-20, 0, 1): [-1, 3, 1]}

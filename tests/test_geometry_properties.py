@@ -23,15 +23,10 @@ from log2sim.geometry import (
     polygon_area,
     project,
     project_boxes,
-    quaternion_from_rotation,
-    rectangles_overlap,
-    rotation_from_quaternion,
     rotation_from_rpy,
     slerp,
     transform,
     undistort,
-    wrap_angle,
-    yaw_of,
 )
 
 ANGLE = st.floats(-10.0, 10.0)
@@ -64,17 +59,6 @@ def test_transforms_compose_and_their_inverse_undoes_them(a_T_b: Array, b_T_c: A
     np.testing.assert_allclose(each, apply(a_T_b, points), atol=1e-7)
 
 
-@given(QUATERNIONS)
-def test_a_rotation_keeps_its_quaternion_up_to_the_sign(q: Array) -> None:
-    rotation = rotation_from_quaternion(q)
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
-    again, unit = quaternion_from_rotation(rotation), q / np.linalg.norm(q)
-    assert again[0] >= 0
-    assert abs(abs(again @ unit) - 1) < 1e-12
-    np.testing.assert_allclose(rotation_from_quaternion(again), rotation, atol=1e-12)
-
-
 @given(QUATERNIONS, QUATERNIONS, st.floats(0.0, 1.0))
 def test_slerp_turns_at_a_constant_rate_and_the_same_way_from_both_ends(p: Array, q: Array, fraction: float) -> None:
     p, q = p / np.linalg.norm(p), q / np.linalg.norm(q)
@@ -84,14 +68,6 @@ def test_slerp_turns_at_a_constant_rate_and_the_same_way_from_both_ends(p: Array
     assert abs(there @ back) == pytest.approx(1.0, abs=1e-9)
     whole, part = (2 * np.arccos(min(abs(p @ other), 1.0)) for other in (q, there))
     assert part == pytest.approx(fraction * whole, abs=1e-6)
-
-
-@given(st.floats(-1e6, 1e6), st.integers(-1000, 1000))
-def test_a_wrapped_angle_is_the_same_direction_within_half_a_turn(angle: float, turns: int) -> None:
-    wrapped = float(wrap_angle(angle))
-    assert -np.pi <= wrapped < np.pi
-    assert np.exp(1j * wrapped) == pytest.approx(np.exp(1j * angle), abs=1e-9)
-    assert np.exp(1j * float(wrap_angle(angle + 2 * np.pi * turns))) == pytest.approx(np.exp(1j * angle), abs=1e-8)
 
 
 @given(RECTANGLES, RECTANGLES)
@@ -108,16 +84,6 @@ def test_overlap_is_symmetric_and_bounded(a: Rectangle, b: Rectangle) -> None:
     assert float(bev_iou(p, p)) == pytest.approx(1.0)
 
 
-def test_overlap_of_boxes_with_collinear_edges_is_that_of_their_intervals() -> None:
-    rng, n = np.random.default_rng(0), 3000
-    xy, yaw, width = rng.uniform(-2, 2, (n, 2)), rng.uniform(-4, 4, n), rng.uniform(0.3, 5, n)
-    length, ahead = rng.uniform(0.3, 8, (2, n)), rng.uniform(-5, 5, n)
-    a = box_corners_bev(xy, length[0], width, yaw)
-    b = box_corners_bev(xy + ahead[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)]), length[1], width, yaw)
-    along = np.minimum(length[0] / 2, ahead + length[1] / 2) - np.maximum(-length[0] / 2, ahead - length[1] / 2)
-    np.testing.assert_allclose(overlap_area(a, b), np.maximum(along, 0.0) * width, atol=1e-9)
-
-
 @given(RECTANGLES, RECTANGLES, ANGLE, METERS, METERS)
 def test_overlap_does_not_change_under_rigid_motion(
     a: Rectangle, b: Rectangle, yaw: float, east_m: float, north_m: float
@@ -126,26 +92,6 @@ def test_overlap_does_not_change_under_rigid_motion(
     turn = rotation_from_rpy(0.0, 0.0, yaw)[:2, :2]
     moved = [c @ turn.T + [100 * east_m, 100 * north_m] for c in (p, q)]
     assert float(overlap_area(*moved)) == pytest.approx(float(overlap_area(p, q)), abs=1e-6)
-
-
-@given(RECTANGLES, RECTANGLES)
-def test_separating_axes_agree_with_the_shared_area(a: Rectangle, b: Rectangle) -> None:
-    (dx, dy), size_a, size_b = b[0] - a[0], a[1][None], b[1][None]
-    yaw_a, yaw_b = np.array([a[2]]), np.array([b[2]])
-    overlap = rectangles_overlap(np.array([dx]), np.array([dy]), yaw_a, yaw_b, size_a, size_b)[0]
-    shared = float(overlap_area(corners(a), corners(b)))
-    assert overlap or shared < 1e-8
-    bigger = rectangles_overlap(np.array([dx]), np.array([dy]), yaw_a, yaw_b, size_a + 1e-3, size_b + 1e-3)[0]
-    assert bigger or not overlap
-
-
-def test_overlap_broadcasts_and_ignores_what_has_no_area() -> None:
-    square = box_corners_bev([[0.0, 0.0]], 2.0, 2.0, 0.0)[0]
-    many = box_corners_bev([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [np.nan, 0.0]], 2.0, 2.0, 0.0)
-    np.testing.assert_allclose(overlap_area(square, many), [4.0, 2.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(overlap_area(square[None], many), overlap_area(many, square))
-    assert overlap_area(many[:0], many[:0]).shape == (0,)
-    assert overlap_area(many[:3, None], many[None, :3]).shape == (3, 3)
 
 
 @given(st.lists(st.integers(-(10**9), 10**9), min_size=1, max_size=30), st.lists(st.integers(-(2 * 10**9), 2 * 10**9)))
@@ -200,10 +146,3 @@ def test_the_image_box_of_a_box_holds_all_of_it_that_the_image_shows(
         flat = points[ahead, :2] / points[ahead, 2:]
         assert np.all(flat.min(axis=0) >= hull.min(axis=0) - 1e-6)
         assert np.all(flat.max(axis=0) <= hull.max(axis=0) + 1e-6)
-
-
-@given(TRANSFORMS)
-def test_yaw_turns_with_the_frame(a_T_b: Array) -> None:
-    turned = transform(rotation_from_rpy(0.0, 0.0, 0.5), np.zeros(3)) @ a_T_b
-    assume(np.hypot(*a_T_b[:2, 0]) > 1e-6)  # x axis not vertical, else there is no yaw
-    assert float(wrap_angle(yaw_of(turned) - yaw_of(a_T_b) - 0.5)) == pytest.approx(0.0, abs=1e-6)

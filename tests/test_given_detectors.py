@@ -12,7 +12,7 @@ from worlds import tiny_log
 from log2sim import Config, reconstruct
 from log2sim.datatypes import Boxes3D, Detections, Frame, Log
 from log2sim.errors import PluginError
-from log2sim.perception.detect.detectors import FunctionDetector, create_detector, detections_of
+from log2sim.perception.detect.detectors import FunctionDetector
 from log2sim.perception.run_detectors import sort_detectors
 
 
@@ -91,76 +91,9 @@ def test_a_wrong_answer_says_where_and_what(frame: Frame, answer: Any, message: 
         given(answer, frame)
 
 
-def test_what_a_function_raises_is_told_with_its_line(frame: Frame) -> None:
-    def find_cars(image: Any) -> None:
-        raise KeyError("weights")
-
-    detector = sort_detectors(find_cars, Config()).images
-    assert detector is not None
-    with pytest.raises(
-        PluginError, match=r"detector 'find_cars': .* raised KeyError: 'weights' \(line \d+ of test_given"
-    ):
-        detector.detect(frame)
-
-
-def test_detectors_are_told_apart(log: Log) -> None:
-    def find_cars(image: Any) -> list[Any]:
-        return []
-
-    in_images = create_detector("labels", log)
-    cases: list[tuple[Any, str]] = [
-        (None, "auto"),
-        ("lidar:vehicle", "lidar:vehicle"),
-        (find_cars, "given:find_cars"),
-        (in_images, "given:labels"),
-        (InSweeps(), "lidar:given:mine"),
-        ([find_cars, "lidar:vehicle"], "given:find_cars+lidar:vehicle"),
-        ((InSweeps(), in_images), "given:labels+lidar:given:mine"),
-    ]
-    for detector, name in cases:
-        assert sort_detectors(detector, Config()).config.detect.name == name
-    assert sort_detectors(find_cars, Config(detect={"tiles": 2})).config.detect.tiles == 2
-
-
-@pytest.mark.parametrize("wrong", [3, [], [print, "labels"], [InSweeps(), "lidar:vehicle"], np.ones(3)])
-def test_what_is_no_detector_is_a_type_error(wrong: Any) -> None:
-    with pytest.raises(TypeError, match=r"^detector: .*expected a function of a picture that returns rows"):
-        sort_detectors(wrong, Config())
-
-
-def test_an_incomplete_object_names_what_it_lacks() -> None:
-    class Incomplete:
-        name = "mine"
-
-        def detect(self, frame: Frame) -> Detections:
-            return Detections.empty()
-
-    with pytest.raises(
-        PluginError,
-        match=r"^detector 'mine': is a Incomplete without 'default_min_score'; expected an object with name, default_min_score, detect",
-    ):
-        sort_detectors(Incomplete(), Config())
-
-
-@pytest.mark.slow
-def test_an_object_finds_what_the_detector_of_its_name_finds(log: Log) -> None:
-    config = Config(stop_s=0.6, map={"lanes": False}, appearance={"colors": False, "signals": False})
-    named = reconstruct(log, config.changed(detect="labels")).scenario
-    handed = reconstruct(log, config, detector=create_detector("labels", log)).scenario
-    assert handed.provenance["detector"] == "labels"
-    assert handed.provenance["config"]["detect"]["name"] == "given:labels"
-    assert [a.id for a in handed.agents] == [a.id for a in named.agents]
-    for ours, theirs in zip(handed.agents, named.agents):
-        assert ours.waypoints.x_m == pytest.approx(theirs.waypoints.x_m, abs=1e-6)
-
-
 def test_sweeps_are_searched_by_what_is_handed_over(log: Log) -> None:
     config = Config(stop_s=0.3, map={"lanes": False})
     result = reconstruct(log, config, detector=[lambda image: [], InSweeps()])
     assert result.scenario.provenance["detector"] == "lambda+mine"
     assert [a.id for a in result.scenario.agents] == ["ego"]
     assert repr(result).startswith("<Result: <Scenario 'tiny': the ego and 0 other agents")
-
-
-def test_rows_alone() -> None:
-    assert detections_of(np.zeros((0, 6))).box_px.shape == (0, 4)

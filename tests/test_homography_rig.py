@@ -13,20 +13,11 @@ from log2sim.geometry import Camera, PoseTrack, apply, apply_homography, inverse
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.rig import (
-    HeightRows,
     Rig,
-    RigRows,
-    RigState,
-    find_plane,
-    foot_homography,
-    heights_of,
-    linearize_feet,
-    road_homography,
     rotation_of,
-    tilt_of_ticks,
 )
-from log2sim.perception.homography.rig_fit import RigFit, fit_feet, fit_rig
-from log2sim.perception.homography_stage import fit_homographies, list_rigs
+from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.homography_stage import fit_homographies
 from log2sim.plan import HomographyScope, Plan
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
@@ -117,27 +108,6 @@ def test_exact_data_give_the_plane_and_the_homographies() -> None:
     assert all(f.ok and f.inliers.all() and f.error_m < 1e-3 for f in fit.fits.values())
 
 
-def test_the_derivatives_of_feet_are_those_of_their_errors() -> None:
-    world = make_world(noise_px=2.0)
-    rig = Rig.of(world.cameras, 0.0)
-    rows = RigRows.of(rig, world.feet, 1.0, 1e-6)  # the whitening does not move with the state
-    state, step = RigState.calibrated(rig, PLANE), 1e-6
-    start = linearize_feet(rig, rows, state)
-    changes = [replace(state, below_px=step), replace(state, lift_m=dict.fromkeys(rig.cameras, step))]
-    changes += [replace(state, feet=dict.fromkeys(rig.cameras, step * e)) for e in np.eye(3)]
-    for k, changed in enumerate(changes):
-        numeric = (linearize_feet(rig, rows, changed).error - start.error) / step
-        np.testing.assert_allclose(numeric, start.slope[:, :, k], rtol=2e-3, atol=0.05)
-
-
-def test_a_ray_passes_over_its_ground_position_at_the_height_of_the_ground() -> None:
-    world = make_world()
-    rig = Rig.of(world.cameras, 0.0)
-    rows = RigRows.of(rig, world.ground, 1.0, 0.1)
-    plane = at_origin(rig)
-    np.testing.assert_allclose(heights_of(rig, rows)[0], rows.xy @ plane[:2] + plane[2], atol=1e-9)
-
-
 @pytest.mark.parametrize("outliers", [0.0, 0.4])
 def test_feet_with_noise_and_outliers_place_obstacles(outliers: float) -> None:
     world = make_world(noise_px=2.0, outliers=outliers, each=12)
@@ -176,105 +146,10 @@ def test_a_mount_that_is_off_is_found_by_the_feet_and_leaves_the_others_alone() 
     assert world.error_m({n: f.ground_H_image for n, f in fit.fits.items()}, PLANE) < 0.3
 
 
-def test_a_camera_without_feet_has_the_ground_of_the_others() -> None:
-    world = make_world(noise_px=1.0)
-    world.feet["rear"] = world.ground["rear"] = Correspondences.join([])
-    fit = world.fit()
-    assert fit.fits["rear"].ok
-    assert world.error_m({n: f.ground_H_image for n, f in fit.fits.items()}, PLANE) < 0.6
-
-
-def test_pitch_and_roll_of_each_tick_are_those_of_all_cameras() -> None:
-    still, moving = make_world(noise_px=1.0).fit(), make_world(noise_px=1.0, tilt=0.005, ticks=40).fit()
-    assert len(still.ticks) == 0
-    assert moving.fits["front"].pitch_roll is not None
-    assert moving.fits["front"].pitch_roll.per_tick
-    assert all(f.per_tick is not None and f.per_tick.shape == (40, 3, 3) for f in moving.fits.values())
-    slopes = PLANE[:2] + 0.005 * np.random.default_rng(0).normal(size=(40, 2))
-    np.testing.assert_allclose(moving.planes[:, :2], slopes, atol=1e-3)
-
-
-def test_a_camera_whose_feet_contradict_the_rig_is_refused_alone() -> None:
-    world, rng = make_world(noise_px=1.0, each=10), np.random.default_rng(3)
-    rows = world.feet["rear"]
-    world.feet["rear"] = replace(rows, uv=rng.uniform([0, 400], [1280, 720], rows.uv.shape))
-    fit = world.fit()
-    assert not fit.fits["rear"].ok
-    assert "agree with the rig" in fit.fits["rear"].reason
-    assert all(fit.fits[n].ok for n in ("front", "left", "right"))
-
-
-def test_nothing_is_fitted_to_nothing_or_to_one_line() -> None:
-    world = make_world()
-    none = {n: Correspondences.join([]) for n in world.cameras}
-    empty = fit_rig(Rig.of(world.cameras, 0.0), none, none, rng=np.random.default_rng(0))
-    assert "0 correspondences" in empty.reason
-    assert empty.fits == {}
-    assert empty.road_at_tick("front", 0) is None
-    x = np.linspace(5, 40, 60)
-    line = HeightRows(np.column_stack([x, 0 * x, 1 + 0 * x]), 0 * x, 0.1 + 0 * x, np.arange(60) // 6)
-    assert find_plane(line, np.random.default_rng(0)) is None
-
-
-def test_a_turn_and_a_far_origin_of_the_frame_change_nothing() -> None:
-    world = make_world(noise_px=1.0)
-    yaw, far = rotation_from_rpy(0, 0, 1.1), np.array([5e5, 5e6, 0.0])
-    moved = transform(yaw, far)
-    cameras = {n: replace(c, mount_T_cam=moved @ c.mount_T_cam) for n, c in world.cameras.items()}
-
-    def shifted(found: dict[str, Correspondences]) -> dict[str, Correspondences]:
-        return {n: replace(c, xy_ego=c.xy_ego @ yaw[:2, :2].T + far[:2]) for n, c in found.items()}
-
-    there = World(cameras, cameras, shifted(world.feet), shifted(world.ground)).fit()
-    here, uv = world.fit(), np.array([[640.0, 500.0], [300.0, 450.0]])
-    for name in cameras:
-        a, b = (apply_homography(f.fits[name].ground_H_image, uv)[0] for f in (here, there))
-        np.testing.assert_allclose(b, a @ yaw[:2, :2].T + far[:2], atol=2e-3)
-
-
-def test_ticks_without_rows_of_their_own_keep_the_plane() -> None:
-    tick = np.repeat(np.arange(3), [40, 1, 40])
-    rng = np.random.default_rng(0)
-    xy1 = np.column_stack([rng.uniform(-20, 20, (81, 2)), np.ones(81)])
-    slopes = np.array([[0.01, 0.0], [0.0, 0.0], [-0.01, 0.0]])
-    rows = HeightRows(xy1, (xy1[:, :2] * slopes[tick]).sum(axis=1), np.full(81, 0.05), tick)
-    ticks, tilt = tilt_of_ticks(rows, np.zeros(3))
-    assert ticks.tolist() == [0, 1, 2]
-    np.testing.assert_allclose(tilt, slopes, atol=1e-3)
-
-
-def test_feet_lie_on_the_road_where_boxes_end_there() -> None:
-    world = make_world()
-    rig = Rig.of(world.cameras, 0.0)
-    rows = RigRows.of(rig, world.feet, 4.0, 0.2)
-    state = fit_feet(rig, rows, RigState.calibrated(rig, at_origin(rig))).state
-    for name in rig.cameras:
-        uv = np.array([[640.0, 480.0]])
-        road, feet = (apply_homography(h(rig, state, name), uv)[0] for h in (road_homography, foot_homography))
-        np.testing.assert_allclose(feet, road, atol=1e-2)
-
-
 def log_of(cameras: dict[str, Camera], *, ego: bool = True) -> Log:
     t = T0_NS + np.arange(3) * 100_000_000
     track = PoseTrack(t, np.repeat(np.eye(4)[None], 3, axis=0)) if ego else None
     return Log("log", "test", cameras, {}, {n: Stream(n, t, lambda i: None) for n in cameras}, track)
-
-
-def test_rigs_are_the_cameras_of_one_place() -> None:
-    cameras = make_cameras()
-    assert list_rigs(log_of(cameras), list(cameras)) == ([list(cameras)], {})
-    rigs, why = list_rigs(log_of({"front": cameras["front"]}), ["front"])
-    assert (rigs, why) == ([], {"front": "no other camera is in its place"})
-    flat = {**cameras, "low": make_camera("low", 0.0, (1.0, 0.0, 0.1))}
-    rigs, why = list_rigs(log_of(flat), list(flat))
-    assert rigs == [list(cameras)]
-    assert "how high" in why["low"]
-    poles = {n: make_camera(n, 0.0, at, "map") for n, at in {"a": (0, 0, 5), "b": (1, 0, 5), "c": (60, 0, 5)}.items()}
-    rigs, why = list_rigs(log_of(poles, ego=False), list(poles))
-    assert (rigs, list(why)) == ([["a", "b"]], ["c"])
-    both = {**cameras, **poles}
-    rigs, why = list_rigs(log_of(both), list(both))
-    assert (rigs, sorted(why)) == ([list(cameras)], ["a", "b", "c"])
 
 
 def test_the_stage_fits_together_what_it_can_and_says_why_the_rest_is_apart() -> None:

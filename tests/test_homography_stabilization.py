@@ -17,8 +17,6 @@ from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy
 from log2sim.perception.homography import estimate
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
-from log2sim.perception.homography.fit import HomographyFit, PitchRoll
-from log2sim.perception.homography.pitch_roll import two_folds
 from log2sim.pipeline import reconstruct
 from log2sim.tracking.tracker import track_ends
 
@@ -135,13 +133,6 @@ def test_a_pitching_vehicle_places_far_cars_as_well_as_one_that_does_not_pitch(m
         assert np.abs(stabilized.error_m - still.error_m).max() < 0.2
 
 
-@pytest.mark.slow
-def test_poses_that_do_not_tell_the_pitch_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    told, untold = (outcome(pitching_log(0.3, level_poses=level), monkeypatch) for level in (False, True))
-    assert untold.homography["pitch_roll"]["per_tick"]
-    np.testing.assert_allclose(untold.error_m, told.error_m, atol=0.15)
-
-
 def test_a_camera_that_moves_on_its_own_is_found_by_the_obstacles_alone() -> None:
     # The LiDAR's ground points are projected by the calibration and tell nothing of a camera that shakes in its mount.
     rng = np.random.default_rng(3)
@@ -159,37 +150,3 @@ def test_a_camera_that_moves_on_its_own_is_found_by_the_obstacles_alone() -> Non
     assert fit.pitch_roll.per_tick
     assert fit.pitch_roll.source == "obstacles"
     assert fit.pitch_roll.pitch_sigma_deg == pytest.approx(np.degrees(shake_px.std() / 2000), rel=0.1)
-
-
-def test_noise_of_the_obstacles_alone_is_no_movement() -> None:
-    rng = np.random.default_rng(4)
-    accepted = 0
-    for _ in range(10):
-        tick = np.repeat(np.arange(40), 6)
-        xy = np.column_stack([rng.uniform(8.0, 50.0, len(tick)), rng.uniform(-8.0, 8.0, len(tick))])
-        uv = np.column_stack([960 - 2000 * xy[:, 1] / xy[:, 0], 600 + 2000 * 1.6 / xy[:, 0]])
-        feet = Correspondences(uv + rng.normal(0.0, 4.0, uv.shape), xy, tick)
-        fit, _ = estimate.fit_camera(feet, Correspondences.join([]), EstimationOptions(), rng=rng)
-        accepted += fit.pitch_roll is not None and fit.pitch_roll.per_tick
-    assert accepted == 0
-
-
-def test_ticks_without_an_estimate_have_the_homography_of_the_stream() -> None:
-    fit = HomographyFit(
-        True, "", np.eye(3), np.ones(4, bool), 0.1, 1.0, np.array([3, 5]), np.stack([2 * np.eye(3), 4 * np.eye(3)]),
-        pitch_roll=PitchRoll(True, "obstacles", 0.1, 0.1, (2.0, 1.0), 5.0),
-    )  # fmt: skip
-    found = [fit.at_tick(k) for k in (2, 3, 4, 5, 6)]
-    assert [h[0, 0] for h in found if h is not None] == [1.0, 2.0, 1.0, 4.0, 1.0]
-    single = replace(fit, pitch_roll=None)
-    assert [single.at_tick(k) is None for k in (2, 3, 4, 5, 6)] == [True, False, True, False, True]
-
-
-def test_every_correspondence_is_tested_once_and_never_trained_on_then() -> None:
-    tick = np.repeat(np.arange(5), [4, 1, 0, 7, 3])
-    numbered = Correspondences(np.column_stack([np.arange(15.0)] * 2), np.zeros((15, 2)), tick)
-    (train, test), (other_train, other_test) = two_folds(numbered)
-    assert sorted([*test.uv[:, 0], *other_test.uv[:, 0]]) == list(range(15))
-    assert not set(train.uv[:, 0]) & set(test.uv[:, 0])
-    np.testing.assert_array_equal(train.uv, other_test.uv)
-    np.testing.assert_array_equal(other_train.uv, test.uv)

@@ -6,15 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import Solid, camera_ahead, outline_px, scan, standing
+from worlds import camera_ahead, outline_px, scan, standing
 
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Obstacles, Stream
 from log2sim.geometry import PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.fit import refused_fit
 from log2sim.perception.homography_stage import (
     CameraHomography,
     calibrated_homography,
@@ -70,21 +68,6 @@ def test_the_calibrations_homography_undoes_the_projection_of_flat_ground(pitch,
     assert np.isfinite(fit.condition)
 
 
-def test_pixels_above_the_horizon_have_no_ground():
-    camera = tilted(0.0)
-    fit = calibrated_homography(log_with(camera), camera)
-    _, below = apply_homography(fit.ground_H_image, np.array([[600.0, 299.0], [600.0, 301.0], [0.0, 0.0]]))
-    assert below.tolist() == [False, True, False]
-
-
-@pytest.mark.parametrize("at", [(1.5, 0.0, 0.0), (1.5, 0.0, 0.1), (1.5, 0.0, -1.0)])
-def test_a_camera_on_the_ground_or_below_has_no_homography(at):
-    camera = tilted(at=at)
-    assert calibrated_homography(log_with(camera), camera) is None
-    raised = tilted(at=(at[0], at[1], at[2] + 0.7))
-    assert calibrated_homography(log_with(raised, ground_z=0.7), raised) is None
-
-
 def fit(log, seen, plan=None, method="time-aware"):
     rng = np.random.default_rng(RNG_SEED)
     return fit_homographies(log, seen, plan or plan_with(), TopdownConfig(method=method), rng=rng)
@@ -93,32 +76,6 @@ def fit(log, seen, plan=None, method="time-aware"):
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():
     seen = Observations(measurements=[unplaced([[1, 2, 3, 4]])])
     assert fit(log_with(tilted()), seen, plan_with(HomographyScope.NONE)) == {}
-
-
-def test_nothing_is_fitted_when_every_detection_has_points():
-    assert fit(log_with(tilted()), Observations(measurements=[Measurements.empty()] * 5)) == {}
-
-
-def test_a_picture_needs_every_camera():
-    fits = fit(
-        log_with(tilted()),
-        Observations(measurements=[Measurements.empty()]),
-        plan_with(HomographyScope.ALL_CAMERAS),
-    )
-    assert list(fits) == ["front"]
-
-
-def test_a_log_without_correspondences_falls_back_on_the_calibration_and_keeps_the_reason():
-    camera = tilted()
-    fits = fit(log_with(camera), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
-    found = fits["front"]
-    assert found.fit.ok
-    assert found.source == "calibration and flat ground"
-    assert "at least 4" in found.refusal
-    low = tilted(at=(1.0, 0.0, 0.05))
-    fits = fit(log_with(low), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
-    assert not fits["front"].fit.ok
-    assert fits["front"].source == "none"
 
 
 def correspondences(camera, count, rng, noise_px=0.0, collinear=False):
@@ -191,49 +148,6 @@ def test_the_covariance_turns_with_the_ego():
     np.testing.assert_allclose(covariance(1.1), turn @ along @ turn.T, atol=1e-9)
 
 
-LEFT_ALONE = {
-    "cut below": [500, 300, 700, 600],
-    "above the horizon": [500, 100, 560, 200],
-    "beyond 60 m": [590, 300, 600, 318],
-}
-
-
-@pytest.mark.parametrize("name", LEFT_ALONE)
-def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
-    camera = tilted(0.0)
-    log = log_with(camera)
-    ground = {"front": CameraHomography(camera, calibrated_homography(log, camera), "calibration")}
-    seen = Observations(measurements=[unplaced([LEFT_ALONE[name]])], obstacles=[None])
-    row = place_by_homography(log, seen, ground)[0]
-    assert row.source.tolist() == [""]
-    assert np.isnan(row.center_m).all()
-
-
-@pytest.mark.parametrize(
-    "homographies", [{}, {"front": CameraHomography(tilted(), refused_fit("no", 0), "none")}], ids=["none", "refused"]
-)
-def test_without_a_homography_nothing_is_placed(homographies):
-    log = log_with(tilted())
-    seen = Observations(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()], obstacles=[None, None])
-    rows = place_by_homography(log, seen, homographies)
-    assert [r.source.tolist() for r in rows] == [[""], []]
-
-
-def test_two_cameras_that_place_one_obstacle_make_one_row_of_it():
-    left, right = tilted(at=(1.5, 0.4, 1.6)), replace(tilted(at=(1.5, -0.4, 1.6)), name="right")
-    log = log_with(left)
-    log = replace(log, cameras={"front": left, "right": right})
-    solid = Solid((15.0, 1.0, 0.875), TYPICAL_SIZE_M["pedestrian"])
-    rows = [
-        unplaced([outline_px(c, c.mount_T_cam, solid)], category="pedestrian", camera=c.name) for c in (left, right)
-    ]
-    ground = {c.name: CameraHomography(c, calibrated_homography(log, c), "calibration") for c in (left, right)}
-    seen = Observations(measurements=[Measurements.join(rows)], obstacles=[None])
-    out = fuse(place_by_homography(log, seen, ground))
-    assert len(out[0]) == 1
-    assert np.hypot(*(out[0].center_m[0] - solid.center_m)[:2]) < 0.3
-
-
 def placed_where_rays_go(solids, at=(15.0, 1.0)):
     """A car's box at a place, and what `place_by_homography` makes of it where a LiDAR saw these solids."""
     camera = tilted(0.0)
@@ -253,13 +167,3 @@ FAR_WALL = standing(22.0, 0.0, 0.0, (0.5, 80.0, 4.0))
 
 def test_what_the_lidar_looks_through_is_not_placed():
     assert placed_where_rays_go([FAR_WALL]).source.tolist() == [""]
-
-
-def test_what_the_lidar_should_have_seen_is_half_as_sure():
-    row = placed_where_rays_go([standing(15, 1), FAR_WALL])
-    assert (row.source.tolist(), row.score.tolist()) == (["topdown"], [0.45])
-
-
-def test_where_the_lidar_saw_nothing_a_placed_object_is_as_sure_as_its_detection():
-    row = placed_where_rays_go([])
-    assert (row.source.tolist(), row.score.tolist()) == (["topdown"], [0.9])

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
+from test_size import measured
+from worlds import measured_row, scan, standing
 
 from log2sim.agents.hypotheses import explain_track, main_place
 from log2sim.agents.smooth.fixed_interval import (
@@ -18,6 +20,7 @@ from log2sim.agents.smooth.fixed_interval import (
     Positions,
     marginal_likelihood,
 )
+from log2sim.agents.static import robust_line
 from log2sim.datatypes import Detections, Measurements, Track
 
 RATES_HZ = [2.0, 5.0, 20.0]
@@ -57,6 +60,7 @@ def along(x_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_two_parked_cars_seen_in_turn_are_two_that_stand(rate_hz, seed):
     t = times(rate_hz)
@@ -69,6 +73,7 @@ def test_two_parked_cars_seen_in_turn_are_two_that_stand(rate_hz, seed):
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_a_motion_is_one_moving_object(rate_hz, seed):
     t = times(rate_hz)
@@ -88,6 +93,7 @@ def test_people_who_walk_are_not_people_who_stand_in_turn(rate_hz):
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_at_rest_is_rest(rate_hz, seed):
     t = times(rate_hz)
@@ -96,6 +102,7 @@ def test_noise_at_rest_is_rest(rate_hz, seed):
     assert len(part.track) == len(t)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_a_jump_to_another_moving_car_splits_the_track(seed):
     t = times(10.0, 5.0)
@@ -106,6 +113,7 @@ def test_a_jump_to_another_moving_car_splits_the_track(seed):
     assert [len(part.track) for part in parts] == pytest.approx([25, 25], abs=2)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_outliers_split_no_track(seed):
     t = times(10.0)
@@ -161,3 +169,89 @@ def test_the_evidence_is_the_likelihood_of_the_gaussian_process():
         if found.inlier.all():
             assert found.log == pytest.approx(expected, abs=0.05)
         assert prior is STANDING or found.inlier.all()
+
+
+TRUCK = (18.0, 2.55, 3.8)
+
+
+def test_a_robust_line_is_least_squares_without_outliers_and_hardly_moves_with_them():
+    rng = np.random.default_rng(2)
+    t = np.sort(rng.uniform(0, 4, 60))
+    xy = np.outer(t, [1.5, -0.5]) + rng.normal(0, 0.1, (60, 2))
+    _, velocity, sigma = robust_line(t, xy, np.full(60, 0.01))
+    np.testing.assert_allclose(velocity, np.polyfit(t, xy, 1)[0], atol=0.02)
+    assert np.abs(velocity - [1.5, -0.5]).max() < 4 * sigma
+    xy[rng.choice(60, 10, replace=False)] += 8.0
+    np.testing.assert_allclose(robust_line(t, xy, np.full(60, 0.01))[1], [1.5, -0.5], atol=0.1)
+    assert robust_line(np.ones(5), xy[:5], np.ones(5))[2] == np.inf
+
+
+def passing(speed_mps: float):
+    """A long truck seen from a sensor that drives past it at 6 m/s and sees 40 degrees to either side of its left."""
+    states, sensors = [], []
+    for k in range(30):
+        states.append((20.0 + 0.1 * k * speed_mps, 8.0, 0.0))
+        sensors.append((0.6 * k, 0.0, 1.9))
+    return measured(states, TRUCK, "truck", sensors=sensors)
+
+
+def test_a_long_truck_of_which_ever_more_shows_stands_and_a_slow_one_does_not():
+    standing, creeping = passing(0.0), passing(1.0)
+    # The center that a typical length gives moves as more of the truck is seen.
+    grown = standing.measurements.center_m.copy()
+    grown[:, 0] = np.linspace(24.0, 20.0, 30)
+    assert explain_track(standing)[0].static
+    object.__setattr__(standing.measurements, "center_m", grown)
+    assert explain_track(standing)[0].static
+    assert not explain_track(creeping)[0].static
+
+
+SIZES = {"bus": (12.0, 2.55, 3.1), "car": (4.4, 1.85, 1.5)}
+
+
+RATES_HZ_STARTING = [2.0, 5.0, 10.0, 20.0]
+
+
+SPAN_S = 6.0
+
+
+WAYS = {
+    "stands": lambda t: 0.0 * t,
+    "starts": lambda t: 0.2 * np.maximum(t - 2.5, 0.0) ** 2,
+    "stops": lambda t: -0.2 * np.maximum(3.5 - t, 0.0) ** 2,
+}
+
+
+def seen_in_passing(category: str, way: str, rate_hz: float, seed: int = 0, ego_mps: float = 3.0) -> Track:
+    """A vehicle ahead on the left of an ego that comes closer; of one tick, the points of its nearer half only."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, SPAN_S, 1 / rate_hz) + rng.uniform(0, 0.02)
+    rows = []
+    broken = int(rng.integers(2, len(t) - 2))
+    for k, (at, x) in enumerate(zip(t, WAYS[way](t))):
+        sensor = np.array([ego_mps * at, 0.0, 1.9])
+        solid = standing(14.0 + x - sensor[0], 4.5, 2.0, SIZES[category])
+        xyz, owner = scan([solid], azimuth_deg=(-180, 180), steps=(720, 10), noise_m=0.03, seed=seed + k)
+        cluster = xyz[(owner == 0) & (xyz[:, 2] > 0.2)] + [*sensor[:2], 0.0]
+        if k == broken:
+            cluster = cluster[cluster[:, 0] < np.median(cluster[:, 0])]
+        rows.append(measured_row(cluster, sensor, category, ends_visible=(True, True), t_ns=round(1e9 * at)))
+    return Track(category, np.arange(len(rows)), Measurements.join(rows))
+
+
+@pytest.mark.matrix
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("category", SIZES)
+@pytest.mark.parametrize("way", WAYS)
+def test_what_starts_or_stops_moves_and_what_stands_does_not(category, way, rate_hz):
+    track = seen_in_passing(category, way, rate_hz, seed=int(rate_hz))
+    assert [part.static for part in explain_track(track)] == [way == "stands"]
+
+
+def test_what_is_seen_of_one_end_only_may_grow():
+    track = seen_in_passing("bus", "starts", 5.0)
+    m = track.measurements
+    far = tuple(c[c[:, 0] > 18.0] for c in m.cluster)
+    grown = tuple(np.concatenate([near[near[:, 0] <= 18.0], end]) for near, end in zip(m.cluster[:1] * len(far), far))
+    object.__setattr__(m, "cluster", grown)
+    assert explain_track(track)[0].static

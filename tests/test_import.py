@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import names, run
-from export_paths import UTM, agent, bend, line, scenario
+from export_paths import agent, bend, line, scenario
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.exporters import Options, export
-from log2sim.export.openscenario import read
 from log2sim.export.openscenario.read import load
 from log2sim.geometry import wrap_angle
 
@@ -61,14 +59,6 @@ def test_a_scenario_comes_back_within_a_micrometer(world: str, revision: str, tm
             np.testing.assert_allclose(getattr(w, key), getattr(v, key), atol=1e-4)
 
 
-def test_the_command_writes_a_valid_scenario_file(tmp_path: Path) -> None:
-    export(WORLDS["sample"], "openscenario", tmp_path / "out")
-    ran = run("import", tmp_path / "out" / "scenario.xosc", "--out", tmp_path / "back.json")
-    assert (ran.code, ran.out) == (0, f"{tmp_path / 'back.json'}: written\n")
-    assert run("validate", tmp_path / "back.json").code == 0
-    assert "exists already" in run("import", tmp_path / "out" / "scenario.xosc", "--out", tmp_path / "back.json").line
-
-
 FOREIGN = """<?xml version="1.0"?>
 <OpenSCENARIO><FileHeader revMajor="1" revMinor="1" date="2024-01-01T00:00:00" author="x" description="theirs"/>
 <ParameterDeclarations><ParameterDeclaration name="y" parameterType="double" value="2.5"/></ParameterDeclarations>
@@ -106,17 +96,6 @@ def test_a_file_of_others_is_read_headings_that_nobody_wrote_follow_the_way(tmp_
     np.testing.assert_allclose(ego.waypoints.speed_mps, 2.0)
     assert (cone.category, cone.static, cone.waypoints.y_m[0]) == ("other", True, 2.5)
     assert cone.size_m == (0.4, 0.4, 0.8)
-
-
-def test_vertices_that_somebody_added_get_speeds_of_their_own(tmp_path: Path) -> None:
-    export(scenario(agent(line(), speed_mps=np.full(31, 99.0))), "openscenario", tmp_path)
-    text = (tmp_path / "scenario.xosc").read_text()
-    begin, end = text.index("<Vertex"), text.index("</Vertex>") + len("</Vertex>")
-    (tmp_path / "edited.xosc").write_text(text[:begin] + text[end:])
-    w = load(tmp_path / "edited.xosc").agents[0].waypoints
-    assert len(w) == 30
-    np.testing.assert_allclose(w.speed_mps, 10.0, atol=1e-4)
-    assert w.observed.all()
 
 
 @pytest.mark.parametrize(
@@ -193,21 +172,3 @@ def test_no_file_a_folder_a_bomb_and_a_giant_are_refused(tmp_path: Path, monkeyp
     with pytest.raises(ScenarioError, match="more than the 1000 that it may have"):
         load(tmp_path / "big.xosc")
     assert names(tmp_path) == ["big.xosc", "deep.xosc", "strange.xosc"]
-
-
-def test_a_trajectory_that_entities_share_counts_for_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "many.xosc").write_text(
-        FOREIGN.replace(
-            '<EntityRef entityRef="Ego"/>', '<EntityRef entityRef="Ego"/>' + '<EntityRef entityRef="a"/>' * 99
-        )
-    )
-    assert len(load(tmp_path / "many.xosc").agents) == 2
-    monkeypatch.setattr(read, "VERTEX_LIMIT", 100)
-    with pytest.raises(ScenarioError, match="more than 100 vertices together"):
-        load(tmp_path / "many.xosc")
-
-
-def test_an_import_keeps_what_the_map_says_of_the_place(tmp_path: Path) -> None:
-    world = scenario(agent(line()), map=replace(UTM, latitude_deg=None, altitude_m=-3.25))
-    export(world, "openscenario", tmp_path)
-    assert load(tmp_path / "scenario.xosc").map == world.map

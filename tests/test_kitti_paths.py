@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_track import OPTIONS, line, names_of, record, seen, stamps
+from test_track import seen, stamps
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.tracking.forward import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
-from log2sim.tracking.tracker import track
+from log2sim.tracking.forward import ACCELERATION_MPS2, first_velocity, measurement_noise, predict
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from kitti.paths import smooth_paths
@@ -70,45 +69,3 @@ def test_smoothed_paths_solve_the_whole_least_squares_problem(whole_boxes: bool)
         np.testing.assert_allclose(paths.covariance[of], covariance, atol=1e-7)
         assert paths.tick[of][paths.row[of] >= 0].tolist() == t.tick.tolist()
         assert paths.row[of][paths.row[of] >= 0].tolist() == list(range(len(t)))
-
-
-def test_paths_go_on_beyond_both_ends_as_far_as_there_are_ticks() -> None:
-    t_ns = stamps(12)
-    inner, outer = a_track([4, 5, 6], t_ns, 1), a_track([1, 2, 11], t_ns, 2)
-    short, long = smooth_paths([inner, outer], t_ns), smooth_paths([inner, outer], t_ns, beyond=np.array([3, 2]))
-    assert long.tick[long.track == 0].tolist() == list(range(1, 10))
-    assert long.tick[long.track == 1].tolist() == list(range(12))
-    first = short.mean[0]
-    expected = [*(first[:2] - first[2:] * 0.3), *first[2:]]
-    np.testing.assert_allclose(long.mean[long.track == 0][0], expected, atol=1e-9)
-    kept = (long.tick >= np.array([4, 1])[long.track]) & (long.tick <= np.array([6, 11])[long.track])
-    np.testing.assert_array_equal(long.mean[kept], short.mean)
-    assert len(smooth_paths([], t_ns).tick) == 0
-
-
-def test_whole_boxes_start_along_their_axis() -> None:
-    yaw = np.array([0.0, 0.7, np.pi / 2])
-    axis, side = np.stack([np.cos(yaw), np.sin(yaw)], 1), np.stack([-np.sin(yaw), np.cos(yaw)], 1)
-    whole = first_velocity(yaw, np.array(["vehicle"] * 3))
-    along, across = (np.einsum("ni,nij,nj->n", d, whole, d) for d in (axis, side))
-    np.testing.assert_allclose(along, FIRST_SPEED_MPS["vehicle"] ** 2)
-    assert (across < 0.3 * along).all()
-    np.testing.assert_allclose(np.einsum("ni,nij,nj->n", axis, whole, side), 0, atol=1e-9)
-    unknown = first_velocity(np.full(3, np.nan), np.array(["vehicle"] * 3))
-    np.testing.assert_allclose(unknown, np.tile(64 * np.eye(2), (3, 1, 1)))
-
-
-def test_parked_side_by_side_whole_boxes_do_not_change_places() -> None:
-    # Two cars stand 2.5 m beside each other; they are seen in turn before both are.
-    t_ns = stamps(12)
-    places = {"left": (30.0, 2.5), "right": (30.0, 0.0)}
-    shown = [["left"], ["right"], ["left"], ["right"], *[["left", "right"]] * 8]
-    found = [seen(np.array([places[n] for n in names]), t, names, sigma_m=0.2) for names, t in zip(shown, t_ns)]
-    whole = track(found, t_ns, **OPTIONS, whole_boxes=True)
-    assert sorted(names_of(whole)) == [["left"], ["right"]]
-
-
-def test_whole_boxes_are_tracked_like_others() -> None:
-    ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0)}
-    found, t_ns = record(ways, 60, hidden={"a": (20, 34)})
-    assert sorted(names_of(track(found, t_ns, **OPTIONS, whole_boxes=True))) == [["a"], ["b"], ["c"]]

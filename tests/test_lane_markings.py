@@ -7,12 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from painted_ground import ASPHALT, CONCRETE, GRASS, WHITE, YELLOW, Painter, dashes_of, line_of, outline_of
+from painted_ground import ASPHALT, GRASS, WHITE, Painter, dashes_of, line_of, outline_of
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
 from log2sim.road.markings import find_markings
-from log2sim.road.strokes import fit_curve, is_dashed, stretches_of, thin
+from log2sim.road.strokes import stretches_of
 
 GRAVEL = (120, 125, 130)
 EXTENT = (0.0, 50.0, -10.0, 14.0)
@@ -75,16 +75,6 @@ def night(painter: Painter) -> None:
     painter.color *= (light + 0.25 * np.exp(-(((x - 42) / 6) ** 2) - ((y + 6) / 6) ** 2))[..., None]
 
 
-def facade(painter: Painter) -> None:
-    painter.color[:] = (110, 130, 160)
-    for x in range(2, 30, 3):
-        for y in range(-9, 9, 3):
-            frame = np.array([[x, y], [x + 1.6, y], [x + 1.6, y + 1.9], [x, y + 1.9]])
-            painter.lay(painter.cover([frame]), (225, 225, 225))
-            inner = np.array([[0.12, 0.12], [-0.12, 0.12], [-0.12, -0.12], [0.12, -0.12]])
-            painter.lay(painter.cover([frame + inner]), (60, 50, 45))
-
-
 def paving(painter: Painter) -> None:
     painter.color[:] = (150, 155, 158)
     x, y = painter.xy
@@ -116,31 +106,6 @@ def test_lane_lines_are_found_where_they_are(change, lidar: bool) -> None:
         assert all(abs(m.width_m - 0.12) < 0.06 for m in markings)
 
 
-def test_worn_lines_are_found_in_part_and_none_is_invented() -> None:
-    painter = Painter(EXTENT)
-    truth = road(painter, worn=0.4)
-    precision, recall, error = compare(find_markings(painter.ground())[0], truth)
-    assert precision >= 0.95
-    assert recall >= 0.75
-    assert error <= 0.02
-
-
-def test_yellow_paint_on_bright_concrete_is_yellow() -> None:
-    painter = Painter(EXTENT, base=CONCRETE)
-    painter.lines([line_of(bend, 0, 50)], color=YELLOW)
-    (marking,) = find_markings(painter.ground(lidar=False))[0]
-    assert (marking.kind, marking.color) == ("solid", "yellow")
-
-
-def test_what_is_left_of_removed_lines_is_no_marking() -> None:
-    painter = Painter(EXTENT)
-    old = [line_of(lambda x, o=offset: bend(x) + o, 0, 50) for offset in (-4.35, -0.85, 2.65)]
-    painter.lines(old, color=(112, 112, 111))
-    painter.paint *= 0.1
-    truth = road(painter)
-    assert compare(find_markings(painter.ground(lidar=False))[0], truth)[0] >= 0.95
-
-
 @pytest.mark.matrix
 @pytest.mark.parametrize("lidar", SENSORS)
 @pytest.mark.parametrize("change", [shadows, sun_through_a_fence, wet_glare, paving], ids=lambda c: c.__name__)
@@ -155,13 +120,6 @@ def test_nothing_is_found_where_nothing_is_painted(change, lidar: bool) -> None:
 @pytest.mark.parametrize(("base", "grain"), [(ASPHALT, 0.05), (GRAVEL, 0.25), (GRASS, 0.3)])
 def test_textures_are_no_paint(base, grain: float) -> None:
     assert find_markings(Painter(EXTENT, base=base).ground(grain=grain, lidar=False))[0] == ()
-
-
-@pytest.mark.slow
-def test_a_facade_is_no_road() -> None:
-    painter = Painter(EXTENT)
-    facade(painter)
-    assert find_markings(painter.ground())[0] == ()
 
 
 def test_a_map_of_nothing_says_so() -> None:
@@ -206,58 +164,6 @@ def test_markings_turn_with_the_map() -> None:
     assert cKDTree(dense(after.points_m[:, :2])).query(dense(quarter))[0].max() < 0.08
 
 
-def test_height_of_the_ground_is_kept() -> None:
-    painter = Painter((0.0, 30.0, -5.0, 5.0))
-    painter.height += 7.0 + 0.05 * painter.xy[0].astype(np.float32)
-    painter.lines([line_of(lambda x: 0 * x, 0, 30)])
-    (marking,) = find_markings(painter.ground())[0]
-    assert np.allclose(marking.points_m[:, 2], 7 + 0.05 * marking.points_m[:, 0], atol=0.02)
-
-
-def test_a_curve_follows_a_clothoid_through_noisy_points() -> None:
-    rng = np.random.default_rng(0)
-    s = np.arange(0, 80, 0.5)
-    heading = s**2 / (2 * 60.0**2)
-    clothoid = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1) * 0.5, axis=0)
-    curve = fit_curve(clothoid + rng.normal(0, 0.03, clothoid.shape))
-    # The last knot is as far along the line as the noise of the last point is.
-    assert cKDTree(dense(clothoid)).query(curve.xy[:-1])[0].max() < 0.08
-    line = thin(curve.xy)
-    assert len(line) < len(curve.xy)
-    assert cKDTree(dense(line)).query(dense(curve.xy))[0].max() < 0.06
-
-
-@pytest.mark.parametrize(("on_m", "off_m"), [(3.0, 3.0), (3.0, 9.0), (6.0, 12.0), (1.0, 1.0)])
-def test_dashes_are_regular_even_when_some_are_gone(on_m: float, off_m: float) -> None:
-    begin = np.arange(12) * (on_m + off_m)
-    strokes = np.stack([begin, begin + on_m], 1)
-    assert is_dashed(strokes)
-    assert is_dashed(strokes[[0, 1, 2, 4, 5, 7, 8, 9, 10, 11]])
-    assert [s.kind for s in stretches_of(strokes)] == ["dashed"]
-
-
-def test_worn_solid_lines_are_not_dashed() -> None:
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        edges = np.sort(rng.uniform(0, 60, 16)).reshape(-1, 2)
-        edges = edges[np.ptp(edges, 1) > 0.5]
-        assert not is_dashed(edges) or len(edges) < 4
-
-
-def test_a_solid_part_ends_a_dashed_line() -> None:
-    strokes = np.array([[0, 3], [6, 9], [12, 15], [18, 21], [24, 44]], float)
-    assert [s.kind for s in stretches_of(strokes)] == ["dashed", "solid"]
-
-
-def test_arrows_one_behind_the_other_are_no_dashes() -> None:
-    painter = Painter(EXTENT)
-    painter.lines([line_of(lambda x: 3.5 + 0 * x, 0, 50)])
-    arrow = np.array([[0, -0.1], [3, -0.1], [3, -0.5], [4.5, 0], [3, 0.5], [3, 0.1], [0, 0.1]])
-    painter.lay(painter.cover([arrow + np.array([x, 0]) for x in (10, 22)]), WHITE, reflects=1.0)
-    markings = find_markings(painter.ground())[0]
-    assert sorted(m.kind for m in markings) == ["other", "other", "solid"]
-
-
 @pytest.mark.parametrize("curb_m", [0.0, 0.12])
 def test_borders_are_where_the_road_ends(curb_m: float) -> None:
     painter = Painter(EXTENT, base=GRASS)
@@ -273,13 +179,6 @@ def test_borders_are_where_the_road_ends(curb_m: float) -> None:
     assert cKDTree(np.concatenate([dense(line) for line in truth])).query(found)[0].max() < 0.4
     assert np.mean(cKDTree(found).query(np.concatenate([dense(line) for line in truth]))[0] < 0.4) > 0.8
     assert not any("no borders" in note for note in notes)
-
-
-def test_shadows_are_no_borders() -> None:
-    painter = Painter(EXTENT)
-    painter.lines([line_of(bend, 0, 50)])
-    shadows(painter)
-    assert find_markings(painter.ground())[1] == ()
 
 
 def dashes(dash_m: float, gap_m: float, *spans: tuple[float, float]) -> np.ndarray:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 from painted_ground import Painter, dashes_of, line_of
 
-from log2sim.datatypes import Marking
 from log2sim.geometry import Camera, ground_homography
-from log2sim.road.lane_picture import find_markings_in_picture, find_shape, find_vanishing_point, join_lines
+from log2sim.road.lane_picture import find_markings_in_picture
 
 OFFSETS = (-5.25, -1.75, 1.75, 5.25)
 
@@ -46,43 +44,3 @@ def test_a_known_camera_measures_lines_where_they_are() -> None:
     image, camera = picture()
     found = find_markings_in_picture(image, camera)
     assert np.allclose([line.offset_m for line in found.lane_lines], sorted(OFFSETS, reverse=True), atol=0.1)
-
-
-@pytest.mark.slow
-def test_an_unknown_camera_finds_the_horizon_and_the_lines() -> None:
-    image, camera = picture()
-    horizon = camera.K @ np.linalg.inv(camera.mount_T_cam[:3, :3]) @ np.array([1.0, 0, 0])
-    point = find_vanishing_point(image, rng=np.random.default_rng(0))
-    assert point is not None
-    assert np.hypot(*(np.array(point) - horizon[:2] / horizon[2])) < 8
-    found = find_markings_in_picture(image)
-    assert np.allclose([line.offset_m for line in found.lane_lines], sorted(OFFSETS, reverse=True), atol=0.25)
-    assert any("assumed" in note for note in found.notes)
-
-
-def test_a_picture_of_nothing_has_no_horizon() -> None:
-    rng = np.random.default_rng(0)
-    image = rng.normal(120, 3, (360, 640, 3)).clip(0, 255).astype(np.uint8)
-    found = find_markings_in_picture(image)
-    assert found.markings == ()
-    assert found.lane_lines == ()
-    assert "horizon" in found.notes[0]
-
-
-def test_what_does_not_follow_the_course_of_the_others_is_left_out() -> None:
-    x = np.arange(5, 45, 0.5)
-    course = 0.02 * x + 0.001 * x**2
-
-    def line(name: str, y: np.ndarray) -> Marking:
-        return Marking(name, "solid", np.column_stack([x, y, 0 * x]), 0.12)
-
-    lines = [line("a", course + 1.8), line("b", course - 1.7), line("wall", 0.25 * x + 1)]
-    found = find_shape(lines, np.ones(3))
-    assert found is not None
-    shape, member = found
-    assert member == [0, 1]
-    assert abs(shape.slope - 0.02) < 0.01
-    assert abs(shape.bend - 0.001) < 2e-4
-    joined = join_lines(lines[:2], shape, 2.0, 60.0)
-    assert [round(one.offset_m, 1) for one in joined] == [1.8, -1.7]
-    assert abs(joined[0].points_m[-1, 1] - (0.02 * 60 + 0.001 * 60**2 + 1.8)) < 0.5

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,7 +10,7 @@ from worlds import camera_ahead, outline_px, scan, standing
 from log2sim.datatypes import Boxes3D, Detections, Measurements
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, if_missed, match_boxes, measure
+from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, match_boxes, measure
 from log2sim.perception.lidar.projection import View
 
 CAMERA = camera_ahead()
@@ -74,22 +72,6 @@ def test_every_box_gets_its_own_partner_and_the_best_pair_is_matched_first() -> 
     assert (twice.box.tolist(), twice.image.tolist()) == ([1], [0])
 
 
-@pytest.mark.parametrize(("one", "other", "same"), [("pedestrian", "cyclist", True), ("pedestrian", "car", False)])
-def test_only_what_is_confused_can_be_the_same(one: str, other: str, same: bool) -> None:
-    assert len(matched(in_sweep((20, 2), category=one), in_image((20, 2), category=other)).box) == same
-
-
-def test_long_names_are_not_cut() -> None:
-    short = replace(in_sweep((20, 2)), category=np.array(["car"]))
-    assert joined(short, in_image((20, 2), category="truck")).category.tolist() == ["truck"]
-
-
-def test_a_shift_too_far_for_the_image_is_another_object() -> None:
-    found = joined(in_sweep((20, 2)), in_image((20, -2)))
-    assert len(found) == 2
-    assert sorted(found.camera.tolist()) == ["", "front"]
-
-
 def test_the_category_of_the_image_counts_only_where_the_boxes_agree() -> None:
     loose = in_image((20, 3.2), category="truck")
     assert 0.3 <= matched(in_sweep((20, 2)), loose).iou[0] < 0.5
@@ -102,25 +84,6 @@ def test_an_object_in_view_that_the_image_misses_is_doubted_and_one_outside_is_n
     score = joined(boxes, in_image()).score
     assert score[0] < 0.5
     assert score[1:].tolist() == [0.6, 0.6]
-
-
-def test_a_small_object_is_doubted_less_than_a_large_one() -> None:
-    near, far, farther = joined(in_sweep((15, 0), (40, 4), (140, 8), score=0.6), in_image()).score
-    assert near < far < farther
-    assert farther == 0.6
-
-
-def test_an_image_box_that_the_sweep_should_show_is_doubted_by_its_points() -> None:
-    cars = [standing(12, -4, 30), standing(30, 6, 30), standing(60, 0, 30)]
-    world, _ = scan(cars, azimuth_deg=(-40, 40), steps=(400, 60))
-    found = in_image((12, -4), (30, 6), (60, 0))
-    found.box_px[:] = [outline_px(CAMERA, CAMERA.mount_T_cam, car) for car in cars]
-    rows = joined(in_sweep(), found, world=world)
-    assert rows.points[0] > rows.points[1] > 4
-    many, few, far = rows.score
-    assert many < few < far == 0.7
-    assert joined(in_sweep(), found).score.tolist() == [0.7] * 3
-    assert measure([(VIEW, found, cloud_of(world))]).score.tolist() == [0.7] * 3
 
 
 def test_a_box_in_both_takes_its_points_from_the_image_boxes_of_others() -> None:
@@ -141,24 +104,6 @@ def test_two_even_chances_that_agree_are_three_to_one() -> None:
     better = [PAIR_WEIGHTS.score(0.6, 0.5, 0.7), PAIR_WEIGHTS.score(0.5, 0.6, 0.7), PAIR_WEIGHTS.score(0.5, 0.5, 0.8)]
     assert min(better) > 0.75
     assert PAIR_WEIGHTS.score(1.0, 1.0, 1.0) < 1
-
-
-def test_a_miss_counts_as_much_as_hits_are_likely() -> None:
-    np.testing.assert_allclose(if_missed(np.array([0.5, 0.5, 1.0]), np.array([0.0, 0.5, 0.0])), [0.5, 1 / 3, 1.0])
-
-
-def test_of_two_cameras_the_better_fit_is_kept() -> None:
-    exact = (VIEW, in_image((20, 2)), None)
-    loose = (replace(VIEW, camera=replace(CAMERA, name="side")), in_image((20, 2.8)), None)
-    for frames in ([exact, loose], [loose, exact]):
-        found = measure(frames, in_sweep((20, 2)), cloud_of())
-        assert found.camera.tolist() == ["front"]
-
-
-def test_without_cameras_boxes_stay_as_they_are() -> None:
-    boxes = in_sweep((20, 2), (5, 5))
-    assert measure([], boxes, cloud_of()).score.tolist() == boxes.score.tolist()
-    assert len(joined(in_sweep(), in_image())) == 0
 
 
 @pytest.mark.parametrize("turn_deg", [37.0, 90.0, 180.0])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import importlib
-import inspect
+import re
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
+import imports
 import pytest
 
 import log2sim
@@ -16,8 +18,7 @@ from log2sim.cli import app
 from log2sim.files import plugins
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-import imports  # noqa: E402
+
 
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (
@@ -41,10 +42,6 @@ def test_every_room_imports_only_rooms_of_a_lower_rank(modules: dict[str, set[st
 
 def test_there_is_no_import_cycle(modules: dict[str, set[str]]) -> None:
     assert imports.cycles(modules) == []
-
-
-def test_a_cycle_would_be_noticed() -> None:
-    assert imports.cycles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [{"b", "c"}]
 
 
 @pytest.mark.parametrize("face", sorted((ROOT / "log2sim").rglob("*/__init__.py")), ids=lambda f: f.parent.name)
@@ -73,29 +70,6 @@ def test_start_up_loads_nothing_heavy(statement: str) -> None:
     assert ran.stderr == ""
 
 
-def test_the_public_names_are_listed_in_a_fresh_interpreter() -> None:
-    code = "import log2sim; print(*(n for n in log2sim.__all__ if n in dir(log2sim)))"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split() == log2sim.__all__
-
-
-@pytest.mark.parametrize("name", [name for name in log2sim.__all__ if name[0].islower()])
-def test_the_public_functions_show_their_signatures(name: str) -> None:
-    function = getattr(log2sim, name)
-    assert inspect.isfunction(function)
-    assert inspect.getdoc(function)
-    assert "kwargs" not in inspect.signature(function).parameters
-
-
-def test_type_checkers_are_told_what_is_imported_lazily() -> None:
-    (block,) = [n for n in ast.parse(Path(log2sim.__file__).read_text()).body if isinstance(n, ast.If)]
-    told = {
-        a.asname or a.name: f"{n.module}:{a.name}" for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names
-    }
-    assert told == log2sim._PLACES
-    assert sorted([*told, "__version__"]) == sorted(log2sim.__all__)
-
-
 def test_every_command_is_a_listed_function() -> None:
     """README says which; those of the cache and of the settings are for the shell, and for `Config`."""
     table = (ROOT / "README.md").read_text(encoding="utf-8").partition("| command | function |")[2].partition("\n\n")[0]
@@ -105,13 +79,42 @@ def test_every_command_is_a_listed_function() -> None:
     assert {function.partition("(")[0].partition(".")[0] for _, function in rows} <= set(log2sim.__all__)
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="has no attribute 'recontruct'"):
-        log2sim.recontruct  # noqa: B018
-
-
 @pytest.mark.parametrize("place", plugins.LATE_FUNCTIONS.values())
 def test_late_functions_are_of_higher_rooms_and_exist(place: str) -> None:
     module, _, name = place.partition(":")
     assert callable(getattr(importlib.import_module(module), name))
     assert RANKED.index(imports.room_of(module.removeprefix("log2sim."))) > RANKED.index("datatypes")
+
+
+TEXT = (ROOT / "log2sim" / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_picture_shows_every_room_in_the_order_of_its_rank() -> None:
+    picture = re.search(r"```text\n(.*?)```", TEXT, re.DOTALL)
+    assert picture is not None
+    shown = [word for line in picture[1].splitlines() for word in line[17:53].split()]
+    assert sorted(shown) == sorted(RANKED)
+    rank = {room: k for k, room in enumerate(RANKED)}
+    lines = [[rank[word] for word in line[17:53].split()] for line in picture[1].splitlines()]
+    for above, below in pairwise(lines):
+        assert min(above) > max(below)
+
+
+@pytest.mark.parametrize(("path", "name"), sorted(set(re.findall(r"`([\w/]+\.py)` `(\w+)`", TEXT))))
+def test_the_names_exist(path: str, name: str) -> None:
+    module = importlib.import_module(f"log2sim.{path.removesuffix('.py').replace('/', '.')}")
+    assert name in vars(module)
+
+
+def test_the_pipeline_calls_the_functions_of_the_table_in_their_order() -> None:
+    source = (ROOT / "log2sim" / "pipeline.py").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [\w ]+ \| `[\w/.]+` `(\w+)`", TEXT, re.MULTILINE)
+    called = {name: source.rfind(f" {name}(") for name in rows if f" {name}(" in source}
+    second_pass = [name for name in rows[rows.index("fit_homographies") :] if name in called]
+    assert len(second_pass) >= 6
+    assert second_pass == sorted(second_pass, key=called.__getitem__)
+
+
+def test_every_kind_of_plug_in_is_explained() -> None:
+    for kind in plugins.BUILT_IN:
+        assert f"kind `{kind}`" in TEXT

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from localization_worlds import BEND, HOUSES, STRAIGHT, drive
+from localization_worlds import BEND, HOUSES, drive
 
 from log2sim.datatypes import Log
 from log2sim.geometry import PoseTrack
-from log2sim.localization import verdict
 from log2sim.localization.choice import localize_like
 from log2sim.localization.given_poses import check_poses, list_faults
 from log2sim.localization.verdict import bridge_by_lidar
@@ -49,20 +48,3 @@ def test_odometry_goes_on_where_the_motion_before_does_not_tell_the_pose() -> No
     again = localize_like(log, {"poses": {"source": "given"}})
     assert again.ego is not None
     np.testing.assert_array_equal(again.ego.map_T_ego, found.track.map_T_ego)
-
-
-def test_odometry_that_does_not_hold_the_way_is_not_used() -> None:
-    log, _ = frozen_log([], STRAIGHT)
-    assert log.ego is not None
-    checked = check_poses(log.ego)
-    assert bridge_by_lidar(log, checked, silent).track is checked.track
-
-
-def test_without_its_library_the_pose_stays_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, _ = frozen_log(HOUSES, BEND)
-    assert log.ego is not None
-    monkeypatch.setattr(verdict, "is_installed", lambda: False)
-    checked = check_poses(log.ego)
-    assert bridge_by_lidar(log, checked, silent) is checked
-    (fault,) = list_faults(log, checked.stretches, None)
-    assert fault.treatment == "left_out"

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.candidate import MIN_SWEEP_CONFIDENCE, followed_confidence
 from log2sim.agents.static import BoxState, LidarMatch, left_free, match_box, match_standing, track_with_lidar
-from log2sim.datatypes import Boxes3D, Measurements, Obstacles, Rays, Track
+from log2sim.datatypes import Obstacles, Rays
 from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.boxes import place_boxes, rotate
+from log2sim.perception.boxes import rotate
 
 T0_NS = 1_700_000_000_000_000_000
 SIZE = np.array([4.4, 1.85, 1.6])
@@ -57,13 +56,6 @@ def test_the_sighting_moves_and_turns_with_the_world(far, turn):
     assert abs(there.points - here.points) <= 3
 
 
-def test_heights_count_from_the_bottom_of_the_box_not_from_the_clouds_origin():
-    cloud = obstacles([standing(14, 3)])
-    lifted = replace(cloud, origin=np.array([0, 0, 6.9]), xyz=cloud.xyz - np.array([0, 0, 1.9], dtype=np.float32))
-    assert seen(lifted, (14.0, 3.0), bottom=5.0).points == seen(cloud, (14.0, 3.0)).points
-    assert seen(lifted, (14.0, 3.0), bottom=0.0) is None
-
-
 @pytest.mark.parametrize("shown_m", [3.0, 2.0])
 def test_what_is_hidden_of_the_box_is_behind_and_widens_the_covariance_by_it(shown_m):
     cloud = obstacles([standing(14, 3)])
@@ -72,53 +64,6 @@ def test_what_is_hidden_of_the_box_is_behind_and_widens_the_covariance_by_it(sho
     assert np.hypot(*(sighting.xy_m - [14, 3])) < 0.15
     assert np.sqrt(sighting.covariance[0, 0]) == pytest.approx((4.4 - shown_m) / np.sqrt(12), rel=0.25)
     assert np.sqrt(sighting.covariance[1, 1]) < 0.25
-
-
-def test_a_box_of_which_hardly_anything_shows_is_not_found():
-    cloud = obstacles([standing(14, 3)])
-    near = cloud.xyz[:, 0] < 14 - 2.2 + 0.9
-    assert seen(replace(cloud, xyz=cloud.xyz[near], t_s=cloud.t_s[near]), (14.0, 3.0)) is None
-
-
-NOT_THERE = {
-    "nothing": [],
-    "a car elsewhere": [standing(20, 3)],
-    "a wall through the box": [Solid((14.0, 3.0, 1.5), (40.0, 0.3, 3.0), np.pi / 2)],
-    "a van": [standing(14, 3, 0, (5.3, 1.85, 1.6))],
-    "a bus": [standing(14, 3, 0, (11.5, 2.7, 3.2))],
-    "a post": [Solid((12.0, 3.0, 0.8), (0.1, 0.1, 1.6))],
-}
-
-
-@pytest.mark.parametrize("name", NOT_THERE)
-def test_what_is_no_such_box_is_not_taken_for_it(name):
-    assert seen(obstacles(NOT_THERE[name]), (14.0, 3.0)) is None
-
-
-def test_a_box_amid_much_else_is_not_taken_for_sure():
-    cloud = obstacles([standing(14, 3)])
-    beside = np.random.default_rng(0).uniform([11.8, 1.2, 0.3], [16.2, 1.5, 0.8], (2000, 3)).astype(np.float32)
-    crowded = replace(cloud, xyz=np.vstack([cloud.xyz, beside]), t_s=np.zeros(len(cloud.t_s) + 2000, np.float32))
-    assert seen(cloud, (14.0, 3.0)) is not None
-    assert seen(crowded, (14.0, 3.0)) is None
-
-
-def test_a_branch_above_and_the_kerb_below_do_not_count():
-    branch = Solid((14.0, 3.0, 3.0), (4.4, 1.85, 0.3))
-    assert seen(obstacles([branch], elevation_deg=(-18, 15)), (14.0, 3.0)) is None
-
-
-def test_the_time_is_that_of_the_boxs_own_points():
-    cloud = obstacles([standing(14, 3), standing(20, -8, 40)], t_s=-0.04)
-    cloud.t_s[np.hypot(*(cloud.xyz[:, :2] - [14, 3]).T) > 4] = 99.0
-    assert (seen(cloud, (14.0, 3.0)).t_ns - T0_NS) / 1e9 == pytest.approx(-0.04, abs=1e-6)
-
-
-@pytest.mark.parametrize("count", [0, 1, 7])
-def test_a_few_points_are_no_sighting(count):
-    xyz = np.tile([12.0, 3.0, 0.8], (count, 1)).astype(np.float32)
-    cloud = Obstacles(T0_NS, np.zeros(3), xyz, np.zeros(count, np.float32), np.zeros(3, np.float32))
-    assert seen(cloud, (14.0, 3.0)) is None
 
 
 # Following
@@ -148,22 +93,6 @@ def test_a_moving_car_is_followed_with_its_time():
         assert s.t_ns == t_ns[s.tick]
 
 
-def test_following_backward_in_time_is_the_same():
-    states = [(10 + 0.8 * k, 3.0, 0.0) for k in range(10)]
-    clouds, t_ns = drive(states)
-    found = run(clouds, t_ns, range(8, -1, -1), states[9][:2], (8.0, 0.0), start=9)
-    assert [s.tick for s in found] == list(range(8, -1, -1))
-    assert max(np.hypot(*(s.xy_m - states[s.tick][:2])) for s in found) < 0.3
-
-
-def test_a_wrong_speed_is_corrected_on_the_way_so_that_a_gap_is_bridged():
-    states = [(10 + 0.7 * k, 3.0, 0.0) for k in range(20)]
-    clouds, t_ns = drive(states, gone=(14,))
-    found = run(clouds, t_ns, range(1, 20), states[0][:2], (10.5, 0.0))
-    assert [s.tick for s in found] == [k for k in range(1, 20) if k != 14]
-    assert np.hypot(*(found[-1].xy_m - states[-1][:2])) < 0.3
-
-
 def test_a_turning_car_is_followed_around_the_bend():
     yaw = np.linspace(0.0, 0.15, 15)
     step = 0.8 * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -172,36 +101,6 @@ def test_a_turning_car_is_followed_around_the_bend():
     found = run(clouds, t_ns, range(1, 15), xy[0], (8.0, 0.0))
     assert [s.tick for s in found] == list(range(1, 15))
     assert max(np.hypot(*(s.xy_m - xy[s.tick])) for s in found) < 0.3
-
-
-def test_one_tick_without_a_sweep_is_bridged_and_two_end_the_search():
-    states = [(10 + 0.8 * k, 3.0, 0.0) for k in range(12)]
-    clouds, t_ns = drive(states, gone=(4,))
-    assert [s.tick for s in run(clouds, t_ns, range(1, 12), states[0][:2], (8.0, 0.0))] == [1, 2, 3, *range(5, 12)]
-    clouds, t_ns = drive(states, gone=(4, 7, 9))
-    assert [s.tick for s in run(clouds, t_ns, range(1, 12), states[0][:2], (8.0, 0.0))] == [1, 2, 3, 5, 6, 8, 10, 11]
-    clouds, t_ns = drive(states, gone=(4, 5))
-    assert [s.tick for s in run(clouds, t_ns, range(1, 12), states[0][:2], (8.0, 0.0))] == [1, 2, 3]
-
-
-def test_a_car_that_left_is_not_followed_any_further():
-    clouds, t_ns = drive([(12.0, 3.0, 0.0)] * 3)
-    empty, _ = drive([(60.0, 30.0, 0.0)] * 5)
-    t_ns = T0_NS + np.arange(8) * STEP_NS
-    found = run([*clouds, *empty], t_ns, range(1, 8), (12.0, 3.0), (0.1, 0.0))
-    assert [s.tick for s in found] == [1, 2]
-
-
-def test_what_stands_is_waited_for_and_does_not_drift():
-    clouds, t_ns = drive([(12.0, 3.0, 0.0)] * 12, gone=(3, 4, 5, 6, 7))
-    found = run(clouds, t_ns, range(1, 12), (12.0, 3.0), (0.0, 0.0))
-    assert [s.tick for s in found] == [1, 2, 8, 9, 10, 11]
-    assert max(np.hypot(*(s.xy_m - [12.0, 3.0])) for s in found) < 0.15
-
-
-def test_no_ticks_and_no_sweeps_give_no_sightings():
-    assert run([], np.zeros(1, dtype=np.int64), [], (0.0, 0.0), (1.0, 0.0)) == []
-    assert run([None] * 4, T0_NS + np.arange(4) * STEP_NS, range(1, 4), (0.0, 0.0), (1.0, 0.0)) == []
 
 
 def test_boxes_that_stand_are_matched_together_as_each_alone():
@@ -252,19 +151,6 @@ def test_a_bus_beside_the_sensor_is_found_by_its_flank_and_one_end(x, azimuth_de
 
 
 WALL = Solid((0.0, 3.0, 1.5), (80.0, 2.55, 3.0))
-NO_BUS = {
-    "a wall": ([WALL], ALL_AROUND),
-    "a part between two borders of the view": ([standing(0, 3, 0, BUS)], (45.0, 135.0)),
-    "a car in its place": ([standing(0, 2.7, 0)], ALL_AROUND),
-    "a post in its place": ([Solid((0.0, 2.0, 1.0), (0.3, 0.3, 2.0))], ALL_AROUND),
-    "posts where it would end": ([Solid((x, 1.8, 1.0), (0.2, 0.2, 2.0)) for x in (-6, 6)], ALL_AROUND),
-}
-
-
-@pytest.mark.parametrize("name", NO_BUS)
-def test_what_is_no_bus_beside_the_sensor_is_not_taken_for_it(name):
-    solids, azimuth_deg = NO_BUS[name]
-    assert seen(around(solids, azimuth_deg), (0.0, 3.0), size=np.array(BUS)) is None
 
 
 @pytest.mark.parametrize(("azimuth_deg", "forward"), [(ALL_AROUND, True), (ALL_AROUND, False), (AHEAD, True)])
@@ -278,24 +164,6 @@ def test_a_bus_is_followed_past_the_sensor_for_as_long_as_points_show_it(azimuth
     found = track_with_lidar(clouds, [*rest, *range(shown[-1] + 1, 20)] if forward else rest, t_ns, start)
     assert [m.tick for m in found] == rest
     assert max(np.hypot(*(m.xy_m - [x[m.tick], 3.0])) for m in found) < 0.6
-
-
-def straight_track(*, score, count=10):
-    """A car that a network found at 10 ticks, 0.8 m from each other."""
-    size, t_ns = np.tile(SIZE, (count, 1)), T0_NS + np.arange(count) * STEP_NS
-    center = np.stack([2.0 + 0.8 * np.arange(count), np.full(count, 3.0), np.full(count, 0.8)], axis=1)
-    some, points = np.full(count, score), np.zeros(count, np.int64)
-    boxes = Boxes3D(t_ns, center, size, np.zeros(count), some, np.full(count, "car"), some, points)
-    rows = replace(Measurements.of_boxes(boxes, np.zeros(3)), yaw_rad=boxes.yaw_rad)
-    return Track("car", np.arange(count), place_boxes(rows))
-
-
-def test_what_moves_on_and_fits_its_points_is_an_object_though_its_scores_are_low():
-    track = straight_track(score=0.3)
-    places = np.stack([10.0 + np.arange(10) * 1.4, np.full(10, 3.0)], axis=1)
-    assert followed_confidence(track, places) >= MIN_SWEEP_CONFIDENCE
-    assert followed_confidence(track, places[:3]) == 0.0
-    assert followed_confidence(straight_track(score=0.05), places) < MIN_SWEEP_CONFIDENCE
 
 
 def test_what_moves_leaves_its_place_free_and_clutter_does_not():

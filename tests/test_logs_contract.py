@@ -187,10 +187,6 @@ def points_on(log: Log, lidar: str, i: int, track: str) -> tuple[Array, Array]:
     return local[near], size / 2
 
 
-def test_every_built_in_reader_is_under_contract() -> None:
-    assert set(ENCODERS) == set(plugins.BUILT_IN["log"])
-
-
 @pytest.mark.matrix
 def test_a_sound_log_gets_no_line_of_damage(log: Log) -> None:
     assert list_time_problems(log) == []
@@ -485,11 +481,6 @@ def test_threads_read_what_one_reads(name: str, path: Path, log: Log) -> None:
 
 def content(record: Any) -> np.ndarray:
     return np.asarray(record.xyz_m if isinstance(record, Sweep) else record)
-
-
-def test_the_digest_is_of_the_log_alone(name: str, log: Log, copy: Path) -> None:
-    assert len(log.digest) == 64
-    assert open_log(copy, format=name).digest == log.digest
 
 
 def test_other_folders_and_files_are_refused_in_one_line(name: str, case: Encoder, path: Path, tmp_path: Path) -> None:

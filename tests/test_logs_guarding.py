@@ -20,9 +20,11 @@ from test_logs_contract import ENCODERS
 
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError, RecordError
-from log2sim.files import plugins
 from log2sim.logs.opening import open_log
-from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, read_sweep, translate_parser_errors
+from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, list_numbered_files, read_sweep
+from log2sim.logs.stamps import (
+    compute_turn_share,
+)
 
 RAISED = [
     ValueError("odd"), TypeError("odd"), OverflowError("too large"), KeyError("x"), IndexError(), AttributeError("odd"),
@@ -30,6 +32,8 @@ RAISED = [
     NotImplementedError("compression type 99"), RuntimeError("encrypted"), RecursionError("deep"), AssertionError(), OSError(5, "I/O"),
     ZeroDivisionError("by zero"), np.linalg.LinAlgError("singular"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"),
 ]  # fmt: skip
+
+
 STAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -57,43 +61,6 @@ def test_whatever_a_parser_raises_is_a_record_error_of_one_line(problem: Excepti
         assert found.value.__cause__ is problem
 
 
-@pytest.mark.parametrize("problem", [KeyboardInterrupt(), MemoryError(), SystemExit(3)], ids=lambda p: type(p).__name__)
-def test_interrupts_and_lack_of_memory_pass(problem: BaseException) -> None:
-    with pytest.raises(type(problem)) as found:
-        with_front(raising(problem)).streams["front"].read(0)
-    assert found.value is problem
-
-
-def test_our_own_errors_keep_their_words() -> None:
-    with pytest.raises(RecordError, match=r"^a\.png: truncated$"):
-        with_front(raising(RecordError("a.png: truncated"))).streams["front"].read(0)
-
-
-def test_what_is_deferred_stays_deferred_and_is_guarded() -> None:
-    def labels() -> Any:
-        raise OverflowError("int too large")
-
-    log = guard_log(world_log().changed(labels=labels), "folder")
-    with pytest.raises(LogError, match=r"^folder: the labels cannot be read: OverflowError: int too large"):
-        _ = log.labels
-
-
-def test_an_opening_that_fails_is_a_log_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = ENCODERS["log2sim"].encode(world_log(), tmp_path / "base")
-
-    def broken(*_: object) -> Any:
-        raise OverflowError("int too large to convert to float")
-
-    monkeypatch.setattr(type(plugins.load("log", "log2sim")), "open", broken)
-    with pytest.raises(LogError, match="cannot be read as format 'log2sim': OverflowError: int too large"):
-        open_log(path)
-
-
-def test_numbers_beyond_every_type_do_not_warn() -> None:
-    with translate_parser_errors("here", RecordError):
-        np.array([1e300]).astype(np.int64)
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
     """Folder and path of the world in each format, written when first asked for."""
@@ -108,16 +75,6 @@ SUPPRESSED = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 @settings(max_examples=4, deadline=None, suppress_health_check=SUPPRESSED)
 @given(data=st.data())
 def test_flipped_bytes_of_any_file_end_no_reading(
-    written: dict[str, tuple[Path, Path]], name: str, data: st.DataObject
-) -> None:
-    read_damaged(written, name, data)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ENCODERS)
-@settings(max_examples=100, deadline=None, suppress_health_check=SUPPRESSED)
-@given(data=st.data())
-def test_many_flipped_bytes_of_any_file_end_no_reading(
     written: dict[str, tuple[Path, Path]], name: str, data: st.DataObject
 ) -> None:
     read_damaged(written, name, data)
@@ -199,7 +156,11 @@ def broken_member(method: int) -> bytes:
 
 
 WIDE = "{'descr': '|V400000000', 'fortran_order': False, 'shape': (3, 3), }"
+
+
 BOMB = header("{'descr': '<f8', 'fortran_order': False, 'shape': (20000000, 64), }") + bytes(1000)
+
+
 BROKEN_SWEEPS: dict[str, tuple[str, bytes, str]] = {
     "unbalanced header": (".npy", header("{'descr': '<f8', 'shape': (4, 3"), "not a readable sweep"),
     "header with a bad token": (".npy", header("{'descr': '<f8', 'shape': (4, 3)?, \\\n"), "not a readable sweep"),
@@ -231,39 +192,45 @@ def test_broken_sweep_files_are_record_errors_without_much_memory(tmp_path: Path
     assert peak_bytes < 20_000_000
 
 
-def test_the_methods_of_zip_are_read_when_they_are_sound(tmp_path: Path) -> None:
-    pytest.importorskip("bz2")
-    for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2):
-        (tmp_path / "s.npz").write_bytes(npz(method, xyz_m=POINTS))
-        assert read_sweep(tmp_path / "s.npz", 0).xyz_m.shape == (4, 3)
+@pytest.mark.parametrize("start_deg", [180.0, 144.0, 0.0, -179.0])
+def test_the_share_of_a_turn_grows_clockwise_from_its_start(start_deg: float) -> None:
+    share = np.linspace(0.001, 0.999, 50)
+    azimuth = np.radians(start_deg) - 2 * np.pi * share
+    xy = 7.0 * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    np.testing.assert_allclose(compute_turn_share(xy, np.radians(start_deg)), share, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "offset",
-    [
-        np.array([0, 0, 0, np.iinfo(np.int64).max]),
-        np.array([0, 0, 0, np.iinfo(np.int64).min]),
-        np.array([0, 0, 0, np.iinfo(np.uint64).max], dtype=np.uint64),
-        np.array([0, 0, 0, 1_000_000_001]),
-        np.array([0, -1_000_000_001, 0, 0], dtype=np.int64),
-    ],
-    ids=["int64 max", "int64 min", "uint64 max", "late", "early"],
-)
-def test_times_of_points_beyond_a_second_of_the_stamp_refuse_the_sweep(tmp_path: Path, offset: np.ndarray) -> None:
-    (tmp_path / "s.npz").write_bytes(npz(xyz_m=POINTS, t_offset_ns=npy(offset)))
-    with pytest.raises(RecordError, match=r"s\.npz .*the time of a point is .* s off the stamp of its sweep"):
-        read_sweep(tmp_path / "s.npz", STAMP_NS)
+def test_files_are_ordered_by_number_and_other_names_are_left_out(tmp_path: Path) -> None:
+    largest = np.iinfo(np.int64).max
+    names = [
+        "10.pkl.gz",
+        "9.pkl.gz",
+        "x9.pkl.gz",
+        "8.gz",
+        "7.PNG",
+        f"{largest}.png",
+        f"{largest + 1}.png",
+        f"{'9' * 99}.png",
+    ]
+    for name in names:
+        (tmp_path / name).touch()
+    assert list(list_numbered_files(tmp_path, (".pkl.gz", ".png"))) == [7, 9, 10, largest]
+    assert list_numbered_files(tmp_path / "none", (".png",)) == {}
 
 
-@pytest.mark.parametrize("kind", ["<i4", "<i8", "<u4", "<u8", "<i2"])
-def test_times_of_points_up_to_a_second_are_kept_in_every_type(tmp_path: Path, kind: str) -> None:
-    low = 0 if kind[1] == "u" else -30_000
-    high = 30_000 if kind.endswith("2") else 1_000_000_000
-    offset = np.array([low, 0, 1, high], dtype=kind)
-    (tmp_path / "s.npz").write_bytes(npz(xyz_m=POINTS, t_offset_ns=npy(offset)))
-    sweep = read_sweep(tmp_path / "s.npz", STAMP_NS)
-    assert sweep.t_ns is not None
-    assert (sweep.t_ns - STAMP_NS).tolist() == [low, 0, 1, high]
+XYZ = np.array([[1.0, 2, 3], [np.nan, 0, 0], [4, 5, 6]], np.float32)
+
+
+def test_files_with_four_columns_and_with_named_columns(tmp_path: Path) -> None:
+    rows = np.column_stack([XYZ, [0.1, 0.2, 0.3]]).astype("<f4")
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+    (tmp_path / "b.bin").write_bytes((rows * [1, 1, 1, 0]).astype("<f4").tobytes())
+    np.savez(tmp_path / "a.npz", xyz_m=XYZ, intensity=np.array([1, 2, 3], np.uint8))
+    np.savez(tmp_path / "b.npz", xyz_m=XYZ)
+    np.testing.assert_allclose(read_sweep(tmp_path / "a.bin", 0).intensity, [0.1, 0.3], rtol=1e-6)
+    np.testing.assert_array_equal(read_sweep(tmp_path / "a.npz", 0).intensity, [1, 3])
+    assert read_sweep(tmp_path / "b.bin", 0).intensity is None
+    assert read_sweep(tmp_path / "b.npz", 0).intensity is None
 
 
 def pcd(fields: str, types: str, sizes: str, counts: str, points: str, rows: np.ndarray) -> bytes:
@@ -300,14 +267,3 @@ def test_odd_headers_of_pcd_files_are_record_errors(tmp_path: Path, name: str) -
     (tmp_path / "s.pcd").write_bytes(ODD_PCD[name])
     with pytest.raises(RecordError, match="not a readable sweep"):
         read_sweep(tmp_path / "s.pcd", STAMP_NS)
-
-
-@pytest.mark.parametrize("kind", ["<u8", "<i8"])
-def test_absolute_whole_times_of_pcd_files_are_exact(tmp_path: Path, kind: str) -> None:
-    rows = timed(kind, 0)
-    rows["t"] = [STAMP_NS - 3, STAMP_NS + 1_000_000_000]
-    data = pcd("x y z timestamp", f"F F F {kind[1].upper()}", "4 4 4 8", "1 1 1 1", "2", rows)
-    (tmp_path / "s.pcd").write_bytes(data)
-    sweep = read_sweep(tmp_path / "s.pcd", STAMP_NS)
-    assert sweep.t_ns is not None
-    assert (sweep.t_ns - STAMP_NS).tolist() == [-3, 1_000_000_000]

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log2sim.datatypes import Log
-from log2sim.errors import LogError, RecordError
-from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, yaw_of
-from log2sim.logs.kitti.labels import EGO_T_IMU, boxes_in_map, poses_from_oxts, spin_offset_ns
+from log2sim.errors import LogError
+from log2sim.geometry import apply, inverse, project, rotation_from_rpy, yaw_of
+from log2sim.logs.kitti.labels import EGO_T_IMU
 from log2sim.logs.opening import open_log
 
 FRAMES = 4
@@ -118,49 +117,6 @@ def test_both_layouts_have_the_same_rig_and_poses(raw: Path, tracking: Path) -> 
     assert any("no stamps" in note for note in b.notes)
 
 
-def test_mercator_poses_agree_with_the_projection_they_state() -> None:
-    from pyproj import Proj
-
-    rows = np.zeros((50, 30))
-    rows[:, 0], rows[:, 1] = 49.0 + np.linspace(0, 0.02, 50), 8.4 + np.linspace(0, -0.03, 50)
-    rows[:, 2], rows[:, 5] = 100.0, np.linspace(-3, 3, 50)
-    poses, frame = poses_from_oxts(rows)
-    imu = poses @ EGO_T_IMU
-    x, y = Proj(frame.projection)(rows[:, 1], rows[:, 0])
-    np.testing.assert_allclose(imu[:, 0, 3], x, atol=1e-6)
-    np.testing.assert_allclose(imu[:, 1, 3], y, atol=1e-6)
-    np.testing.assert_allclose(imu[:, 2, 3] + frame.altitude_m, 100.0)
-    np.testing.assert_allclose(yaw_of(poses), rows[:, 5], atol=1e-12)
-    # True lengths near the origin: a degree of latitude on the sphere is R pi / 180.
-    assert y[1] / 0.02 * 49 == pytest.approx(6378137 * np.pi / 180, rel=1e-4)
-
-
-def test_the_scanner_sees_left_before_front_before_right() -> None:
-    xyz = np.array([[-1.0, 1e-9, 0], [0, 1, 0], [1, 0, 0], [0, -1, 0], [-1, -1e-9, 0]])
-    np.testing.assert_array_equal(spin_offset_ns(xyz, -50, 60), [-50, -25, 0, 30, 60])
-
-
-def test_stamps_keep_their_nanoseconds(raw: Path) -> None:
-    log = open_log(raw)
-    assert log.streams["image_02"].t_ns[0] == 1_317_042_272_223_456_789
-    sweep = log.streams["velodyne"].read(1)
-    np.testing.assert_array_equal(sweep.t_ns - log.streams["velodyne"].t_ns[1], [0, -25_000_000, 25_000_000])
-
-
-def test_a_missing_sweep_is_a_gap_not_a_shift(raw: Path) -> None:
-    folder = next(raw.glob("*/*/velodyne_points"))
-    (folder / "data" / f"{1:010d}.bin").unlink()
-    log = open_log(raw)
-    steps = np.diff(log.streams["velodyne"].t_ns)
-    assert steps.tolist() == [200_000_000, 100_000_000]
-    assert any("velodyne_points: 1 of 4 records are missing" in note for note in log.notes)
-
-
-def test_a_root_a_date_and_a_drive_open_alike(raw: Path) -> None:
-    drive = next(raw.glob("*/*_sync"))
-    assert {open_log(p).digest for p in (raw, drive.parent, drive)} == {open_log(raw).digest}
-
-
 def test_labels_become_boxes_in_the_map(tracking: Path) -> None:
     log = open_log(tracking)
     labels = log.labels
@@ -178,14 +134,6 @@ def test_labels_become_boxes_in_the_map(tracking: Path) -> None:
     ego_yaw = yaw_of(log.ego.at(labels.t_ns[:1])[0])
     assert abs(labels.yaw_rad[0] - ego_yaw[0]) < 0.08
     assert log.image_labels["image_02"].box_px.tolist() == [[1, 2, 30, 20], [1, 2, 30, 20]]
-
-
-def test_dont_care_boxes_are_regions_without_labels_of_camera_2(tracking: Path) -> None:
-    log = open_log(tracking)
-    regions = log.ignored_regions["image_02"]
-    assert (regions.t_ns.tolist(), regions.box_px.tolist()) == ([0], [[1, 1, 9, 9]])
-    assert log.labels.cameras == ("image_02",)
-    assert len(log.labels.t_ns) == len(log.image_labels["image_02"].t_ns) == 2
 
 
 def test_a_raw_drive_takes_the_labels_of_its_tracking_sequence_at_its_own_stamps(raw: Path, tracking: Path) -> None:
@@ -210,42 +158,10 @@ def test_a_raw_drive_takes_the_labels_of_its_tracking_sequence_at_its_own_stamps
         open_log(raw, format="kitti")
 
 
-def test_rotation_about_the_camera_axis_turns_clockwise_in_the_map() -> None:
-    """With the camera looking along the map's x, rotation_y 0 points to the camera's right, the map's -y."""
-    map_T_rect = np.eye(4)[None].repeat(3, 0)
-    map_T_rect[:, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    values = np.array([[2, 1, 4, 0, 1, 10, turn] for turn in (0.0, -np.pi / 2, np.pi / 4)])
-    center, size, yaw = boxes_in_map(map_T_rect, values)
-    np.testing.assert_allclose(yaw, [-np.pi / 2, 0, -3 * np.pi / 4], atol=1e-12)
-    np.testing.assert_allclose(center[0], [10, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(size[0], [4, 1, 2])
-
-
 def edit(file: Path, old: str, new: str) -> None:
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new, 1))
-
-
-def test_a_repeated_line_of_the_sweep_times_is_told(raw: Path) -> None:
-    file = raw / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps_start.txt"
-    assert not [note for note in open_log(raw).notes if "still turns" in note]
-    lines = file.read_text().splitlines()
-    lines.insert(2, lines[1])
-    file.write_text("\n".join(lines))
-    assert [note for note in open_log(raw).notes if "still turns, first number 0000000002" in note]
-
-
-def test_a_rotation_that_is_not_orthonormal_is_refused_with_its_error(raw: Path) -> None:
-    bent = R_CAM.copy()
-    bent[0, 0] += 0.01
-    bent[1] *= 1.002
-    edit(raw / "2011_09_26" / "calib_velo_to_cam.txt", numbers(R_CAM), numbers(bent))
-    with pytest.raises(LogError, match=r"calib_velo_to_cam.txt, entry 'R'.*off the identity by 0\.01"):
-        open_log(raw)
-    edit(raw / "2011_09_26" / "calib_velo_to_cam.txt", numbers(bent), numbers(-R_CAM))
-    with pytest.raises(LogError, match=r"determinant -1"):
-        open_log(raw)
 
 
 @pytest.mark.parametrize(
@@ -269,14 +185,16 @@ def test_a_fault_of_a_drive_names_its_file(raw: Path, file: str, old: str, new: 
     assert words in str(caught.value)
 
 
-def test_a_missing_calibration_and_a_cut_sweep(raw: Path) -> None:
-    cloud = next(raw.glob("*/*/velodyne_points/data/*2.bin"))
-    cloud.write_bytes(cloud.read_bytes()[:-3])
-    with pytest.raises(RecordError, match=r"0000000002\.bin"):
-        open_log(raw).streams["velodyne"].read(2)
-    (raw / "2011_09_26" / "calib_imu_to_velo.txt").unlink()
-    with pytest.raises(LogError, match=r"calib_imu_to_velo.txt: no such file"):
-        open_log(raw)
+@pytest.mark.real
+def test_the_recorded_drive_opens_with_its_real_stamps(real_data: Path) -> None:
+    log = open_log(real_data / "kitti_raw")
+    assert json.dumps(log.streams["image_02"].t_ns[:1].tolist()) == "[1317042272345808896]"
+    assert log.streams["image_02"].read(0).shape == (375, 1242, 3)
+    sweep = log.streams["velodyne"].read(0)
+    assert np.ptp(sweep.t_ns) == pytest.approx(0.1033e9, rel=0.01)
+    near = np.linalg.norm(sweep.xyz_m[:, :2], axis=1) < 12
+    heights = apply(log.lidars["velodyne"].mount_T_lidar, sweep.xyz_m[near])[:, 2]
+    assert abs(np.median(heights[heights < 0.4])) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -297,61 +215,3 @@ def test_a_damaged_label_line_is_left_out_and_counted(tracking: Path, line: str)
     assert log.labels.track_id.tolist() == before.labels.track_id.tolist()
     (note,) = set(log.notes) - set(before.notes)
     assert note.startswith(f"1 of 4 rows of labels are damaged and left out, first: {file}, line 4: ")
-
-
-def test_a_file_without_a_line_that_is_a_label_is_refused(tracking: Path) -> None:
-    (tracking / "training" / "label_02" / "0007.txt").write_text("frame,id\n1,2\n")
-    with pytest.raises(LogError, match=r"0007.txt, line 1"):
-        open_log(tracking)
-
-
-def count_points(log: Log, category: str, within_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points inside the label boxes, and inside boxes half a meter larger to each side."""
-    inside, around = [], []
-    labels, stream = log.labels, log.streams["velodyne"]
-    for i in range(0, len(stream.t_ns), 8):
-        sweep = stream.read(i)
-        points = apply(log.map_T_sensor("velodyne", sweep.t_ns)[0], sweep.xyz_m)
-        ego = log.ego.at(stream.t_ns[i])[0][0, :3, 3]
-        for k in np.flatnonzero((labels.t_ns == stream.t_ns[i]) & (labels.category == category)):
-            if np.linalg.norm(labels.center_m[k] - ego) < within_m:
-                args = labels.center_m[k], labels.size_m[k], labels.yaw_rad[k]
-                inside.append(points_in_box(points, *args, margin_m=0.1).sum())
-                around.append(points_in_box(points, args[0], args[1] + np.array([1.0, 1.0, 0.0]), args[2]).sum())
-    return np.array(inside), np.array(around)
-
-
-@pytest.mark.slow
-@pytest.mark.real
-def test_label_boxes_of_the_recorded_drive_hold_the_points_of_their_cars(real_data: Path) -> None:
-    log = open_log(real_data / "kitti_tracking")
-    inside, around = count_points(log, "car", 30.0)
-    assert len(inside) > 10
-    assert np.mean(inside > 20) > 0.9
-    assert inside.sum() / around.sum() > 0.8
-    assert log.labels.center_m[log.labels.category == "car", 2].mean() == pytest.approx(0.9, abs=0.5)
-
-
-@pytest.mark.real
-def test_dont_care_boxes_of_the_recorded_drive_are_where_no_label_is(real_data: Path) -> None:
-    """80 frames of sequence 0000 have 130 such boxes by count of the file's lines, none at the place of a label."""
-    log = open_log(real_data / "kitti_tracking")
-    regions, boxes = log.ignored_regions["image_02"], log.image_labels["image_02"]
-    text = (real_data / "kitti_tracking" / "training" / "label_02" / "0000.txt").read_text()
-    assert len(regions.t_ns) == text.count("DontCare") == 130
-    for t in np.unique(regions.t_ns):
-        a, b = regions.box_px[regions.t_ns == t][:, None], boxes.box_px[boxes.t_ns == t][None]
-        overlap = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(-1)
-        assert np.all(overlap < 0.5 * (b[..., 2:] - b[..., :2]).prod(-1))
-
-
-@pytest.mark.real
-def test_the_recorded_drive_opens_with_its_real_stamps(real_data: Path) -> None:
-    log = open_log(real_data / "kitti_raw")
-    assert json.dumps(log.streams["image_02"].t_ns[:1].tolist()) == "[1317042272345808896]"
-    assert log.streams["image_02"].read(0).shape == (375, 1242, 3)
-    sweep = log.streams["velodyne"].read(0)
-    assert np.ptp(sweep.t_ns) == pytest.approx(0.1033e9, rel=0.01)
-    near = np.linalg.norm(sweep.xyz_m[:, :2], axis=1) < 12
-    heights = apply(log.lidars["velodyne"].mount_T_lidar, sweep.xyz_m[near])[:, 2]
-    assert abs(np.median(heights[heights < 0.4])) < 0.1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
@@ -11,11 +10,9 @@ import pytest
 
 from log2sim import open_log
 from log2sim.config import Config
-from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, transform
-from log2sim.logs.kitti.object import intrinsics_and_rotation
 
 K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
 # x right, y down, z forward of the level camera 0 along the LiDAR's -y, -z, x.
@@ -125,72 +122,3 @@ def test_its_labels_as_detector_are_perfect_by_kittis_rules(root: Path) -> None:
     assert [rows[name]["truths"] for name in ("all", "easy", "moderate")] == [3, 2, 3]
     assert rows["all"]["ap_r40"] == rows["easy"]["ap_r40"] == 1
     assert rows["all"]["false_positives"] == 0
-
-
-def test_the_height_of_the_imu_is_believed_where_it_is_known(tmp_path: Path) -> None:
-    write_frame(tmp_path / "training", 0, [(2.0, 15.0, 0.4)], imu=transform(np.eye(3), [-0.8, 0.3, -0.8]))
-    log = open_log(tmp_path)
-    assert log.ground_z_ego_m == 0
-    assert log.lidars["velodyne"].mount_T_lidar[2, 3] == pytest.approx(0.93 + 0.8)
-
-
-def test_a_split_without_labels_or_pictures_and_two_splits(tmp_path: Path) -> None:
-    write_frame(tmp_path / "testing", 0, [])
-    for name in ("label_2", "image_2"):
-        for file in (tmp_path / "testing" / name).iterdir():
-            file.unlink()
-    log = open_log(tmp_path / "testing")
-    assert (log.labels, log.cameras, log.reference_camera) == (None, {}, None)
-    assert log.lidars["velodyne"].mount_T_lidar[2, 3] == pytest.approx(1.73)
-    write_frame(tmp_path / "training", 0, [])
-    with pytest.raises(ConfigError, match="--sequence NAME: testing, training"):
-        open_log(tmp_path)
-    assert open_log(tmp_path, sequence="training").name == "kitti-object-training"
-
-
-def test_frames_with_other_cameras_are_told(tmp_path: Path) -> None:
-    write_frame(tmp_path / "training", 0, [])
-    write_frame(tmp_path / "training", 1, [], tilt=np.eye(3))
-    assert any(note.startswith("1 of 2 frames have another P2") for note in open_log(tmp_path).notes)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("P2:", "P9:", "no entry 'P2'"),
-        ("R0_rect: 1.0", "R0_rect: 3.0", "not a rotation matrix"),
-        ("Tr_velo_to_cam:", "Tr:", "no entry 'Tr_velo_to_cam'"),
-        ("P2: 700.0", "P2: -700.0", "'P2': .* is singular or mirrors the image"),
-    ],
-)
-def test_a_bad_calibration_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
-    write_frame(tmp_path / "training", 2, [])
-    path = tmp_path / "training" / "calib" / "000002.txt"
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(LogError, match=message) as error:
-        open_log(tmp_path)
-    assert "000002.txt" in str(error.value)
-    path.unlink()
-    with pytest.raises(LogError, match=r"000002.txt: no such file"):
-        open_log(tmp_path)
-
-
-def test_a_damaged_label_line_is_left_out_and_counted(tmp_path: Path) -> None:
-    write_frame(tmp_path / "training", 2, [(0.0, 10.0, 0.0)])
-    with (tmp_path / "training" / "label_2" / "000002.txt").open("a") as file:
-        file.write("Spaceship 1 2 3\n")
-    log = open_log(tmp_path)
-    assert len(log.labels.t_ns) == 1
-    assert any(
-        re.match(r"1 of 3 rows of labels are damaged and left out, first: .*000002.txt, line 3: ", n) for n in log.notes
-    )
-
-
-def test_a_projection_is_split_into_intrinsics_and_rotation() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        rotation = rotation_from_rpy(*rng.uniform(-3, 3, 3))
-        matrix, scale = K + np.diag(rng.uniform(0, 50, 3) * [1, 1, 0]), rng.uniform(0.1, 3)
-        found_K, found_R = intrinsics_and_rotation(scale * matrix @ rotation)
-        np.testing.assert_allclose(found_K, matrix, atol=1e-9)
-        np.testing.assert_allclose(found_R, rotation, atol=1e-12)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import struct
-import time
 import zlib
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
-from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
-from log2sim.logs.excerpt import summarize
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.stamps import transverse_mercator
@@ -138,21 +133,6 @@ def test_gnss_gives_the_poses_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.ego.map_T_ego[:, :3, :3], log.ego.map_T_ego[:, :3, :3], atol=1e-8)
 
 
-def test_gnss_yaw_is_turned_to_the_grid_of_the_projection(tmp_path: Path) -> None:
-    """Three degrees off the central meridian of UTM, grid north is about sin(latitude) * 3 degrees off true north."""
-    write_log(
-        make_log(map_frame=MapFrame(48.1, 11.5, 500.0, transverse_mercator(48.1, 11.5))), tmp_path / "log", ego="gnss"
-    )
-    edit(tmp_path / "log", lambda m: m.update(map={"projection": "+proj=utm +zone=32 +datum=WGS84"}))
-    for k in range(FRAMES):
-        edit_line(tmp_path / "log" / "ego" / "gnss.csv", k + 2, f"{T0_NS + k},48.0,12.0,500,0,0,0.5")
-    log = open_log(tmp_path / "log")
-    expected = np.radians(3.0) * np.sin(np.radians(48.0))
-    assert wrap_angle(yaw_of(log.ego.map_T_ego[0]) - 0.5) == pytest.approx(expected, abs=2e-5)
-    assert log.map.offset_m[1] == pytest.approx(5.32e6, abs=5e3)
-    assert np.abs(log.ego.map_T_ego[0, :2, 3]).max() <= 500.0
-
-
 def test_a_far_map_origin_changes_nothing_but_the_offset(tmp_path: Path) -> None:
     near, far = make_log(), make_log((7_000_000.0, -10_000_000.0, 0.0))
     write_log(near, tmp_path / "near")
@@ -169,141 +149,6 @@ def test_a_far_map_origin_changes_nothing_but_the_offset(tmp_path: Path) -> None
     np.testing.assert_allclose(b.streams["top"].read(0).xyz_m, a.streams["top"].read(0).xyz_m, atol=1e-6)
     write_log(b, tmp_path / "again")
     assert open_log(tmp_path / "again").map.offset_m == b.map.offset_m
-
-
-def test_a_roadside_log_needs_no_ego(tmp_path: Path) -> None:
-    log = make_log()
-    fixed = replace(
-        log, ego=None, cameras={"pole": log.cameras["pole"]}, lidars={"world": log.lidars["world"]},
-        streams={k: log.streams[k] for k in ("pole", "world")}, image_labels={}, reference_camera=None,
-    )  # fmt: skip
-    write_log(fixed, tmp_path / "log")
-    back = open_log(tmp_path / "log")
-    assert back.ego is None
-    assert back.map_T_sensor("pole", back.streams["pole"].t_ns)[1].all()
-
-
-def test_the_images_of_a_log_are_copied_as_they_are(folder: Path, tmp_path: Path) -> None:
-    write_log(open_log(folder), tmp_path / "copy")
-    for name in ("front", "pole"):
-        for k in range(FRAMES):
-            file = f"{name}/{k:06d}.jpg"
-            assert (tmp_path / "copy" / file).read_bytes() == (folder / file).read_bytes()
-
-
-def test_records_that_cannot_be_read_are_left_out_where_that_is_wanted(folder: Path, tmp_path: Path) -> None:
-    (folder / "top" / "000001.npz").write_bytes(b"torn")
-    (folder / "front" / "000002.jpg").unlink()
-    with pytest.raises(RecordError, match=r"000002\.jpg|000001\.npz"):
-        write_log(open_log(folder), tmp_path / "copy")
-    assert not (tmp_path / "copy").exists()
-    problems: list[str] = []
-    write_log(open_log(folder), tmp_path / "copy", problems=problems)
-    assert [("front" in p, "top" in p) for p in problems] == [(True, False), (False, True)]
-    copy = open_log(tmp_path / "copy")
-    assert {name: len(stream.t_ns) for name, stream in copy.streams.items()} == {
-        "front": 4,
-        "pole": 5,
-        "top": 4,
-        "world": 5,
-    }
-    assert validate_log(tmp_path / "copy") == []
-    for file in (folder / "world").glob("*.npz"):
-        file.write_bytes(b"torn")
-    with pytest.raises(LogError, match="'world': none of its 5 records"):
-        write_log(open_log(folder), tmp_path / "none", problems=[])
-    assert not (tmp_path / "none").exists()
-
-
-def test_sweeps_of_one_stream_are_of_one_kind(tmp_path: Path) -> None:
-    log = make_log()
-    t_ns = log.streams["top"].t_ns
-
-    def read(i: int) -> Sweep:
-        return replace(log.streams["top"].read(i), compensated_ns=int(t_ns[i]) if i else None)
-
-    mixed = replace(log, streams={**log.streams, "top": Stream("top", t_ns, read)})
-    with pytest.raises(ConfigError, match="are not compensated"):
-        write_log(mixed, tmp_path / "log")
-
-
-@pytest.mark.parametrize("road_m", [0.0, 641.5, 1612.0])
-def test_the_road_of_a_roadside_log_keeps_its_height_in_the_map(tmp_path: Path, road_m: float) -> None:
-    log = make_log((0.0, 0.0, road_m))
-    fixed = replace(
-        log,
-        cameras={"pole": log.cameras["pole"]},
-        lidars={"world": log.lidars["world"]},
-        streams={name: log.streams[name] for name in ("pole", "world")},
-        ego=None,
-        reference_camera=None,
-        image_labels={},
-        ground_z_ego_m=road_m,
-    )
-    write_log(fixed, tmp_path / "log")
-    for _ in range(2):
-        back = open_log(tmp_path / "log")
-        assert back.ground_z_ego_m + back.map.offset_m[2] == pytest.approx(road_m)
-        assert back.cameras["pole"].mount_T_cam[2, 3] - back.ground_z_ego_m == pytest.approx(6.0)
-        write_log(back, tmp_path / "log", overwrite=True)
-
-
-def test_an_occlusion_is_a_number_from_0_to_3(folder: Path) -> None:
-    file = folder / "labels" / "boxes_3d.csv"
-    file.write_text(file.read_text().replace("visible", "occlusion"))
-    assert open_log(folder).labels.occlusion.tolist() == [1, 0, 1, 0, 1]
-    edit_line(file, 4, f"{T0_NS},a,car,1,2,3,4,2,1,0,4")
-    with pytest.raises(LogError, match="line 4, field 'occlusion': 4, expected 0, 1, 2 or 3"):
-        open_log(folder)
-
-
-def test_a_log_without_poses_stays_one(tmp_path: Path) -> None:
-    log = replace(make_log(), ego=None)
-    write_log(log, tmp_path / "log")
-    back = open_log(tmp_path / "log")
-    assert back.ego is None
-    assert back.ego_vehicle == log.ego_vehicle
-    assert back.ground_z_ego_m == log.ground_z_ego_m
-    assert back.cameras["front"].mount == "ego"
-
-
-def test_late_and_repeated_records_are_put_right_and_noted(folder: Path) -> None:
-    index = folder / "front" / "index.csv"
-    rows = index.read_text().splitlines()
-    index.write_text("\n".join([rows[0], rows[2], rows[1], rows[3], rows[3], rows[4], rows[5]]) + "\n")
-    poses = folder / "ego" / "poses.csv"
-    rows = poses.read_text().splitlines()
-    poses.write_text("\n".join([rows[0], *rows[:0:-1]]) + "\n")
-    log = open_log(folder)
-    expected = make_log()
-    np.testing.assert_array_equal(log.streams["front"].t_ns, expected.streams["front"].t_ns)
-    np.testing.assert_allclose(log.ego.map_T_ego, expected.ego.map_T_ego, atol=1e-12)
-    assert abs(log.streams["front"].read(0).astype(int) - expected.streams["front"].read(0)).mean() < 3
-    text = "\n".join(log.notes)
-    assert f"front: 1 of 6 records out of order, first at stamp {T0_NS}" in text
-    assert f"front: 1 of 6 records repeat a stamp, first at stamp {T0_NS + 200_000_000}" in text
-    assert "ego: 4 of 5 records out of order" in text
-    assert len(validate_log(folder)) == 3
-
-
-def test_negative_and_zero_stamps_are_stamps(folder: Path) -> None:
-    for k in range(FRAMES):
-        edit_line(folder / "front" / "index.csv", k + 2, f"{(k - 2) * 10},front/{k:06d}.jpg")
-    assert open_log(folder).streams["front"].t_ns.tolist() == [-20, -10, 0, 10, 20]
-
-
-def test_rows_that_are_not_finite_are_left_out_with_their_times(folder: Path) -> None:
-    xyz = np.array([[1, 2, 3], [np.nan, 0, 0], [4, 5, 6], [0, np.inf, 0]], dtype=np.float32)
-    np.savez(folder / "top" / "000001.npz", xyz_m=xyz, t_offset_ns=np.array([10, 20, 30, 40]))
-    sweep = open_log(folder).streams["top"].read(1)
-    np.testing.assert_array_equal(sweep.xyz_m, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(sweep.t_ns - sweep.stamp_ns, [10, 30])
-
-
-def test_an_empty_cloud_is_a_sweep_without_points(folder: Path) -> None:
-    np.savez(folder / "top" / "000001.npz", xyz_m=np.zeros((0, 3), np.float32))
-    assert open_log(folder).streams["top"].read(1).xyz_m.shape == (0, 3)
-    assert any("no points" in p for p in validate_log(folder))
 
 
 PCD = "FIELDS x y z intensity {t}\nSIZE 4 4 4 4 {size}\nTYPE F F F F {kind}\nPOINTS {n}\nDATA {data}\n"
@@ -324,62 +169,6 @@ def test_pcd_points_and_their_times(folder: Path, data: str) -> None:
     sweep = open_log(folder).streams["top"].read(0)
     np.testing.assert_array_equal(sweep.xyz_m, xyz)
     np.testing.assert_array_equal(sweep.t_ns - T0_NS, [100, 200])
-
-
-def test_an_absolute_time_in_a_pcd_file_is_taken_from_the_stamp(folder: Path) -> None:
-    header = PCD.format(t="timestamp", size=8, kind="U", n=2, data="ascii")
-    (folder / "top" / "cloud.pcd").write_text(f"{header}1 2 3 0 {T0_NS + 5}\n4 5 6 0 {T0_NS - 7}\n")
-    edit_line(folder / "top" / "index.csv", 2, f"{T0_NS},top/cloud.pcd")
-    np.testing.assert_array_equal(open_log(folder).streams["top"].read(0).t_ns, [T0_NS + 5, T0_NS - 7])
-
-
-def test_a_root_of_several_logs_needs_a_sequence(tmp_path: Path) -> None:
-    write_log(make_log(), tmp_path / "a")
-    assert open_log(tmp_path).name == "small"
-    write_log(make_log(), tmp_path / "b")
-    with pytest.raises(ConfigError, match=r"2 sequences.*--sequence NAME: a, b"):
-        open_log(tmp_path)
-    with pytest.raises(ConfigError, match=r"no sequence 'bb'.*did you mean 'b'"):
-        open_log(tmp_path, sequence="bb")
-    assert open_log(tmp_path, sequence="b").digest == open_log(tmp_path / "a").digest
-
-
-def test_the_digest_follows_every_index(folder: Path) -> None:
-    before = open_log(folder).digest
-    edit_line(folder / "labels" / "boxes_3d.csv", 2, f"{T0_NS},a,car,1,2,3,4,2,1.5,0.1,1")
-    assert open_log(folder).digest != before
-
-
-def test_a_folder_is_never_half_written_nor_lost(tmp_path: Path) -> None:
-    log = make_log()
-
-    def broken(i: int) -> None:
-        raise RecordError("no such record")
-
-    bad = replace(log, streams={**log.streams, "world": Stream("world", log.streams["world"].t_ns, broken)})
-    write_log(log, tmp_path / "log")
-    with pytest.raises(RecordError):
-        write_log(bad, tmp_path / "log", overwrite=True)
-    assert open_log(tmp_path / "log").name == "small"
-    assert [p.name for p in tmp_path.iterdir()] == ["log"]
-    with pytest.raises(ConfigError, match="exists already"):
-        write_log(log, tmp_path / "log")
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("x")
-    with pytest.raises(ConfigError, match="is no log folder"):
-        write_log(log, tmp_path / "mine", overwrite=True)
-    assert (tmp_path / "mine" / "thesis.txt").exists()
-
-
-def test_the_summary_counts_and_finds_gaps(folder: Path) -> None:
-    edit_line(folder / "front" / "index.csv", 6, f"{T0_NS + 900_000_000},front/000004.jpg")
-    summary = summarize(open_log(folder))
-    assert summary["cameras"]["front"]["rate_hz"] == 10.0
-    assert summary["cameras"]["front"]["gaps"] == [{"after_ns": T0_NS + 300_000_000, "length_s": 0.6}]
-    assert summary["labels"] == {"boxes": 5, "tracks": 1, "tracks_by_category": {"car": 1}}
-    assert summary["ego"]["distance_m"] == 6.0
-    assert any("no ego pose for 1 of 5" in p for p in validate_log(folder))
-    json.dumps(summary, allow_nan=False)
 
 
 # --- bad input: (what breaks it, words that the message must hold)
@@ -443,20 +232,6 @@ def test_a_fault_of_a_table_names_its_line_and_field(folder: Path, fault: str) -
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-def test_a_stream_without_records_is_an_error(folder: Path) -> None:
-    (folder / "front" / "index.csv").write_text("t_ns,file\n")
-    with pytest.raises(LogError, match=r"front/index.csv: no records"):
-        open_log(folder)
-
-
-def test_a_symbolic_link_cannot_lead_out(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "secret.jpg").write_bytes(b"x")
-    (folder / "front" / "link.jpg").symlink_to(tmp_path / "secret.jpg")
-    edit_line(folder / "front" / "index.csv", 2, f"{T0_NS},front/link.jpg")
-    with pytest.raises(LogError, match=r"line 2, field 'file'.*leaves the log folder"):
-        open_log(folder)
-
-
 def png_header(width_px: int, height_px: int) -> bytes:
     """The first chunk of a gray PNG file, sound by its check sum."""
     chunk = b"IHDR" + struct.pack(">IIBBBBB", width_px, height_px, 8, 0, 0, 0, 0)
@@ -500,59 +275,3 @@ def test_a_record_that_cannot_be_read_is_one_record(folder: Path, fault: str) ->
     assert str(T0_NS + 200_000_000) in str(caught.value)
     stream.read(1)
     assert len([p for p in validate_log(folder) if file.name in p]) == 1
-
-
-def test_a_header_that_promises_too_much_allocates_nothing(folder: Path) -> None:
-    header = np.lib.format.header_data_from_array_1_0(np.zeros((1, 3))) | {"shape": (10**12, 3)}
-    with (folder / "top" / "000002.npy").open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
-    edit_line(folder / "top" / "index.csv", 4, f"{T0_NS + 200_000_000},top/000002.npy")
-    with pytest.raises(RecordError, match="1000000000000 points, more than"):
-        open_log(folder).streams["top"].read(2)
-    text = PCD.format(t="t", size=4, kind="U", n=10**12, data="binary")
-    (folder / "top" / "x.pcd").write_text(text)
-    edit_line(folder / "top" / "index.csv", 4, f"{T0_NS + 200_000_000},top/x.pcd")
-    with pytest.raises(RecordError, match="more than"):
-        open_log(folder).streams["top"].read(2)
-    (folder / "top" / "x.pcd").write_text(text.replace(str(10**12), "2").replace("binary", "binary_compressed"))
-    with pytest.raises(RecordError, match="binary_compressed is not supported"):
-        open_log(folder).streams["top"].read(2)
-
-
-@pytest.fixture
-def switching_collector() -> Iterator[None]:
-    """Collect garbage often, each time with a change of threads, as where a library (Dask, hypothesis) follows the collector."""
-    threshold = gc.get_threshold()
-
-    def switch(phase: str, info: dict[str, int]) -> None:
-        time.sleep(0)
-
-    gc.callbacks.append(switch)
-    gc.set_threshold(50)
-    yield
-    gc.set_threshold(*threshold)
-    gc.callbacks.remove(switch)
-
-
-@pytest.mark.usefixtures("switching_collector")
-def test_threads_parse_headers_of_arrays_at_the_same_time(folder: Path) -> None:
-    log = open_log(folder)
-    stream = log.streams[next(iter(log.lidars))]
-    expected = stream.read(0).xyz_m
-    with ThreadPoolExecutor(8) as pool:
-        for sweep in pool.map(stream.read, [0] * 2000):
-            assert np.array_equal(sweep.xyz_m, expected)
-
-
-def test_a_missing_or_unknown_folder_says_what_is_expected(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="no such folder"):
-        open_log(tmp_path / "none")
-    with pytest.raises(LogError, match=r"no known log format.*log2sim \(a folder with log.json\).*kitti.*pandaset"):
-        open_log(tmp_path)
-    with pytest.raises(LogError, match="holds no sequence of format 'kitti'"):
-        open_log(tmp_path, format="kitti")
-    with pytest.raises(ConfigError, match=r"unknown log format 'kiti'.*did you mean 'kitti'"):
-        open_log(tmp_path, format="kiti")
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(LogError, match="is a file"):
-        open_log(tmp_path / "file")

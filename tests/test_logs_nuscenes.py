@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,10 @@ from log_encoders.world import labels_at
 
 from log2sim import Config, reconstruct
 from log2sim.datatypes import Labels, Log
-from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.files import plugins
-from log2sim.geometry import NS_PER_S, apply, inverse, points_in_box
+from log2sim.errors import LogError
+from log2sim.geometry import NS_PER_S, apply, inverse
 from log2sim.logs.nuscenes import tables
-from log2sim.logs.nuscenes.scene import FIRING_NS, read_sweep, turn_ends
+from log2sim.logs.nuscenes.scene import FIRING_NS
 from log2sim.logs.opening import open_log
 from log2sim.logs.stamps import compute_scan_offset_ns
 from log2sim.perception.lidar.cloud import deskew, transform_rigidly
@@ -86,38 +84,6 @@ def test_scanning_finds_what_parsing_the_whole_table_finds(
             assert found == [row for row in rows if row.get(key) in wanted]
 
 
-@pytest.mark.slow
-def test_scanning_a_large_table_takes_little_memory(tmp_path: Path) -> None:
-    row = {"token": "0" * 32, "sample_token": "1" * 32, "filename": "sweeps/" + "x" * 300, "prev": "", "next": ""}
-    one = json.dumps(row, indent=0)
-    wanted = one.replace("1" * 32, "2" * 32)
-    path = tmp_path / "sample_data.json"
-    path.write_text("[" + (one + ",") * 50_000 + wanted + "," + (one + ",") * 50_000 + wanted + "]")
-    tracemalloc.start()
-    found = list(tables.scan_records(path, "sample_token", ["2" * 32]))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert len(found) == 2
-    assert peak < 5 * tables.CHUNK_BYTES < path.stat().st_size
-
-
-def test_keys_that_stand_twice_in_a_wanted_record_are_told(tmp_path: Path) -> None:
-    path = tmp_path / "sample_data.json"
-    path.write_text('[{"token": "a", "x": 1}, {"token": "b", "x": 1, "x": 2}]')
-    assert list(tables.scan_records(path, "token", ["a"])) == [{"token": "a", "x": 1}]
-    with pytest.raises(LogError, match=r"sample_data.json, byte \d+: a key occurs twice in one object, first 'x'"):
-        list(tables.scan_records(path, "token", ["b"]))
-
-
-def test_a_table_that_goes_on_with_zeros_is_refused_at_the_first_of_them(tmp_path: Path) -> None:
-    path = tmp_path / "sample.json"
-    path.write_text('[{"token": "a"}]')
-    with path.open("r+b") as file:
-        file.truncate(64 * 1024**3)  # takes no place on the disk, and minutes to read
-    with pytest.raises(LogError, match="byte 16: not valid JSON: a zero byte"):
-        list(tables.scan_records(path, "token", ["b"]))
-
-
 def test_points_are_where_and_when_the_world_has_them(root: Path) -> None:
     """The file order gives the times; rays without a return are not points."""
     log, world = open_log(root), hdl32_world()
@@ -131,36 +97,6 @@ def test_points_are_where_and_when_the_world_has_them(root: Path) -> None:
         # The order within a firing is that of the rings, for both.
         order = np.argsort(truth.t_ns, kind="stable")
         assert np.abs(in_map - expected[order]).max() < 5e-3
-
-
-def test_rays_without_a_return_are_left_out_at_any_speed(tmp_path: Path) -> None:
-    """At 40 m/s the sensor is 2 m farther at the end of a turn, so that the first of these rays lie 2 m behind."""
-    firings, stamp_ns = 1085, 10**18
-    ago_s = (firings - 1 - np.arange(firings)) * FIRING_NS / NS_PER_S
-    rows = np.zeros((firings, 32, 5), "<f4")
-    rows[..., 1], rows[..., 4] = -40.0 * ago_s[:, None], np.arange(32)
-    rows[::7, 5, :3] += [0.0, 1.2, 0.0]
-    rows.tofile(tmp_path / "x.pcd.bin")
-
-    def poses(t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        map_T_lidar = np.repeat(np.eye(4)[None], len(t_ns), axis=0)
-        map_T_lidar[:, 1, 3] = 40.0 * (t_ns - stamp_ns) / NS_PER_S
-        return map_T_lidar, np.ones(len(t_ns), dtype=bool)
-
-    sweep = read_sweep(tmp_path / "x.pcd.bin", stamp_ns, poses)
-    np.testing.assert_array_equal(sweep.xyz_m, rows[::7, 5, :3])
-    np.testing.assert_array_equal(sweep.t_ns - stamp_ns, np.round(-ago_s[::7] * NS_PER_S))
-
-
-def test_points_in_another_order_have_no_times(root: Path, spoilable: Path) -> None:
-    file = sorted(spoilable.glob("samples/top/*"))[0]
-    rows = np.fromfile(file, "<f4").reshape(-1, 5)
-    file.unlink()
-    rows[::-1].tofile(file)
-    sweep, ordered = open_log(spoilable).streams["top"].read(0), open_log(root).streams["top"].read(0)
-    assert sweep.t_ns is None
-    assert sweep.compensated_ns == sweep.stamp_ns
-    np.testing.assert_array_equal(sweep.xyz_m[::-1], ordered.xyz_m)
 
 
 def test_the_turn_is_clockwise_from_the_left() -> None:
@@ -198,17 +134,6 @@ def track_like(truth: Labels, labels: Labels, rows: np.ndarray) -> str:
     return min(sizes, key=lambda track: np.abs(sizes[track] - labels.size_m[rows][0]).sum())
 
 
-def test_turns_are_filled_in_where_tables_know_key_frames_alone() -> None:
-    t_ns = np.array([0, 50, 102, 600, 675]) * 1_000_000
-    ends = turn_ends(t_ns) // 1_000_000
-    np.testing.assert_allclose(
-        ends, [0, 50, 102, 151, 201, 251, 301, 351, 400, 450, 500, 550, 600, 637, 675], atol=1.01
-    )
-    np.testing.assert_array_equal(turn_ends(t_ns[:1]), t_ns[:1])
-    far = np.array([0, 1, 2, 10**9]) * 1_000_000
-    np.testing.assert_array_equal(turn_ends(far), far[[0, 3]])
-
-
 def test_categories_follow_kinds_and_attributes(root: Path, spoilable: Path) -> None:
     def kinds(rows: list[dict[str, Any]]) -> None:
         names = {row["name"]: row for row in rows}
@@ -233,22 +158,6 @@ def test_categories_follow_kinds_and_attributes(root: Path, spoilable: Path) -> 
     assert "animal (2)" in " ".join(log.notes)
 
 
-def test_samples_of_one_stamp_and_far_away_ones_are_not_interpolated(root: Path, spoilable: Path) -> None:
-    first = min(row["timestamp"] for row in json.loads((root / "v1.0-mini" / "sample.json").read_text()))
-    for stamp in (first, 1, 10**15):
-        edit(spoilable, "sample", lambda rows, stamp=stamp: rows[1].update(timestamp=stamp))
-        labels = open_log(spoilable).labels
-        assert labels is not None
-        assert len(labels.t_ns) < len(open_log(root).labels.t_ns)
-
-
-def test_a_scene_without_annotations_has_no_labels(spoilable: Path) -> None:
-    edit(spoilable, "sample_annotation", list.clear)
-    log = open_log(spoilable)
-    assert log.labels is None
-    assert any("no annotations" in note for note in log.notes)
-
-
 def test_files_of_a_partial_download_are_left_out_and_counted(root: Path, spoilable: Path) -> None:
     whole = open_log(root)
     for file in [*spoilable.glob("sweeps/top/*"), *spoilable.glob("s*/front/*")]:
@@ -266,23 +175,6 @@ def test_files_of_a_partial_download_are_left_out_and_counted(root: Path, spoila
         file.unlink()
     with pytest.raises(LogError, match="none of the 20 images and sweeps of scene 'world' is there"):
         open_log(spoilable)
-
-
-def test_the_table_log_json_is_no_log_of_ours(root: Path) -> None:
-    """Whichever order readers are asked in."""
-    native = plugins.load("log", "log2sim")
-    assert not native.matches(root)
-    assert not native.matches(root / "v1.0-mini")
-
-
-def test_a_key_that_stands_twice_in_an_annotation_is_told(spoilable: Path) -> None:
-    path = spoilable / "v1.0-mini/sample_annotation.json"
-    sample = json.loads(path.read_text())[0]["sample_token"]
-    path.write_text(path.read_text().replace("[", f'[{{"sample_token": "{sample}", "sample_token": []}}, ', 1))
-    with pytest.raises(
-        LogError, match=r"sample_annotation.json, byte 2: a key occurs twice in one object, first 'sample_token'"
-    ):
-        _ = open_log(spoilable).labels
 
 
 TABLES = (
@@ -306,69 +198,8 @@ def test_a_table_without_records_is_refused_or_missed_by_name(spoilable: Path, t
         assert labels is not None or "nothing is labeled" in notes
 
 
-@pytest.mark.parametrize("table", TABLES)
-def test_records_that_are_there_twice_count_once(root: Path, spoilable: Path, table: str) -> None:
-    if not (spoilable / "v1.0-mini" / f"{table}.json").is_file():
-        pytest.skip("a table that is not written")
-    edit(spoilable, table, lambda rows: rows.extend([dict(row) for row in rows]))
-    once, twice = open_log(root, format="nuscenes"), open_log(spoilable, format="nuscenes")
-    for name, stream in once.streams.items():
-        assert twice.streams[name].t_ns.tolist() == stream.t_ns.tolist()
-    assert once.labels is not None
-    assert twice.labels is not None
-    assert twice.labels.t_ns.tolist() == once.labels.t_ns.tolist()
-    assert twice.labels.track_id.tolist() == once.labels.track_id.tolist()
-
-
-def test_links_between_records_that_go_in_a_circle_have_no_effect(root: Path, spoilable: Path) -> None:
-    def circle(rows: list[dict[str, Any]]) -> None:
-        for row in rows:
-            row["prev"] = row["next"] = row["token"]
-
-    for table in ("sample", "sample_data", "sample_annotation"):
-        edit(spoilable, table, circle)
-    once, again = open_log(root), open_log(spoilable)
-    assert once.labels is not None
-    assert again.labels is not None
-    assert again.labels.t_ns.tolist() == once.labels.t_ns.tolist()
-
-
 def assert_one_line(problem: Exception) -> None:
     assert "\n" not in str(problem)
-
-
-def test_scenes_of_several_versions_are_told_apart(root: Path, spoilable: Path) -> None:
-    assert open_log(root / "v1.0-mini").name == open_log(root).name == "nuscenes-world"
-    other = spoilable / "v1.0-test"
-    other.mkdir()
-    for file in (root / "v1.0-mini").iterdir():
-        (other / file.name).write_bytes(file.read_bytes())
-    with pytest.raises(ConfigError, match=r"v1\.0-mini/world, v1\.0-test/world"):
-        open_log(spoilable)
-    assert open_log(spoilable, sequence="v1.0-test/world").details["tables"] == "v1.0-test"
-
-
-def test_the_order_of_records_has_no_effect(root: Path, spoilable: Path) -> None:
-    for table in ("sample", "sample_data", "ego_pose", "sample_annotation"):
-        edit(spoilable, table, list.reverse)
-    log, other = open_log(root), open_log(spoilable)
-    for name in log.streams:
-        np.testing.assert_array_equal(log.streams[name].t_ns, other.streams[name].t_ns)
-    np.testing.assert_array_equal(log.ego.map_T_ego, other.ego.map_T_ego)
-    np.testing.assert_array_equal(log.labels.t_ns, other.labels.t_ns)
-
-
-def test_the_map_lies_where_the_development_kit_puts_it(root: Path) -> None:
-    """The destination on a sphere by bearing and distance from the south-western corner."""
-    from pyproj import Proj
-
-    frame, x, y = open_log(root).map, 599.8, 1647.6
-    longitude, latitude = Proj(frame.projection)(x, y, inverse=True)
-    angle, bearing = np.hypot(x, y) / 6378137.0, np.arctan2(x, y)
-    lat0, lon0 = np.radians([42.336849169438615, -71.05785369873047])
-    lat = np.arcsin(np.sin(lat0) * np.cos(angle) + np.cos(lat0) * np.sin(angle) * np.cos(bearing))
-    lon = lon0 + np.arctan2(np.sin(bearing) * np.sin(angle) * np.cos(lat0), np.cos(angle) - np.sin(lat0) * np.sin(lat))
-    np.testing.assert_allclose([latitude, longitude], np.degrees([lat, lon]), atol=1e-9)
 
 
 def remove(root: Path, table: str) -> None:
@@ -442,56 +273,6 @@ def test_errors_name_the_table_and_what_was_expected(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
-@given(st.data())
-@settings(max_examples=40, deadline=None)
-def test_damaged_tables_never_end_in_anything_but_a_log_error(root: Path, data: st.DataObject) -> None:
-    folder = root / "v1.0-mini"
-    path = data.draw(st.sampled_from([p for p in sorted(folder.iterdir()) if p.stem not in ("map", "visibility")]))
-    whole = path.read_bytes()
-    damaged = bytearray(whole)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(damaged) - 1))
-        new = data.draw(st.sampled_from([b"", b"-", b"9e999", b'"', b"{", b"}", b"[", b"null", b"\xff", b"NaN", b"\\"]))
-        damaged[at : at + data.draw(st.integers(0, 9))] = new
-    problem: Exception | None = None
-    try:
-        path.write_bytes(damaged)
-        log = open_log(root)
-        _ = log.notes
-        for stream in log.streams.values():
-            stream.read(0)
-    except (LogError, ConfigError) as error:  # ConfigError: the name of the scene can go, or become two
-        problem = error
-    finally:
-        path.write_bytes(whole)
-    assert "\n" not in str(problem)
-
-
-def test_a_sweep_of_half_a_point_costs_that_sweep_only(spoilable: Path) -> None:
-    file = sorted(spoilable.glob("samples/top/*"))[0]
-    data = file.read_bytes()
-    file.unlink()
-    file.write_bytes(data[:-7])
-    stream = open_log(spoilable).streams["top"]
-    with pytest.raises(RecordError, match=r"694393 bytes, expected five float32 \(x, y, z, intensity, ring\) a point"):
-        stream.read(0)
-    assert len(stream.read(1).xyz_m) > 100
-
-
-def test_coordinates_of_far_maps_are_made_small(root: Path, spoilable: Path) -> None:
-    def far(rows: list[dict[str, Any]]) -> None:
-        for row in rows:
-            row["translation"][0] += 50_000
-
-    edit(spoilable, "ego_pose", far)
-    edit(spoilable, "sample_annotation", far)
-    log, near = open_log(spoilable), open_log(root)
-    assert log.map.offset_m == (50_000, 0, 0)
-    np.testing.assert_allclose(log.ego.map_T_ego, near.ego.map_T_ego, atol=1e-6)
-    np.testing.assert_allclose(log.labels.center_m, near.labels.center_m, atol=1e-6)
-
-
 def test_key_frames_alone_give_a_scenario(tmp_path: Path) -> None:
     """Ticks of a download without sweeps are its key frames, here five in a second."""
     root = encode(hdl32_world(), tmp_path, key_every=2)
@@ -549,36 +330,3 @@ def test_recorded_points_are_compensated_to_the_end_of_their_turn(folder: str, s
     assert path[0, 1] < -0.4
     if speed_mps is not None:  # of the CAN bus
         assert -path[0, 1] == pytest.approx(speed_mps * len(firings) * FIRING_NS / NS_PER_S, rel=0.02)
-
-
-@pytest.mark.real
-def test_recorded_points_are_timed_by_their_direction_too(scene: Log) -> None:
-    sweep = scene.streams["LIDAR_TOP"].read(0)
-    assert sweep.t_ns is not None
-    far = np.linalg.norm(sweep.xyz_m, axis=1) > 15
-    difference = (sweep.t_ns - sweep.stamp_ns - compute_scan_offset_ns(sweep.xyz_m, TURN_NS))[far]
-    wrapped = (difference + TURN_NS // 2) % TURN_NS - TURN_NS // 2
-    assert np.percentile(np.abs(wrapped), 99) < 200_000
-
-
-@pytest.mark.real
-def test_the_recorded_road_is_at_the_ego_s_origin_and_boxes_hold_points(scene: Log) -> None:
-    sweep = scene.streams["LIDAR_TOP"].read(0)
-    xyz = transform_rigidly(scene, "LIDAR_TOP", sweep)
-    ego = apply(inverse(scene.ego.at(sweep.stamp_ns)[0][0]), xyz)
-    road = (np.abs(ego[:, 0]) < 15) & (np.abs(ego[:, 1]) < 3) & (np.abs(ego[:, 2]) < 0.4)
-    assert np.median(ego[road, 2]) == pytest.approx(0, abs=0.03)
-    labels = scene.labels
-    now = (labels.t_ns > sweep.stamp_ns - TURN_NS) & (labels.t_ns <= sweep.stamp_ns) & (labels.category == "car")
-    near = np.flatnonzero(now & (np.linalg.norm(labels.center_m - xyz.mean(axis=0), axis=1) < 40))
-    counts = [points_in_box(xyz, labels.center_m[k], labels.size_m[k] + 0.1, labels.yaw_rad[k]).sum() for k in near]
-    assert len(counts) >= 2
-    assert min(counts) >= 10
-
-
-@pytest.mark.slow
-@pytest.mark.real
-def test_a_scenario_lasts_as_long_as_the_recorded_images_that_are_there(scene: Log) -> None:
-    result = reconstruct(scene, Config.load(detect={"name": "labels"}))
-    assert result.scenario.duration_s == pytest.approx(0.5, abs=0.1)
-    assert len(result.scenario.agents) > 10

@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +18,16 @@ from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
-from log2sim.files import plugins
 from log2sim.geometry import (
     NS_PER_S,
-    PoseTrack,
     inverse,
     quaternion_from_rotation,
     rotation_from_rpy,
     transform,
     wrap_angle,
 )
-from log2sim.logs.excerpt import summarize
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-from log2sim.logs.stamps import strictly_increasing
 
 SWEEP_SUFFIXES = (".bin", ".npz", ".npy", ".pcd", ".gz")
 _listeners: list[list[str]] = []
@@ -111,89 +106,6 @@ def test_a_recorded_log_opens_without_its_sweeps(real_data: Path, path: str) -> 
         open_log(real_data / path)
     assert names
     assert not [name for name in names if name.endswith(SWEEP_SUFFIXES)]
-
-
-def test_installed_packages_are_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_log(tiny_log(observe=False, duration_s=0.3)[0], tmp_path / "log")
-    asked, real = [], plugins.installed
-
-    def installed(kind: str) -> EntryPoints:
-        asked.append(kind)
-        return real(kind)
-
-    monkeypatch.setattr(plugins, "installed", installed)
-    assert open_log(tmp_path / "log").format == "log2sim"
-    assert asked == ["log"]
-
-
-def test_stamps_far_from_all_others_are_left_out() -> None:
-    stamps = np.array([3, 1, 0, 2, 2, 9], dtype=np.int64) * 10**8 + 1_700_000_000 * NS_PER_S
-    stamps[[2, 5]] = 0, np.iinfo(np.int64).max
-    notes = list[str]()
-    rows = strictly_increasing(stamps, "a", notes)
-    assert rows.tolist() == [1, 3, 0]
-    assert notes[0] == "a: 2 of 6 records have stamps more than 1000000 s off the others, first 0; left out"
-    assert len(notes) == 3
-    assert strictly_increasing(stamps[:0], "a", notes).tolist() == []
-
-
-def test_a_pose_of_another_time_does_not_hinder_a_summary() -> None:
-    log, _ = tiny_log()
-    assert log.ego is not None
-    usual = summarize(log)["ego"]
-    ego = PoseTrack(np.append(0, log.ego.t_ns), np.concatenate([log.ego.map_T_ego[:1], log.ego.map_T_ego]))
-    found = summarize(log.changed(ego=ego))["ego"]
-    assert found["records"] == usual["records"] + 1
-    assert found["distance_m"] == pytest.approx(usual["distance_m"], abs=0.02)
-    assert found["top_speed_mps"] == pytest.approx(usual["top_speed_mps"], rel=0.05)
-
-
-def test_a_changed_log_leaves_what_is_deferred_unread() -> None:
-    def unread() -> Any:
-        raise AssertionError("was read")
-
-    log = Log("a", "log2sim", {}, {}, {}, labels=unread, notes=unread)
-    changed = log.changed(name="b", ground_z_ego_m=0.5)
-    assert (changed.name, changed.ground_z_ego_m, changed.format, log.name) == ("b", 0.5, "log2sim", "a")
-    with pytest.raises(AssertionError, match="was read"):
-        _ = changed.labels
-    with pytest.raises(TypeError, match="no field nam"):
-        log.changed(nam="b")
-
-
-@pytest.mark.slow
-def test_a_folder_of_several_formats_says_which_else_it_holds(tmp_path: Path) -> None:
-    log, _ = tiny_log()
-    write_log(log, tmp_path / "logs/a")
-    pandaset(tmp_path / "logs/007")
-    opened = open_log(tmp_path / "logs")
-    other = {"log2sim": "pandaset", "pandaset": "log2sim"}[opened.format]
-    assert f"holds logs of other formats, too: {other}; --format chooses one" in opened.notes[0]
-    assert open_log(tmp_path / "logs", format=other).format == other
-
-
-@pytest.mark.parametrize("part", ["lidar", "lidar/00.pkl.gz", "camera/front_camera/00.jpg"])
-def test_who_gives_a_part_of_a_log_is_told_its_folder(part: str, tmp_path: Path) -> None:
-    root = pandaset(tmp_path / "007")
-    with pytest.raises(LogError, match=re.escape(f"{root}, which it is in, holds logs of the format 'pandaset'")):
-        open_log(root / part)
-
-
-@pytest.mark.parametrize(
-    ("file", "value", "expected"),
-    [
-        ("timestamps", 1e300, "a stamp in seconds below"),
-        ("poses", {"x": 1e300, "y": 0.0, "z": 0.0}, "finite numbers up to"),
-    ],
-)
-def test_numbers_that_no_place_or_time_has_are_refused(file: str, value: Any, expected: str, tmp_path: Path) -> None:
-    root = pandaset(tmp_path / "007")
-    path = root / f"lidar/{file}.json"
-    rows = json.loads(path.read_text())
-    rows[1] = value if file == "timestamps" else rows[1] | {"position": value}
-    path.write_text(json.dumps(rows))
-    with pytest.raises(LogError, match=rf"{file}\.json.*record 1: .*expected {expected}"):
-        open_log(root)
 
 
 def _in_frame(labels: Labels, frame_T_map: Any) -> Any:

@@ -19,12 +19,12 @@ from log2sim.datatypes import CATEGORIES, EgoVehicle, Labels, Lidar, Log, MapFra
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, RollingShutter, rotation_from_rpy, transform
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
-from log2sim.logs.kitti.labels import parse_labels, parse_oxts
+from log2sim.logs.kitti.labels import parse_oxts
 from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.unpickle import read_pickled_table
-from log2sim.logs.records import read_image, read_sweep
+from log2sim.logs.records import read_sweep
 
 COLUMNS = {"t_ns": "int", "x_m": "float", "name": "str", "flag": "bool"}
 
@@ -68,17 +68,6 @@ def test_a_damaged_sweep_is_a_record_error_or_a_sweep(tmp_path: Path, suffix: st
 
 
 @quick
-@given(data=damaged(b"t_ns,x_m,name,flag\n1,2.5,a,true\n2,-3e2,b,0\n"))
-def test_a_damaged_table_is_a_log_error_or_a_table(tmp_path: Path, data: bytes) -> None:
-    path = tmp_path / "table.csv"
-    path.write_bytes(data)
-    table = result_or_refusal(lambda: read_csv_table(path, COLUMNS), LogError, str(path))
-    if table is not None:
-        assert {len(table[name]) for name in COLUMNS} == {len(table)}
-        assert np.isfinite(table["x_m"]).all()
-
-
-@quick
 @given(
     rows=st.lists(
         st.tuples(
@@ -117,16 +106,6 @@ def test_a_damaged_pickle_is_an_error_or_a_table(tmp_path: Path, packed: bool, d
     assert columns is None or len({len(values) for values in columns.values()}) <= 1
 
 
-@pytest.mark.parametrize("head", [b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x04\0\0\0\x04"])
-@quick
-@given(data=st.binary(max_size=300))
-def test_bytes_that_are_no_image_are_a_record_error(tmp_path: Path, head: bytes, data: bytes) -> None:
-    path = tmp_path / "image.jpg"
-    path.write_bytes(head + data)
-    with pytest.raises(RecordError, match="image"):
-        read_image(path, 0, 4, 4)
-
-
 WORDS = st.sampled_from(["0", "1", "-1", "Car", "DontCare", "nan", "1e400", "x", "3.5", "\n", "\n\n"])
 ANY_TEXT = st.text(max_size=200) | st.lists(WORDS, max_size=60).map(" ".join)
 
@@ -136,13 +115,6 @@ ANY_TEXT = st.text(max_size=200) | st.lists(WORDS, max_size=60).map(" ".join)
 def test_any_text_is_a_log_error_or_rows_of_oxts(text: str) -> None:
     rows = result_or_refusal(lambda: parse_oxts(text, "file"), LogError, "file, line")
     assert rows is None or (rows.shape[1] == 30 and np.isfinite(rows).all())
-
-
-@quick
-@given(text=ANY_TEXT)
-def test_any_text_is_a_log_error_or_labels_of_kitti(text: str) -> None:
-    rows = result_or_refusal(lambda: parse_labels(text, Path("file")), LogError, "file, line")
-    assert rows is None or (rows.values.shape == (len(rows.frame), 14) and np.isfinite(rows.values).all())
 
 
 @quick

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Log, Stream, Sweep
-from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
+from log2sim.geometry import rotation_from_rpy, transform
 from log2sim.logs.kitti.labels import EGO_T_IMU as EGO_T_KITTI_IMU
 from log2sim.logs.ros.bag import Bag, find_recordings
 from log2sim.logs.stamps import transverse_mercator
@@ -100,25 +100,6 @@ def test_every_source_of_poses_gives_the_poses_that_were_written(poses: str, tmp
     assert [c["source"] for c in log.details["poses"] if c["used"]] == ["pose" if poses == "covariance" else poses]
 
 
-@pytest.mark.slow
-def test_the_scenario_is_that_of_the_log_in_every_container(tmp_path: Path) -> None:
-    world = geodetic_world()
-    style = Style(ego_T_base=transform(np.eye(3), EGO_T_IMU[:3, 3]))
-    found = []
-    for k, container in enumerate(("bag", "db3", "mcap")):
-        log = open_log(written(world, tmp_path / str(k), replace(style, container=container)))
-        found.append(scenario_of(replace(log, labels=world.labels, image_labels=world.image_labels)))
-    assert found[0] == found[1] == found[2]
-    expected = scenario_of(world)
-    assert [a["id"] for a in found[0]["agents"]] == [a["id"] for a in expected["agents"]]
-    assert len(found[0]["agents"]) == 4
-    assert_close(found[0]["agents"], expected["agents"])
-
-
-def scenario_of(log: Log) -> dict[str, Any]:
-    return plain_scenario(log, Config.load(detect={"name": "labels"}))
-
-
 def assert_close(ours: Any, theirs: Any, tolerance: float = 1e-6) -> None:
     """Numbers differ by less than what poses lose as quaternions."""
     if isinstance(theirs, dict):
@@ -133,29 +114,6 @@ def assert_close(ours: Any, theirs: Any, tolerance: float = 1e-6) -> None:
         assert ours == pytest.approx(theirs, abs=tolerance)
     else:
         assert ours == theirs
-
-
-def test_an_antenna_and_an_imu_have_their_own_places(tmp_path: Path) -> None:
-    turned, aside = (
-        transform(rotation_from_rpy(0.1, -0.2, 2.0), [0.5, 0.1, 0.4]),
-        transform(np.eye(3), [-0.8, 0.4, 1.6]),
-    )
-    style = Style(poses="gnss", base_T_imu=turned, base_T_antenna=aside)
-    assert_same_log(open_log(written(geodetic_world(), tmp_path, style)), geodetic_world(), 1e-5)
-
-
-@pytest.mark.parametrize("encoding", ["rgb8", "bgr8"])
-def test_raw_images_are_read_without_loss(encoding: str, tmp_path: Path) -> None:
-    log = open_log(written(world_log(), tmp_path, Style(raw=encoding)))
-    assert log.streams["front"].encoded is None
-    np.testing.assert_array_equal(log.streams["front"].read(2), world_log().streams["front"].read(2))
-
-
-def test_a_turned_frame_of_the_vehicle_is_turned_back(tmp_path: Path) -> None:
-    style = Style(ego_T_base=EGO_T_IMU)
-    w, x, y, z = ros.quaternion_from_rotation(inverse(EGO_T_IMU)[:3, :3]).tolist()
-    settings = ros.settings_of(world_log(), style).replace("[ego]", f"[ego]\nrotation_wxyz = {[w, x, y, z]}")
-    assert_same_log(open_log(written(world_log(), tmp_path, style, settings)), world_log())
 
 
 @pytest.mark.slow
@@ -189,12 +147,3 @@ def plain_scenario(log: Log, config: Config) -> dict[str, Any]:
     document = reconstruct(replace(log, name="log", digest=""), config).scenario.to_dict()
     document.pop("provenance")
     return document
-
-
-@pytest.mark.parametrize("poses", ["odometry", "tf", "gnss"])
-def test_poses_of_another_clock_are_told_with_it(poses: str, tmp_path: Path) -> None:
-    world = world_log()
-    later = PoseTrack(world.ego.t_ns + 18 * NS_PER_S, world.ego.map_T_ego)
-    log = open_log(ros.encode_as(world.changed(ego=later), tmp_path, Style(poses=poses)))
-    assert log.ego is None
-    assert any("no poses of" in n and "they do not overlap" in n and "GPS time against UTC?" in n for n in log.notes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,15 +14,13 @@ from hypothesis import strategies as st
 from log_encoders import ros
 from rosbags.typesys import get_types_from_msg
 
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, apply, inverse, project, rotation_from_rpy, transform
-from log2sim.logs.ros.frames import FrameTree, measure_ground_m
-from log2sim.logs.ros.messages import LidarTopic, StaticTransform, sweep_from_livox
+from log2sim.logs.ros.frames import FrameTree
+from log2sim.logs.ros.messages import LidarTopic, sweep_from_livox
 from log2sim.logs.ros.sensors import (
     ENCODINGS,
-    CalibrationProblem,
     camera_from_info,
-    encoded_from,
     image_from,
     offsets_ns,
     sweep_from,
@@ -99,26 +96,6 @@ def test_points_without_a_return_are_left_out_with_their_times() -> None:
 
 # What drivers write for points measured from the stamp of the message until 92 ms after it.
 AFTER_NS = np.arange(24, dtype=np.int64) * 4_000_000
-DRIVERS = {
-    "t, whole ns": ("t", "u4", AFTER_NS),
-    "time, s": ("time", "f4", AFTER_NS / NS_PER_S),
-    "offset_time, us": ("offset_time", "u4", AFTER_NS // 1000),
-    "timestamp, ms": ("timestamp", "f8", AFTER_NS / 1e6),
-    "timestamp, s of the clock": ("timestamp", "f8", (STAMP_NS + AFTER_NS) / NS_PER_S),
-    "timestamp, ns of the clock": ("timestamp", "f8", (STAMP_NS + AFTER_NS).astype(np.float64)),
-    "stamps, us of the clock": ("stamps", "f8", (STAMP_NS + AFTER_NS) / 1e3),
-    "timestamp, s of another clock": ("timestamp", "f8", 12345.678 + AFTER_NS / NS_PER_S),
-}
-
-
-@pytest.mark.parametrize("driver", DRIVERS)
-def test_the_unit_of_times_is_recognized_by_their_span(driver: str) -> None:
-    name, kind, values = DRIVERS[driver]
-    points = table({"x": "f4", "y": "f4", "z": "f4", name: kind}, **{name: values})
-    sweep = sweep_from(cloud(points), STAMP_NS, PERIOD_NS, PLAIN, "cloud")
-    assert sweep.t_ns is not None
-    # A float64 of today's seconds resolves 0.24 us, of nanoseconds 256 ns.
-    np.testing.assert_allclose(sweep.t_ns - STAMP_NS, AFTER_NS, atol=600)
 
 
 @pytest.mark.parametrize(("stamp", "first_ms", "expected_ms"), [
@@ -129,25 +106,6 @@ def test_the_stamp_is_the_start_or_the_end_of_the_turn(stamp: Any, first_ms: flo
     offset = offsets_ns(values, STAMP_NS, PERIOD_NS, LidarTopic(topic="/p", stamp=stamp))
     assert offset is not None
     np.testing.assert_allclose(offset, AFTER_NS + expected_ms * 1e6, atol=1)
-
-
-def test_times_can_be_told_and_forbidden() -> None:
-    points = table({"x": "f4", "y": "f4", "z": "f4", "when": "f8", "t": "u4"}, when=AFTER_NS / 1e9, t=7)
-
-    def times(**told: Any) -> Any:
-        sweep = sweep_from(cloud(points), STAMP_NS, PERIOD_NS, LidarTopic(topic="/p", **told), "cloud")
-        return sweep.t_ns if sweep.t_ns is None else sweep.t_ns - STAMP_NS
-
-    assert times() is None  # all times are the same
-    assert times(time_field="none") is None
-    np.testing.assert_array_equal(times(time_field="when"), AFTER_NS)
-    # Told to be milliseconds, they span 92 us.
-    np.testing.assert_array_equal(times(time_field="when", time_unit="ms"), AFTER_NS // 1000)
-
-
-def test_a_cloud_that_a_node_has_compensated_says_so() -> None:
-    sweep = sweep_from(LAYOUTS["packed"], STAMP_NS, PERIOD_NS, LidarTopic(topic="/p", compensated=True), "cloud")
-    assert sweep.compensated_ns == STAMP_NS
 
 
 @settings(max_examples=60, deadline=None)
@@ -198,27 +156,12 @@ def test_bayer_patterns_begin_with_the_pixel_that_they_name(order: str) -> None:
     np.testing.assert_array_equal(image[2:4, 2:6], np.broadcast_to([30, 90, 200], (2, 4, 3)))
 
 
-@pytest.mark.parametrize(("encoding", "code"), [("yuv422_yuy2", [0, 1]), ("yuv422", [1, 0])])
-def test_yuv_images_are_gray_where_their_colors_are(encoding: str, code: list[int]) -> None:
-    pixels = np.full((6, 8, 2), 128, np.uint8)
-    pixels[..., code.index(0)] = 235  # white of BT.601
-    assert (image_from(picture(encoding, pixels), "image", (8, 6)) > 250).all()
-
-
 def test_images_that_contradict_their_size_are_errors_of_the_record() -> None:
     good = picture("rgb8", RGB)
     for change in ({"step": 20}, {"data": good.data[:-1]}, {"encoding": "32FC1"}, {"width": 9}, {"height": 1 << 31}):
         with pytest.raises(RecordError, match=r"^image: "):
             image_from(SimpleNamespace(**{**vars(good), **change}), "image", (8, 6))
     assert all(hasattr(cv2, conversion) for _, _, conversion in ENCODINGS.values() if conversion)
-
-
-def test_a_compressed_image_is_what_its_first_bytes_say() -> None:
-    jpeg, png = (cv2.imencode(kind, RGB)[1].ravel() for kind in (".jpg", ".png"))
-    for data in (jpeg, png):
-        assert encoded_from(SimpleNamespace(format="anything", data=data), "image") == data.tobytes()
-    with pytest.raises(RecordError, match=r"neither a JPEG nor a PNG image .its format states 'h264'"):
-        encoded_from(SimpleNamespace(format="h264", data=np.arange(40, dtype=np.uint8)), "image")
 
 
 K = np.array([[700.0, 0, 330], [0, 710, 250], [0, 0, 1]])
@@ -250,24 +193,6 @@ def test_lens_models_of_ros_are_those_of_cameras(ros1: bool, model: str, D: Any,
     np.testing.assert_array_equal(camera.K, K)
 
 
-@pytest.mark.parametrize("info", [
-    camera_info(model="rational_polynomial", D=[0.1] * 14), camera_info(model="mei", D=[0.1] * 4), camera_info(k=np.zeros(9)),
-    camera_info(width=0), camera_info(k=np.zeros(4)), camera_info(D=[np.nan] * 5),
-])  # fmt: skip
-def test_a_calibration_that_no_camera_has_is_named(info: Any) -> None:
-    with pytest.raises(CalibrationProblem):
-        camera_from_info("front", info, ("ego", POSE), rectified=False)
-
-
-def test_a_region_that_is_binned_shows_the_same_rays() -> None:
-    region = SimpleNamespace(x_offset=100, y_offset=40, width=400, height=300, do_rectify=False)
-    whole = camera_from_info("front", camera_info(), ("ego", POSE), rectified=False)
-    part = camera_from_info("front", camera_info(roi=region, binning_x=2, binning_y=2), ("ego", POSE), rectified=False)
-    point = np.array([[0.1, -0.05, 4.0]])
-    assert (part.width_px, part.height_px) == (200, 150)
-    np.testing.assert_allclose(project(part, point)[0], (project(whole, point)[0] - [100, 40]) / 2)
-
-
 def test_rectified_images_have_the_projection_and_the_turned_axes() -> None:
     turn = rotation_from_rpy(0.01, -0.02, 0.03)
     P = np.column_stack([K * [[0.9], [0.9], [1.0]], [-300.0, 0.0, 0.0]])
@@ -279,14 +204,6 @@ def test_rectified_images_have_the_projection_and_the_turned_axes() -> None:
         uv, _ = project(camera, apply(inverse(camera.mount_T_cam) @ POSE, point_frame))
         expected = P[:, :3] @ turn @ point_frame[0] + (P[:, 3] if stereo else 0)
         np.testing.assert_allclose(uv[0], expected[:2] / expected[2])
-
-
-def test_rectified_images_without_a_projection_have_the_camera_matrix() -> None:
-    info = camera_info(D=[-0.3, 0.1, 0, 0, 0], P=np.zeros((3, 4)))
-    camera = camera_from_info("front", info, ("ego", POSE), rectified=True)
-    assert camera.rectified
-    np.testing.assert_array_equal(camera.K, K)
-    np.testing.assert_array_equal(camera.mount_T_cam, POSE)
 
 
 def tf(parent: str, child: str, xyz: Any, t_s: float = 0.0, q: Any = (1.0, 0.0, 0.0, 0.0)) -> SimpleNamespace:
@@ -332,43 +249,9 @@ def test_a_frame_that_moves_has_no_mount_but_a_track() -> None:
     assert tree.track("world", "lidar") is None
 
 
-def test_a_tree_that_is_none_is_refused_by_the_names_of_its_frames() -> None:
-    tree = FrameTree("recording")
-    tree.add([tf("a", "c", (0, 0, 0)), tf("b", "c", (0, 0, 0)), tf("x", "y", (0, 0, 0)), tf("y", "x", (0, 0, 0))])
-    with pytest.raises(LogError, match="recording: frame 'c' has two parents in /tf, 'a' and 'b'"):
-        tree.mount("a", "c")
-    with pytest.raises(LogError, match="cycle: x -> y -> x"):
-        tree.mount("a", "x")
-    tree.add([tf("a", "d", (np.nan, 0, 0)), tf("a", "d", (0, 0, 0), q=(0.0, 0.0, 0.0, 0.0))])
-    assert tree.refused == 2
-    tree.add([tf("a", "e", (1e300, 0, 0)), tf("a", "e", (0, 0, -2e9))])
-    assert tree.refused == 4
-    assert "e" not in tree.frames
-    tree.add(tf(f"f{k + 1}", f"f{k}", (0, 0, 0)) for k in range(2000))
-    with pytest.raises(LogError, match="frame 'f0' has more than 100 frames above it"):
-        tree.rigid_root("f0")
-    tree.add_static([StaticTransform(parent="a", child="c", translation_m=(1.0, 2.0, 3.0))])
-    np.testing.assert_array_equal(tree.mount("a", "c")[:3, 3], [1, 2, 3])
-
-
-def test_the_road_is_measured_below_the_sensor() -> None:
-    rng = np.random.default_rng(1)
-    around = rng.uniform(-30, 30, (4000, 2))
-    road = np.column_stack([around, rng.normal(-1.73, 0.01, 4000)])
-    wall = np.column_stack([np.full(1000, 8.0), rng.uniform(-5, 5, 1000), rng.uniform(-1.7, 3, 1000)])
-    message = cloud(np.array([tuple(p) for p in np.vstack([road, wall])], dtype=[(a, "f4") for a in "xyz"]))
-    sweep = sweep_from(message, STAMP_NS, PERIOD_NS, PLAIN, "cloud")
-    mount = transform(np.eye(3), [1.0, 0.0, 0.5])
-    assert measure_ground_m(sweep, mount) == pytest.approx(-1.23, abs=0.01)
-    # Points without a return that a driver puts far below are no road.
-    far = replace(sweep, xyz_m=np.vstack([sweep.xyz_m, [[10.0, 0.0, -1e9]] * 3]).astype(np.float32))
-    assert measure_ground_m(far, mount) == pytest.approx(-1.23, abs=0.01)
-    few = sweep_from(LAYOUTS["packed"], STAMP_NS, PERIOD_NS, PLAIN, "cloud")
-    with pytest.raises(RecordError, match="too few to find the road"):
-        measure_ground_m(few, mount)
-
-
 LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+
+
 LIVOX = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 )

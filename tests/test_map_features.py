@@ -61,14 +61,6 @@ def test_a_scenario_without_them_has_no_such_keys() -> None:
     assert Scenario.from_dict(document).map_features is None
 
 
-def test_that_nothing_was_found_is_kept_apart_from_not_looked_for() -> None:
-    document = scenario(map_features=MapFeatures(notes=("no markings seen",))).to_dict()
-    read = Scenario.from_dict(document).map_features
-    assert read is not None
-    assert not read
-    assert read.notes == ("no markings seen",)
-
-
 def test_they_move_with_the_map_and_the_time() -> None:
     here = scenario(map=MapFrame(offset_m=(100.0, 200.0, 5.0)))
     there = replace(here, map=MapFrame(offset_m=(90.0, 0.0, 0.0)), t0_ns=here.t0_ns - 2 * 10**9)
@@ -77,10 +69,6 @@ def test_they_move_with_the_map_and_the_time() -> None:
     np.testing.assert_allclose(moved.map_features.lanes[1].points_m, shifted(30, 202, 5))
     np.testing.assert_allclose(moved.signals[0].position_m, [11.0, 202.0, 10.1])
     np.testing.assert_allclose(moved.signals[0].t_s, [2.0, 4.5])
-
-
-def test_states_last_until_the_next() -> None:
-    assert scenario().signals[0].at([-1.0, 0.0, 2.4, 2.5, 99.0]).tolist() == ["unknown", "red", "red", "green", "green"]
 
 
 def double_id(document: dict[str, Any]) -> None:

@@ -7,13 +7,12 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-from ground_worlds import EGO_R_CAM, World, empty_scenario, height_at, is_paint, parked_car, world_log
+from ground_worlds import World, empty_scenario, height_at, is_paint, world_log
 
 from log2sim.config import MapConfig
-from log2sim.datatypes import Agent, Log, Scenario, Stream, Sweep, Waypoints
-from log2sim.errors import LogError
-from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform
-from log2sim.road.builder import MAX_SWEEPS, STANDING_RECORDS, choose_records, map_ground, sweep_step_m
+from log2sim.datatypes import Agent, Stream, Sweep, Waypoints
+from log2sim.geometry import Array, apply
+from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.road_users import RoadUsers, draw_outlines
 from log2sim.road.surface import PointCollector
@@ -78,34 +77,6 @@ def test_colors_lie_where_the_paint_is_on_a_slope(ground: GroundMap) -> None:
     assert wrong.mean() < 0.002
 
 
-def test_a_shift_of_ten_centimeters_would_be_noticed() -> None:
-    log = world_log(World(camera_shift_m=0.1))
-    shifted = map_ground(log, empty_scenario(log), SETTINGS)
-    xy = positions(shifted)
-    seen = (shifted.alpha > 200) & clear_of_edges(xy, 0.06) & near_path(xy, 8.0) & (np.abs(xy[..., 1]) < 5)
-    assert ((shifted.color_bgr[..., 1][seen] > 120) != is_paint(xy[seen])).mean() > 0.02
-
-
-def test_exposures_are_balanced_over_the_overlap(ground: GroundMap) -> None:
-    xy = positions(ground)
-    seen = (ground.alpha > 200) & clear_of_edges(xy, 0.2) & near_path(xy, 8.0) & is_paint(xy)
-    left, right = (ground.color_bgr[..., 0][seen & side] for side in (xy[..., 1] > 2, xy[..., 1] < -2))
-    assert 0.93 < float(np.median(left)) / float(np.median(right)) < 1.07  # 1.43 without gains
-
-
-@pytest.mark.slow
-def test_parked_cars_are_unknown_ground() -> None:
-    log = world_log()
-    ground = map_ground(log, empty_scenario(log, parked_car(8.0, 2.5)), SETTINGS)
-    rows, columns = ground.cells_of([[8.0, 2.5], [8.0, -2.5]])
-    (r, s), (c, d) = np.rint(rows).astype(int), np.rint(columns).astype(int)
-    assert ground.alpha[r, c] == 0
-    assert np.isnan(ground.height_m[r, c])
-    assert np.isnan(ground.intensity[r, c])
-    assert ground.alpha[s, d] > 0
-    assert np.isfinite(ground.height_m[s, d])
-
-
 def test_cameras_alone_lie_on_the_ground_under_the_ego() -> None:
     log = world_log(World(lidars=0))
     ground = map_ground(log, empty_scenario(log), SETTINGS)
@@ -116,82 +87,6 @@ def test_cameras_alone_lie_on_the_ground_under_the_ego() -> None:
     seen = (ground.alpha > 200) & clear_of_edges(xy, 0.15) & near_path(xy, 3.0) & (xy[..., 0] < 9)
     assert seen.sum() > 5000
     assert ((ground.color_bgr[..., 1][seen] > 120) != is_paint(xy[seen])).mean() < 0.02
-
-
-@pytest.mark.slow
-def test_a_log_of_lidars_alone_has_no_color() -> None:
-    log = world_log(World(gains=()))
-    ground = map_ground(log, empty_scenario(log), SETTINGS)
-    assert not ground.alpha.any()
-    picture, known = ground.as_picture(), np.isfinite(ground.intensity)
-    assert ((picture.alpha > 0) == known).all()
-    np.testing.assert_allclose(picture.image_bgr[known][:, 0] / 255, np.clip(ground.intensity[known], 0, 1), atol=0.003)
-    assert np.isfinite(ground.height_m).any()
-    assert any("no color" in note for note in ground.notes)
-
-
-def test_a_map_ends_where_nothing_more_is_known(ground: GroundMap) -> None:
-    known = ground.known
-    assert all(known[edge].any() for edge in (0, -1, np.s_[:, 0], np.s_[:, -1]))
-    nothing = GroundMap(
-        np.zeros((3, 4, 3), np.uint8), np.zeros((3, 4), np.uint8), np.full((3, 4), np.nan, np.float32),
-        np.full((3, 4), np.nan, np.float32), 0.5, (0.0, 2.0, 0.0, 1.5),
-    )  # fmt: skip
-    assert nothing.around(nothing.known).extent_m == (0.0, 0.5, 1.0, 1.5)
-
-
-def test_a_log_without_poses_is_refused_with_the_reason() -> None:
-    log = world_log()
-    with pytest.raises(LogError, match="no pose"):
-        map_ground(log.changed(ego=None), empty_scenario(log), SETTINGS)
-
-
-@pytest.mark.slow
-def test_a_long_log_gets_coarser_cells_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("log2sim.road.ground_map.MAX_CELLS", 100_000)
-    log = world_log(World(gains=()))
-    ground = map_ground(log, empty_scenario(log), SETTINGS)
-    assert ground.alpha.size <= 100_000
-    assert any("cells of 0." in note for note in ground.notes)
-
-
-@pytest.mark.slow
-def test_sweeps_without_intensity_leave_the_heights() -> None:
-    log = world_log(World(gains=()))
-    read = log.streams["l0"].read
-    stream = dataclasses.replace(
-        log.streams["l0"], t_ns=log.streams["l0"].t_ns, read=lambda i: dataclasses.replace(read(i), intensity=None)
-    )
-    ground = map_ground(log.changed(streams={"l0": stream}), empty_scenario(log), SETTINGS)
-    assert np.isfinite(ground.height_m).any()
-    assert not np.isfinite(ground.intensity).any()
-    assert any("no intensity" in note for note in ground.notes)
-
-
-def roadside_log(passing: bool) -> Log:
-    """A camera on a pole, before which something bright passes in two of seven pictures, and no ego."""
-    mount = transform(rotation_from_rpy(0.0, 0.6, 0.0) @ EGO_R_CAM, [0.0, 0.0, 6.0])
-    camera = Camera("pole", 320, 240, np.array([[250.0, 0, 160], [0, 250.0, 120], [0, 0, 1]]), "map", mount)
-
-    def read(i: int) -> np.ndarray:
-        image = np.full((240, 320, 3), 90, np.uint8)
-        image[:, 150:170] = 180
-        if passing and i in (2, 3):
-            image[100:160] = 250
-        return image
-
-    stamps = np.arange(7) * 500_000_000 + 10**18
-    return Log("pole", "log2sim", {"pole": camera}, {}, {"pole": Stream("pole", stamps, read)})
-
-
-@pytest.mark.slow
-def test_what_passes_a_roadside_camera_is_not_mapped() -> None:
-    plain, passed = (
-        map_ground(log, Scenario("pole", 10**18, 3.0, ()), SETTINGS)
-        for log in (roadside_log(False), roadside_log(True))
-    )
-    assert (plain.alpha > 200).sum() > 10_000
-    np.testing.assert_array_equal(plain.color_bgr, passed.color_bgr)
 
 
 def moving_car(speed_mps: float = 5.0) -> Agent:
@@ -262,16 +157,3 @@ def test_what_the_lowest_beam_meets_hides_the_ground_from_its_foot_on_and_a_sign
     assert above[beside].min() < 0.1
     assert np.diff(np.unique(above[beside].round(2))).max() < 0.15
     assert above[over].min() > 2.0
-
-
-def test_dense_sweeps_are_taken_farther_apart_and_sparse_ones_where_the_log_has_them() -> None:
-    log = world_log(World(lidars=1))
-    way_m = float(np.ptp(log.ego.map_T_ego[:, 0, 3]))  # type: ignore[union-attr]
-    (name,) = log.lidars
-    counts = {}
-    for points in (1_000, 400_000):
-        step_m = sweep_step_m(points)
-        counts[points] = len(choose_records(log, empty_scenario(log), {name: step_m}, MAX_SWEEPS)[name])
-        assert counts[points] >= STANDING_RECORDS
-        assert counts[points] <= max(way_m / step_m + 1, STANDING_RECORDS)
-    assert counts[1_000] > counts[400_000]

@@ -7,13 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from log2sim.errors import ConfigError
 from log2sim.geometry import (
     Array,
     Camera,
-    fold_radius,
-    ground_homography,
-    inverse,
     rotation_from_rpy,
     transform,
     undistort,
@@ -108,11 +104,6 @@ def test_two_cameras_reproduce_the_checkerboard_within_5_cm(two_cameras: list[tu
     assert wrong_cells(picture, edge_m=0.05) == 0.0
 
 
-def test_a_shift_of_15_cm_would_be_noticed(two_cameras: list[tuple[np.ndarray, View]]) -> None:
-    moved = [(image, View(v.camera, transform(np.eye(3), [0.15, 0, 0]) @ v.map_T_cam)) for image, v in two_cameras]
-    assert wrong_cells(lay(moved, (0, 10, -8, 8)), edge_m=0.05) > 0.02
-
-
 @pytest.mark.matrix
 @pytest.mark.parametrize("axis", [0, 1])
 def test_cells_show_their_own_center(axis: int) -> None:
@@ -126,33 +117,6 @@ def test_cells_show_their_own_center(axis: int) -> None:
     assert abs(float(np.mean(picture.color_bgr[..., 0][inner] - expected))) < 0.2
 
 
-def test_far_map_coordinates_and_another_ground_height_change_nothing(
-    two_cameras: list[tuple[np.ndarray, View]],
-) -> None:
-    near, offset = lay(two_cameras, (0, 10, -8, 8)), np.array([5e5, 5e6, 300.0])
-    shift = transform(np.eye(3), offset)
-    far = [(image, View(v.camera, shift @ v.map_T_cam)) for image, v in two_cameras]
-    extent = (offset[0], offset[0] + 10, offset[1] - 8, offset[1] + 8)
-    far_picture = lay(far, extent, z_m=300.0)
-    assert np.mean(np.abs(near.color_bgr.astype(int) - far_picture.color_bgr.astype(int)) > 8) < 0.002
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "distortion"), [("brown", (-0.25, 0.08, 0.001, -0.0005, -0.01)), ("fisheye", (-0.02, 0.003, 0.0, 0.0))]
-)
-def test_distorted_cameras_are_straightened(model: str, distortion: tuple[float, ...]) -> None:
-    camera = make_camera(model, distortion, halved=2)
-    picture = lay([(shoot(camera, pose(0)), View(camera, pose(0)))], (0, 7, -5, 5))
-    assert wrong_cells(picture, edge_m=0.06) == 0.0
-
-
-def test_a_lens_model_that_folds_back_is_cut_where_it_turns() -> None:
-    # r (1 - 0.1 r^2) rises until 1 = 0.3 r^2.
-    assert fold_radius(make_camera("brown", (-0.1, 0.0, 0.0, 0.0))) == pytest.approx(np.sqrt(1 / 0.3))
-    assert fold_radius(make_camera("fisheye", (0.0, 0.0, 0.0, 0.0))) == np.inf
-
-
 def test_nothing_above_the_horizon_or_behind_the_camera_is_covered() -> None:
     white = np.full((720, 1280, 3), 255, dtype=np.uint8)
     picture = lay([(white, View(make_camera(), pose(0)))], (-30, 30, -30, 30), 0.1)
@@ -161,42 +125,3 @@ def test_nothing_above_the_horizon_or_behind_the_camera_is_covered() -> None:
     assert not picture.coverage[x < 0].any()
     up = View(make_camera(), pose(0, pitch_deg=-40.0))
     assert not lay([(white, up)], (-30, 30, -30, 30), 0.1).coverage.any()
-
-
-def test_a_ground_homography_agrees_with_the_projection_of_3d_points() -> None:
-    rng = np.random.default_rng(3)
-    ground = np.column_stack([rng.uniform(4, 40, 50), rng.uniform(-8, 8, 50), np.full(50, 0.7)])
-    points_cam = ground @ inverse(pose(5))[:3, :3].T + inverse(pose(5))[:3, 3]
-    uv = points_cam @ K.T
-    uv = uv / uv[:, 2:]
-    back = uv @ ground_homography(make_camera(), pose(5), 0.7).T
-    assert (back[:, 2] > 0).all()
-    np.testing.assert_allclose(back[:, :2] / back[:, 2:], ground[:, :2], atol=1e-8)
-
-
-def test_a_camera_in_the_ground_plane_is_refused() -> None:
-    with pytest.raises(ValueError, match="ground plane"):
-        ground_homography(make_camera(), pose(0, z=0.0))
-
-
-@pytest.mark.slow
-def test_exposures_are_leveled_where_cameras_overlap() -> None:
-    camera = make_camera()
-    views = [(shoot(camera, p, gain=g), View(camera, p)) for p, g in zip((pose(12), pose(-12)), (1.0, 0.7))]
-    picture = lay(views, (3, 9, -5, 5))
-    x, y = cell_centers(picture)
-    bright = (checker(np.column_stack([x.ravel(), y.ravel()])) > 130).reshape(x.shape)
-    inner = np.minimum(np.abs(x - np.rint(x)), np.abs(y - np.rint(y))) > 0.2
-    left, right = (
-        float(picture.color_bgr[..., 0][bright & inner & side & (picture.alpha > 200)].mean())
-        for side in (y > 2.5, y < -2.5)
-    )
-    assert 0.93 < left / right < 1.07  # 1.43 before
-
-
-@pytest.mark.parametrize(
-    "extent", [(0.0, 0.0, 0.0, 1.0), (0.0, np.nan, 0.0, 1.0), (0.0, 1e5, 0.0, 1e5), (0.0, 1e9, 0.0, 0.05)]
-)
-def test_an_extent_without_area_or_too_large_is_refused(extent: tuple[float, float, float, float]) -> None:
-    with pytest.raises(ConfigError, match="bird's-eye view"):
-        Raster.covering(extent, 0.05)

@@ -9,7 +9,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Fault, Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.localization.choice import localize, localize_like, refine
-from log2sim.localization.pose_refinement import Keyframe, corrected, refine_poses, solve_twists
+from log2sim.localization.pose_refinement import Keyframe, refine_poses, solve_twists
 from log2sim.localization.surfaces import Registration, exp_of, log_of
 
 T_NS = np.arange(0, 41) * 100_000_000 + 10**18
@@ -92,17 +92,6 @@ def test_a_run_takes_refined_poses_where_those_of_the_log_drift_and_finds_them_a
     assert refine(*localize(log, Config()), [late])[0] is log  # the sweeps of such a LiDAR show another motion
 
 
-@pytest.mark.slow
-def test_poses_that_are_right_stay() -> None:
-    log = street_log(true_poses())
-    found, choice = refine(*localize(log, Config()))
-    assert found is log
-    assert not choice.refined
-    assert choice.for_map is not None
-    moved = np.linalg.norm(choice.for_map.map_T_ego[:, :3, 3] - true_poses()[:, :3, 3], axis=1)
-    assert moved.max() < 0.03
-
-
 def test_one_false_registration_changes_little() -> None:
     frames = [Keyframe(int(t), p, None) for t, p in zip(T_NS[::4], drifted()[::4])]  # type: ignore[arg-type]
     true = true_poses()[::4]
@@ -114,12 +103,6 @@ def test_one_false_registration_changes_little() -> None:
     fixed = np.stack([f.map_T_ego @ exp_of(twist) for f, twist in zip(frames, solve_twists(frames, links))])
     off = log_of(inverse(inverse(true[:1]) @ true) @ (inverse(fixed[:1]) @ fixed))
     assert np.abs(off[:, :3]).max() < 0.02
-
-
-def test_corrections_are_interpolated_and_held_at_the_ends() -> None:
-    track = PoseTrack(T_NS, np.repeat(np.eye(4)[None], len(T_NS), axis=0))
-    moved = corrected(track, T_NS[[10, 20]], np.array([[1.0, 0, 0, 0, 0, 0], [3.0, 0, 0, 0, 0, 0]]))
-    np.testing.assert_allclose(moved.map_T_ego[[0, 10, 15, 20, 40], 0, 3], [1, 1, 2, 3, 3])
 
 
 def test_logs_without_lidar_or_way_stay_as_they_are() -> None:

@@ -8,22 +8,18 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.candidate import HIDDEN_S, agent_confidence, image_confidence, is_confirmed, sweep_confidence
+from log2sim.agents.candidate import image_confidence, is_confirmed
 from log2sim.agents.moving import heading_log_odds
 from log2sim.agents.size import (
     TICK_CORRELATION,
     independent,
     independent_along,
-    mean_box_axis,
-    moving_geometry,
-    static_geometry,
-    typical_box_size,
 )
-from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
-from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, weighted_quantile, wrap_angle
+from log2sim.datatypes import Boxes3D, Measurements, Track
+from log2sim.geometry import NS_PER_S, rotation_from_rpy, wrap_angle
 from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.measure import measure, outside_ego
+from log2sim.perception.lidar.measure import measure
 from log2sim.tracking.tracker import mark_unrecorded
 
 ORIGIN = np.array([500.0, -200.0, 3.0])
@@ -74,25 +70,6 @@ def test_points_correct_a_yaw_that_is_somewhat_wrong_and_keep_its_direction() ->
         assert abs(wrap_angle(rows.yaw_rad[k] - car.yaw_rad)) < np.deg2rad(2)
 
 
-def test_a_box_without_points_keeps_its_own_place() -> None:
-    ghost = [standing(30.0, 30.0)]
-    rows = measure([], boxes_of(ghost), cloud_of(CARS))
-    assert len(rows.cluster[0]) == 0
-    np.testing.assert_allclose(rows.center_m, boxes_of(ghost).center_m)
-    assert rows.points[0] == 40
-    assert rows.source.tolist() == ["lidar"]
-
-
-def test_a_point_belongs_to_one_box_only() -> None:
-    cars = [standing(12.0, 5.0), standing(12.0, 6.95)]
-    rows = measure([], boxes_of(cars), cloud_of(cars))
-    one, other = ({tuple(p) for p in cluster.round(4)} for cluster in rows.cluster)
-    assert one
-    assert other
-    assert not one & other
-    assert max(p[1] for p in one) - ORIGIN[1] < 6.0
-
-
 @pytest.mark.parametrize(("turn_deg", "flip"), [(73.0, 1.0), (180.0, 1.0), (0.0, -1.0), (-140.0, -1.0)])
 def test_turning_and_mirroring_the_world_turns_and_mirrors_the_rows(turn_deg: float, flip: float) -> None:
     turn = float(np.deg2rad(turn_deg))
@@ -103,17 +80,6 @@ def test_turning_and_mirroring_the_world_turns_and_mirrors_the_rows(turn_deg: fl
     np.testing.assert_allclose(wrap_angle(there.yaw_rad - (flip * here.yaw_rad + turn)), 0.0, atol=0.01)
     ends = here.ends_visible if flip > 0 else here.ends_visible[:, ::-1]
     assert (there.ends_visible == ends).mean() > 0.8
-
-
-def test_the_ego_itself_is_no_object() -> None:
-    poses = transform(rotation_from_rpy(0, 0, np.deg2rad(90)), ORIGIN)
-    log = Log(
-        "l", "t", {}, {}, {}, PoseTrack(np.array([9, 11]) * NS_PER_S // 10, np.stack([poses, poses])), EgoVehicle()
-    )
-    found = boxes_of([standing(x, y) for x, y in ((0.0, 1.4), (-1.2, 2.0), (0.0, 4.5), (-2.5, 1.4))])
-    kept = outside_ego(log, found)
-    np.testing.assert_allclose(kept.center_m - ORIGIN, [[0.0, 4.5, 0.8], [-2.5, 1.4, 0.8]])
-    assert len(outside_ego(replace(log, ego=None), found)) == 4
 
 
 def test_the_better_of_two_centers_counts_more_and_a_missing_one_not_at_all() -> None:
@@ -153,36 +119,6 @@ def test_more_ticks_are_surer_about_the_front_up_to_a_limit() -> None:
     assert independent(10**6) == pytest.approx(2.0)
 
 
-def test_the_axis_of_boxes_does_not_mind_flips_and_the_median_no_outlier() -> None:
-    m = track_of(10, flipped=0.5).measurements
-    assert abs(wrap_angle(2 * (mean_box_axis(m) - CARS[0].yaw_rad))) < 0.02
-    sizes = m.box_size_m.copy()
-    sizes[:3] = 40.0
-    np.testing.assert_allclose(typical_box_size(replace(m, box_size_m=sizes)), CARS[0].size_m)
-    assert weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([10.0, 1.0, 1.0]), 0.5) == 3.0
-
-
-@pytest.mark.parametrize("moving", [False, True])
-def test_sides_never_seen_have_the_size_of_the_boxes(moving: bool) -> None:
-    van = [standing(14.0, 0.0, 0.0, (5.6, 2.0, 2.1))]
-    row = measure([], boxes_of(van), cloud_of(van))
-    track = Track("car", np.arange(8), Measurements.join([row] * 8))
-    shape = moving_geometry(track, np.zeros(8)) if moving else static_geometry(track)
-    assert shape.size_m[0] == pytest.approx(5.6, abs=0.15)
-    np.testing.assert_allclose(shape.xy_m[0], np.array([14.0, 0.0]) + ORIGIN[:2], atol=0.15)
-
-
-def test_a_long_false_track_with_a_few_high_scores_is_not_confirmed() -> None:
-    score = np.full(60, 0.25)
-    score[[3, 20, 31, 44, 50]] = 0.9
-    false, true = track_of(60, score), track_of(60, 0.7)
-    assert sweep_confidence(false) < 0.3
-    assert not is_confirmed(false, typical=True)
-    assert is_confirmed(true, typical=True)
-    assert agent_confidence(true) == pytest.approx(sweep_confidence(true))
-    assert image_confidence(true) == 0.0
-
-
 def test_ticks_in_one_place_are_alike_and_far_ones_are_independent() -> None:
     here, far = np.zeros((30, 2)), np.column_stack([np.arange(30) * 1e3, np.zeros(30)])
     assert independent_along(here, 0.7) == pytest.approx(independent(30))
@@ -205,63 +141,6 @@ def test_who_walks_on_needs_less_sure_boxes_than_what_stays() -> None:
     assert is_confirmed(person(1.5, 0.58), typical=True)
     assert not is_confirmed(person(0.0, 0.58), typical=True)
     assert not is_confirmed(person(1.5, 0.45), typical=True)
-
-
-def test_what_the_image_confirms_needs_no_sweep() -> None:
-    assert is_confirmed(track_of(20, 0.45, camera="front"), typical=True)
-    assert not is_confirmed(track_of(20, 0.45), typical=True)
-
-
-@pytest.mark.parametrize(("score", "confirmed"), [(0.5, False), (0.7, True)])
-def test_people_whom_images_alone_show_have_to_be_surer_than_vehicles(score: float, confirmed: bool) -> None:
-    car = track_of(20, score, camera="front")
-    boxless = replace(car.measurements, box_yaw_rad=np.full(20, np.nan))
-    person = Track("pedestrian", car.tick, replace(boxless, category=np.full(20, "pedestrian")))
-    assert is_confirmed(Track("car", car.tick, boxless), typical=True)
-    assert is_confirmed(person, typical=True) is confirmed
-
-
-@pytest.mark.parametrize("camera", ["", "front"])
-@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.5])
-def test_a_track_seen_at_every_third_tick_is_no_object(camera: str, period_s: float) -> None:
-    whole = track_of(60, 0.7, camera=camera)
-    stamps = (np.arange(60) * period_s * NS_PER_S).astype(np.int64)
-    whole = replace(whole, measurements=replace(whole.measurements, t_ns=stamps))
-    rows = np.arange(0, 60, 3)
-    sparse = Track("car", whole.tick[rows], whole.measurements.take(rows))
-    pairs = np.sort(np.r_[rows, rows[::3] + 1])
-    gappy = Track("car", whole.tick[pairs], whole.measurements.take(pairs))
-    confidence = image_confidence if camera else sweep_confidence
-    # Gaps of more than a second may be occlusions.
-    limit = 0.5 if period_s < HIDDEN_S / 3 else 0.7
-    for missed in (sparse, gappy):
-        assert confidence(missed) < limit * confidence(whole)
-
-
-def test_weak_detections_of_a_person_are_no_occlusion() -> None:
-    # Three looks of two sure detections each, 2 s apart; in between a building hides the person, or it is detected weakly.
-    sure = np.isin(np.arange(62) % 20, (0, 1))
-    whole = track_of(62, np.where(sure, 0.7, 0.2), camera="front")
-    boxless = replace(whole.measurements, box_yaw_rad=np.full(62, np.nan), category=np.full(62, "pedestrian"))
-    weak = Track("pedestrian", whole.tick, boxless)
-    hidden = Track("pedestrian", whole.tick[sure], boxless.take(sure))
-    assert image_confidence(weak) == pytest.approx(0.7 * sure.mean(), rel=0.02)
-    assert image_confidence(hidden) > 2 * image_confidence(weak)
-
-
-def test_ticks_at_which_nothing_was_recorded_do_not_count_against_a_track() -> None:
-    whole = track_of(60, 0.7)
-    rows = np.r_[0:20, 29:60]  # 0.9 s without
-    missed = Track("car", whole.tick[rows], whole.measurements.take(rows))
-    recorded = np.ones(60, dtype=bool)
-    recorded[20:29] = False
-    [silent] = mark_unrecorded([missed], {"": recorded, "front": np.ones(60, dtype=bool)})
-    assert sweep_confidence(missed) < 0.9 * sweep_confidence(whole)
-    assert sweep_confidence(silent) == pytest.approx(sweep_confidence(whole), rel=0.01)
-    [seen] = mark_unrecorded([missed], {"": ~recorded | recorded})
-    assert sweep_confidence(seen) == sweep_confidence(missed)
-    [half] = mark_unrecorded([missed], {"": recorded | (np.arange(60) % 2 == 0)})
-    assert sweep_confidence(missed) < sweep_confidence(half) < sweep_confidence(silent)
 
 
 def test_ticks_at_which_no_picture_was_searched_do_not_count_against_what_pictures_show() -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
@@ -17,7 +16,7 @@ from log2sim.errors import ScenarioError
 from log2sim.evaluation.metrics.comparison import Selection, compare, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import format_table, format_verdict
-from log2sim.evaluation.metrics.verdicts import MEASURES, REPORTED, judge
+from log2sim.evaluation.metrics.verdicts import REPORTED, judge
 from log2sim.files.documents import check
 
 TICKS = len(T_S)
@@ -85,16 +84,6 @@ def test_an_object_of_another_kind_is_no_object_of_the_kind():
     }
 
 
-def test_another_category_of_the_kind_is_confusion_but_not_wrong():
-    found = judged([agent("x", 0.0, category="truck")], [agent("a", 0.0)])
-    assert faults(found) == {"wrong_class": TICKS}
-    assert found["confusion"]["ticks"] == {"truck": {"car": TICKS}}
-    text = format_table(evaluate(scenario(agent("x", 0.0, category="truck")), scenario(agent("a", 0.0))))
-    assert "class: car as truck (1 agent, 31 ticks)" in text
-    assert "class:" not in format_table(evaluate(world(), world()))
-    assert found["judged_agents"][0]["wrong_ticks"] == 0
-
-
 def test_the_matched_object_tells_the_class_not_a_nearer_one_of_another_kind():
     truth = [agent("a", 1.0), agent("b", 0.1, category="pedestrian")]
     assert faults(judged([agent("x", 0.0)], truth)) == {}
@@ -104,14 +93,6 @@ def test_a_duplicate_is_taken_for_what_it_doubles_not_for_a_nearer_object_of_ano
     truth = [agent("a", 0.0), agent("b", 1.6, category="pedestrian")]
     found = judged([agent("x", 0.0), agent("y", 1.5)], truth)
     assert faults(found) == {"duplicate": TICKS, "wrong": TICKS}
-
-
-def test_the_matched_object_tells_the_class_not_a_nearer_one_of_the_kind():
-    truth = [agent("a", 0.0, category="truck"), agent("b", 2.6)]
-    # y matches b, which leaves a to x.
-    found = judged([agent("x", 1.4, category="truck"), agent("y", 2.6)], truth)
-    assert faults(found) == {}
-    assert [r["taken_for"] for r in found["judged_agents"]] == [{"a": TICKS}, {"b": TICKS}]
 
 
 @pytest.mark.parametrize(("speed", "wrong"), [(4.01, {}), (5.99, {}), (3.99, 1), (6.01, 1)])
@@ -312,18 +293,6 @@ def test_what_is_not_selected_is_not_judged_at_all():
         assert not np.any(mask & ~near)
 
 
-def test_categories_narrow_what_is_judged():
-    found = judged(world(), world(), categories=["pedestrian"])
-    assert (found["agents"], list(found["by_category"])) == (2, ["pedestrian"])
-
-
-def test_nothing_to_judge_gives_no_figures():
-    for ours, truth in (([], world()), (world(), []), ([], [])):
-        found = judged(ours, truth)
-        assert (found["agents"], found["ticks"], found["invented"]["share"]) == (0, 0, None)
-        assert found["judged_agents"] == []
-
-
 def broken():
     """The world with one agent of each fault."""
     car = {"size_m": (7.0, 2.8, 1.5), "confidence": 0.88}
@@ -361,22 +330,6 @@ def test_a_document_without_its_figures_breaks_the_schema():
         del part[path[-1]]
         with pytest.raises(ScenarioError):
             check(spoiled, "metrics-1", ScenarioError)
-
-
-@pytest.mark.slow
-def test_the_command_writes_them_and_draws_the_reliability(tmp_path):
-    broken().save(tmp_path / "s.json")
-    world().save(tmp_path / "t.json")
-    ran = run(
-        "evaluate", tmp_path / "s.json", "--truth", tmp_path / "t.json", "--out", tmp_path / "m.json",
-        "--plot", tmp_path / "r.png",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    assert "car-18 backwards" in ran.out
-    document = json.loads((tmp_path / "m.json").read_text())
-    check(document, "metrics-1", ScenarioError)
-    assert document["correctness"]["invented"]["agents"] == 1
-    assert (tmp_path / "r.png").read_bytes()[1:4] == b"PNG"
 
 
 def without_names(found):
@@ -437,29 +390,6 @@ def scenes(draw) -> list[Agent]:
             )
         )  # fmt: skip
     return agents
-
-
-def shares(figures):
-    yield from (figures[name]["share"] for name in (*REPORTED, "wrong"))
-    yield from figures["doubted"].values()
-
-
-@pytest.mark.slow
-@settings(max_examples=40, deadline=None)
-@given(scenes(), scenes())
-def test_shares_are_shares_and_parts_add_up(ours, truth):
-    found = judged(ours, truth)
-    assert all(s is None or 0 <= s <= 1 for s in shares(found))
-    wrong = found["wrong"]["ticks"]
-    assert max(found[name]["ticks"] for name in MEASURES) <= wrong <= sum(found[name]["ticks"] for name in MEASURES)
-    assert found["matched_ticks"] + found["invented"]["ticks"] + found["duplicate"]["ticks"] == found["ticks"]
-    for parts in (found["by_kind"], found["by_category"]):
-        for name in ("ticks", "agents", "undecided_ticks"):
-            assert sum(part[name] for part in parts.values()) == found[name]
-    rows = found["judged_agents"]
-    assert sum(row["wrong_ticks"] for row in rows) == wrong
-    assert sum(n for row in found["confusion"]["ticks"].values() for n in row.values()) == found["ticks"]
-    assert sum(n for row in found["confusion"]["agents"].values() for n in row.values()) == found["agents"] == len(rows)
 
 
 @settings(max_examples=15, deadline=None)

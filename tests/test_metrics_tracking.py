@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 
 import numpy as np
 import pytest
 
-from log2sim.evaluation.metrics.comparison import assign, associate, gate_m, mota, near_pairs, switches
+from log2sim.evaluation.metrics.comparison import assign, associate, mota, near_pairs, switches
+from log2sim.evaluation.metrics.correctness import normalized_errors, reliability
 from log2sim.evaluation.metrics.evaluator import hota
 
 
@@ -39,6 +39,7 @@ def there(xy):
     return np.isfinite(xy[..., 0])
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(5))
 def test_counts_equal_those_of_motmetrics(seed):
     motmetrics = pytest.importorskip("motmetrics")
@@ -62,6 +63,7 @@ def test_counts_equal_those_of_motmetrics(seed):
     assert mota(int(there(truth).sum()), missed, false, switched) == pytest.approx(expected["mota"], abs=1e-12)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(5))
 def test_hota_equals_that_of_trackeval(seed):
     reference = pytest.importorskip("trackeval.metrics.hota", exc_type=ImportError)
@@ -88,54 +90,6 @@ def test_hota_equals_that_of_trackeval(seed):
     assert found.ass_a == pytest.approx(expected["AssA"].mean(), abs=1e-12)
 
 
-def test_hota_of_a_track_cut_in_two_halves_the_association():
-    # Every box is found; each half shares 10 of the 20 ticks with the truth: Jaccard 10 / (20 + 10 - 10) = 1/2.
-    truth = np.zeros((1, 20, 2))
-    other = np.full((2, 20, 2), np.nan)
-    other[0, :10] = other[1, 10:] = 0.0
-    found = hota(pairs_of(truth, other), there(truth), there(other))
-    assert (found.det_a, found.ass_a) == (1.0, 0.5)
-    assert found.hota == pytest.approx(np.sqrt(0.5), abs=1e-12)
-
-
-def test_hota_of_a_constant_offset_counts_the_thresholds_that_it_passes():
-    # 0.5 m of 2 m is a similarity of 0.75: 15 of the 19 thresholds from 0.05 to 0.95 are passed.
-    truth = np.zeros((1, 12, 2))
-    found = hota(pairs_of(truth, truth + np.array([0.5, 0.0])), there(truth), there(truth))
-    assert found.hota == pytest.approx(15 / 19, abs=1e-12)
-
-
-def test_a_match_is_kept_while_it_is_within_the_gate_although_another_is_nearer():
-    truth = np.zeros((1, 3, 2))
-    other = np.array([[[0.0, 0], [1.5, 0], [2.5, 0]], [[1.0, 0], [0.1, 0], [0.1, 0]]])
-    found = associate(pairs_of(truth, other), 1, 2, 3)
-    assert found.match.tolist() == [[0, 0, 1]]
-    assert switches(found.match, np.ones((1, 3), dtype=bool)).tolist() == [[False, False, True]]
-
-
-def test_most_pairs_come_before_least_distance():
-    # Greedy by distance would pair truth 1 with other 0 and leave truth 0 alone.
-    truth = np.array([[[0.0, 0]], [[1.6, 0]]])
-    other = np.array([[[1.5, 0]], [[3.4, 0]]])
-    assert associate(pairs_of(truth, other), 2, 2, 1).match.tolist() == [[0], [1]]
-
-
-def test_switches_are_counted_across_ticks_that_do_not_count():
-    match = np.array([[0, 1, 1, -1, 0]])
-    counted = np.array([[True, False, True, True, True]])
-    assert switches(match, counted).tolist() == [[False, False, True, False, True]]
-
-
-def test_order_of_agents_does_not_matter():
-    truth, other = random_tracks(3)
-    plain = hota(pairs_of(truth, other), there(truth), there(other))
-    turned = hota(pairs_of(truth[::-1], other[::-1]), there(truth)[::-1], there(other)[::-1])
-    assert turned.hota == pytest.approx(plain.hota, abs=1e-12)
-    plain_match = associate(pairs_of(truth, other), len(truth), len(other), truth.shape[1]).match
-    turned_match = associate(pairs_of(truth[::-1], other[::-1]), len(truth), len(other), truth.shape[1]).match[::-1]
-    assert np.array_equal(np.where(turned_match < 0, -1, len(other) - 1 - turned_match), plain_match)
-
-
 def test_assignment_equals_the_dense_solver():
     from scipy.optimize import linear_sum_assignment
 
@@ -148,17 +102,34 @@ def test_assignment_equals_the_dense_solver():
         assert dense[rows[chosen], cols[chosen]].sum() == pytest.approx(dense[linear_sum_assignment(-dense)].sum())
 
 
-def test_the_gate_grows_with_long_vehicles_only():
-    assert gate_m(np.array([0.7, 4.5, 8.0, 12.0])).tolist() == [2.0, 2.0, 2.0, 3.0]
+def test_the_calibration_error_of_two_bins_by_hand():
+    confidence = np.array([0.25, 0.25, 0.25, 0.25, 0.95, 1.0])
+    table = reliability(confidence, np.array([True, False, False, False, True, False]))
+    assert table["count"] == 6
+    # The first bin is right as often as it says; of the last, 0.975 on average, one of two is.
+    assert table["expected_calibration_error"] == pytest.approx(2 / 6 * (0.975 - 0.5))
+    low, high = table["bins"][2], table["bins"][9]
+    assert (low["count"], low["mean_confidence"], low["right"]) == (4, 0.25, 0.25)
+    assert (high["count"], high["mean_confidence"], high["right"]) == (2, 0.975, 0.5)
+    assert [b["right"] for b in table["bins"]].count(None) == 8
 
 
-@pytest.mark.slow
-def test_500_agents_over_600_ticks_take_seconds():
+def test_what_is_right_as_often_as_it_claims_is_calibrated():
     rng = np.random.default_rng(0)
-    truth = rng.uniform(0, 150, (500, 1, 2)) + rng.normal(0, 0.3, (500, 1, 2)) * np.arange(600)[None, :, None]
-    other = truth + rng.normal(0, 0.3, truth.shape)
-    begin = time.perf_counter()
-    pairs = pairs_of(truth, other)
-    associate(pairs, 500, 500, 600)
-    hota(pairs, there(truth), there(other))
-    assert time.perf_counter() - begin < 60  # measured: a few seconds; the margin is for busy machines
+    confidence = rng.uniform(size=100_000)
+    calibrated = reliability(confidence, rng.uniform(size=100_000) < confidence)
+    assert calibrated["expected_calibration_error"] < 0.01
+    overconfident = reliability(confidence, rng.uniform(size=100_000) < confidence**2)
+    # The integral of c - c^2 over 0 to 1.
+    assert overconfident["expected_calibration_error"] == pytest.approx(1 / 6, abs=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
+def test_errors_drawn_from_their_sigma_have_a_nees_of_one(factor):
+    rng = np.random.default_rng(1)
+    sigma = rng.uniform(0.05, 2.0, size=50_000)
+    found = normalized_errors(factor * sigma[:, None] * rng.normal(size=(50_000, 2)), sigma)
+    assert found["nees"] == pytest.approx(factor**2, rel=0.03)
+    assert found["median"] == pytest.approx(np.log(2) * factor**2, rel=0.03)
+    # A Rayleigh distribution: P(r < R) = 1 - exp(-R^2 / 2).
+    assert found["within_95"] == pytest.approx(1 - 0.05 ** (1 / factor**2), abs=0.01)

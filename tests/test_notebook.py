@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-import sys
 from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -20,12 +19,10 @@ from worlds import tiny_log
 from log2sim import plot
 from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.datatypes.scenario import COLUMNS
-from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError, ScenarioError
-from log2sim.files import plugins
+from log2sim.errors import ConfigError, ScenarioError
 from log2sim.perception.sync import synchronize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.visualization import notebook
 from log2sim.visualization.notebook import labels_of
 from log2sim.visualization.overlay import labels_at, read_moment
 
@@ -95,31 +92,6 @@ def test_a_repr_is_one_short_line(log: Log, scenario: Scenario, replayed: Replay
     assert repr(replace(scenario, agents=scenario.others[:1])) == "<Scenario 'tiny': 1 agent, 1.0 s>"
 
 
-def test_what_holds_columns_shows_them_by_their_shapes(log: Log, scenario: Scenario) -> None:
-    agent = scenario.agents[0]
-    values = (agent, agent.waypoints, log.labels, log.ego, log.cameras["front"], log.streams["front"], log.lidars)
-    shown = [repr(value) for value in values]
-    assert max(map(len, shown)) < 500
-    assert not any("array(" in text or "\n" in text for text in shown)
-    assert repr(agent).startswith(f"<Agent {agent.id!r}: {agent.category}")
-    assert f"t_s=<({len(agent.waypoints)},) float64>" in shown[1]
-
-
-def test_the_labels_of_a_log_are_its_truth(log: Log) -> None:
-    truth = log.truth()
-    assert {a.id for a in truth.others} <= set(log.labels.track_id)
-    with pytest.raises(LogError, match="label"):
-        log.changed(labels=None).truth()
-
-
-def test_a_repr_reads_no_stamps(log: Log) -> None:
-    def never() -> Any:
-        raise AssertionError
-
-    waiting = log.changed(streams={"front": Stream("front", never, never)}, ego=None)
-    assert repr(waiting) == "<Log 'tiny' (synthetic): 1 camera, 1 LiDAR>"
-
-
 @pytest.mark.parametrize("kind", ["log", "scenario", "replayed"])
 def test_the_html_has_escaped_text_and_a_small_picture(kind: str, request: pytest.FixtureRequest) -> None:
     value = request.getfixturevalue(kind)
@@ -142,40 +114,6 @@ def test_the_html_has_escaped_text_and_a_small_picture(kind: str, request: pytes
     assert len(page) < MAX_PAGE_BYTES
 
 
-def test_the_html_names_doubts_and_collisions(scenario: Scenario, replayed: Replay) -> None:
-    doubted = replace(
-        scenario, agents=tuple(replace(a, confidence=0.2) if a.id == "car" else a for a in scenario.agents)
-    )
-    assert re.search(r"doubtful\s+car\b", Tags(notebook.html_of(doubted)).text)
-    event = {"belongs_to": "replay", "t_s": 0.5, "agents": ["ego", "car"]}
-    crashed = replace(replayed, metrics={**replayed.metrics, "collisions": [event]})
-    assert "ego and car at 0.50 s" in Tags(notebook.html_of(crashed)).text
-
-
-def test_a_log_without_cameras_shows_a_sweep(log: Log) -> None:
-    blind = log.changed(cameras={})
-    assert "top, from above" in Tags(blind._repr_html_() or "").text
-
-
-def test_what_cannot_be_drawn_is_left_out(scenario: Scenario, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*arguments: Any) -> Any:
-        raise RuntimeError
-
-    monkeypatch.setattr(notebook, "thumbnail_of_scenario", broken)
-    page = scenario._repr_html_()
-    assert page is not None
-    assert "<img" not in page
-    assert "3 other agents" in page
-
-    def unreadable(index: int) -> Any:
-        raise RecordError("broken")
-
-    dark = log.changed(streams={n: Stream(n, s.t_ns, unreadable) for n, s in log.streams.items()})
-    assert notebook.thumbnails_of_log(dark) == []
-    monkeypatch.setitem(plugins.LATE_FUNCTIONS, "html_of", "log2sim.nowhere:html_of")
-    assert scenario._repr_html_() is None
-
-
 # Tables
 
 
@@ -193,50 +131,6 @@ def test_the_dataframe_holds_every_waypoint(scenario: Scenario) -> None:
     assert str(frame.observed.dtype) == "bool"
     assert frame.sigma_yaw_rad.isna().all()
     assert len(replace(scenario, agents=()).to_dataframe()) == 0
-
-
-def test_units_are_those_of_the_names() -> None:
-    suffixes = {"_s": "s", "_m": "m", "_rad": "rad", "_mps": "m/s"}
-    for name, (unit, _) in COLUMNS.items():
-        suffix = max((s for s in suffixes if name.endswith(s)), key=len, default=None)
-        assert unit == (suffixes[suffix] if suffix else "1" if name == "confidence" else "")
-
-
-def test_parquet_holds_the_dataframe_and_the_units(scenario: Scenario, tmp_path: Path) -> None:
-    pd, pq = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
-    path = tmp_path / "new" / "agents.parquet"
-    scenario.to_parquet(path)
-    schema = pq.read_schema(path)
-    assert schema.field("speed_mps").metadata[b"unit"] == b"m/s"
-    assert schema.metadata[b"t0_ns"] == str(scenario.t0_ns).encode()
-    pd.testing.assert_frame_equal(pd.read_parquet(path), scenario.to_dataframe(), check_dtype=False)
-
-
-def test_a_failed_parquet_file_leaves_the_old_one(
-    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pq = pytest.importorskip("pyarrow.parquet")
-    path = tmp_path / "agents.parquet"
-    path.write_text("old")
-
-    def full(table: Any, target: Path) -> None:
-        target.write_text("half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pq, "write_table", full)
-    with pytest.raises(ConfigError, match=r"agents\.parquet: cannot be written: No space left"):
-        scenario.to_parquet(path)
-    assert [f.name for f in tmp_path.iterdir()] == ["agents.parquet"]
-    assert path.read_text() == "old"
-
-
-@pytest.mark.parametrize(("module", "extra"), [("pandas", "dataframe"), ("pyarrow", "parquet")])
-def test_tables_name_the_extra_that_they_need(
-    module: str, extra: str, scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingExtra, match=rf"needs the extra '{extra}'"):
-        scenario.to_dataframe() if module == "pandas" else scenario.to_parquet(tmp_path / "a.parquet")
 
 
 # Ticks
@@ -262,41 +156,6 @@ def test_ticks_are_those_of_the_schedule_and_read_nothing_unasked(log: Log) -> N
         tick.images["back"]
 
 
-def test_points_of_a_tick_are_in_the_map(log: Log) -> None:
-    tick = log.ticks()[5]
-    assert tick.map_T_ego is not None
-    x_m = 3.0 * (tick.t_ns - log.ego.t_ns[0]) / 1e9  # type: ignore[union-attr]  # the ego drives east at 3 m/s
-    assert tick.map_T_ego[:3, 3] == pytest.approx([x_m, 0.0, 0.0], abs=0.02)
-    assert len(tick.points) == len(tick.sweeps["top"].xyz_m)
-    assert (np.abs(tick.points[:, 2]) < 1e-6).mean() > 0.3
-    assert tick.points is tick.points
-
-
-def test_ticks_can_be_cut(log: Log) -> None:
-    ticks = log.ticks()
-    assert [t.t_ns for t in ticks[2:4]] == [ticks[2].t_ns, ticks[3].t_ns]
-    assert ticks[-1].t_ns == ticks[len(ticks) - 1].t_ns
-    later = log.ticks(start_s=0.35, stop_s=0.65)
-    assert [t.t_s for t in later] == pytest.approx([0.4, 0.5, 0.6])
-    assert len(list(ticks)) == len(ticks)
-
-
-def test_ticks_without_cameras_are_sweeps(log: Log) -> None:
-    ticks = log.changed(cameras={}, ego=None).ticks()
-    assert len(ticks) == len(log.streams["top"].t_ns)
-    assert ticks[0].map_T_ego is None
-    assert ticks[0].points.shape == (0, 3)
-
-
-def test_wrong_ticks_are_told(log: Log) -> None:
-    with pytest.raises(ConfigError, match=r"no camera 'frnt' \(did you mean 'front'\?\); the log has front"):
-        log.ticks(["frnt"])
-    with pytest.raises(ConfigError, match=r"no tick from 7 to inf s; the log has ticks from 0 to 0\.900 s"):
-        log.ticks(start_s=7.0)
-    with pytest.raises(LogError, match="neither a camera nor a LiDAR"):
-        log.changed(cameras={}, lidars={}).ticks()
-
-
 # Pictures
 
 
@@ -313,13 +172,37 @@ def test_agents_are_drawn_where_their_labels_are(log: Log, scenario: Scenario) -
         assert size == pytest.approx(known.size_m[k])
 
 
-def test_agents_of_another_map_origin_are_brought_to_the_log(log: Log, scenario: Scenario) -> None:
-    t_ns = log.ticks()[5].t_ns
-    near, far = (
-        labels_of(replace(scenario, map=replace(scenario.map, offset_m=(x_m, 0.0, 0.0))), log, t_ns)
-        for x_m in (0.0, 1000.0)
-    )
-    assert far.center_m - near.center_m == pytest.approx(np.tile([1000.0, 0.0, 0.0], (len(near.t_ns), 1)))
+def test_what_holds_columns_shows_them_by_their_shapes(log: Log, scenario: Scenario) -> None:
+    agent = scenario.agents[0]
+    values = (agent, agent.waypoints, log.labels, log.ego, log.cameras["front"], log.streams["front"], log.lidars)
+    shown = [repr(value) for value in values]
+    assert max(map(len, shown)) < 500
+    assert not any("array(" in text or "\n" in text for text in shown)
+    assert repr(agent).startswith(f"<Agent {agent.id!r}: {agent.category}")
+    assert f"t_s=<({len(agent.waypoints)},) float64>" in shown[1]
+
+
+def test_a_log_without_cameras_shows_a_sweep(log: Log) -> None:
+    blind = log.changed(cameras={})
+    assert "top, from above" in Tags(blind._repr_html_() or "").text
+
+
+def test_a_failed_parquet_file_leaves_the_old_one(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pq = pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "agents.parquet"
+    path.write_text("old")
+
+    def full(table: Any, target: Path) -> None:
+        target.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(ConfigError, match=r"agents\.parquet: cannot be written: No space left"):
+        scenario.to_parquet(path)
+    assert [f.name for f in tmp_path.iterdir()] == ["agents.parquet"]
+    assert path.read_text() == "old"
 
 
 def test_a_log_shows_a_moment(log: Log, scenario: Scenario, tmp_path: Path) -> None:
@@ -337,24 +220,6 @@ def test_a_log_shows_a_moment(log: Log, scenario: Scenario, tmp_path: Path) -> N
         log.show(7.0)
 
 
-def test_plot_draws_into_given_axes(scenario: Scenario, replayed: Replay) -> None:
-    figure = matplotlib.figure.Figure(figsize=(6, 3))
-    ax = figure.add_subplot()
-    assert plot(scenario, ax, replay=replayed) is ax
-    for agent in scenario.others:
-        w = agent.waypoints
-        assert ax.get_xlim()[0] < w.x_m[0] < ax.get_xlim()[1]
-        assert ax.get_ylim()[0] < w.y_m[0] < ax.get_ylim()[1]
-    assert ax.get_legend() is None
-    limits = ax.get_xlim(), ax.get_ylim()
-    doubted = replace(scenario, agents=tuple(replace(a, confidence=0.2) for a in scenario.agents[:2]))
-    plot(doubted, ax, legend=True)
-    assert (ax.get_xlim(), ax.get_ylim()) == limits
-    legend = ax.get_legend()
-    assert legend is not None
-    assert any("doubt" in text.get_text() for text in legend.get_texts())
-
-
 def test_plot_makes_a_figure_of_its_own(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib.pyplot as plt
 
@@ -367,8 +232,3 @@ def test_plot_makes_a_figure_of_its_own(scenario: Scenario, monkeypatch: pytest.
     with pytest.raises(ScenarioError, match=r"map\.projection"):
         plot(scenario, truth=other)
     assert plt.get_fignums() == []
-
-
-def test_an_empty_scenario_can_be_shown() -> None:
-    nothing = Scenario("nothing", 0, 0.0, ())
-    assert "<img" in notebook.html_of(nothing)

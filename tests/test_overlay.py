@@ -11,9 +11,17 @@ from command_line import names, run
 from scipy.optimize import brentq
 from worlds import camera_ahead, tiny_log
 
-from log2sim.datatypes import Log, Stream
-from log2sim.errors import ConfigError, RecordError
-from log2sim.geometry import RollingShutter, apply, box_corners, inverse, line_time_s, points_in_box, project_moving
+from log2sim.datatypes import Log
+from log2sim.geometry import (
+    Camera,
+    RollingShutter,
+    apply,
+    box_corners,
+    box_lines,
+    inverse,
+    points_in_box,
+    project_moving,
+)
 from log2sim.visualization.overlay import draw_moment, labels_at, read_moment
 
 SPEED_MPS, TURN_RADPS = 12.0, 0.4
@@ -37,13 +45,6 @@ def test_labels_are_interpolated_to_a_stamp(log: Log, later_ns: int) -> None:
     expected = {"car": [4.0, 0.0, 0.0], "parked": [0.0, 0.0, 0.0], "walker": [0.0, -1.4, 0.0]}
     for row, track in enumerate(sorted(expected)):
         assert driven[row] == pytest.approx(np.array(expected[track]) * later_ns / 1e9, abs=2e-3)
-
-
-def test_labels_end_with_their_track(log: Log) -> None:
-    last = int(log.labels.t_ns.max())
-    assert len(labels_at(log.labels, last + 50_000_000).t_ns) == 3
-    assert len(labels_at(log.labels, last + 80_000_000).t_ns) == 0
-    assert len(labels_at(None, last).t_ns) == 0
 
 
 def test_points_on_a_car_are_drawn_in_its_wireframe(log: Log) -> None:
@@ -112,53 +113,6 @@ def test_a_point_is_seen_by_the_line_that_is_exposed_when_it_is_there(direction:
     assert moved > 5.0
 
 
-def test_the_first_line_is_read_half_the_readout_before_the_middle() -> None:
-    camera = replace(camera_ahead(), rolling_shutter=RollingShutter("down", 0.05))
-    corners = np.array([[10.0, 0.0], [10.0, 300.0], [10.0, 600.0], [np.nan, np.nan]])
-    assert line_time_s(camera, corners) == pytest.approx([-0.025, 0.0, 0.025, 0.0])
-    assert not line_time_s(camera_ahead(), corners).any()
-
-
-def test_a_log_without_cameras_is_drawn_from_above(log: Log) -> None:
-    streams = {"top": log.streams["top"]}
-    moment = read_moment(replace(log, cameras={}, streams=streams, reference_camera=None))
-    assert moment.shots == ()
-    assert len(moment.boxes.t_ns) == 3
-    assert "from above" in texts(moment)
-
-
-def test_a_log_without_poses_is_drawn_as_if_it_stood(log: Log) -> None:
-    moment = read_moment(replace(log, ego=None))
-    assert len(moment.shots[0].depth_m) > 100
-    assert "no poses" in texts(moment)
-
-
-def test_what_cannot_be_read_is_said(log: Log) -> None:
-    def broken(i: int) -> None:
-        raise RecordError(f"image {i} is torn")
-
-    streams = {**log.streams, "front": Stream("front", log.streams["front"].t_ns, broken)}
-    moment = read_moment(replace(log, streams=streams))
-    assert moment.shots[0].image is None
-    assert len(moment.shots[0].depth_m) > 100
-    assert "is torn" in texts(moment)
-
-
-def test_the_tick_with_the_most_records_is_drawn_unless_another_is_asked_for(log: Log) -> None:
-    top = log.streams["top"]
-    one = replace(log, streams={**log.streams, "top": Stream("top", top.t_ns[:1], top.read)})
-    assert len(read_moment(one).sweeps) == 1
-    assert read_moment(one).at_s <= 0.2
-    assert read_moment(one, at_s=0.5).at_s == pytest.approx(0.5)
-    assert read_moment(log).at_s > 0.2
-
-
-@pytest.mark.parametrize("at_s", [-1.0, 99.0])
-def test_a_time_outside_the_log_is_refused(log: Log, at_s: float) -> None:
-    with pytest.raises(ConfigError, match="ticks from 0 to"):
-        read_moment(log, at_s=at_s)
-
-
 def test_inspect_writes_the_picture_and_nothing_over_another(tiny_folder: Path, tmp_path: Path) -> None:
     picture = tmp_path / "o.png"
     ran = run("inspect", tiny_folder, "--overlay", picture, "--at", "0.3", "--cameras", "front")
@@ -170,3 +124,26 @@ def test_inspect_writes_the_picture_and_nothing_over_another(tiny_folder: Path, 
     assert "no camera 'side'" in run("inspect", tiny_folder, "--overlay", tmp_path / "p.png", "--cameras", "side").line
     assert "--overlay" in run("inspect", tiny_folder, "--at", "1").line
     assert ".png" in run("inspect", tiny_folder, "--overlay", tmp_path / "p.txt").line
+
+
+CAMERA = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]), "ego", np.eye(4))
+
+
+def corners_cam(x0: float, x1: float) -> np.ndarray:
+    """A box of 2 m x 2 m across that reaches from depth x0 to x1, in the order of `box_corners` seen by the camera."""
+    across = [(-1, x1), (-1, x0), (1, x0), (1, x1)]
+    return np.array([(u, v, z) for v in (1, -1) for u, z in across], dtype=float)
+
+
+def test_corners_land_where_the_pinhole_puts_them() -> None:
+    lines = box_lines(CAMERA, corners_cam(10.0, 20.0)).reshape(-1, 2)
+    # 500 px * 1 m / 10 m = 50 px and half of it at 20 m.
+    expected = {(320 + s * d, 240 + t * d) for d in (50, 25) for s in (-1, 1) for t in (-1, 1)}
+    assert {tuple(np.round(p, 9)) for p in lines} == {(float(u), float(v)) for u, v in expected}
+
+
+def test_a_box_beside_the_camera_is_cut_at_the_near_plane() -> None:
+    lines = box_lines(CAMERA, corners_cam(-5.0, 10.0))
+    assert np.isfinite(lines).all()
+    assert len(lines) == 10  # four edges far ahead, four along, the crossed-out front
+    assert len(box_lines(CAMERA, corners_cam(-9.0, -3.0))) == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import shutil
 from collections.abc import Callable
@@ -11,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from damaged_bytes import damaged, quick, result_or_refusal
 from hypothesis import given, settings
@@ -29,41 +27,14 @@ from log2sim.export.openscenario.read import load
 from log2sim.export.roads.opendrive import require_roads
 from log2sim.export.xml_text import read
 from log2sim.files.documents import read_json
-from log2sim.logs.arrow import read_columns
-from log2sim.logs.kitti.labels import calibration_entry, read_calibration
-from log2sim.logs.nuscenes.tables import scan_records
 from log2sim.logs.opening import open_log
-from log2sim.logs.ros.messages import definition_fields, read_settings
-from log2sim.logs.waymo.messages import WireError, fields_of
-from log2sim.simulation.metrics.all_metrics import parse_limits
+from log2sim.logs.ros.messages import read_settings
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 from log2sim.synth.scene import load_scene
 
 few = settings(quick, max_examples=25)
 fewer = settings(quick, max_examples=8)
-WORDS = st.sampled_from(
-    [
-        "=",
-        ".",
-        "detect",
-        "name",
-        "track",
-        "[",
-        "]",
-        '"',
-        "1e999",
-        "nan",
-        "9" * 30,
-        "\n",
-        "\0",
-        ",",
-        "P2:",
-        "true",
-        "\u0663",
-    ]
-)
-ANY_TEXT = st.text(max_size=60) | st.lists(WORDS, max_size=12).map("".join)
 
 
 @cache
@@ -114,17 +85,6 @@ def test_a_damaged_document_is_an_error_or_a_value(
     result_or_refusal(lambda: parse(path), error, str(path))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", DOCUMENTS)
-@few
-@given(text=ANY_TEXT)
-def test_any_text_is_an_error_or_a_document(tmp_path: Path, kind: str, text: str) -> None:
-    parse, error = DOCUMENTS[kind]
-    path = tmp_path / "file"
-    path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    result_or_refusal(lambda: parse(path), error, str(path))
-
-
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**40), 10**40) | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
@@ -151,85 +111,6 @@ def test_any_value_in_a_document_is_an_error_or_a_value(
     holder[key] = data.draw(json_values)
     with contextlib.suppress(Log2SimError):
         parse(document)
-
-
-@few
-@given(text=ANY_TEXT)
-def test_any_setting_is_an_error_or_a_setting(text: str) -> None:
-    result_or_refusal(lambda: Config.load(None, [text]), ConfigError, "--set")
-    result_or_refusal(lambda: Config.load(None, [f"track.max_gap_s={text}"]), ConfigError, "--set")
-
-
-@few
-@given(text=ANY_TEXT)
-def test_any_limit_is_an_error_or_a_limit(text: str) -> None:
-    limits = result_or_refusal(lambda: parse_limits([f"min_ttc_s={text}"]), ConfigError, "limit")
-    assert limits is None or np.isfinite(list(limits.values())).all()
-
-
-@few
-@given(text=ANY_TEXT | st.lists(st.floats().map(repr), max_size=14).map(lambda words: "P2: " + " ".join(words)))
-def test_any_text_is_an_error_or_a_calibration_of_kitti(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "calib.txt"
-    path.write_text(text.encode("utf-8", "replace").decode(), encoding="utf-8")
-    found = result_or_refusal(
-        lambda: calibration_entry(read_calibration(path), path, (3, 4), "P2"), LogError, str(path)
-    )
-    assert found is None or (found.shape == (3, 4) and np.isfinite(found).all())
-
-
-RECORDS = json.dumps([{"token": "a", "x": 1}, {"token": "b", "x": [1, 2]}], indent=0).encode()
-
-
-@few
-@given(data=damaged(RECORDS))
-def test_a_damaged_table_of_nuscenes_is_an_error_or_records(tmp_path: Path, data: bytes) -> None:
-    path = tmp_path / "table.json"
-    path.write_bytes(data)
-    found = result_or_refusal(lambda: list(scan_records(path, "token", {"a", "b"})), LogError, str(path))
-    assert found is None or all(record["token"] in ("a", "b") for record in found)
-
-
-@cache
-def table_bytes(suffix: str) -> bytes:
-    pyarrow = pytest.importorskip("pyarrow")
-    stream = io.BytesIO()
-    table = pyarrow.table(
-        {"t": [1, 2, 3], "x": [0.5, 1.5, None], "name": ["a", "b", "c"], "v": [[1.0], [2.0, 3.0], []]}
-    )
-    if suffix == ".feather":
-        from pyarrow import feather
-
-        feather.write_feather(table, stream, compression="lz4")
-    else:
-        from pyarrow import parquet
-
-        parquet.write_table(table, stream)
-    return stream.getvalue()
-
-
-@pytest.mark.parametrize("suffix", [".feather", ".parquet"])
-@few
-@given(data=st.data())
-def test_a_damaged_column_file_is_an_error_or_columns(tmp_path: Path, suffix: str, data: st.DataObject) -> None:
-    path = tmp_path / f"table{suffix}"
-    path.write_bytes(data.draw(damaged(table_bytes(suffix))))
-    kinds = {"t": "int", "x": "float", "name": "text", "v": "floats"}
-    columns = result_or_refusal(lambda: read_columns(path, kinds), LogError, str(path))
-    assert columns is None or len({len(column) for column in columns.values()}) == 1
-
-
-@few
-@given(data=st.binary(max_size=60))
-def test_any_bytes_are_fields_of_a_message_or_a_wire_error(data: bytes) -> None:
-    with contextlib.suppress(WireError):
-        assert all(field.number >= 0 for field in fields_of(data))
-
-
-@few
-@given(text=ANY_TEXT)
-def test_any_definition_has_names_of_fields(text: str) -> None:
-    assert all(isinstance(name, str) for name in definition_fields(text))
 
 
 def _bag(container: str) -> Callable[[Log, Path], Path]:

@@ -12,7 +12,6 @@ from worlds import CAR, PARKED, WALKER, tiny_log, tiny_table
 
 from log2sim.config import Config, LidarConfig
 from log2sim.datatypes import Agent, Boxes3D, Detections, Frame, Log, Scenario
-from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import inverse, project_boxes, wrap_angle
 from log2sim.perception.detect.detectors import create_detector
@@ -55,52 +54,6 @@ def test_a_log_without_cameras_is_reconstructed(world: tuple[Log, Scenario]) -> 
     assert result.scenario.provenance["detector"] == "lidar:labels"
 
 
-def test_a_detector_in_sweeps_leaves_the_cameras_of_a_log_alone(world: tuple[Log, Scenario]) -> None:
-    log, _ = world
-
-    def broken(_: int) -> Any:
-        raise AssertionError("an image was read")
-
-    unread = replace(log, streams=dict(log.streams) | {"front": replace(log.streams["front"], read=broken)})
-    result = run(unread, "lidar:labels")
-    plan = {entry["stage"]: entry for entry in result.report["plan"]}
-    for stage in ("image decoding", "detection in every frame", "homography", "fusion of cameras"):
-        assert not plan[stage]["kept"]
-        assert "no camera is used" in plan[stage]["reason"]
-    assert plan["detection in LiDAR sweeps"]["reason"] == "detector 'lidar:labels'"
-    assert [c["used"] for c in result.scenario.cameras] == [False]
-
-
-def test_an_object_outside_all_cameras_is_found_by_the_lidar_alone(world: tuple[Log, Scenario]) -> None:
-    log, _ = world
-    assert nearest(run(log, "labels"), BEHIND["pose"]) is None
-    for detector in ("lidar:labels", "labels+lidar:labels"):
-        found = nearest(run(log, detector), BEHIND["pose"])
-        assert found is not None
-        assert found.category == "car"
-
-
-def test_both_detectors_together_see_every_object_once(world: tuple[Log, Scenario]) -> None:
-    log, truth = world
-    result = run(log, "labels+lidar:labels")
-    assert len(result.scenario.others) == 4
-    assert evaluate(result.scenario, truth)["precision"] == 1.0
-    assert result.scenario.provenance["detector"] == "labels+lidar:labels"
-    assert set(result.report["detections"]) == {"front", "lidar:labels"}
-
-
-def test_sensors_that_a_detector_needs_are_asked_for(world: tuple[Log, Scenario]) -> None:
-    log, _ = world
-    with pytest.raises(ConfigError, match=r"--cameras: detector 'lidar:labels' uses no camera"):
-        run(log, "lidar:labels", "cameras=front")
-    with pytest.raises(LogError, match="the log has no LiDAR; detector 'lidar:labels' needs one"):
-        run(replace(log, lidars={}), "labels+lidar:labels")
-    with pytest.raises(LogError, match=r"no camera, which detector 'labels' needs; .* --detector lidar:labels"):
-        run(replace(log, cameras={}), "labels+lidar:labels")
-    with pytest.raises(ConfigError, match=r"sync\.reference: LiDAR 'front' is not used; used: top"):
-        run(log, "lidar:labels", "sync.reference=front")
-
-
 @dataclass(frozen=True)
 class Images:
     """Image boxes of the labels, some of them changed."""
@@ -133,21 +86,6 @@ def run_with(log: Log, images: Images | None, sweeps: Sweeps | None) -> Result:
     return infer_scenario(replace(started, plan=started.plan.only_agents()), observe_log(started))
 
 
-def nothing(frame: Frame, found: Detections) -> Detections:
-    return Detections.empty()
-
-
-@pytest.mark.parametrize(("score", "agents"), [(0.9, 4), (0.45, 1)])
-def test_what_a_blind_camera_misses_is_found_where_the_lidar_is_sure(
-    world: tuple[Log, Scenario], score: float, agents: int
-) -> None:
-    log, _ = world
-    sweeps = Sweeps(log, lambda boxes: replace(boxes, score=np.full(len(boxes), score)))
-    found = run_with(log, Images(log, nothing), sweeps).scenario.others
-    # Behind the ego no camera could see it, so a score of 0.45 starts a track; it must be likely to become an agent.
-    assert len(found) == (agents if score > 0.5 else 0)
-
-
 def test_a_false_image_box_is_doubted_where_the_lidar_sees_something_else() -> None:
     container = {"center": [14.0, 6.0], "size_m": [4.4, 1.8, 1.6], "color": [190, 180, 170]}
     log, _ = tiny_log([CAR], lidar=ALL_AROUND, building=[container])
@@ -163,26 +101,6 @@ def test_a_false_image_box_is_doubted_where_the_lidar_sees_something_else() -> N
     assert nearest(alone, (14.0, 6.0)) is not None
     assert nearest(both, (14.0, 6.0)) is None
     assert len(both.scenario.others) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("yaw_deg", [10.0, 190.0])
-def test_which_way_a_parked_car_points_is_told_by_the_boxes(yaw_deg: float) -> None:
-    log, _ = tiny_log([CAR, PARKED | {"pose": [14.0, -4.0, yaw_deg]}], lidar=ALL_AROUND)
-
-    def unsure(boxes: Boxes3D) -> Boxes3D:
-        """One in four boxes is turned round, as it says."""
-        turned = np.where(np.random.default_rng(int(boxes.t_ns.sum()) % 2**31).random(len(boxes)) < 0.25, np.pi, 0.0)
-        return replace(boxes, yaw_rad=boxes.yaw_rad + turned, heading_score=np.full(len(boxes), 0.75))
-
-    for change in (lambda boxes: boxes, unsure):
-        parked = nearest(run_with(log, None, Sweeps(log, change)), (14.0, -4.0))
-        assert parked is not None
-        assert abs(wrap_angle(parked.waypoints.yaw_rad[0] - np.deg2rad(yaw_deg))) < np.deg2rad(5)
-    # Without them traffic says that it points along with the ego and the other car, and the outline of its points what is true.
-    without = nearest(run(log, "labels"), (14.0, -4.0))
-    assert without is not None
-    assert abs(wrap_angle(without.waypoints.yaw_rad[0] - np.deg2rad(yaw_deg))) < np.deg2rad(5)
 
 
 def test_a_moving_car_points_where_it_goes_whatever_the_boxes_say(world: tuple[Log, Scenario]) -> None:

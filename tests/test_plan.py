@@ -7,7 +7,8 @@ import pytest
 
 from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log
-from log2sim.errors import ConfigError, LogError
+from log2sim.files import stages
+from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, transform
 from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
 
@@ -55,42 +56,6 @@ def test_every_stage_is_decided_once_with_a_reason() -> None:
     assert decisions[0].to_dict() == {"stage": "use of every LiDAR", "kept": True, "reason": "1 within range"}
 
 
-def test_without_lidar_there_is_nothing_to_compensate() -> None:
-    assert decided(Stage.MOTION_COMPENSATION, make_log(lidars=())) == (False, "the log has no LiDAR")
-
-
-def test_without_poses_nothing_can_be_compensated() -> None:
-    kept, reason = decided(Stage.MOTION_COMPENSATION, make_log(moved_m=None))
-    assert not kept
-    assert "no ego poses" in reason
-
-
-@pytest.mark.parametrize("moved_m", [0.0, 0.049])
-def test_an_ego_that_stands_needs_no_compensation(moved_m: float) -> None:
-    kept, reason = decided(Stage.MOTION_COMPENSATION, make_log(moved_m=moved_m))
-    assert not kept
-    assert f"{moved_m * 100:.1f} cm" in reason
-
-
-@pytest.mark.parametrize("moved_m", [0.051, 12.5])
-def test_an_ego_that_moves_needs_compensation(moved_m: float) -> None:
-    kept, reason = decided(Stage.MOTION_COMPENSATION, make_log(moved_m=moved_m))
-    assert kept
-    assert f"{moved_m:.1f} m" in reason
-
-
-def test_boxes_of_the_log_need_no_pixel() -> None:
-    assert not decided(Stage.IMAGE_DECODING, None, "detect.name=labels")[0]
-
-
-def test_a_detector_needs_pixels() -> None:
-    assert decided(Stage.IMAGE_DECODING, None, "detect.name=some.onnx")[0]
-
-
-def test_a_homography_is_left_out_when_told_so() -> None:
-    assert decided(Stage.HOMOGRAPHY, None, "topdown.method=off") == (False, "topdown.method=off")
-
-
 def test_a_homography_is_kept_without_lidar_and_for_what_lidar_misses() -> None:
     assert plan_of(make_log(lidars=())).homography is HomographyScope.CAMERAS_IN_NEED
     assert plan_of().homography is HomographyScope.CAMERAS_IN_NEED
@@ -98,38 +63,6 @@ def test_a_homography_is_kept_without_lidar_and_for_what_lidar_misses() -> None:
     reasons = [decided(Stage.HOMOGRAPHY, log)[1] for log in (make_log(lidars=()), make_log())]
     assert "without LiDAR" in reasons[0]
     assert "without LiDAR points" in reasons[1]
-
-
-def test_one_camera_needs_no_fusion() -> None:
-    assert decided(Stage.FUSION, make_log(cameras=("front",))) == (
-        False,
-        "one camera; only duplicates of its detector are dropped",
-    )
-    assert not decided(Stage.FUSION, None, "cameras=left")[0]
-    assert decided(Stage.FUSION) == (True, "2 cameras")
-
-
-def test_tracking_is_always_kept() -> None:
-    assert decided(Stage.TRACKING, make_log(cameras=("front",), lidars=(), moved_m=None), "detect.name=labels")[0]
-
-
-def test_smoothing_is_left_out_when_told_so() -> None:
-    assert decided(Stage.SMOOTHING, None, "smooth.enabled=false") == (False, "smooth.enabled=false")
-
-
-def test_cameras_are_all_or_those_asked_for_in_their_order() -> None:
-    assert plan_of().cameras == ("front", "left")
-    assert plan_of(config=Config(cameras=("left", "front"))).cameras == ("left", "front")
-
-
-def test_a_camera_that_the_log_lacks_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"no camera 'frnt' \(did you mean 'front'\?\); the log has front, left"):
-        select_sensors(make_log(), Config(cameras=("left", "frnt")))
-
-
-def test_a_log_without_cameras_is_refused() -> None:
-    with pytest.raises(LogError, match="drive: the log has no camera"):
-        select_sensors(make_log(cameras=()), Config())
 
 
 def test_a_variant_changes_one_decision() -> None:
@@ -140,3 +73,64 @@ def test_a_variant_changes_one_decision() -> None:
     assert [d for d in later.decisions if d.stage is not Stage.HOMOGRAPHY] == [
         d for d in plan.decisions if d.stage is not Stage.HOMOGRAPHY
     ]
+
+
+class Hand:
+    """A clock that stands until it is moved."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+    def move(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def hand(monkeypatch):
+    made = Hand()
+    monkeypatch.setattr(stages.time, "perf_counter", made)
+    return made
+
+
+def test_an_inner_stage_stops_the_clock_of_the_outer_one(hand):
+    watch = StageClock()
+    with watch.stage("outer"):
+        hand.move(1.0)
+        with watch.stage("inner"):
+            hand.move(4.0)
+            with watch.stage("innermost"):
+                hand.move(16.0)
+            hand.move(32.0)
+        hand.move(2.0)
+    assert watch.seconds == {"outer": 3.0, "inner": 36.0, "innermost": 16.0}
+    assert sum(watch.seconds.values()) == watch.total()
+
+
+def fail(watch, hand):
+    with watch.stage("fails"):
+        hand.move(3.0)
+        raise RuntimeError
+
+
+def test_a_stage_that_fails_is_counted_and_the_outer_one_runs_on(hand):
+    watch = StageClock()
+    with watch.stage("outer"):
+        with pytest.raises(RuntimeError):
+            fail(watch, hand)
+        hand.move(5.0)
+    assert watch.seconds == {"fails": 3.0, "outer": 5.0}
+
+
+def test_the_table_holds_ticks_per_second_and_none_for_a_stage_that_took_no_time(hand):
+    watch = StageClock()
+    with watch.stage("sync"):
+        pass
+    with watch.stage("detect"):
+        hand.move(4.0)
+    none, some = watch.table(ticks=10)
+    assert (none["stage"], none["seconds"], none["ticks_per_second"]) == ("sync", 0.0, None)
+    assert (some["stage"], some["seconds"], some["ticks_per_second"]) == ("detect", 4.0, 2.5)
+    assert StageClock().table(ticks=10) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,24 +19,17 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import encoding
-from log2sim.visualization.plot.animation import AnimatedArtists, choose_frame_timing
 from log2sim.visualization.plot.layers import Overlays
-from log2sim.visualization.plot.layout import place_labels
 from log2sim.visualization.plot.selection import (
     PlotOptions,
     TimeRange,
     cut_replay,
     cut_scenario,
-    parse_extent,
-    parse_ids,
-    parse_size,
     select_shown,
 )
 from log2sim.visualization.plot.style import INK
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import assign_roles, choose_viewport
-
-SMALL = PlotOptions(size_px=(480, 320), fps=10, stop_s=0.5)
+from log2sim.visualization.plot.viewport import assign_roles
 
 
 def scene() -> Scenario:
@@ -67,40 +59,6 @@ def test_an_mp4_is_h264_of_the_size_and_rate_that_were_asked_for(tmp_path: Path)
     assert ink.sum() > 40  # BT.709 both ways; the colors of BT.601 are off by up to 20
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["film.mp4", "film.webm", "film.gif"])
-def test_the_same_scenario_gives_the_same_film(tmp_path: Path, name: str) -> None:
-    written = [plot_tracks(scene(), tmp_path / folder / name, options=SMALL) for folder in "ab"]
-    assert written[0].read_bytes() == written[1].read_bytes()
-
-
-def test_without_pyav_an_mp4_becomes_a_webm_which_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoding, "_import_av", lambda: None)
-    scene().save(tmp_path / "s.json")
-    options = ("--size", "480x320", "--stop", 0.3, "--fps", 10)
-    ran = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
-    assert ran.code == 0, ran.err
-    (note,) = [line for line in ran.out.splitlines() if line.startswith("note:")]
-    assert "'video'" in note
-    assert note.endswith("written as film.webm")
-    assert names(tmp_path) == ["film.webm", "s.json"]
-    again = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
-    assert (again.code, "film.webm: exists already" in again.line) == (2, True)
-    first = (tmp_path / "film.webm").read_bytes()
-    assert run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options, "--overwrite").code == 0
-    assert (tmp_path / "film.webm").read_bytes() == first
-    found, frames = read_film(tmp_path / "film.webm")
-    assert (found["name"], found["width"], len(frames)) == ("vp9", 480, 4)
-
-
-def test_without_h264_vp9_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("av")
-    monkeypatch.setattr(encoding, "H264", "no-such-encoder")
-    film = encoding.choose_film_file(tmp_path / "film.mp4")
-    assert film.path.name == "film.webm"
-    assert film.note == "film.mp4 needs H.264, which this PyAV lacks; written as film.webm"
-
-
 def living(count: int, alive: list[int]) -> Iterator[np.ndarray]:
     """Frames that differ, and how many of them there are at once."""
     seen: list[weakref.ref[np.ndarray]] = []
@@ -128,50 +86,6 @@ def test_frames_are_not_kept(tmp_path: Path, codec: str) -> None:
     assert max(alive) <= 3
 
 
-def test_a_gif_shows_each_frame_as_it_was(tmp_path: Path) -> None:
-    from PIL import Image
-
-    frames = list(living(12, []))
-    encoding.write_gif(itertools.chain(frames[:1], frames), tmp_path / "a.gif", 10, ["#0072B2"])
-    with Image.open(tmp_path / "a.gif") as moving:
-        assert (moving.n_frames, moving.info["duration"], moving.info["loop"]) == (13, 100, 0)
-        for k, frame in enumerate(frames[:1] + frames):
-            moving.seek(k)
-            assert np.abs(np.asarray(moving.convert("RGB")).astype(int) - frame).max() <= 6
-
-
-@pytest.mark.parametrize("name", ["film.mp4", "film.webm", "film.gif"])
-def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    show = AnimatedArtists.show
-
-    def interrupted(artists: AnimatedArtists, t_s: float) -> None:
-        if t_s > 0.25:
-            raise KeyboardInterrupt
-        show(artists, t_s)
-
-    monkeypatch.setattr(AnimatedArtists, "show", interrupted)
-    told: list[tuple[str, int, int]] = []
-    with pytest.raises(KeyboardInterrupt):
-        plot_tracks(scene(), tmp_path / name, options=SMALL, progress=lambda *step: told.append(step))
-    assert names(tmp_path) == []
-    assert told == [("draw", k, 6) for k in (1, 2, 3)]
-
-
-def test_long_films_play_faster_unless_a_speed_is_given() -> None:
-    def timing(duration_s: float, suffix: str, **options: Any) -> tuple[int, float, float]:
-        found = choose_frame_timing(TimeRange(2.0, 2.0 + duration_s), PlotOptions(**options), suffix)
-        assert found.start_s == 2.0
-        return found.frames, round(found.speed_up, 6), found.fps
-
-    assert timing(4.0, ".mp4") == (101, 1.0, 25.0)
-    assert timing(600.0, ".mp4") == (1501, 10.0, 25.0)
-    assert timing(600.0, ".mp4", speed=1) == (15001, 1.0, 25.0)
-    assert timing(4.0, ".mp4", speed=0.5, fps=50) == (401, 0.5, 50.0)
-    assert timing(60.0, ".gif") == (301, 2.0, 10.0)
-    assert timing(3.0, ".gif", fps=30) == (101, 1.0, pytest.approx(100 / 3))
-    assert timing(0.0, ".mp4")[0] == 1
-
-
 def test_a_range_of_time_cuts_tracks_at_its_ends() -> None:
     scenario = scene()
     cut = cut_scenario(scenario, TimeRange(0.6, 1.25))
@@ -194,30 +108,6 @@ def test_a_range_of_time_cuts_tracks_at_its_ends() -> None:
     assert cut_scenario(scenario, TimeRange(0.0, scenario.duration_s)) is scenario
     early = world(straight("ego"), straight("gone", start=(0.0, 3.0), t_s=np.array([0.0, 0.5, 1.0])))
     assert [a.id for a in cut_scenario(early, TimeRange(2.0, 3.0)).agents] == ["ego"]
-
-
-def test_a_picture_shows_the_agents_and_the_part_of_the_map_that_it_is_asked_for() -> None:
-    scenario = scene()
-    options = PlotOptions(extent_m=(12.0, 9.0, -3.0, -4.0), agents=("car-1",))
-    shown, result = select_shown(scenario, replay(scenario, dt_s=0.05), options)
-    assert [a.id for a in shown.agents] == [a.id for a in result.agents] == ["car-1"]
-    layout = still(shown, assign_roles(shown), Overlays(options=options))
-    x0, x1, y0, y1 = *layout.ax.get_xlim(), *layout.ax.get_ylim()
-    assert (x0 + x1, y0 + y1) == pytest.approx((9.0, 5.0))
-    assert min(x1 - x0 - 15.0, y1 - y0 - 13.0) == pytest.approx(0.0, abs=1e-9)
-    with pytest.raises(ConfigError, match=r"agents: 'car1' is no agent.*'car-1'"):
-        select_shown(scenario, None, PlotOptions(agents=("car1",)))
-
-
-@pytest.mark.matrix
-@pytest.mark.parametrize("size", [(640, 360), (360, 640), (1920, 1080), (300, 300)])
-def test_a_picture_has_the_size_that_was_asked_for_and_room_for_all(tmp_path: Path, size: tuple[int, int]) -> None:
-    from PIL import Image
-
-    scenario = scene()
-    out = plot_tracks(scenario, tmp_path / "a.png", options=PlotOptions(size), replay=replay(scenario, dt_s=0.05))
-    with Image.open(out) as image:
-        assert image.size == size
 
 
 @pytest.mark.parametrize(
@@ -247,49 +137,6 @@ def test_options_that_do_not_fit_are_told_in_one_line(tmp_path: Path, arguments:
     assert names(tmp_path) == ["s.json"]
 
 
-def test_options_are_read() -> None:
-    assert parse_size("1280X720") == (1280, 720)
-    assert parse_extent("-20,-10.5,60,4e1") == (-20.0, -10.5, 60.0, 40.0)
-    assert parse_ids(" ego, car-1,ego") == ("ego", "car-1")
-    assert parse_size(None) is parse_extent(None) is parse_ids(None) is None
-
-
-def test_labels_say_what_the_legend_then_leaves_out() -> None:
-    scenario = scene()
-    layout = still(scenario, assign_roles(scenario))
-    labels = {t.get_text() for t in layout.ax.texts}
-    assert {"ego · 18 km/h", "car-1 · 29 km/h"} <= labels
-    rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
-    assert rows[:2] == ["km/h: highest speed of each", "1 static"]
-
-
-@pytest.mark.slow
-def test_a_full_label_is_nearest_to_its_own_track_and_else_the_legend_has_it() -> None:
-    lanes = [
-        dataclasses.replace(straight(f"vehicle-{k}", start=(0.0, 1.2 * k)), size_m=(4.0, 1.0, 1.5)) for k in range(12)
-    ]
-    scenario = world(straight("ego", start=(0.0, -3.0)), *lanes)
-    roles = assign_roles(scenario)
-    placed = place_labels(roles, choose_viewport(roles).fitted(490, 490), 1.0)
-    assert 2 <= len(placed.told) < 13
-    for label in placed.labels:
-        (owner,) = [a for a in scenario.agents if label.text.startswith(f"{a.id} ·")] or [None]
-        if owner is not None:
-            y = {a.id: abs(a.waypoints.y_m[0] - label.place_m[1]) for a in scenario.agents}
-            assert owner.id in placed.told
-            beyond = label.place_m[0] > 17.0 or label.place_m[0] < -2.0
-            assert y[owner.id] == min(y.values()) or beyond
-    rows = [t.get_text() for t in still(scenario, roles).figure.legends[0].get_texts()]
-    told = {
-        a.id
-        for a in scenario.agents
-        if any(t.get_text().startswith(f"{a.id} ·") for t in still(scenario, roles).ax.texts)
-    }
-    assert {a.id for a in scenario.agents if not any(row.startswith(f"{a.id} ·") for row in rows)} - {"ego"} == told - {
-        "ego"
-    }
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None or DRIVER is None, reason="no Chromium with its driver here")
 @pytest.mark.parametrize(
@@ -316,3 +163,35 @@ def test_a_film_plays_in_a_browser(tmp_path: Path, name: str, kind: str) -> None
             c.width = v.videoWidth; c.height = v.videoHeight; const g = c.getContext('2d'); g.drawImage(v, 0, 0);
             return [...g.getImageData(2, 2, 1, 1).data].slice(0, 3)"""
         assert min(browser.run(pixel)) > 245  # the paper is white
+
+
+def test_without_pyav_an_mp4_becomes_a_webm_which_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(encoding, "_import_av", lambda: None)
+    scene().save(tmp_path / "s.json")
+    options = ("--size", "480x320", "--stop", 0.3, "--fps", 10)
+    ran = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
+    assert ran.code == 0, ran.err
+    (note,) = [line for line in ran.out.splitlines() if line.startswith("note:")]
+    assert "'video'" in note
+    assert note.endswith("written as film.webm")
+    assert names(tmp_path) == ["film.webm", "s.json"]
+    again = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
+    assert (again.code, "film.webm: exists already" in again.line) == (2, True)
+    first = (tmp_path / "film.webm").read_bytes()
+    assert run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options, "--overwrite").code == 0
+    assert (tmp_path / "film.webm").read_bytes() == first
+    found, frames = read_film(tmp_path / "film.webm")
+    assert (found["name"], found["width"], len(frames)) == ("vp9", 480, 4)
+
+
+def test_a_picture_shows_the_agents_and_the_part_of_the_map_that_it_is_asked_for() -> None:
+    scenario = scene()
+    options = PlotOptions(extent_m=(12.0, 9.0, -3.0, -4.0), agents=("car-1",))
+    shown, result = select_shown(scenario, replay(scenario, dt_s=0.05), options)
+    assert [a.id for a in shown.agents] == [a.id for a in result.agents] == ["car-1"]
+    layout = still(shown, assign_roles(shown), Overlays(options=options))
+    x0, x1, y0, y1 = *layout.ax.get_xlim(), *layout.ax.get_ylim()
+    assert (x0 + x1, y0 + y1) == pytest.approx((9.0, 5.0))
+    assert min(x1 - x0 - 15.0, y1 - y0 - 13.0) == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(ConfigError, match=r"agents: 'car1' is no agent.*'car-1'"):
+        select_shown(scenario, None, PlotOptions(agents=("car1",)))

@@ -59,42 +59,6 @@ def test_a_camera_sees_what_projection_puts_into_its_image(lens, far):
     np.testing.assert_allclose(seen.depth, in_cam[seen.index, 2], rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.15])
-def test_points_in_boxes_are_those_that_plain_comparison_finds(margin):
-    view = view_of()
-    seen = project_points(view, np.zeros(3), np.ascontiguousarray(some_points(20000).T))
-    rng = np.random.default_rng(1)
-    corner = rng.uniform([-50, -50], [view.camera.width_px, view.camera.height_px], (40, 2))
-    boxes = np.concatenate([corner, corner + rng.uniform(0, 400, (40, 2))], axis=1)
-    boxes[3] = np.nan
-    found = points_in_image_boxes(seen, boxes, margin)
-    total = 0
-    for (u0, v0, u1, v1), rows in zip(boxes, found, strict=True):
-        wide, tall = margin * (u1 - u0), margin * (v1 - v0)
-        plain = (seen.u >= u0 - wide) & (seen.u <= u1 + wide) & (seen.v >= v0 - tall) & (seen.v <= v1)
-        assert rows.tolist() == np.flatnonzero(plain).tolist()
-        total += len(rows)
-    assert total > 1000
-    assert len(found[3]) == 0
-
-
-def test_nothing_in_sight_and_no_boxes():
-    view = view_of()
-    none = project_points(view, np.zeros(3), np.zeros((3, 0), dtype=np.float32))
-    assert len(none.index) == 0
-    assert [len(rows) for rows in points_in_image_boxes(none, np.array([[0.0, 0, 10, 10]]))] == [0]
-    assert points_in_image_boxes(none, np.zeros((0, 4))) == []
-
-
-def test_a_large_cloud_before_a_small_one_leaves_nothing_behind():
-    view, small = view_of(), np.ascontiguousarray(some_points(300, seed=2).T)
-    before = project_points(view, np.zeros(3), small)
-    project_points(view, np.zeros(3), np.ascontiguousarray(some_points(5000, seed=3).T))
-    after = project_points(view, np.zeros(3), small)
-    np.testing.assert_array_equal(before.index, after.index)
-    np.testing.assert_array_equal(before.u, after.u)
-
-
 READOUT_S = 0.05
 T_NS = 10**18
 
@@ -148,13 +112,6 @@ def test_a_box_in_an_image_read_column_by_column_holds_the_points_of_its_object(
     middle = project_points(replace(view, cam_T_map_at=None), origin, columns)
     assert np.abs(middle.u - found.u[middle.index]).max() > 10
     assert len(points_in_image_boxes(middle, box[None])[0]) < len(on_car)
-
-
-def test_only_cameras_that_move_while_they_are_read_take_several_poses():
-    assert projection.view_of(moving_log({}), "front", T_NS).cam_T_map_at is not None
-    assert projection.view_of(moving_log({}, direction=None), "front", T_NS).cam_T_map_at is None
-    assert projection.view_of(moving_log({}, mount="map"), "front", T_NS).cam_T_map_at is None
-    assert projection.view_of(moving_log({}), "front", T_NS + 10**10) is None
 
 
 def test_a_box_is_projected_by_the_pose_of_the_line_that_shows_its_middle():

@@ -67,20 +67,6 @@ def test_commands_of_the_readme_parse(line: str) -> None:
     parse(line)
 
 
-def test_the_readme_shows_the_main_commands() -> None:
-    shown = {line.split()[1] for line in commands()}
-    assert {"reconstruct", "replay", "evaluate", "plot", "inspect", "validate"} <= shown
-
-
-def test_a_wrong_command_would_be_noticed() -> None:
-    with pytest.raises(AssertionError, match="no command"):
-        parse("log2sim reconstrct LOG")
-    with pytest.raises(Exception, match=r"No such option.*--outt"):
-        parse("log2sim replay scenario.json --outt x")
-    with pytest.raises(Exception, match="Missing parameter: out"):
-        parse("log2sim reconstruct LOG")
-
-
 def test_commands_of_the_demo_parse() -> None:
     spec = importlib.util.spec_from_file_location("demo", ROOT / "tools/demo.py")
     assert spec is not None
@@ -96,15 +82,6 @@ def test_every_command_is_documented() -> None:
         assert command.help, name
         for parameter in command.params:
             assert getattr(parameter, "help", None), f"{name} {parameter.name}"
-
-
-def test_scripts_and_links_exist() -> None:
-    scripts = set(re.findall(r"(?<![\w/])tools/\w+\.sh", README))
-    assert {"tools/demo.sh", "tools/test.sh"} <= scripts
-    assert [s for s in sorted(scripts) if not os.access(ROOT / s, os.X_OK)] == []
-    links = re.findall(r"\]\(([^)\s#]+)", README) + re.findall(r"""src=["']([^"']+)""", README)
-    for target in (*scripts, *(link for link in links if "://" not in link)):
-        assert (ROOT / target).exists(), target
 
 
 def test_names_that_python_code_imports_exist() -> None:

@@ -10,20 +10,16 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
-import tomllib
-import zipfile
 from pathlib import Path
 
 import pytest
 from worlds import tiny_log
 
-import log2sim
 from log2sim.cli import app
 from log2sim.files.plugins import BUILT_IN
-from log2sim.version import FALLBACK, read_version
+from log2sim.version import FALLBACK
 
 ROOT = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 GIT = ("git", "-c", "user.name=test", "-c", "user.email=test@example.org", "-c", "commit.gpgsign=false")
 UNTYPED = ("[no-untyped-def]", "[no-untyped-call]", "[union-attr]")
 """What short examples of the README may do: state no types, and save the figure of axes, which could be a part of one."""
@@ -41,52 +37,6 @@ page = resources.files("log2sim.visualization.page").joinpath("page.html").read_
 typed = resources.files("log2sim").joinpath("py.typed").is_file()
 print(json.dumps([log2sim.__file__, log2sim.__version__, load_schema("scenario-1")["$schema"], detector.name, len(page), typed]))
 """
-
-
-def test_the_version_is_what_the_build_wrote(tmp_path: Path) -> None:
-    file = tmp_path / "version.txt"
-    assert read_version(file) == FALLBACK == PROJECT["tool"]["hatch"]["version"]["fallback-version"]
-    file.write_text("1.2.3.dev4+gabcdef\n", encoding="ascii")
-    assert read_version(file) == "1.2.3.dev4+gabcdef"
-    written = ROOT / PROJECT["tool"]["hatch"]["build"]["hooks"]["vcs"]["version-file"]
-    assert log2sim.__version__ == read_version(written)
-
-
-def test_the_oldest_python_is_the_same_everywhere() -> None:
-    versions = [c.rsplit(" ", 1)[1] for c in PROJECT["project"]["classifiers"] if re.search(r":: 3\.\d+$", c)]
-    assert versions == ["3.11", "3.12", "3.13"]
-    assert PROJECT["project"]["requires-python"] == f">={versions[0]}"
-    assert PROJECT["tool"]["mypy"]["python_version"] == versions[0]
-    assert PROJECT["tool"]["ruff"]["target-version"] == f"py{versions[0].replace('.', '')}"
-
-
-def test_the_citation_names_the_project_and_its_papers() -> None:
-    yaml = pytest.importorskip("yaml")
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["cff-version"] == "1.2.0"
-    assert {"message", "title", "authors"} <= set(citation)
-    assert citation["title"] == PROJECT["project"]["name"]
-    assert citation["license"] == PROJECT["project"]["license"]
-    assert citation["authors"] == [{"name": "log2sim developers"}]
-    assert len(citation["references"]) == 4
-    for reference in citation["references"]:
-        assert {"type", "title", "authors"} <= set(reference)
-        assert all({"given-names", "family-names"} <= set(author) for author in reference["authors"])
-
-
-def test_telemetry_is_off_wherever_a_model_is_opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    import onnxruntime
-
-    from log2sim.perception.detect3d.network import open_session
-
-    called: list[str] = []
-    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: called.append("off"))
-    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda *_, **__: called.append("session"))
-    open_session(tmp_path / "model.onnx", None)
-    assert called == ["off", "session"]
-    opening = re.compile(r"InferenceSession\(")
-    sources = [f for f in (ROOT / "log2sim").rglob("*.py") if opening.search(f.read_text(encoding="utf-8"))]
-    assert [f.name for f in sources] == ["network.py"]
 
 
 def call(*command: str | Path, cwd: Path, **variables: str) -> str:
@@ -125,16 +75,6 @@ def test_a_checkout_without_tags_and_a_copy_without_git_have_a_version(checkout:
     shutil.copytree(checkout, tmp_path / "copy", ignore=shutil.ignore_patterns(".git"))
     named = call(sys.executable, "-c", ask.format(str(tmp_path)), cwd=tmp_path / "copy")
     assert named.strip() == f"log2sim-{FALLBACK}.dist-info"
-
-
-def test_an_editable_installation_works_beside_the_checkout(checkout: Path, tmp_path: Path) -> None:
-    build = "from hatchling.build import build_editable as build; print(build({!r}))"
-    wheel = tmp_path / call(sys.executable, "-c", build.format(str(tmp_path)), cwd=checkout).strip()
-    with zipfile.ZipFile(wheel) as packed:
-        packed.extractall(tmp_path / "site")
-    code = f"import site; site.addsitedir({str(tmp_path / 'site')!r}); import log2sim; print(log2sim.__file__)"
-    # The folder above the checkout, from where the checkout looks like a package without a module.
-    assert Path(call(sys.executable, "-S", "-c", code, cwd=checkout.parent).strip()).is_relative_to(checkout)
 
 
 @pytest.mark.slow

@@ -11,10 +11,8 @@ from replay_scenes import line
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
 from log2sim.geometry import rectangles_overlap
-from log2sim.simulation.metrics import conflicts as post_encroachment_time
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import (
-    CROSSING_RAD,
     HORIZON_S,
     conflicts,
     most_critical,
@@ -40,14 +38,6 @@ def test_time_to_touch_is_the_gap_over_the_closing_speed():
     assert touch(12, 9, -6, -3, 0.0, np.pi / 2) == pytest.approx(max((12 - 3) / 6, (9 - 3) / 3))
     # A corner ahead of a side: it reaches (4 + 2) / 2 / sqrt(2) from its center.
     assert touch(20, 0, -8, 0, 0.0, np.pi / 4) == pytest.approx((20 - 2 - 3 / np.sqrt(2)) / 8)
-
-
-def test_boxes_that_pass_part_or_overlap_never_touch():
-    assert touch(20, 2.0, -8, 0) == np.inf
-    assert touch(20, 0, 8, 0) == np.inf
-    assert touch(20, 0, 0, 0) == np.inf
-    assert touch(3, 0, -1, 0) == np.inf
-    assert touch(12, 9, -6, -0.5, 0.0, np.pi / 2) == np.inf
 
 
 def test_time_to_touch_is_when_moments_see_the_first_overlap():
@@ -114,17 +104,6 @@ def test_the_least_times_to_collision_are_those_of_all_pairs_at_all_rows():
     np.testing.assert_array_equal(found.row, rows)
 
 
-def test_a_follower_that_brakes_has_its_least_time_where_gap_over_speed_is_least():
-    gap, closing, brake = 20.0, 9.0, 2.5
-    leader = (lambda t: 30 + gap + 10 * t, 0.0, 0.0)
-    follower = (lambda t: 26 + (10 + closing) * t - brake / 2 * np.minimum(t, closing / brake) ** 2 - np.maximum(t - closing / brake, 0) * closing, 0.0, 0.0)  # fmt: skip
-    t = np.arange(0, 4, 1e-4)
-    speed = closing - brake * t
-    expected = ((gap - closing * t + brake / 2 * t**2) / np.where(speed > 0, speed, np.nan))[speed > 0].min()
-    (found,) = times_to_collision(boxes_of(leader, follower), np.ones(2, bool), SPACING_S).time_s
-    assert found == pytest.approx(expected, abs=2e-3)
-
-
 def test_velocities_are_of_the_motion_and_not_of_the_heading():
     boxes = boxes_of((lambda t: 3 * t, lambda t: -4 * t + t**2, 1.0, 1.0, 3.0), (0.0, 0.0, 0.5, 2.0, 2.0))
     vx, vy = boxes.velocities(SPACING_S)
@@ -149,23 +128,6 @@ def test_at_right_angles_it_is_from_the_rear_out_to_the_front_in():
             assert found.left_row * SPACING_S == pytest.approx(1.3, abs=5e-4)
 
 
-def test_who_stops_on_the_crossing_leaves_when_it_drives_on():
-    first = (lambda t: np.minimum(10 * (t - 0.5), 0.0) + 10 * np.maximum(t - 2.0, 0), 0.0, 0.0)
-    second = (0.0, lambda t: 8 * (t - 3.5), np.pi / 2)
-    found = post_encroachment_times(boxes_of(first, second), SPACING_S)
-    assert (found.came_row - found.left_row) * SPACING_S == pytest.approx((3.5 - 3 / 8) - 2.3, abs=5e-4)
-
-
-def test_the_time_between_those_who_collide_is_zero_and_never_negative():
-    first = (lambda t: 10 * (t - 1.0), 0.0, 0.0)
-    for late_s in (0.0, 0.17, 0.4, 0.85):  # the last is 0.05 s less than it takes to get out of each other's way
-        found = post_encroachment_times(
-            boxes_of(first, (0.0, lambda t, late_s=late_s: 5 * (t - 1.0 - late_s), np.pi / 2)), SPACING_S
-        )
-        assert np.all(found.came_row == found.left_row)
-        assert len(found.first) == 1
-
-
 def pairs_of(*tracks):
     return len(post_encroachment_times(boxes_of(*tracks), SPACING_S).first)
 
@@ -185,50 +147,6 @@ def test_only_who_is_seen_to_leave_and_who_is_seen_to_come_counts():
     assert pairs_of((lambda t: straight(t + 0.8), 0.0, 0.1), (straight, 0.0, 0.0)) == 0  # one follows the other
     assert pairs_of((straight, 5.0, 0.0), (lambda t: 20 - straight(t), 0.0, np.pi)) == 0  # in other lanes
     assert pairs_of((straight, 0.0, 0.0)) == 0
-
-
-@pytest.mark.slow
-def test_the_shortest_post_encroachment_times_are_those_of_all_rows():
-    boxes = town(30, seed=11)
-    found = post_encroachment_times(boxes, SPACING_S)
-    pairs = [(min(p), max(p)) for p in zip(found.first.tolist(), found.second.tolist())]
-    got = dict(zip(pairs, (found.came_row - found.left_row).tolist()))
-    i, j = (g.ravel() for g in np.meshgrid(np.arange(len(T_S)), np.arange(len(T_S)), indexing="ij"))
-    i, j = i[i < j], j[i < j]
-    expected = {}
-    for a in range(30):
-        for b in range(30):
-            if a == b or not boxes.present[:, [a, b]].any(axis=0).all():
-                continue
-            k, m = (np.full(len(i), c) for c in (a, b))
-            turn = np.angle(np.exp(1j * (boxes.yaw_rad[j, b] - boxes.yaw_rad[i, a])))
-            valid = boxes.present[i, a] & boxes.present[j, b] & (np.abs(turn) >= CROSSING_RAD)
-            at = np.flatnonzero(valid)
-            at = at[boxes.overlap(i[at], k[at], j[at], m[at])]
-            last, first = np.flatnonzero(boxes.present[:, a])[-1], np.flatnonzero(boxes.present[:, b])[0]
-            at = at[~boxes.overlap(np.full(len(at), last), k[at], j[at], m[at])]
-            at = at[~boxes.overlap(i[at], k[at], np.full(len(at), first), m[at])]
-            if len(at):
-                pair = (min(a, b), max(a, b))
-                expected[pair] = min(expected.get(pair, np.inf), float((j - i)[at].min()))
-    assert len(expected) > 15
-    assert set(got) == set(expected)
-    rows = np.array([expected[p] - got[p] for p in got])
-    # Between the rows it may be shorter: each moment moves by at most 1 + 1/4 + 1/16 + 1/64 rows.
-    assert np.all((rows > -0.01) & (rows <= 2 * 85 / 64))
-
-
-@pytest.mark.parametrize(("late_s", "count"), [(3.9, 1), (8.2, 1), (10.3, 1), (10.6, 0)])
-def test_it_is_found_up_to_ten_seconds_later_and_not_after(late_s, count):
-    t = np.arange(0, 400) * SPACING_S
-    x = np.stack([10 * (t - 2.0), 0 * t], axis=1)
-    y = np.stack([0 * t, 10 * (t - 2.0 - late_s)], axis=1)
-    yaw = np.tile([0.0, np.pi / 2], (400, 1))
-    boxes = BoxTracks(x, y, 0 * x, yaw, 0 * x + 10, np.tile([4.0, 2.0, 1.5], (2, 1)))
-    found = post_encroachment_times(boxes, SPACING_S)
-    assert len(found.first) == count
-    # Out at 3 m past the crossing, in at 3 m before: 0.6 s less than they are apart.
-    assert np.all(np.abs((found.came_row - found.left_row) * SPACING_S - (late_s - 0.6)) < 5e-4)
 
 
 def test_a_new_collision_is_zero_and_one_of_the_log_is_left_out_of_the_least():
@@ -257,15 +175,3 @@ def test_on_a_slope_the_time_to_collision_is_that_on_the_flat_and_under_a_bridge
 
     assert least(lambda a: grade * a.waypoints.x_m) == least(lambda a: 0 * a.waypoints.x_m) is not None
     assert least(lambda a: 0 * a.waypoints.x_m + 6 * (a.id == "slow")) is None
-
-
-def test_agents_that_stand_in_one_place_are_not_compared_for_post_encroachment(monkeypatch):
-    """4.5 million pairs with every difference of headings: none of them leaves or arrives."""
-    count, rows = 3000, 81
-    still = np.zeros((rows, count))
-    yaw = np.broadcast_to(np.linspace(-3, 3, count), (rows, count))
-    boxes = BoxTracks(still, still, still, yaw, still, np.tile([4.0, 2.0, 1.5], (count, 1)))
-    compared = []
-    monkeypatch.setattr(post_encroachment_time._SweptRectangles, "met", lambda self, pairs: compared.append(len(pairs.a)) or pairs)  # fmt: skip
-    assert len(post_encroachment_time.post_encroachment_times(boxes, 0.05).first) == 0
-    assert sum(compared) == 0

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
+from export_worlds import straight, world
 from replay_maneuvers import agent_from, scenario_of
 from scipy.optimize import brentq
 
-from log2sim.errors import ScenarioError
+from log2sim.datatypes import Agent, Scenario
+from log2sim.errors import CheckFailed
 from log2sim.geometry import rectangles_overlap, wrap_angle
-from log2sim.simulation.metrics import collisions as collisions_module
+from log2sim.simulation import Controls, Observation
+from log2sim.simulation.metrics.all_metrics import require_strict, summarize
 from log2sim.simulation.metrics.collisions import (
     MAX_STEPS,
     BoxTracks,
     RelativeMotion,
     collisions,
-    contacts,
     first_contact,
 )
+from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
 SPACING_S = 0.05
+
+
 T_S = np.arange(0, 81) * SPACING_S
 
 
@@ -78,14 +86,6 @@ def test_two_that_cross_at_right_angles_touch_while_both_cover_the_crossing(late
     assert event["relative_speed_mps"] == pytest.approx(np.hypot(50, 30), abs=1e-3)
 
 
-def test_one_that_leaves_the_crossing_before_the_other_comes_is_not_hit():
-    a = (lambda t: 50 * (t - 1.013), 0.0, 0.0)
-    missed = 3 / 50 + 3 / 30
-    for late_s, count in ((missed + 0.001, 0), (missed - 0.002, 1), (-missed - 0.001, 0)):
-        b = (0.0, lambda t, late_s=late_s: 30 * (t - 1.013 - late_s), np.pi / 2)
-        assert len(events_of(boxes_of(a, b))) == count
-
-
 @pytest.mark.parametrize("view", [0.0, 0.5, -2.0])
 @pytest.mark.parametrize("rate", [1.5, -6.0])
 def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate, view):
@@ -139,22 +139,6 @@ def test_first_touches_are_those_of_a_thousand_moments():
     assert np.mean(np.abs(late) < 2 / 1024) > 0.99  # the others graze for less than a step before
 
 
-def test_backward_the_first_touch_is_the_last():
-    motion = random_motions(300, seed=5)
-    touched = ~np.isnan(first_contact(motion))
-    last = 1 - first_contact(motion.reversed())
-    assert np.mean(touched == ~np.isnan(last)) > 0.99
-    both = touched & ~np.isnan(last)
-    assert np.all(last[both] >= first_contact(motion)[both] - 1e-3)
-
-
-def test_one_that_leaps_over_another_does_not_hit_it():
-    b = (20.0, 0.0, 0.0)
-    assert events_of(boxes_of((lambda t: 5 * t + np.where(t > 1.02, 40.0, 0.0), 0.0, 0.0), b)) == []
-    (event,) = events_of(boxes_of((lambda t: 5 * t + np.where(t > 1.02, 16.0, 0.0), 0.0, 0.0), b))
-    assert event["t_s"] == pytest.approx(1.05)  # it lands in it
-
-
 def test_boxes_that_appear_inside_each_other_say_so_and_those_of_other_times_do_not_meet():
     stands, passes = (0.0, 0.0, 0.0), (lambda t: -8 + 4 * t, 0.0, 0.0)
     (event,) = events_of(boxes_of(stands, (*passes, 1.5, 4.0)))
@@ -165,19 +149,6 @@ def test_boxes_that_appear_inside_each_other_say_so_and_those_of_other_times_do_
     assert (event["t_s"], event["until_s"]) == pytest.approx((1.0, 1.5), abs=1e-4)
     assert events_of(boxes_of((*stands, 0.0, 0.9), passes)) == []
     assert events_of(boxes_of((*stands, 0.0, 2.0), (0.0, 0.0, 0.0, 2.05, 4.0))) == []
-
-
-def test_one_alone_and_nobody_hit_nothing():
-    assert events_of(boxes_of((lambda t: 5 * t, 0.0, 0.0))) == []
-    none = np.zeros((len(T_S), 0))
-    assert events_of(BoxTracks(none, none, none, none, none, np.zeros((0, 3)))) == []
-
-
-def test_the_order_of_agents_does_not_matter():
-    a, b = (lambda t: 17 * t, 0.3, 0.1), (30.0, lambda t: 20 - 13 * t, -1.2)
-    one, other = contacts(boxes_of(a, b), np.ones(2, bool)), contacts(boxes_of(b, a), np.ones(2, bool))
-    np.testing.assert_allclose(one.first_row, other.first_row, atol=1e-3)
-    assert len(one.a) > 1
 
 
 @pytest.mark.parametrize("mode", ["exact", "pid"])
@@ -191,34 +162,61 @@ def test_a_collision_does_not_depend_on_the_step(mode):
         assert event["relative_speed_mps"] == pytest.approx(60.0, abs=0.01)
 
 
-def test_batches_of_pairs_find_the_same_contacts(monkeypatch):
-    rng = np.random.default_rng(4)
-    tracks = [
-        (lambda t, x=x, v=v: x + v * t, lambda t, y=y, w=w: y + w * t, float(yaw))
-        for x, y, v, w, yaw in rng.uniform([0, 0, -9, -9, -3], [60, 60, 9, 9, 3], (40, 5))
-    ]
-    boxes, moves = boxes_of(*tracks), np.ones(40, bool)
-    whole = contacts(boxes, moves)
-    assert len(whole.a) > 50
-    monkeypatch.setattr(collisions_module, "MAX_PAIRS", 7)
-    monkeypatch.setattr(collisions_module, "BATCH", 11)
-    parts = contacts(boxes, moves)
-    for name in ("a", "b", "first_row", "last_row"):
-        one, two = (getattr(c, name)[np.lexsort((c.first_row, c.b, c.a))] for c in (whole, parts))
-        np.testing.assert_allclose(one, two)
+RECONSTRUCTED = {"history": ["reconstruct"], "detector": "labels"}
 
 
-@pytest.mark.slow
-def test_agents_on_top_of_each_other_are_refused_before_all_pairs_are_kept(monkeypatch):
-    import tracemalloc
+def standing(name: str, x_m: float, y_m: float) -> Agent:
+    return replace(straight(name, start=(x_m, y_m), speed=0.0, t_s=np.array([0.0, 3.0])), static=True)
 
-    monkeypatch.setattr(collisions_module, "MAX_CONTACTS", 200_000)
-    count = 1500
-    still = np.zeros((len(T_S), count))
-    boxes = BoxTracks(still, still, still, still, still, np.tile([4.0, 2.0, 1.5], (count, 1)))
-    tracemalloc.start()
-    with pytest.raises(ScenarioError, match="1500 agents touch in more than 200000 pairs and steps: they lie on top"):
-        contacts(boxes, np.ones(count, bool))
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak_bytes < 800_000_000
+
+def scene(**provenance: Any) -> Scenario:
+    """An ego that passes a wall, and a car that drives through a parked one 20 m aside."""
+    agents = (
+        straight("ego"),
+        standing("wall", 30.0, 0.0),
+        straight("car", start=(0.0, 20.0)),
+        standing("parked", 9.0, 20.0),
+    )
+    return replace(world(*agents), provenance=provenance)
+
+
+def accelerate(observation: Observation) -> Controls:
+    """Drive into the wall."""
+    return Controls(accel_mps2=8.0, steer_rad=0.0)
+
+
+def owners(result: Replay) -> list[tuple[tuple[str, ...], str]]:
+    return [(tuple(e["agents"]), e["belongs_to"]) for e in result.metrics["collisions"]]
+
+
+@pytest.mark.parametrize(("provenance", "kind"), [(RECONSTRUCTED, "reconstruction"), ({}, "scenario")])
+def test_overlaps_of_its_own_boxes_are_the_scenarios_and_new_ones_the_replays(provenance: Any, kind: str) -> None:
+    result = replay(scene(**provenance), ego=accelerate, dt_s=0.02)
+    assert owners(result) == [(("car", "parked"), kind), (("ego", "wall"), "replay")]
+    assert result.metrics["new_collisions"] == 1
+    lines = summarize(result).splitlines()
+    assert any(line.startswith(f"2 collisions, 1 of the replay and 1 of the {kind} itself · ") for line in lines)
+    assert lines[-2].startswith("  ego and wall collide at")
+    assert lines[-2].endswith("m/s)")
+    assert lines[-1].startswith("  car and parked collide at")
+    assert lines[-1].endswith(f", in the {kind} itself")
+    with pytest.raises(CheckFailed, match=r"ego and wall collide at .* the scenario has no such collision") as failed:
+        require_strict(result)
+    assert "parked" not in str(failed.value)
+
+
+def test_older_files_that_only_say_in_log_are_read_and_written() -> None:
+    """They lack the owner and call the contact of a pair that touches in the scenario "log"."""
+    result = replay(scene(**RECONSTRUCTED), ego=accelerate, dt_s=0.02)
+    assert {c["contact"] for c in result.metrics["conflicts"]} == {"new", "scenario"}
+    document = result.to_dict()
+    metrics = document["metrics"]
+    for event in [*metrics["collisions"], *(e for m in metrics["by_agent"].values() for e in m["collisions"])]:
+        event.pop("belongs_to", None)
+    for conflict in metrics["conflicts"]:
+        conflict["contact"] = conflict["contact"].replace("scenario", "log")
+    read = Replay.from_dict(document)
+    assert owners(read) == [(("car", "parked"), "scenario"), (("ego", "wall"), "replay")]
+    assert read.metrics["by_agent"]["ego"]["collisions"][0]["belongs_to"] == "replay"
+    assert {c["contact"] for c in read.metrics["conflicts"]} == {"new", "scenario"}
+    assert Replay.from_dict(read.to_dict()).metrics == read.metrics

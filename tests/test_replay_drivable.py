@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
@@ -14,13 +12,9 @@ from log2sim.simulation.feasible_trajectory import (
     _cost,
     _LeastSquares,
     _normal_equations,
-    fit_trajectory,
 )
 from log2sim.simulation.reference import (
-    GRID_S,
     feasible_trajectory_of,
-    log_reference,
-    point_reference,
     vehicle_reference,
 )
 
@@ -39,22 +33,6 @@ def rolling_error(course):
     x = course.x_m[:-1] + np.sum(speed * np.cos(yaw) * step, axis=1)
     y = course.y_m[:-1] + np.sum(speed * np.sin(yaw) * step, axis=1)
     return np.hypot(x - course.x_m[1:], y - course.y_m[1:])
-
-
-@pytest.mark.parametrize("name", MANEUVERS)
-def test_what_a_vehicle_drove_stays_as_it_is(name):
-    path = Trajectory.through(MANEUVERS[name]().waypoints, 1.3)
-    course, departure_m = feasible_trajectory_of(path, LIMITS)
-    assert departure_m.max() < 0.06
-    assert rolling_error(course).max() < 0.005
-
-
-def test_a_constant_turn_is_found_with_its_curvature_and_speed():
-    agent = driven(lambda t: np.full_like(t, 6.0), lambda s: np.full_like(s, -0.1), 4.0)
-    course, _ = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
-    inner = slice(3, -3)
-    np.testing.assert_allclose(course.curvature_1pm[inner], -0.1, atol=1e-3)
-    np.testing.assert_allclose(course.speed_mps[inner], 6.0, atol=1e-2)
 
 
 def test_noise_in_position_and_heading_gives_a_course_that_rolls():
@@ -112,15 +90,6 @@ def test_boxes_turned_back_to_front_are_outvoted(turned):
     np.testing.assert_allclose(course.speed_mps, right.speed_mps, atol=0.1)
 
 
-def test_a_box_that_jitters_on_the_spot_does_not_turn():
-    rng = np.random.default_rng(1)
-    t = np.arange(50) * 0.1
-    agent = agent_from(t, rng.normal(0, 0.03, 50), rng.normal(0, 0.03, 50), np.full(50, 0.4), np.zeros(50))
-    course, _ = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
-    assert np.abs(course.yaw_rad - 0.4).max() < 0.05
-    assert np.abs(course.speed_mps).max() < 0.1
-
-
 def test_shifting_and_turning_the_log_shifts_and_turns_the_course():
     agent = MANEUVERS["reversing"]()
     w = agent.waypoints
@@ -168,47 +137,3 @@ def test_the_band_is_that_of_the_residuals_derivatives():
     for column, lower in enumerate(band.reshape(24, 12)):
         below = expected[column : column + 12, column]
         np.testing.assert_allclose(lower[: len(below)], below, rtol=1e-6, atol=1.0)
-
-
-def test_two_moments_suffice():
-    course = fit_trajectory(
-        np.array([0.0, 0.1]), np.array([0.0, 0.5]), np.zeros(2), np.zeros(2), np.full(2, 5.0), LIMITS
-    )
-    np.testing.assert_allclose(course.x_m + 1.3, [0.0, 0.5], atol=1e-3)
-    np.testing.assert_allclose(course.speed_mps, 5.0, atol=1e-2)
-
-
-@pytest.mark.parametrize("make", [point_reference, log_reference, None])
-def test_rows_on_either_side_of_begin_and_end_lead_straight_through_them(make):
-    t = 0.113 + np.arange(30) * 0.1
-    path = Trajectory.through(
-        agent_from(t, 5 * t, -2 * t, np.full(30, np.arctan2(-2, 5)), np.full(30, np.hypot(5, 2))).waypoints
-    )
-    limits = replace(LIMITS, offset_m=0.0)
-    reference = make(path) if make else vehicle_reference(path, limits, accel_ahead_s=0.1, curvature_ahead_s=0.1)
-    rows = (reference.first_row + np.arange(len(reference.columns))) * GRID_S
-    assert rows[0] < t[0]
-    assert rows[-1] > t[-1]
-    np.testing.assert_allclose(reference.columns[:, 0], 5 * (rows - t[0]), atol=1e-6)
-    np.testing.assert_allclose(reference.columns[:, 1], -2 * (rows - t[0]), atol=1e-6)
-    np.testing.assert_allclose(reference.exact(rows), reference.columns, atol=1e-9)
-
-
-def test_feed_forward_is_that_of_a_later_time():
-    agent = driven(lambda t: ramp(t, (0, 2), (2, 2), (4, 8), (6, 8)), lambda s: ramp(s, (4, 0), (8, 0.1)), 5.0)
-    path = Trajectory.through(agent.waypoints, 1.3)
-    now = vehicle_reference(path, LIMITS, accel_ahead_s=0.0, curvature_ahead_s=0.0).columns
-    later = vehicle_reference(path, LIMITS, accel_ahead_s=0.2, curvature_ahead_s=0.4).columns
-    np.testing.assert_allclose(later[:-10, 4], now[10:, 4], atol=1e-9)
-    np.testing.assert_allclose(later[:-20, 5], now[20:, 5], atol=1e-9)
-    assert now[150, 4] == pytest.approx(3.0, abs=0.1)
-
-
-def test_a_life_too_long_to_be_fitted_is_followed_as_logged(monkeypatch):
-    monkeypatch.setattr("log2sim.simulation.reference.MAX_KNOTS", 20)
-    agent = MANEUVERS["brake to stop and go"]()
-    w = agent.waypoints
-    course, departure_m = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
-    np.testing.assert_allclose(departure_m, 0.0, atol=1e-9)
-    np.testing.assert_allclose(course.accel_mps2[22:48], -10 / 3, atol=0.01)
-    np.testing.assert_allclose(course.x_m, w.x_m - w.x_m[0] - 1.3, atol=1e-9)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import builtins
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from replay_maneuvers import scenario_of
 from replay_scenes import line, parked
 
-from log2sim.errors import ConfigError, MissingExtra
+from log2sim.errors import MissingExtra
 
 gymnasium = pytest.importorskip("gymnasium")
 
@@ -32,19 +31,6 @@ def test_it_passes_gymnasiums_own_checker_without_a_warning():
 
     env = gymnasium.make(log2sim.simulation.env.ID, scenario=SAMPLE, render_mode="rgb_array")
     check_env(env.unwrapped)
-
-
-@pytest.mark.slow
-def test_who_crosses_on_a_bridge_is_not_hit():
-    over = line("over", 40, -40, 10, 8, np.pi / 2)
-    for z_m, hit in ((6.0, False), (0.0, True)):
-        bridge = replace(over, waypoints=replace(over.waypoints, z_m=over.waypoints.z_m + z_m))
-        env = made(scenario_of(line("ego", 0, speed=10, duration_s=8), bridge), agents="scenario")
-        env.reset()
-        ended = cut = False
-        while not (ended or cut):
-            *_, ended, cut, info = env.step(np.zeros(2, np.float32))
-        assert info["collision"] == hit
 
 
 def test_the_ego_drives_along_its_path_to_the_end_and_is_paid_by_the_meter():
@@ -78,22 +64,6 @@ def test_a_collision_ends_the_episode_and_costs():
     assert info["t_s"] == pytest.approx((20 - 4.4) / 10, abs=0.1)
 
 
-def test_leaving_the_path_or_standing_to_the_end_of_time_is_cut_off():
-    env = made(scenario_of(line("ego", 0, speed=10, duration_s=6)))
-    for action, reason in (([0.0, 0.5], "off path"), ([-1.0, 0.0], "time")):
-        env.reset()
-        ended = cut = False
-        while not (ended or cut):
-            seen, _, ended, cut, info = env.step(action)
-        assert (ended, cut) == (False, True)
-        if reason == "time":
-            assert info["t_s"] == pytest.approx(6.0)
-            assert seen["ego"][0] == 0.0
-        else:
-            assert info["t_s"] < 6.0
-            assert info["reward"]["off_path"] < -0.1
-
-
 def test_episodes_repeat_and_actions_are_shares_of_what_the_vehicle_can_do():
     scene = scenario_of(line("ego", 0, speed=10, duration_s=6), line("f", -20, speed=10, duration_s=6))
     env = made(scene, agents="reactive")
@@ -109,29 +79,6 @@ def test_episodes_repeat_and_actions_are_shares_of_what_the_vehicle_can_do():
     assert env.world.traffic.rate[1] < 1  # the follower brakes too
 
 
-def test_an_ego_that_appears_later_is_waited_for():
-    from dataclasses import replace
-
-    late = line("ego", 0, speed=10, duration_s=3)
-    late = replace(late, waypoints=replace(late.waypoints, t_s=late.waypoints.t_s + 2.0))
-    env = made(scenario_of(late, line("f", -50, speed=5, duration_s=6)))
-    assert env.reset()[1]["t_s"] == pytest.approx(2.0)
-    with pytest.raises(ConfigError, match="ego policy"):
-        made(scenario_of(line("f", 0, duration_s=1)))
-
-
-def test_the_picture_shows_the_ego_in_the_middle():
-    env = made(scenario_of(line("ego", 0, speed=10, duration_s=1), parked("p", 20, 6)), render_mode="rgb_array")
-    env.reset()
-    picture = env.render()
-    assert picture.shape == (400, 400, 3)
-    assert picture.dtype == np.uint8
-    assert picture[200, 195].max() < 60  # dark
-    assert picture[200 - 30, 200 + 100].min() > 100  # the parked car: 5 px a meter, left is up
-    assert picture[200 - 30, 200 + 100].tolist() != [255, 255, 255]
-    assert made(scenario_of(line("ego", 0, duration_s=1))).render_mode is None
-
-
 def test_without_gymnasium_the_extra_is_named(monkeypatch):
     real = builtins.__import__
 
@@ -144,14 +91,3 @@ def test_without_gymnasium_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(MissingExtra, match="needs the extra 'gym'"):
         import log2sim.simulation.env  # noqa: F401
-
-
-def test_steps_before_the_reset_and_actions_that_are_no_two_numbers_are_refused():
-    env = made(scenario_of(line("ego", 0, speed=10, duration_s=2)))
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\)"):
-        env.step([0.0, 0.0])
-    env.reset()
-    for action in ([np.nan, 0.0], [np.inf, 0.0], [0.0], None, [[0.0, 0.0]]):
-        with pytest.raises(ValueError, match="expected two finite numbers from -1 to 1"):
-            env.step(action)
-    assert env.step([0.0, 0.0])[4]["t_s"] == pytest.approx(0.1)

@@ -41,27 +41,3 @@ def test_rows_are_those_of_the_replay(tmp_path: Path, capsys: pytest.CaptureFixt
     printed = capsys.readouterr().out
     assert "| scene.json | 100 | 1 |" in printed
     assert "none" in printed
-
-
-def test_an_error_beyond_its_limit_is_told_and_ends_with_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from benchmarks import replay as bench_replay
-
-    monkeypatch.setitem(bench_replay.LIMITS, "cross_track_max_m", 1e-4)
-    path = tmp_path / "scene.json"
-    scenario_of(MANEUVERS["lane change"]()).save(path)
-    assert bench_replay.main([str(path), "--dt", "0.1", "--agents"]) == 1
-    assert "| a |" in capsys.readouterr().out
-
-
-def test_cars_on_rings_drive_what_their_speeds_say() -> None:
-    import numpy as np
-    from benchmarks.replay import ring_car
-
-    for index in (0, 7):
-        w = ring_car(index, 20.0).waypoints
-        way = np.hypot(np.diff(w.x_m), np.diff(w.y_m))
-        # The box center is on a ring that is wider than the rear axle's by half of offset^2 / radius.
-        np.testing.assert_allclose(way, (w.speed_mps[1:] + w.speed_mps[:-1]) / 2 * 0.1, rtol=2e-3, atol=1e-6)
-    assert ring_car(0, 20.0).waypoints.speed_mps.min() == 0.0

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from command_line import run as run_command
 from replay_maneuvers import agent_from, scenario_of
-from replay_scenes import Speed, departure, gap, line
+from replay_scenes import Speed, line
 from test_prediction import circle
 
 from log2sim.datatypes import Scenario
-from log2sim.errors import ConfigError
 from log2sim.simulation.corridors import HORIZON_S, PathTable
 from log2sim.simulation.reactive import MotionForesight
 from log2sim.simulation.runner import replay as run
-
-SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
 
 def replay(scene: Scenario, **options):
@@ -51,24 +45,6 @@ def test_who_does_not_turn_off_as_in_the_scenario_is_braked_for_earlier_by_those
     assert at["motion"] > 4.0  # the ego is within 3 s of the street from then on
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("foresight", ["path", "motion"])
-def test_where_nobody_interferes_the_scenario_is_kept(foresight: str) -> None:
-    scene = scenario_of(line("a", 0.0, speed=12.0), line("f", -20.0, speed=12.0), circle(30.0, 8.0, 20.0, id="c"))
-    kept, free = (replay(scene, agents=a, foresight=foresight) for a in ("reactive", "scenario"))
-    for agent in "afc":
-        assert departure(kept, free, agent) < 1e-6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("foresight", ["path", "motion"])
-def test_an_ego_that_stops_is_not_run_into(foresight: str) -> None:
-    scene = scenario_of(line("ego", 40.0, duration_s=20.0), line("f", 0.0, duration_s=20.0))
-    result = replay(scene, ego=Speed(lambda t: 25.0 if t < 5.0 else 0.0), foresight=foresight)
-    assert gap(result, "f").min() > 0.5
-    assert result.agent("f").speed_mps[-1] < 0.2
-
-
 def test_motion_is_extrapolated_from_the_past_alone() -> None:
     agents = [circle(20.0, 6.0), line("b", 0.0, speed=9.0)]
     foresight = MotionForesight(PathTable([a.trajectory for a in agents]), agents)
@@ -79,21 +55,3 @@ def test_motion_is_extrapolated_from_the_past_alone() -> None:
     assert np.diff(x[1]) == pytest.approx(0.5 * 9.0 * 0.25)
     assert np.diff(yaw[0]) == pytest.approx(6.0 / 20.0 * 0.25, rel=0.02)
     assert speed[:, 0] == pytest.approx([6.0, 4.5], rel=1e-3)
-
-
-def test_a_world_that_starts_again_expects_the_same() -> None:
-    scene = scenario_of(turns_off("ego"), line("f", -85.0, speed=10.0, duration_s=12.0))
-    agents = list(scene.agents)
-    paths = PathTable([a.trajectory for a in agents])
-    fresh, used = MotionForesight(paths, agents), MotionForesight(paths, agents)
-    for t in (3.0, 7.0, 7.1):
-        used.expect_driven(0, t, paths.at(np.arange(2), np.full(2, t)))
-    again, first = (f.expect_driven(0, 0.0, paths.at(np.arange(2), np.zeros(2))) for f in (used, fresh))
-    assert np.array(again) == pytest.approx(np.array(first))
-
-
-def test_an_unknown_foresight_and_one_that_nobody_has_are_refused() -> None:
-    with pytest.raises(ConfigError, match="foresight 'crystal': expected one of path, motion"):
-        replay(Scenario.load(SAMPLE), foresight="crystal")
-    assert "nobody reacts" in run_command("replay", SAMPLE, "--foresight", "motion").line
-    assert run_command("replay", SAMPLE, "--agents", "reactive", "--foresight", "motion", "--dt", 0.1).code == 0

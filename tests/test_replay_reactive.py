@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
+from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
 
 from log2sim.datatypes import Scenario, Trajectory
-from log2sim.errors import ConfigError
-from log2sim.simulation.corridors import PathTable, _nearest_edge, scenario_times_of_distance
-from log2sim.simulation.policy import Controls, load_policy
+from log2sim.simulation.corridors import PathTable, _nearest_edge
+from log2sim.simulation.policy import load_policy
 from log2sim.simulation.reactive import idm_parameters, leader_demand, rate_response
 from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world
@@ -163,41 +162,6 @@ def test_at_the_edge_of_a_conflict_an_agent_does_not_hunt():
     assert np.count_nonzero(np.diff((c.accel_mps2 < -0.5).astype(int)) > 0) <= 2  # brakes once, perhaps once more
 
 
-@pytest.mark.slow
-def test_two_that_wait_for_each_other_do_not_wait_for_ever():
-    # Four ways into one crossing; everybody comes late by another delay.
-    legs = [line(f"a{k}", *(-60 * np.array([np.cos(yaw), np.sin(yaw)]) + 2 * np.array([np.sin(yaw), -np.cos(yaw)])), 10, 40, yaw)
-            for k, yaw in enumerate(np.arange(4) * np.pi / 2)]  # fmt: skip
-    legs = [changed(a, waypoints=changed(a.waypoints, t_s=a.waypoints.t_s + 3.0 * k)) for k, a in enumerate(legs)]
-    blocker = line("ego", -45, -2, 10, 40)
-    result = replay(
-        scenario_of(blocker, *legs), ego=Speed(lambda t: 0.0 if t < 9 else 10.0), agents="reactive", dt_s=0.05
-    )
-    assert new_collisions(result) == []
-    for k in range(4):
-        a = result.agent(f"a{k}")
-        assert np.hypot(a.x_m[-1] - a.x_m[0], a.y_m[-1] - a.y_m[0]) > 120
-
-
-@pytest.mark.slow
-def test_a_logged_stop_is_kept_as_long_as_it_was():
-    stop = driven(lambda t: ramp(t, (0, 10), (8, 10), (11, 0), (15, 0), (19, 8), (30, 8)), np.zeros_like, 30.0, id="s")
-    scene = scenario_of(line("ego", 25, speed=10, duration_s=40), stop)
-    ego = Speed(lambda t: 3.0 if t < 6 else 14.0)
-
-    def stands(r):
-        return np.ptp(r.t_s[np.abs(r.speed_mps) < 0.02]), r.x_m[np.abs(r.speed_mps) < 0.02][0]
-
-    logged = replay(scene, dt_s=0.05).agent("s")
-    result = replay(scene, ego=ego, agents="reactive", dt_s=0.05)
-    s = result.agent("s")
-    assert s.x_m[s.t_s <= 10][-1] < logged.x_m[logged.t_s <= 10][-1] - 5  # it was held up before
-    assert stands(s)[0] == pytest.approx(stands(logged)[0], abs=0.3)
-    assert stands(s)[1] == pytest.approx(stands(logged)[1], abs=0.1)
-    assert s.t_s[-1] > logged.t_s[-1] + 1  # it lives until its way ends
-    assert s.x_m[-1] == pytest.approx(logged.x_m[-1], abs=0.3)
-
-
 # No interference.
 
 
@@ -231,20 +195,6 @@ def test_an_ego_that_does_about_as_the_log_moves_nobody():
     assert max(departure(result, log, k) for k in ids) < 0.05
 
 
-@pytest.mark.matrix
-@pytest.mark.parametrize(
-    "other",
-    [line("o", 300, 3.5, 25, 12, np.pi), parked("o", 150, -2.3), line("o", -29, 0, 27, 12), line("o", -8, 3.2, 25, 12)],
-    ids=["oncoming", "parked beside", "from behind", "next lane"],
-)
-def test_who_is_not_in_the_way_makes_nobody_brake(other):
-    scene = scenario_of(other, line("f", 0, duration_s=12))
-    world = open_world(scene, model="kinematic", dt_s=0.05, drives_ego=False, agents=["f"])
-    world.traffic._distrusted[:] = True  # the log, which has the other there too, is no excuse
-    stored, columns = rollout(world)["f"]
-    np.testing.assert_allclose(columns[0], 25.0 * 0.05 * stored, atol=1e-6)
-
-
 def test_who_cuts_in_at_the_same_speed_is_followed_and_not_braked_for_as_if_he_stood():
     t = np.arange(0, 12.01, 0.1)
     share = np.clip((t - 2) / 4, 0, 1)
@@ -271,75 +221,6 @@ def test_what_the_log_drives_into_is_braked_for():
 
 
 # Choice, invariance, extremes.
-
-
-@pytest.mark.slow
-def test_only_those_named_react():
-    scene = scenario_of(*(line(k, -30.0 * n, duration_s=12) for n, k in enumerate(("ego", "f", "g"))))
-    result = replay(scene, ego=stops_at(1.0), agents=["f"], dt_s=0.05)
-    assert [a.driver for a in result.agents] == ["policy", "reactive", "pid"]
-    assert next(e["agents"] for e in new_collisions(result)) == ["f", "g"]
-    assert replay(scene, agents="reactive", dt_s=0.05).agent("ego").driver == "pid"
-    assert replay(scene, agents=["ego"], dt_s=0.05).agent("ego").driver == "reactive"
-
-
-@pytest.mark.parametrize(
-    ("agents", "said"),
-    [
-        ("react", "expected scenario or reactive"),
-        (["g"], "there is none of that id"),
-        (["p"], "cannot react"),
-        (["ego"], "cannot react"),
-    ],
-)
-def test_names_of_agents_that_cannot_react_are_refused(agents, said):
-    scene = scenario_of(line("ego", 0, duration_s=1), line("f", -20, duration_s=1), parked("p", 50, 5))
-    with pytest.raises(ConfigError, match=said):
-        replay(scene, ego=stops_at(0.5), agents=agents)
-
-
-@pytest.mark.slow
-def test_far_from_the_origin_and_turned_the_reaction_is_the_same():
-    def scene(x, y, yaw):
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        return scenario_of(line("ego", x + 30 * cos, y + 30 * sin, 15, 10, yaw), line("f", x, y, 15, 10, yaw))
-
-    one = replay(scene(0, 0, 0), ego=stops_at(2, 15), agents="reactive", dt_s=0.05).agent("f")
-    far = replay(scene(1e6, -1e6, 2.5), ego=stops_at(2, 15), agents="reactive", dt_s=0.05).agent("f")
-    np.testing.assert_allclose(np.hypot(far.x_m - far.x_m[0], far.y_m - far.y_m[0]), one.x_m, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_the_step_hardly_matters():
-    scene = scenario_of(line("ego", 35, duration_s=14), line("f", 0, duration_s=14))
-    ends = [replay(scene, ego=stops_at(2), agents="reactive", dt_s=dt).agent("f").x_m[-1] for dt in (0.01, 0.1)]
-    assert np.ptp(ends) < 0.6
-
-
-@pytest.mark.slow
-def test_exact_agents_react_exactly_on_their_way():
-    turn = MANEUVERS["turn of radius 8 m"]()
-    scene = scenario_of(changed(turn, id="t"), line("ego", 15, 0.0, 5, 8))
-    result = replay(scene, mode="exact", ego=stops_at(0, 5), agents="reactive")
-    t, path = result.agent("t"), Trajectory.through(turn.waypoints, 1.3)
-    assert t.driver == "reactive"
-    assert t.speed_mps[-1] == 0.0
-    x, y, *_ = path.at(np.arange(0, 8, 0.001))
-    assert max(np.hypot(x - a, y - b).min() for a, b in zip(t.x_m, t.y_m)) < 0.01
-
-
-@pytest.mark.slow
-def test_a_leap_of_the_log_comes_when_the_late_agent_is_there():
-    f = line("f", 0, speed=10, duration_s=12)
-    leap = np.where(f.waypoints.t_s > 5.05, 40.0, 0.0)
-    f = changed(f, waypoints=changed(f.waypoints, x_m=f.waypoints.x_m + leap))
-    scene = scenario_of(line("ego", 25, speed=10, duration_s=14), f)
-    log = replay(scene, agents="reactive", dt_s=0.05)
-    assert departure(log, replay(scene, dt_s=0.05), "f") < 1e-9
-    r = replay(scene, ego=Speed(lambda t: 7.0), agents="reactive", dt_s=0.05).agent("f")
-    (at,) = np.flatnonzero(np.diff(r.x_m) > 20)
-    assert r.t_s[at] > 5.5
-    assert r.x_m[at] == pytest.approx(50, abs=1.5)
 
 
 # Geometry.
@@ -375,15 +256,3 @@ def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
     np.testing.assert_allclose(np.abs(foot.left_m[inner, 0]), offset[inner], atol=0.06)
     along = foot.distance_m[:, 0] + foot.ahead_m[:, 0]
     np.testing.assert_allclose(along[inner], 5.0 * fine[nearest][inner], atol=0.25)  # 5 m/s
-
-
-def test_the_time_of_the_log_at_a_place_is_found_from_the_way_gone():
-    path = Trajectory.through(line("a", 0, speed=10, duration_s=10).waypoints, 0.0)
-    t = np.linspace(0, 10, 201)
-    np.testing.assert_allclose(scenario_times_of_distance(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
-
-
-def test_controls_of_a_policy_hold_only_for_the_ego():
-    scene = scenario_of(line("ego", 0, speed=5, duration_s=2), line("f", -50, speed=5, duration_s=2))
-    result = replay(scene, ego=lambda seen: Controls(0.0, 0.4), agents="reactive")
-    assert np.abs(result.agent("f").y_m).max() < 1e-6

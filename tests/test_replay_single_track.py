@@ -26,7 +26,6 @@ BMW = published_parameters(2, rear_axle_offset_m=1.4)
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 STEPS = {"single-track": (step_single_track, BMW), "dynamic": (step_dynamic, CAR)}
 ALL_STEPS = {**STEPS, "kinematic": (step_bicycle, CAR)}
-BOTH = pytest.mark.parametrize("name", STEPS)
 ALL = pytest.mark.parametrize("name", ALL_STEPS)
 
 
@@ -114,39 +113,6 @@ def test_the_right_hand_side_is_the_published_one(number):
         steer_rate, accel = rng.uniform(-0.3, 0.3), rng.uniform(-9.0, 2.0)  # within the published limits
         rates = linear_rates(number, state, steer_rate, accel, 1e-7)
         np.testing.assert_allclose(rates, vehicle_dynamics_st(state, [steer_rate, accel], theirs), rtol=1e-3, atol=1e-3)
-
-
-def test_a_swerve_at_25_mps_is_that_of_a_high_order_integrator_on_the_published_equations():
-    theirs = published(2)
-    from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
-
-    def pedal(t):
-        return -5.0 if t >= 1.2 else 0.0
-
-    def wanted(t):
-        return 0.06 * math.sin(math.pi * math.floor(t / 0.2 + 1e-9) * 0.2)
-
-    fast = replace(BMW, steer_lag_s=np.array([0.05]))
-    dt_s = 0.02
-    ours = run(step_single_track, fast, vehicle(speed_mps=25.0), lambda t: command(pedal(t), wanted(t)), 3.0, dt_s)
-    rates = np.diff(ours[:, [4, 3]], axis=0) / dt_s  # what the actuators did, step by step
-    state = np.array([BMW.cg_to_rear_m[0], 0.0, 0.0, 25.0, 0.0, 0.0, 0.0])
-    theirs_xy = []
-    for rate in rates:
-        solved = solve_ivp(
-            lambda t, s, u=rate: vehicle_dynamics_st(s, u, theirs),
-            (0, dt_s),
-            state,
-            method="DOP853",
-            rtol=1e-9,
-            atol=1e-9,
-        )
-        state = solved.y[:, -1]
-        theirs_xy.append(state[:2])
-    to_rear = BMW.cg_to_rear_m[0]
-    cg = ours[1:, :2] + to_rear * np.stack([np.cos(ours[1:, 2]), np.sin(ours[1:, 2])], axis=1)
-    assert np.ptp(cg[:, 1]) > 1.0
-    assert np.hypot(*(cg - theirs_xy).T).max() < 0.01
 
 
 @pytest.mark.parametrize("accel", [-3.0, 3.0])
@@ -241,43 +207,6 @@ def test_the_saturating_model_is_that_of_scipy_on_the_documented_equations(speed
     np.testing.assert_allclose(ours[[3, 6, 7]], solved[3:], atol=5e-3)
 
 
-def test_without_friction_the_momentum_stays_what_it_is():
-    p = replace(CAR, friction=np.array([1e-9]))
-    start = vehicle(speed_mps=20.0, lateral_mps=3.0, yaw_rate_radps=0.8, steer_rad=0.3, yaw_rad=0.4)
-    states = run(step_dynamic, p, start, command(-5.0, 0.3), 3.0, 0.01)
-    to_rear = float(p.cg_to_rear_m[0])
-    cg = states[:, :2] + to_rear * np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], axis=1)
-    along, aside = 20.0, 3.0 + 0.8 * to_rear
-    velocity = [along * math.cos(0.4) - aside * math.sin(0.4), along * math.sin(0.4) + aside * math.cos(0.4)]
-    np.testing.assert_allclose(cg, cg[0] + np.linspace(0, 3, len(cg))[:, None] * velocity, atol=1e-2)
-    assert states[-1, 2] == pytest.approx(0.4 + 0.8 * 3.0, abs=1e-5)
-
-
-def test_steady_cornering_understeers_as_the_stiffness_of_the_axles_says():
-    speed, steer = 20.0, 0.01
-    end = run(step_dynamic, CAR, vehicle(speed_mps=speed, steer_rad=steer), command(steer=steer), 6.0, 0.02)[-1]
-    compliance = 1 / CAR.front_stiffness_1prad[0] - 1 / CAR.rear_stiffness_1prad[0]
-    gradient = compliance / (CAR.friction[0] * GRAVITY_MPS2)
-    assert end[7] == pytest.approx(speed * steer / (CAR.wheelbase_m[0] + gradient * speed**2), rel=3e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("friction", [1.05, 0.1])
-def test_tires_never_bear_more_than_friction_times_weight(friction):
-    p, rng = replace(CAR, friction=np.array([friction])), np.random.default_rng(1)
-    for speed in (1.0, 10.0, 30.0, 60.0):
-        wanted = rng.uniform([-12, -1], [8, 1], (20, 2))
-        states = run(
-            step_dynamic, p, vehicle(speed_mps=speed), lambda t, w=wanted: command(*w[int(t / 0.2 + 1e-9)]), 4.0, 0.01
-        )
-        yaw, u, side = states[:, 2], states[:, 3], states[:, 6] + CAR.cg_to_rear_m[0] * states[:, 7]
-        velocity = np.stack([u * np.cos(yaw) - side * np.sin(yaw), u * np.sin(yaw) + side * np.cos(yaw)])
-        force, limit = np.diff(velocity) / 0.01, friction * GRAVITY_MPS2
-        middle = (yaw[1:] + yaw[:-1]) / 2
-        assert np.abs(force[1] * np.cos(middle) - force[0] * np.sin(middle)).max() < 1.005 * limit
-        assert np.hypot(*force).max() < 1.15 * limit  # the drive adds a seventh while the yaw rate changes
-
-
 def test_the_brakes_of_a_slippery_road_stop_after_a_distance_that_friction_sets():
     p = replace(CAR, friction=np.array([0.1]))
     end = run(step_dynamic, p, vehicle(speed_mps=10.0, pedal_mps2=-9.0), command(-9.0), 15.0, 0.05)[-1]
@@ -301,110 +230,6 @@ def test_at_walking_pace_and_below_the_saturating_model_is_the_kinematic_bicycle
     np.testing.assert_allclose(slipping[:, 3], rolling[:, 3], rtol=0.01 * speed**2 + 1e-12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gear", [1, -1])
-def test_at_walking_pace_the_published_model_drives_the_circle_of_small_angles(gear):
-    speed, steer = 0.05, 0.2
-    rate = gear * speed * steer / float(BMW.wheelbase_m[0])
-    start = vehicle(speed_mps=gear * speed, steer_rad=steer, yaw_rate_radps=rate)
-    states = run(step_single_track, BMW, start, command(steer=steer), 40.0, 0.05)
-    turn = gear * speed * 40.0 * steer / BMW.wheelbase_m[0]
-    assert states[-1, 2] == pytest.approx(turn, rel=1e-4)
-    slip = steer * BMW.cg_to_rear_m[0] / BMW.wheelbase_m[0]  # of the center of gravity
-    radius = gear * speed * 40.0 / turn
-    cg = states[:, :2] + BMW.cg_to_rear_m[0] * np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], axis=1)
-    away = [radius * (math.sin(turn + slip) - math.sin(slip)), radius * (math.cos(slip) - math.cos(turn + slip))]
-    np.testing.assert_allclose(cg[-1] - cg[0], away, atol=1e-4)
-
-
-# Speed, command (of time), friction, and how far in m the path at dt 10 ms and more may be from the converged one.
-EXTREMES = {
-    "swerve at 60 m/s": (60.0, lambda t: command(-3.0, 0.03 * math.copysign(1, math.sin(4 * t))), 1.05, 0.2),
-    "full lock at 60 m/s": (60.0, lambda t: command(0.0, 1.2), 1.05, 0.1),
-    "full lock at 60 m/s on ice": (60.0, lambda t: command(0.0, 1.2), 0.1, 0.1),
-    "hard braking to standstill": (20.0, lambda t: command(-12.0, 0.0), 1.05, 0.001),
-    "hard braking at full lock": (10.0, lambda t: command(-12.0, 1.2), 1.05, 0.03),
-    "stop and go": (8.0, lambda t: command(-5.0 if t < 3 else 2.0, 0.3 if t > 3 else 0.05), 1.05, 0.01),
-    "from rest at 0.2 rad": (0.0, lambda t: command(1.5, 0.2), 1.05, 0.01),
-    "from rest at full lock": (0.0, lambda t: command(3.0, 1.2), 1.05, 0.03),
-    "from rest on ice": (0.0, lambda t: command(6.0, 0.5), 0.1, 0.01),
-    "reversing at full lock": (0.0, lambda t: command(2.0, -1.2, reverse=True), 1.05, 0.03),
-    "from reverse to forward": (-3.0, lambda t: command(-4.0 if t < 2 else 2.0, 0.4), 1.05, 0.01),
-}
-
-
-@pytest.mark.slow
-@ALL
-def test_the_path_is_the_converged_one_at_every_step_in_every_extreme(name):
-    step, one = ALL_STEPS[name]
-    cases = EXTREMES.values()
-    p = replace(one.take(np.zeros(len(cases), int)), friction=np.array([c[2] for c in cases]))
-
-    def paths(dt_s):
-        """x, y at full seconds (6, A, 2); commands change only there, so that all steps see the same."""
-        state = VehicleState.zeros(len(cases))
-        state.speed_mps[:] = [c[0] for c in cases]
-        out = []
-        for second in range(5):
-            each = [c[1](second) for c in cases]
-            controls = VehicleControls(
-                *(np.concatenate([getattr(e, f.name) for e in each]) for f in fields(VehicleControls))
-            )
-            for _ in range(round(1 / dt_s)):
-                state = step(state, controls, p, dt_s)
-            out.append(np.stack([state.x_m, state.y_m], axis=1))
-        return np.array(out)
-
-    converged, limits = paths(0.002), np.array([c[3] for c in cases])
-    for dt_s in (0.01, 0.02, 0.05, 0.2, 1.0):
-        error = np.linalg.norm(paths(dt_s) - converged, axis=2).max(axis=0)
-        assert {k: e for k, e, limit in zip(EXTREMES, error, limits) if e > limit} == {}
-
-
-@pytest.mark.slow
-@BOTH
-def test_halving_the_step_quarters_the_error(name):
-    step, p = STEPS[name]
-
-    def end(dt_s):
-        start = vehicle(speed_mps=15.0, steer_rad=0.04, pedal_mps2=-1.0)
-        return run(step, p, start, command(-1.0, 0.04), 1.6, dt_s)[-1, :3]
-
-    converged = end(0.0003125)
-    errors = [np.abs(end(dt_s) - converged).max() for dt_s in (0.01, 0.005, 0.0025)]
-    assert 3.0 < errors[0] / errors[1] < 5.5
-    assert 3.0 < errors[1] / errors[2] < 5.5
-
-
-@pytest.mark.slow
-@ALL
-@pytest.mark.parametrize("friction", [1.05, 0.1])
-def test_who_braked_to_standstill_stays_and_then_starts_the_right_way(name, friction):
-    step, p = ALL_STEPS[name]
-    p = replace(p, friction=np.array([friction]))
-    stopped = vehicle(speed_mps=4.0, steer_rad=0.5)
-    for _ in range(150):
-        stopped = step(stopped, command(-10.0, 0.5), p, 0.05)
-    assert stopped.speed_mps[0] == 0.0
-    waited = step(stopped, command(-10.0, -0.5), p, 1.0)
-    for key in ("x_m", "y_m", "yaw_rad", "speed_mps"):
-        assert getattr(waited, key)[0] == pytest.approx(getattr(stopped, key)[0], abs=1e-12)
-    for reverse, sign in ((False, 1), (True, -1)):
-        away = run(step, p, waited, command(1.0, -0.3, reverse), 1.5, 0.05)
-        ahead = np.diff(away[:, 0]) * np.cos(away[:-1, 2]) + np.diff(away[:, 1]) * np.sin(away[:-1, 2])
-        assert np.all(sign * ahead >= -1e-9)
-        assert sign * ahead.sum() > 0.3
-        assert sign * (away[-1, 2] - away[0, 2]) < -0.02  # to the right, in reverse with the nose to the left
-
-
-@BOTH
-def test_saturated_actuators_are_those_of_the_kinematic_bicycle(name):
-    step, p = STEPS[name]
-    ours, bicycle = (run(f, p, vehicle(speed_mps=5.0), command(-50.0, 9.0), 1.0, 0.01) for f in (step, step_bicycle))
-    np.testing.assert_allclose(ours[:, 4:6], bicycle[:, 4:6], atol=1e-9)
-    assert abs(ours[:, 4]).max() <= p.max_steer_rad[0]
-
-
 def some_states(rng, count):
     columns = {
         "x_m": rng.normal(0, 50, count), "y_m": rng.normal(0, 50, count), "yaw_rad": rng.uniform(-9, 9, count),
@@ -417,17 +242,6 @@ def some_states(rng, count):
 
 def some_controls(rng, count):
     return VehicleControls(rng.normal(0, 5, count), rng.normal(0, 0.5, count), rng.random(count) < 0.3)
-
-
-@ALL
-def test_agents_at_once_move_as_one_by_one(name):
-    step, one = ALL_STEPS[name]
-    rng = np.random.default_rng(2)
-    state, controls = some_states(rng, 40), some_controls(rng, 40)
-    together = stack(step(state, controls, one.take(np.zeros(40, int)), 0.03))
-    for k in range(40):
-        alone = stack(step(state.take([k]), controls.take([k]), one, 0.03))
-        np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-12, atol=1e-12)
 
 
 @ALL

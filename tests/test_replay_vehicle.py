@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from replay_maneuvers import agent_from
+from replay_maneuvers import agent_from, driven, lane_change, ramp, scenario_of
 
-from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for, rear_axle_offset
+from log2sim.simulation.runner import replay
+from log2sim.simulation.vehicles.model_choice import SLIP_TOLERANCE_RAD
+from log2sim.simulation.vehicles.parameters import PUBLISHED, STEER_LAG_S, parameters_for
 from log2sim.simulation.vehicles.vehicle import (
+    GRAVITY_MPS2,
     POINT_MAX_ACCEL_MPS2,
     PointControls,
     PointState,
@@ -52,12 +55,6 @@ def test_constant_steering_drives_a_circle_of_wheelbase_over_tangent(dt_s, speed
     assert state.y_m[0] == pytest.approx(radius * (1 - np.cos(turned)), abs=1e-6)
 
 
-def test_reversing_with_left_lock_turns_the_heading_right():
-    state = run(at_rest(speed=-2.0, steer=0.3), command(steer=0.3), 1.0, 0.01)
-    assert state.yaw_rad[0] == pytest.approx(-2.0 * np.tan(0.3) / CAR.wheelbase_m[0], abs=1e-9)
-    assert state.x_m[0] < -1.5
-
-
 @pytest.mark.parametrize("dt_s", [0.003, 0.01, 0.09])
 def test_braking_stops_after_the_stopping_distance_and_stays(dt_s):
     speed, brake = 10.0, 5.0
@@ -66,24 +63,12 @@ def test_braking_stops_after_the_stopping_distance_and_stays(dt_s):
     assert state.x_m[0] == pytest.approx(speed**2 / (2 * brake), abs=1e-6)
 
 
-def test_the_pedal_follows_its_command_as_a_first_order_lag():
-    state = run(at_rest(speed=10.0), command(pedal=1.0), 0.25, 0.01)
-    assert state.pedal_mps2[0] == pytest.approx(1 - np.exp(-0.25 / PEDAL_LAG_S), abs=1e-9)
-    gained = 0.25 - PEDAL_LAG_S * (1 - np.exp(-0.25 / PEDAL_LAG_S))
-    assert state.speed_mps[0] == pytest.approx(10 + gained, abs=1e-9)
-
-
 def test_the_wheels_turn_no_faster_than_their_rate_and_no_further_than_the_lock():
     early = run(at_rest(), command(steer=5.0), 0.2, 0.01)
     late = run(at_rest(), command(steer=5.0), 5.0, 0.01)
     assert early.steer_rad[0] == pytest.approx(0.2 * CAR.max_steer_rate_radps[0], abs=1e-9)
     assert late.steer_rad[0] == pytest.approx(CAR.max_steer_rad[0], abs=1e-6)
     assert np.all(CAR.steer_lag_s == STEER_LAG_S)
-
-
-def test_throttle_in_reverse_gear_drives_backward_from_rest_only():
-    assert run(at_rest(), command(pedal=1.0, reverse=True), 1.0, 0.01).speed_mps[0] < -0.5
-    assert run(at_rest(speed=3.0), command(pedal=1.0, reverse=True), 1.0, 0.01).speed_mps[0] > 3.5
 
 
 def test_a_step_in_one_or_in_two_halves_is_the_same_while_the_steering_is_constant():
@@ -108,10 +93,66 @@ def test_a_point_follows_the_parabola_and_its_acceleration_is_limited():
     assert gained[0] == pytest.approx(POINT_MAX_ACCEL_MPS2 * 0.1)
 
 
-def test_an_unknown_rear_axle_lies_behind_the_center_of_what_has_wheels():
-    def agent(category, offset_m):
-        return agent_from([0.0], [0.0], [0.0], [0.0], [0.0], category=category, offset_m=offset_m)
+SLIPPING = pytest.mark.parametrize("model", ["dynamic", "single-track"])
 
-    assert rear_axle_offset(agent("car", 1.1)) == 1.1
-    assert 1.0 < rear_axle_offset(agent("car", 0.0)) < 2.2
-    assert rear_axle_offset(agent("pedestrian", 1.1)) == 0.0
+
+def cruise(speed, curvature=np.zeros_like, duration_s=8.0):
+    return driven(lambda t: np.full_like(t, speed), curvature, duration_s)
+
+
+def bend(radius_m):
+    return lambda s: ramp(s, (20, 0), (60, 1 / radius_m), (100, 1 / radius_m), (140, 0))
+
+
+def test_the_slip_expected_on_the_course_decides():
+    p = parameters_for([cruise(10.0)])
+    # Steady cornering at the tolerance, from the law of the tires: tan(slip) * C = f / sqrt(1 - f^2).
+    force = SLIP_TOLERANCE_RAD * p.rear_stiffness_1prad[0]
+    limit_mps2 = p.friction[0] * GRAVITY_MPS2 * force / np.sqrt(1 + force**2)
+    for share, expected in ((0.9, "kinematic"), (1.1, "dynamic")):
+        agent = replay(scenario_of(cruise(15.0, bend(15.0**2 / (share * limit_mps2))))).agents[0]
+        assert agent.model == expected
+        assert "rear tires slip up to 0.0" in agent.model_reason
+
+
+@pytest.mark.parametrize("model", ["kinematic", "dynamic", "single-track"])
+def test_a_model_that_is_asked_for_moves_every_vehicle(model):
+    result = replay(scenario_of(cruise(10.0)), model=model)
+    assert (result.model, result.agents[0].model, result.agents[0].model_reason) == (model, model, "asked for")
+
+
+@pytest.mark.matrix
+@SLIPPING
+@pytest.mark.parametrize("dt_s", [0.01, 0.05])
+@pytest.mark.parametrize(
+    ("speed", "curvature"), [(20.0, lane_change), (20.0, bend(70.0)), (5.0, bend(9.0)), (60.0, bend(1000.0))],
+    ids=["lane change at 20 m/s", "6 m/s2 sideways", "tight turn", "60 m/s"],
+)  # fmt: skip
+def test_vehicles_that_slip_follow_their_waypoints(model, speed, curvature, dt_s):
+    metrics = replay(scenario_of(cruise(speed, curvature)), model=model, dt_s=dt_s).metrics
+    assert metrics["cross_track_rms_m"] < 0.10
+    assert metrics["cross_track_max_m"] < 0.35
+    assert metrics["along_track_rms_m"] < 0.3
+    assert metrics["speed_rms_mps"] < 0.3
+
+
+def test_parameters_grow_with_the_size_and_loads_stay_on_the_wheels():
+    sizes = {"car": (4.4, 1.8, 1.5), "truck": (9.0, 2.5, 3.5), "bus": (12.0, 2.5, 3.2), "motorcycle": (2.1, 0.8, 1.6), "cyclist": (1.8, 0.6, 1.8)}  # fmt: skip
+    agents = [agent_from([0.0], [0.0], [0.0], [0.0], [0.0], category=c, size_m=s) for c, s in sizes.items()]
+    p = parameters_for(agents)
+    assert np.all(np.diff(p.gyration_m2[:3]) > 0)
+    assert np.all((p.cg_to_rear_m > 0.3 * p.wheelbase_m) & (p.cg_to_rear_m < 0.7 * p.wheelbase_m))
+    assert np.all(p.front_stiffness_1prad < p.rear_stiffness_1prad)  # all understeer
+    assert np.all(p.cg_height_m < 0.6 * np.array([s[2] for s in sizes.values()]))
+
+
+def test_the_published_model_takes_the_published_car_nearest_in_size():
+    def wheelbase(length, width):
+        one = [agent_from([0.0], [0.0], [0.0], [0.0], [0.0], size_m=(length, width, 1.5))]
+        return float(parameters_for(one, published=True).wheelbase_m[0])
+
+    for vehicle in PUBLISHED.values():
+        near = wheelbase(vehicle.length_m + 0.01, vehicle.width_m - 0.01)
+        assert near == pytest.approx(vehicle.cg_to_front_m + vehicle.cg_to_rear_m)
+    bus = agent_from([0.0], [0.0], [0.0], [0.0], [0.0], category="bus", size_m=(12.0, 2.5, 3.2))
+    assert parameters_for([bus], published=True).wheelbase_m == parameters_for([bus]).wheelbase_m

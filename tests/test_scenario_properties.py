@@ -7,7 +7,6 @@ from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis.extra.numpy import arrays
 
@@ -124,19 +123,6 @@ def test_a_saved_scenario_reads_back_bit_by_bit(tmp_path: Path, scenario: Scenar
     again.save(path)
     assert path.read_bytes() == before
     assert json.loads(before)["scenario_version"] == 1
-
-
-@pytest.mark.slow
-@settings(deadline=None, max_examples=60)
-@given(scenarios(), scenarios())
-def test_aligning_there_and_back_changes_nothing_but_rounding(one: Scenario, other: Scenario) -> None:
-    again = one.aligned_to(other).aligned_to(one)
-    assert (again.t0_ns, again.map) == (one.t0_ns, one.map)
-    shift_s = abs(one.t0_ns - other.t0_ns) / 1e9
-    for a, b in zip(one.agents, again.agents, strict=True):
-        assert np.abs(a.waypoints.t_s - b.waypoints.t_s).max() <= 1e-15 * (shift_s + 1e5)
-        np.testing.assert_allclose(b.waypoints.x_m, a.waypoints.x_m, rtol=1e-12, atol=1e-4)
-        assert b.waypoints.yaw_rad is a.waypoints.yaw_rad
 
 
 @settings(deadline=None, max_examples=60)

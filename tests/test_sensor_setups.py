@@ -9,15 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from command_line import names, run
 from worlds import tiny_log, tiny_table
 
-from log2sim.agents.estimate import roadside_sensors
 from log2sim.datatypes import Scenario
 from log2sim.files import plugins
-from log2sim.geometry import rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
 
 TOP, FRONT = tiny_table()["lidar"][0], tiny_table()["camera"][0]
@@ -36,7 +33,6 @@ SETUPS: dict[str, tuple[dict[str, Any], str]] = {
 }
 # The others hold nothing that these do not; they take as long again.
 EACH = [name if name in ("lidar", "roadside") else pytest.param(name, marks=pytest.mark.slow) for name in SETUPS]
-CAMERALESS = ("lidar", "roadside-lidar")
 
 
 @pytest.fixture(scope="module")
@@ -57,21 +53,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path
         return known[name]
 
     return make
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EACH)
-def test_a_log_is_described_checked_and_drawn(
-    made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path
-) -> None:
-    log, _ = made(name)
-    summary = json.loads(run("inspect", log, "--json").out)
-    assert (summary["ego"] is None) == name.startswith("roadside")
-    ran = run("validate", log)
-    assert (ran.code, ran.out) == (0, f"{log}: valid\n")
-    assert run("inspect", log, "--overlay", tmp_path / "o.png").code == 0
-    assert run("convert", log, "--out", tmp_path / "part", "--start", "0.3", "--stop", "0.6", "--quiet").code == 0
-    assert run("validate", tmp_path / "part").code == 0
 
 
 @pytest.mark.matrix
@@ -114,36 +95,6 @@ def test_the_scenario_is_drawn_replayed_changed_and_exported(
         assert names(tmp_path / format)
 
 
-def test_formats_with_an_ego_say_how_to_choose_one(made: Callable[[str], tuple[Path, Path]], tmp_path: Path) -> None:
-    _, scenario = made("roadside")
-    for format in ("scenarionet", "commonroad"):
-        assert "choose one with --ego AGENT" in run("export", scenario, "--to", format, "--out", tmp_path / format).line
-    ran = run("export", scenario, "--to", "csv", "--out", tmp_path / "csv", "--ego", "car-9")
-    assert "no agent 'car-9' (did you mean 'car-" in ran.line
-    _, driven = made("lidar")
-    ran = run("export", driven, "--to", "csv", "--out", tmp_path / "csv", "--ego", "car-1")
-    assert "has an ego already" in ran.line
-    assert names(tmp_path) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CAMERALESS)
-def test_what_needs_a_camera_says_so(made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path) -> None:
-    log, scenario = made(name)
-    out = tmp_path / "out.json"
-    assert "--detector lidar:labels" in run("reconstruct", log, "--out", out, "--detector", "labels").line
-    # Neither LiDAR is tilted.
-    assert "--detector lidar:vehicle" in run("reconstruct", log, "--out", out, "--detector", "ssd-mobilenet-v2").line
-    picture = tmp_path / "ground.png"
-    ran = run("reconstruct", log, "--out", out, "--detector", "lidar:labels", "--topdown", picture)
-    assert "no camera, so there is no picture of the ground" in ran.line
-    assert "bench compares methods for images" in run("bench", log, "--out", tmp_path / "bench").line
-    assert names(tmp_path) == []
-    # The ground in LiDAR intensities takes the place of a picture.
-    assert run("plot", scenario, "--out", picture, "--background", log).code == 0
-    assert names(tmp_path) == ["ground.png"]
-
-
 def test_sensors_at_the_road_stand_in_the_scenario_with_where_they_look(
     made: Callable[[str], tuple[Path, Path]], tmp_path: Path
 ) -> None:
@@ -159,45 +110,3 @@ def test_sensors_at_the_road_stand_in_the_scenario_with_where_they_look(
     assert pole["fov_rad"] == pytest.approx(math.radians(120.0), abs=0.02)
     moved = scenario.aligned_to(replace(scenario, map=replace(scenario.map, offset_m=(100.0, 0.0, 0.0))))
     assert abs(moved.sensors[0]["x_m"]) == pytest.approx(100.0)
-
-
-def test_fields_of_view_are_those_of_the_lens_and_of_the_points() -> None:
-    log, _ = tiny_log(camera=[EYE], lidar=[{**POLE, "azimuth_deg": [-180.0, 180.0]}], ego=None)
-    focal_px = log.cameras["eye"].width_px / 2.5  # of an equidistant lens: half the width is 1.25 rad
-    K = np.array([[focal_px, 0.0, log.cameras["eye"].width_px / 2], [0.0, focal_px, 150.0], [0.0, 0.0, 1.0]])
-    lens = {"K": K, "distortion_model": "fisheye", "distortion": (1e-9, 0.0, 0.0, 0.0)}
-    level = transform(rotation_from_rpy(-math.pi / 2, 0.0, -math.pi / 2), np.zeros(3))
-    rolled = transform(rotation_from_rpy(0.0, 0.0, math.pi / 2), np.zeros(3))
-    for roll, half in ((np.eye(4), 1.25), (rolled, 150.0 / focal_px)):
-        eye = replace(log.cameras["eye"], **lens, mount_T_cam=level @ roll)
-        camera, pole = roadside_sensors(replace(log, cameras={"eye": eye}), 50.0)
-        assert (camera["yaw_rad"], camera["fov_rad"]) == pytest.approx((0.0, 2 * half), abs=0.01)
-        assert (pole["fov_rad"], pole["range_m"]) == (2 * math.pi, 50.0)
-
-
-@pytest.mark.slow
-def test_what_needs_a_lidar_says_so(made: Callable[[str], tuple[Path, Path]], tmp_path: Path) -> None:
-    log, _ = made("roadside-camera")
-    for command in ("reconstruct", "detect"):
-        assert "no LiDAR" in run(command, log, "--out", tmp_path / "o.json", "--detector", "lidar:labels").line
-
-
-def test_a_log_without_poses_is_named_as_such(tmp_path: Path) -> None:
-    log, _ = tiny_log()
-    write_log(replace(log, ego=None), tmp_path / "log")
-    ran = run("validate", tmp_path / "log")
-    assert ran.code == 3
-    assert "no poses of the ego, on which front, top are mounted" in ran.err
-
-
-def test_gaps_are_noted_and_missing_files_are_problems(log_folder: Path) -> None:
-    index = log_folder / "top" / "index.csv"
-    lines = index.read_text().splitlines()
-    index.write_text("\n".join([*lines[:4], *lines[6:]]) + "\n")
-    ran = run("validate", log_folder)
-    assert ran.code == 0
-    assert "note: stream 'top': 1 gap in its records at 10 Hz, the longest of 0.3 s after stamp" in ran.out
-    (log_folder / "front" / "000003.jpg").unlink()
-    ran = run("validate", log_folder)
-    assert ran.code == 3
-    assert "000003.jpg" in ran.err

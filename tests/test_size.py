@@ -17,7 +17,6 @@ from log2sim.perception.boxes import rotate
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
 CAR = (4.4, 1.85, 1.6)
-PERSON = (0.7, 0.7, 1.75)
 
 
 def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, ends_visible=(True, True)):
@@ -85,12 +84,6 @@ def test_what_stays_stands_and_what_goes_moves(category, jitter_m):
         assert not stands(bare(xy + along, category))
 
 
-def test_a_few_wild_positions_do_not_make_a_parked_car_move():
-    xy = np.tile([20.0, 3.0], (40, 1))
-    xy[[7, 23]] += 6.0
-    assert stands(bare(xy))
-
-
 def test_of_two_sightings_a_vehicle_stands_and_a_person_walks():
     xy = [[20.0, 3.0], [20.0, 3.1]]
     assert stands(bare(xy, "car"))
@@ -150,19 +143,6 @@ def test_a_standing_box_lies_where_its_points_are_though_every_tick_was_off():
     off = track.measurements.center_m + np.array([0.5, -0.4, 0.0])
     shape = static_geometry(replace(track, measurements=replace(track.measurements, center_m=off)))
     assert np.hypot(*(shape.xy_m - [12, 5]).T).max() < 0.1
-
-
-def test_standing_without_points_keeps_the_measured_places_and_the_typical_size():
-    track = bare([[20.0, 3.0], [20.1, 3.0], [20.0, 3.1]])
-    shape = static_geometry(track)
-    np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
-    np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
-    assert shape.yaw_rad is None
-
-
-@pytest.mark.parametrize("size", [(0.6, 0.5, 1.0), (9.5, 3.5, 1.6)])
-def test_what_no_car_can_be_is_not_typical(size):
-    assert not static_geometry(measured([(12, 6, 0.2)] * 15, size, sensors=PASSING[:15])).is_likely
 
 
 # Moving
@@ -233,21 +213,6 @@ def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():
     assert whole.size_m[0] == pytest.approx(3.6, abs=0.25)
     assert cut.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.05)
     assert (np.trace(cut.covariance, axis1=1, axis2=2) > np.trace(whole.covariance, axis1=1, axis2=2)).all()
-
-
-def test_a_walker_is_as_tall_as_its_points():
-    states = [(10.0, -3 + 0.14 * k, np.pi / 2) for k in range(20)]
-    shape = moving_geometry(measured(states, PERSON, "pedestrian"), np.full(20, np.pi / 2))
-    assert shape.size_m[2] == pytest.approx(1.75, abs=0.15)
-    assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.2
-
-
-def test_moving_without_points_keeps_the_measured_places():
-    track = bare([[10.0 + k, 2.0] for k in range(5)])
-    shape = moving_geometry(track, np.zeros(5))
-    np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
-    np.testing.assert_array_equal(shape.covariance, track.measurements.covariance)
-    np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
 
 
 def swept(speed_mps, size=(12.5, 2.55, 3.6), start=(-9.0, 4.0), ticks=20):

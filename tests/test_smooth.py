@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-import time
 from pathlib import Path
 from types import ModuleType
 
@@ -24,15 +23,13 @@ from log2sim.agents.smooth.motion_model import (
 )
 from log2sim.agents.smooth.quadratic import (
     ACCELERATION_PRIOR_MPS2,
-    KNOT_STEP_S,
     VELOCITY_PRIOR_MPS,
     NoisyPositions,
     from_band,
-    place_knots,
     selected_inverse,
     to_band,
 )
-from log2sim.agents.smooth.smoother import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
+from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.geometry import wrap_angle
 
 DT = 0.1
@@ -121,14 +118,6 @@ def test_states_between_observations_are_those_of_a_knot_there() -> None:
     np.testing.assert_allclose(path.covariance, expected_covariance[rows], rtol=1e-3, atol=1e-6)
 
 
-def test_states_within_a_step_of_a_knot_are_carried_from_it() -> None:
-    t = DT * np.arange(20)
-    asked = t + 0.75 * KNOT_STEP_S
-    path = smooth_track(t, np.column_stack([2.0 * t**2, 0 * t]), sigma_m=0.01, at_s=asked)
-    np.testing.assert_allclose(path.xy_m[5:-5, 0], 2.0 * asked[5:-5] ** 2, atol=0.01)
-    np.testing.assert_allclose(path.velocity_mps[5:-5, 0], 4.0 * asked[5:-5], atol=0.01)
-
-
 @pytest.mark.parametrize("step_s", [1e-3, 0.01, 0.1, 1.0, 10.0])
 def test_steps_from_milliseconds_to_seconds(step_s: float) -> None:
     t = step_s * np.arange(60)
@@ -185,23 +174,12 @@ def test_more_noise_in_the_data_less_weight() -> None:
     np.testing.assert_allclose(as_matrix.xy_m, smooth_track(t, xy, sigma_m=sigma).xy_m, atol=0.05)
 
 
-def test_the_noise_is_estimated_when_not_told() -> None:
-    for sigma in (0.05, 0.3):
-        for maneuver in (straight, turn):
-            t = DT * np.arange(200)
-            xy = maneuver(t) + np.random.default_rng(2).normal(0, sigma, (200, 2))
-            xy[::25] += 30.0  # a few outliers change little
-            assert estimate_sigma(t, xy) == pytest.approx(sigma, rel=0.35)
-    uneven = np.cumsum(np.random.default_rng(3).uniform(0.02, 0.2, 400))
-    xy = straight(uneven) + np.random.default_rng(4).normal(0, 0.3, (400, 2))
-    assert estimate_sigma(uneven, xy) == pytest.approx(0.3, rel=0.2)
-
-
 def noisy_stop(seed: int, sigma: float = 0.15) -> SmoothedTrack:
     t = DT * np.arange(150)
     return smooth_track(t, stop(t) + np.random.default_rng(seed).normal(0, sigma, (150, 2)), sigma_m=sigma)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_heading_is_held_at_a_standstill(seed: int) -> None:
     path = noisy_stop(seed)
@@ -242,14 +220,6 @@ def test_reversing_keeps_the_heading_and_turns_the_speed() -> None:
         assert np.abs(speed - expected)[5:-5].max() < 0.15
 
 
-def test_pedestrians_may_turn_on_the_spot() -> None:
-    t = DT * np.arange(80)
-    there_and_back = np.column_stack([np.where(t < 4, 1.4 * t, 11.2 - 1.4 * t), 0 * t])
-    path = smooth_track(t, there_and_back, sigma_m=0.05, motion=MotionModel(holonomic=True))
-    assert np.abs(path.yaw_rad[:30]).max() < 0.1
-    assert np.abs(wrap_angle(path.yaw_rad[-30:] - np.pi)).max() < 0.1
-
-
 def test_yaw_runs_on_across_the_half_turn() -> None:
     t = DT * np.arange(200)
     path = smooth_track(t, turn(t), sigma_m=0.05)
@@ -283,15 +253,6 @@ def test_time_offset_changes_nothing(shift_s: float) -> None:
     np.testing.assert_allclose(b.t_s - shift_s, a.t_s)
 
 
-def test_utm_offset_changes_less_than_a_micrometer() -> None:
-    t, offset = DT * np.arange(80), np.array([457_000.0, 5_428_000.0])
-    xy = np.round(turn(t) + np.random.default_rng(8).normal(0, 0.3, (80, 2)), 6)
-    a, b = smooth_track(t, xy, sigma_m=0.3), smooth_track(t, xy + offset, sigma_m=0.3)
-    assert np.abs(b.xy_m - offset - a.xy_m).max() < 1e-6
-    assert np.abs(b.velocity_mps - a.velocity_mps).max() < 1e-6
-    assert np.abs(b.covariance - a.covariance).max() < 1e-8
-
-
 def test_a_turned_scene_gives_a_turned_track() -> None:
     t, c, s = DT * np.arange(60), np.cos(2.0), np.sin(2.0)
     rotation = np.array([[c, -s], [s, c]])
@@ -299,18 +260,6 @@ def test_a_turned_scene_gives_a_turned_track() -> None:
     a, b = smooth_track(t, xy, sigma_m=0.3), smooth_track(t, xy @ rotation.T, sigma_m=0.3)
     np.testing.assert_allclose(b.xy_m, a.xy_m @ rotation.T, atol=1e-8)
     np.testing.assert_allclose(wrap_angle(b.yaw_rad - a.yaw_rad - 2.0), 0.0, atol=1e-7)
-
-
-def test_one_position_is_a_place_and_two_are_a_way() -> None:
-    one = smooth_track([3.0], [[5.0, 6.0]], sigma_m=0.2, motion=MotionModel(heading_rad=0.7))
-    np.testing.assert_allclose(one.xy_m, [[5.0, 6.0]], atol=1e-9)
-    np.testing.assert_allclose(one.velocity_mps, 0.0, atol=1e-9)
-    np.testing.assert_allclose(one.covariance, [0.04 * np.eye(2)], rtol=1e-6)
-    assert one.yaw_rad.tolist() == [0.7]
-    two = smooth_track([0.0, 1.0], [[0.0, 0.0], [3.0, 4.0]], sigma_m=0.01)
-    np.testing.assert_allclose(two.xy_m, [[0, 0], [3, 4]], atol=0.01)
-    np.testing.assert_allclose(two.velocity_mps.mean(axis=0), [3.0, 4.0], atol=0.1)
-    np.testing.assert_allclose(two.yaw_rad, np.arctan2(4, 3), atol=0.01)
 
 
 def test_gaps_are_filled_and_their_covariance_says_so() -> None:
@@ -368,52 +317,11 @@ def test_impossible_motion_is_flagged() -> None:
     assert "acceleration" in [limit.name for limit in broken]
 
 
-def test_knots_stand_no_nearer_than_their_step() -> None:
-    t = np.array([0.3, 0.0, 0.001, 0.3, KNOT_STEP_S, 0.31, 0.5])
-    knots = place_knots(t)
-    assert knots.tolist() == [0.0, KNOT_STEP_S, 0.3, 0.5]
-
-
-def test_observations_a_millisecond_apart_agree_with_one_knot_each_in_the_mean() -> None:
-    # Two cameras see the same object 1 ms apart, ten times a second.
-    t = np.sort(np.concatenate([DT * np.arange(30), DT * np.arange(30) + 1e-3]))
-    path = smooth_track(t, turn(t), sigma_m=0.1)
-    assert np.abs(path.xy_m - turn(t)).max() < 0.03
-    assert np.abs(path.velocity_mps - 8.0 * np.column_stack([np.cos(0.4 * t), np.sin(0.4 * t)]))[10:-10].max() < 0.1
-
-
 @pytest.fixture(scope="module")
 def maneuvers() -> ModuleType:
     """The module of maneuvers with known truth that the benchmark uses as well."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
     return importlib.import_module("benchmarks.smoothing")
-
-
-def errors(maneuvers: ModuleType, sigma: float, outliers: float, *, told: bool, seeds: int = 3) -> np.ndarray:
-    """Median errors of position, velocity, yaw and curvature over all maneuvers."""
-    rows = []
-    for world in maneuvers.worlds(sigma, outliers, seeds):
-        path = smooth_track(world.truth.t_s, world.xy_m, world.valid, sigma_m=sigma if told else None)
-        rows.append(maneuvers.errors_of(world.truth, path.xy_m, path.velocity_mps, path.yaw_rad, path.curvature_1pm))
-    return np.median(rows, axis=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
-def test_no_smoothing_spline_is_better_not_even_the_one_tuned_with_the_truth(
-    maneuvers: ModuleType, sigma: float
-) -> None:
-    best = np.median([maneuvers.best_spline_errors(w) for w in maneuvers.worlds(sigma, seeds=3)], axis=0)
-    for told in (True, False):
-        assert (errors(maneuvers, sigma, 0.0, told=told) <= 1.05 * best).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
-def test_outliers_cost_little(maneuvers: ModuleType, sigma: float) -> None:
-    for told in (True, False):
-        clean, wrong = (errors(maneuvers, sigma, share, told=told, seeds=6) for share in (0.0, 0.03))
-        assert (wrong <= 1.15 * clean).all()
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
@@ -508,13 +416,6 @@ def test_what_rolls_slowly_goes_along_its_hint() -> None:
         xy = np.column_stack([0.45 * t, 0 * t]) + np.random.default_rng(seed).normal(0, 0.3, (60, 2))
         path = smooth_track(t, xy, sigma_m=0.3, motion=MotionModel(4.0, heading_rad=0.0))
         assert np.sqrt(np.mean(path.velocity_mps[:, 1] ** 2)) < 0.06
-
-
-def test_what_creeps_visibly_is_not_held() -> None:
-    t = DT * np.arange(80)
-    xy = np.column_stack([0.3 * t, 0 * t]) + np.random.default_rng(3).normal(0, 0.1, (80, 2))
-    path = smooth_track(t, xy, sigma_m=0.1, motion=MotionModel(heading_rad=0.0))
-    assert path.velocity_mps[:, 0].mean() == pytest.approx(0.3, abs=0.05)
 
 
 def test_a_slow_vehicle_goes_where_it_points() -> None:
@@ -658,16 +559,6 @@ def test_a_view_that_changes_at_the_end_is_no_acceleration(rate_hz: float) -> No
     assert np.median(off) < {2.0: 0.44, 10.0: 0.625}[rate_hz]
 
 
-def test_noise_at_rest_has_one_sign_of_speed() -> None:
-    t = DT * np.arange(60)
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        error = np.array([np.interp(t, np.arange(0, 7, 0.7), rng.normal(0, 0.1, 10)) for _ in range(2)]).T
-        covariance = np.tile(0.1**2 * np.eye(2), (60, 1, 1))
-        path = smooth_track(t, error, covariance=covariance, motion=MotionModel(heading_rad=0.4))
-        assert signed_speed(path.velocity_mps, path.yaw_rad).min() > -0.1
-
-
 def test_sigma_grows_beyond_both_ends_as_vehicles_move() -> None:
     """A calm motion says little about what came before and after it."""
     t = DT * np.arange(40)
@@ -682,22 +573,8 @@ def test_sigma_grows_beyond_both_ends_as_vehicles_move() -> None:
     assert sigma[len(sigma) // 2] < 0.05
 
 
-@pytest.mark.slow
-def test_it_takes_no_longer_than_two_splines(maneuvers: ModuleType) -> None:
-    """Both in one process, so that the machine does not matter; generous, since it may be busy."""
-    world = next(iter(maneuvers.worlds(0.3, seeds=1)))
-    seconds: dict[str, list[float]] = {"ours": [], "spline": []}
-    for _ in range(15):
-        begin = time.process_time()
-        smooth_track(world.truth.t_s, world.xy_m, world.valid, sigma_m=0.3)
-        seconds["ours"].append(time.process_time() - begin)
-        begin = time.process_time()
-        maneuvers.spline_estimate(world, 0.1)
-        seconds["spline"].append(time.process_time() - begin)
-    assert min(seconds["ours"]) < 2 * min(seconds["spline"])
-
-
 @pytest.mark.parametrize("pulled_m", [0.6, 0.9])
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(3))
 def test_what_comes_to_rest_does_not_turn_where_its_last_boxes_are_pulled_aside(pulled_m: float, seed: int) -> None:
     """Of a car that is hidden little by little, one corner is left, with which the center of its box seems to drive off."""

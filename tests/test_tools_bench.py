@@ -18,54 +18,6 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
 
 
-def test_a_section_is_replaced_between_its_markers_and_nothing_else_changes(tmp_path: Path) -> None:
-    from benchmarks.table import replace_section
-
-    file = tmp_path / "B.md"
-    replace_section(file, "one", "first")
-    replace_section(file, "two", "second")
-    file.write_text(file.read_text().replace("first", "by hand") + "\nTail.\n")
-    replace_section(file, "one", "new")
-    text = file.read_text()
-    assert text.startswith("# Benchmarks")
-    assert "by hand" not in text
-    assert text.index("new") < text.index("second") < text.index("Tail.")
-    assert text.count("<!-- bench one -->") == text.count("<!-- end one -->") == 1
-
-
-def test_the_world_of_homographies_is_what_its_truth_says() -> None:
-    from benchmarks.homography import FAR_M, NEAR_M, Case, camera, errors_m, limit, make_stream, mapped
-
-    stream = make_stream(Case(noise_px=0.0, outliers=0.4, nod_deg=0.2), seed=1)
-    again = make_stream(Case(noise_px=0.0, outliers=0.4, nod_deg=0.2), seed=1)
-    np.testing.assert_array_equal(stream.uv, again.uv)
-    assert (~stream.clean).reshape(40, 20).sum(axis=1).tolist() == [8] * 40
-    own = np.concatenate(
-        [mapped(np.linalg.inv(h), stream.uv[stream.tick == t]) for t, h in enumerate(stream.image_H_ground)]
-    )
-    off = np.hypot(*(own - stream.xy).T)
-    assert np.median(off[stream.clean]) == pytest.approx(0.05 * 1.18, rel=0.15)  # the median of a Rayleigh distribution
-    assert np.median(off[~stream.clean]) > 2.0
-    assert errors_m(np.linalg.inv(stream.image_H_ground), stream, FAR_M).max() < 1e-9
-    # A camera 2.1 m high that looks 2 degrees down sees its horizon at 640 - 2050 tan 2 degrees.
-    far = mapped(camera(), np.array([[1e7, 0.0]]))
-    np.testing.assert_allclose(far, [[960.0, 640.0 - 2050.0 * np.tan(np.radians(2.0))]], atol=1e-2)
-    still = make_stream(Case(), seed=2)
-    assert np.median(errors_m(limit(still, 1.0)[None], still, NEAR_M)) < 0.05
-
-
-def test_maneuvers_are_integrals_of_their_velocities() -> None:
-    from benchmarks.smoothing import STEP_S, errors, maneuver
-
-    for name in ("lane change", "turn", "stop and go", "slalom"):
-        truth = maneuver(name)
-        slope = np.gradient(truth.xy, STEP_S, axis=0)[1:-1]
-        assert np.abs(slope - truth.velocity[1:-1]).max() < 0.15
-        assert errors((truth.xy, truth.velocity, truth.yaw, truth.curvature), truth) == [0.0] * 4
-    assert maneuver("turn").yaw[-1] - maneuver("turn").yaw[0] == pytest.approx(np.pi / 2, abs=1e-3)
-    assert np.hypot(*maneuver("stop and go").velocity.T).min() == 0.0
-
-
 def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
     from benchmarks.projection import make_boxes, make_sweep, make_views, with_log2sim, with_numpy, with_opencv
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from worlds import tiny_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from benchmarks import lanes as bench_lanes
@@ -50,19 +49,3 @@ def test_rows_hold_means_over_seeds_and_sums_of_counts() -> None:
     assert rest[6:8] == ["3 of 6 + 6", "-"]
     assert rest[-1] == "0.90"
     assert rest[8] == "-"
-
-
-def test_colors_are_summed_by_light() -> None:
-    rows = bench_lanes.color_rows([result(1, 0.8), result(2, 0.6, right=2, confused={}, ciede2000_median=None)])
-    assert rows == [[sky, "6", "4", "3 of 4", "6.0", "red as brown (1)"] for sky in ("dusk, rain", "all")]
-
-
-@pytest.mark.parametrize(("rig", "cameras", "lidars"), [("all", 1, 1), ("cameras", 1, 0), ("lidar", 0, 1)])
-def test_a_rig_leaves_out_the_other_sensors(rig: str, cameras: int, lidars: int) -> None:
-    log = bench_lanes.with_rig(tiny_log([], observe=False)[0], rig)
-    assert (len(log.cameras), len(log.lidars), len(log.streams)) == (cameras, lidars, cameras + lidars)
-
-
-def test_every_scene_of_the_bench_is_there_and_has_a_name_of_its_own() -> None:
-    assert all((bench_lanes.SAMPLES / case.scene).is_file() for case in bench_lanes.CASES)
-    assert len({case.name for case in bench_lanes.CASES}) == len(bench_lanes.CASES)

@@ -12,7 +12,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
 from benchmarks import warnings as bench_warnings  # noqa: E402
-from benchmarks.warnings import CAMERA_AHEAD_M, kitti_tracking  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -40,21 +39,6 @@ def drive(tmp_path: Path) -> Path:
     (tmp_path / "calib").mkdir()
     (tmp_path / "calib" / "0003.txt").write_text(CALIBRATION)
     return tmp_path
-
-
-def test_kitti_s_labels_become_a_scenario(drive: Path) -> None:
-    ((name, scenario),) = kitti_tracking(drive)
-    assert name == "0003"
-    ego, car, van = scenario.agents
-    assert (car.id, van.id, van.static) == ("car-1", "car-2", True)
-    states = {a.id: a.at(1.5) for a in scenario.agents}
-    assert ego.size_m[0] > 4.0
-    center_m = 15.0 - CAMERA_AHEAD_M + ego.rear_axle_offset_m
-    assert (states["ego"].x_m[0], states["ego"].y_m[0]) == pytest.approx((100.0, center_m), abs=1e-6)
-    assert (states["car-1"].x_m[0], states["car-1"].y_m[0]) == pytest.approx((97.0, 35.0), abs=1e-6)
-    assert states["car-1"].yaw_rad[0] == pytest.approx(np.pi / 2)
-    assert states["car-1"].speed_mps[0] == pytest.approx(SPEED_MPS, abs=1e-6)
-    assert car.size_m == (4.4, 1.8, 1.5)
 
 
 def test_the_figures_count_warnings_a_minute(

@@ -6,55 +6,11 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
-import pytest
-
 from log2sim.datatypes import Log
-from log2sim.errors import LogError
-from log2sim.logs.records import translate_parser_errors
-from log2sim.perception.sync import Schedule
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import profile_ticks
 from profile_ticks import Measured, Times
-
-
-def test_time_is_given_to_the_innermost_function_of_log2sim() -> None:
-    assert profile_ticks.function_of(None) == "libraries"
-    assert profile_ticks.function_of(sys._getframe()) == "other"
-    frames = []
-
-    class Noticing(Exception):
-        def __str__(self) -> str:
-            frames.append(sys._getframe())
-            return "noticed"
-
-    with pytest.raises(LogError), translate_parser_errors("here", LogError):
-        raise Noticing
-    assert {profile_ticks.function_of(frame) for frame in frames} == {"logs.records.translate_parser_errors"}
-
-
-@pytest.mark.parametrize(
-    ("function", "part"),
-    [
-        ("logs.records.guarded", "logs"),
-        ("perception.lidar.cloud.deskew", "perception.lidar"),
-        ("perception.frames.get", "perception.frames"),
-        ("pipeline.start", "pipeline"),
-        ("libraries", "libraries"),
-    ],
-)
-def test_parts_are_packages_and_those_of_perception(function: str, part: str) -> None:
-    assert profile_ticks.part_of(function) == part
-
-
-def test_the_floor_has_each_record_once() -> None:
-    index = np.array([0, -1, 2])
-    sweeps = np.array([[0, 0, 1], [0, 1, 1]])
-    schedule = Schedule("a", np.arange(3), {"a": index, "b": index + 4}, {"top": sweeps}, {})
-    found = profile_ticks.records_of(schedule)
-    assert len(found) == len(set(found))
-    assert set(found) == {("a", 0), ("a", 2), ("b", 4), ("b", 3), ("b", 6), ("top", 0), ("top", 1)}
 
 
 def test_figures_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread() -> None:

@@ -135,6 +135,7 @@ def test_noise_of_a_center_is_the_sensors_and_that_of_the_view() -> None:
     np.testing.assert_allclose(r[1], np.array([[2.0, 0.5], [0.5, 1.0]]) + np.eye(2) * CENTER_SIGMA_M["pedestrian"] ** 2)
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 def test_every_way_becomes_one_track_with_all_its_measurements(seed: int) -> None:
     ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0), "d": line(5, 30, 3, -6)}
@@ -147,6 +148,7 @@ def test_every_way_becomes_one_track_with_all_its_measurements(seed: int) -> Non
         assert t.category == "car"
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("apart_m", [1.5, 3.0])
 def test_tracks_that_cross_keep_their_identities(apart_m: float, seed: int) -> None:
@@ -155,43 +157,6 @@ def test_tracks_that_cross_keep_their_identities(apart_m: float, seed: int) -> N
     tracks = track(*record(ways, 60, seed=seed), **OPTIONS)
     assert sorted(names_of(tracks)) == [["across"], ["along"]]
     assert [len(t) for t in tracks] == [60, 60]
-
-
-def street(seed: int, period_s: float, detected: float = 0.85) -> tuple[list[Measurements], np.ndarray]:
-    """A row of parked cars on either side of a street, traffic both ways and people, with missed and false detections.
-
-    Only what is within 40 m of a vehicle that drives along is seen.
-    """
-    rng = np.random.default_rng(seed)
-    ways: dict[str, tuple[str, Way]] = {}
-    for side in (-4.6, 4.6):
-        for k, x in enumerate(-60.0 + np.cumsum(rng.uniform(5.2, 11.0, 17))):
-            ways[f"parked {side} {k}"] = ("car", line(x, side, 0, 0))
-    for k in range(4):
-        ways[f"oncoming {k}"] = ("car", line(rng.uniform(0, 150), 1.9, -rng.uniform(7, 14), 0))
-        ways[f"walker {k}"] = ("pedestrian", line(rng.uniform(-40, 40), 7 * (-1) ** k, rng.choice([-1.3, 1.3]), 0))
-    ways["ahead"] = ("car", line(-40, -1.9, 8.5, 0))
-    t_ns, found = stamps(int(12 / period_s), period_s), []
-    for k in range(len(t_ns)):
-        ego = np.array([-50 + 8.0 * k * period_s, -1.9])
-        places = {n: np.array(way(k * period_s)) for n, (_, way) in ways.items() if rng.random() < detected}
-        places = {n: xy for n, xy in places.items() if np.hypot(*(xy - ego)) < 40}
-        places |= {f"false {j}": ego + rng.uniform(-30, 30, 2) * (1, 0.3) for j in range(rng.poisson(0.5))}
-        xy = np.array(list(places.values())).reshape(-1, 2)
-        kinds = [ways[n][0] if n in ways else "car" for n in places]
-        found.append(seen(xy + rng.normal(0, 0.15, xy.shape), t_ns[k], list(places), kinds, sigma_m=0.15))
-    return found, t_ns
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("period_s", "share"), [(0.5, 0.95), (0.2, 0.99), (0.1, 0.995), (0.05, 0.995)])
-def test_tracks_in_a_street_of_parked_cars_hold_one_object_at_any_rate(period_s: float, share: float) -> None:
-    own = total = 0
-    for seed in range(3):
-        for t in track(*street(seed, period_s), **OPTIONS):
-            own += int(np.unique(t.measurements.camera, return_counts=True)[1].max())
-            total += len(t)
-    assert own / total > share
 
 
 def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
@@ -203,12 +168,6 @@ def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
         here = here if k >= 1 else here[:-1]  # when another one comes into view at the end
         found.append(seen(np.array([row[n] for n in here]), t_ns[k], here))
     assert sorted(names_of(track(found, t_ns, **OPTIONS))) == [[n] for n in row]
-
-
-def test_pedestrians_that_meet_walk_on() -> None:
-    ways = {"east": line(-4, 0.3, 1.4, 0), "west": line(4, -0.3, -1.4, 0)}
-    tracks = track(*record(ways, 60, noise_m=0.05, category="pedestrian"), **OPTIONS)
-    assert sorted(names_of(tracks)) == [["east"], ["west"]]
 
 
 @pytest.mark.parametrize("gap_ticks", [1, 3, 8, 11])
@@ -228,24 +187,6 @@ def test_an_occlusion_is_stitched_and_not_beyond_what_is_allowed() -> None:
     # The gap is 2.1 s from the last tick before to the first one after it.
     assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.05})) == 3
     assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.15})) == 2
-
-
-def test_a_rider_taken_for_a_pedestrian_before_an_occlusion_stays_one_track() -> None:
-    found, t_ns = record({"a": line(0, 0, 3.6, 0)}, 40, hidden={"a": (15, 27)}, category="pedestrian")
-    after = [replace(m, category=np.full(len(m), "cyclist")) if k >= 27 else m for k, m in enumerate(found)]
-    (rider,) = track(after, t_ns, **OPTIONS)
-    assert (rider.category, len(rider)) == ("cyclist", 28)
-    # Somebody who walks before it and a rider after it are two.
-    slow, _ = record({"a": line(0, 0, 1.2, 0)}, 40, hidden={"a": (15, 27)}, category="pedestrian")
-    two = [replace(m, category=np.full(len(m), "cyclist")) if k >= 27 else m for k, m in enumerate(slow)]
-    assert len(track(two, t_ns, **OPTIONS)) == 2
-
-
-def test_a_chain_of_occlusions_is_one_track() -> None:
-    found, t_ns = record({"a": line(0, 0, 8, 0)}, 100, noise_m=0.05)
-    found = [Measurements.empty() if 20 <= k < 32 or 50 <= k < 62 or 75 <= k < 87 else m for k, m in enumerate(found)]
-    assert len(track_forward(found, t_ns, birth_score=0.4)) == 4
-    assert [len(t) for t in track(found, t_ns, **OPTIONS)] == [64]
 
 
 def test_what_comes_out_of_an_occlusion_elsewhere_is_somebody_else() -> None:
@@ -287,19 +228,6 @@ def test_what_was_measured_before_and_after_its_tick_is_placed_where_it_was_then
     assert tracklet.mean[2] == pytest.approx(20.0, abs=0.3)
 
 
-def test_stamps_out_of_order_between_ticks_do_not_break_a_track() -> None:
-    t_ns = stamps(40)
-    age_ns = np.where(np.arange(40) % 2 == 0, 60_000_000, -60_000_000)  # every second one was taken before its neighbor
-    assert (np.diff(t_ns + age_ns) < 0).any()
-    found = [
-        seen(np.array([[10.0 * (k * PERIOD_S + age_ns[k] / NS_PER_S), 0.0]]), t_ns[k] + age_ns[k], "a")
-        for k in range(40)
-    ]
-    for hidden in ((0, 0), (15, 27)):
-        shown = [Measurements.empty() if hidden[0] <= k < hidden[1] else m for k, m in enumerate(found)]
-        assert [len(t) for t in track(shown, t_ns, **OPTIONS)] == [40 - hidden[1] + hidden[0]]
-
-
 def test_order_of_rows_does_not_matter() -> None:
     ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0)}
     found, t_ns = record(ways, 30)
@@ -327,12 +255,6 @@ def test_without_measurements_there_are_no_tracks() -> None:
     assert stitch([], t_ns, max_gap_s=3.0) == []
 
 
-def test_measurements_without_a_place_are_passed_over() -> None:
-    t_ns = stamps(10)
-    found = [seen(np.array([[0.0, 0.0], [5.0, 5.0]]), t, ["lost", "a"], source=["", "lidar"]) for t in t_ns]
-    assert names_of(track(found, t_ns, **OPTIONS)) == [["a"]]
-
-
 def test_a_track_takes_what_is_likely_and_nothing_else() -> None:
     # What stood for 2 s is known to 0.4 m or so: 1.2 m aside for a moment is an outlier of it, 5 m aside is another one.
     t_ns = stamps(40)
@@ -342,29 +264,12 @@ def test_a_track_takes_what_is_likely_and_nothing_else() -> None:
         assert [len(t.ticks) for t in track_forward(found, t_ns, birth_score=0.4)] == lives
 
 
-@pytest.mark.parametrize(("seen_ticks", "gap_s", "pieces"), [(10, 1.1, 1), (10, 1.3, 2), (2, 0.4, 1), (2, 0.5, 2)])
-def test_a_track_waits_longer_when_it_is_confirmed(seen_ticks: int, gap_s: float, pieces: int) -> None:
-    hidden = (seen_ticks, seen_ticks + round(gap_s / PERIOD_S) - 1)
-    found, t_ns = record({"a": line(0, 0, 1, 0)}, 40, hidden={"a": hidden})
-    assert len(track_forward(found, t_ns, birth_score=0.4)) == pieces
-
-
 def test_weak_scores_continue_a_track_but_start_none() -> None:
     t_ns = stamps(20)
     place = np.array([[5.0, 5.0]])
     assert track([seen(place, t, score=0.39) for t in t_ns], t_ns, **OPTIONS) == []
     (one,) = track([seen(place, t, score=0.4 if k < 3 else 0.2) for k, t in enumerate(t_ns)], t_ns, **OPTIONS)
     assert len(one) == 20
-
-
-def test_strong_scores_choose_first() -> None:
-    # A weak false alarm lies nearer to the track than the strong detection.
-    t_ns = stamps(12)
-    found = [seen(np.array([[5.0, 5.0]]), t, "a") for t in t_ns[:10]]
-    for t in t_ns[10:]:
-        strong, weak = seen(np.array([[5.5, 5.0]]), t, "a"), seen(np.array([[5.1, 5.0]]), t, "ghost", score=0.2)
-        found.append(Measurements.join([weak, strong]))
-    assert names_of(track(found, t_ns, **OPTIONS)) == [["a"]]
 
 
 def test_short_lives_are_false_alarms_except_in_a_log_as_short() -> None:
@@ -463,12 +368,6 @@ def test_a_weak_detection_of_a_person_continues_a_track_only_near_its_prediction
     assert len(only) == 11 + continued
 
 
-def test_tracks_come_in_the_order_of_their_start() -> None:
-    ways = {"late": line(0, 0, 5, 0), "right": line(50, 9, 5, 0), "left": line(-50, -9, 5, 0)}
-    tracks = track(*record(ways, 30, hidden={"late": (0, 10)}), **OPTIONS)
-    assert names_of(tracks) == [["left"], ["right"], ["late"]]
-
-
 @pytest.mark.parametrize(
     ("speed_mps", "category"), [(1.4, "pedestrian"), (2.7, "pedestrian"), (3.4, "cyclist"), (6.0, "cyclist")]
 )
@@ -479,18 +378,6 @@ def test_a_pedestrian_faster_than_people_run_is_a_cyclist_at_any_rate(speed_mps,
     rows = seen(xy, t_ns, category="pedestrian")
     assert decide_category(rows) == category
     assert decide_category(seen(xy, t_ns, category="car")) == "car"
-
-
-def test_a_few_wrong_positions_do_not_make_a_pedestrian_a_cyclist() -> None:
-    t_ns = stamps(40)
-    xy = np.zeros((40, 2))
-    xy[[10, 25]] += 5.0
-    assert decide_category(seen(xy, t_ns, category="pedestrian")) == "pedestrian"
-
-
-def test_a_track_too_short_to_have_a_speed_keeps_its_category() -> None:
-    rows = seen(np.array([[0.0, 0.0], [4.0, 0.0]]), stamps(2), category="pedestrian")
-    assert decide_category(rows) == "pedestrian"
 
 
 @settings(max_examples=40, deadline=None)

@@ -8,18 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from log2sim.datatypes import Detections, Log, Scenario, Signal
+from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import box_corners, inverse, project
-from log2sim.perception.detect.layouts import COCO_80, COCO_91, TRAFFIC_LIGHT, classes_from_names
 from log2sim.perception.traffic_light_boxes import LightBox, crop_lights, with_ranges
 from log2sim.road.signals import (
     STATES,
-    changes_of,
     find_signals,
     lamp_evidence,
-    most_probable_states,
     place_lights,
-    rates,
 )
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
@@ -93,14 +89,6 @@ def test_signals_of_a_junction_are_placed_and_change_when_they_do() -> None:
         assert found.confidence > 0.8
 
 
-def test_a_camera_at_rest_leaves_the_distance_as_unsure_as_the_size() -> None:
-    log, truth = junction(moving=False)
-    boxes = boxes_of(log, truth, np.random.default_rng(1))
-    for housing in place_lights(log, boxes):
-        distance = float(np.linalg.norm(housing.position - housing.eyes[0]))
-        assert housing.sigma_m == pytest.approx(0.22 * distance, rel=0.15)
-
-
 def test_a_range_by_lidar_points_makes_the_distance_sure() -> None:
     log, truth = junction(moving=False)
     boxes = boxes_of(log, truth, np.random.default_rng(1))
@@ -140,59 +128,6 @@ def test_boxes_that_do_not_repeat_or_never_shine_are_no_signals() -> None:
 @pytest.mark.parametrize("height", [18, 36])
 def test_the_lamp_that_shines_is_told(state: str, glare: bool, height: int) -> None:
     assert STATES[int(np.argmax(lamp_evidence(drawn(state, height, glare))))] == state
-
-
-def test_a_bright_sky_beside_the_housing_is_no_lamp() -> None:
-    crop = np.full((40, 26, 3), 250, np.uint8)
-    crop[2:38, 6:20] = drawn("green", 36)[:, :14]
-    assert STATES[int(np.argmax(lamp_evidence(crop)))] == "green"
-    crop[2:38, 6:20] = drawn("off", 36)[:, :14]
-    assert STATES[int(np.argmax(lamp_evidence(crop)))] == "off"
-
-
-def test_one_wrong_picture_does_not_switch_a_signal() -> None:
-    t_s = np.arange(0, 6, 0.1)
-    evidence = np.tile(np.log([0.8, 0.05, 0.05, 0.05, 0.05]), (60, 1))
-    evidence[30] = np.log([0.05, 0.05, 0.05, 0.8, 0.05])
-    evidence[45:] = np.log([0.05, 0.05, 0.05, 0.8, 0.05])
-    course, probability = most_probable_states(t_s, evidence)
-    times, states = changes_of(t_s, course)
-    assert states == ["red", "green", "unknown"]
-    assert times[1] == pytest.approx(4.45)
-    assert probability[10] > 0.95
-
-
-def test_without_pictures_a_state_is_unknown() -> None:
-    t_s = np.array([0.0, 0.1, 0.2, 9.0, 9.1, 9.2])
-    times, states = changes_of(t_s, np.zeros(6, int))
-    assert states == ["red", "unknown", "red", "unknown"]
-    assert times[1] == pytest.approx(0.8)
-    Signal("a", np.zeros(3), None, times, np.array(states))
-    assert changes_of(t_s / 2.5, np.zeros(6, int))[1] == ["red", "unknown"]
-    assert changes_of(t_s / 2.5, np.array([0, 0, 0, 3, 3, 3]))[1] == ["red", "unknown", "green", "unknown"]
-
-
-def test_rates_keep_probability() -> None:
-    np.testing.assert_allclose(rates().sum(axis=1), 0.0, atol=1e-12)
-    assert (rates() - np.diag(np.diag(rates())) >= 0).all()
-
-
-def test_models_with_the_classes_of_coco_know_traffic_lights() -> None:
-    scores = np.zeros((2, 80))
-    scores[0, 9], scores[1, 2] = 0.7, 0.6
-    row, _, category = COCO_80.best(scores, 0.5)
-    assert dict(zip(row.tolist(), category.tolist())) == {0: TRAFFIC_LIGHT, 1: "car"}
-    assert COCO_91.category_of[10] == TRAFFIC_LIGHT
-    assert classes_from_names("['car', 'traffic light']", "x").category_of[1] == TRAFFIC_LIGHT
-
-
-def test_crops_leave_out_boxes_at_the_border_and_within_others() -> None:
-    image = np.zeros((100, 100, 3), np.uint8)
-    lights = np.array([[10, 10, 20, 40, 0.5], [11, 12, 19, 30, 0.9], [0, 10, 10, 40, 0.9], [60, 10, 160 / 2, 70, 0.4]])
-    found = crop_lights("a", 0, image, lights)
-    assert [light.score for light in found] == [0.9, 0.4]
-    assert max(found[1].crop.shape[:2]) == 40
-    assert len(Detections.empty().traffic_lights) == 0
 
 
 def test_points_in_the_middle_of_a_box_give_its_range() -> None:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.datatypes import Agent, Trajectory, Waypoints
+from log2sim.agents.candidate import Timeline
+from log2sim.agents.estimate import spans_of_ticks
+from log2sim.datatypes import Agent, Scenario, Trajectory, Waypoints
+from log2sim.edit.apply import edit
+from log2sim.edit.edits import Shift, Speed
 from log2sim.geometry import Array, wrap_angle
+from log2sim.logs.opening import open_log
+from log2sim.tracking.forward import MAX_MISSES
 
 finite = st.floats(-50.0, 50.0)
 
@@ -65,23 +72,6 @@ def test_a_rigid_motion_of_the_map_moves_all_states_alike(w: Waypoints, dx: floa
     np.testing.assert_allclose(wrap_angle(b.yaw_rad - a.yaw_rad - turn), 0.0, atol=1e-9)
 
 
-@given(rides(), st.floats(-1000.0, 1000.0))
-@settings(max_examples=40, deadline=None)
-def test_a_shift_of_time_shifts_the_trajectory(w: Waypoints, later_s: float) -> None:
-    later = waypoints(w.t_s + later_s, w.x_m, w.y_m, w.yaw_rad, w.speed_mps)
-    a, b = Trajectory.through(w).at(between(w)), Trajectory.through(later).at(between(w) + later_s)
-    np.testing.assert_allclose([b.x_m, b.y_m, b.speed_mps], [a.x_m, a.y_m, a.speed_mps], atol=1e-6)
-
-
-@given(rides())
-@settings(max_examples=40, deadline=None)
-def test_the_trajectory_is_continuous_with_the_logged_velocity(w: Waypoints) -> None:
-    t = between(w, 2001)
-    states = Trajectory.through(w).at(t)
-    step = np.hypot(np.diff(states.x_m), np.diff(states.y_m))
-    assert np.all(step <= (w.speed_mps.max() * 1.5 + 1.0) * (t[1] - t[0]) + 1e-9)
-
-
 @given(st.floats(-30.0, 30.0), st.floats(-np.pi, np.pi))
 @settings(max_examples=60, deadline=None)
 def test_constant_velocity_is_exact(speed: float, yaw: float) -> None:
@@ -104,15 +94,6 @@ def test_a_circle_is_followed_to_a_millimeter_where_chords_cut_it_by_centimeters
     assert radius * (1 - np.cos(rate * 0.125)) > 0.01
 
 
-@given(st.floats(2.5, 3.1), st.floats(2.5, 3.1))
-@settings(max_examples=30, deadline=None)
-def test_yaw_takes_the_shorter_arc(before: float, after: float) -> None:
-    w = waypoints(np.array([0.0, 1.0]), 0.0, 0.0, np.array([before, -after]), 0.0)
-    yaw = Trajectory.through(w).at(between(w)).yaw_rad
-    assert np.all(np.abs(yaw) >= 2.5 - 1e-9)
-    assert np.all((-np.pi <= yaw) & (yaw < np.pi))
-
-
 def test_before_a_discontinuity_the_agent_goes_straight_on() -> None:
     t = np.arange(0.0, 2.01, 0.1)
     w = waypoints(t, 5 * t + np.where(t > 1.05, 30.0, 0.0), 0.0, 0.0, 5.0)
@@ -122,18 +103,30 @@ def test_before_a_discontinuity_the_agent_goes_straight_on() -> None:
     assert trajectory.at(np.array([1.1])).x_m == pytest.approx([35.5])
 
 
-def test_an_agent_is_where_its_trajectory_is_and_nowhere_outside_it() -> None:
-    t = np.arange(0.0, 1.01, 0.1)
-    w = waypoints(t, 8 * t + t**2, 0.3 * t, 0.04, 8 + 2 * t)
-    agent = Agent("a", "car", (4.0, 1.8, 1.5), w, rear_axle_offset_m=1.3)
-    inside, at = np.array([0.0, 0.05, 0.83, 1.0]), Trajectory.through(w, 1.3)
-    np.testing.assert_array_equal(agent.at(inside).x_m, at.at(inside).x_m)
-    assert agent.at([-0.1, 1.1]).valid.tolist() == [False, False]
-    assert np.isnan(agent.at([-0.1, 1.1]).x_m).all()
+SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"
 
 
-@pytest.mark.parametrize("key", ["x_m", "observed", "visible"])
-def test_a_column_of_another_length_is_refused_at_once(key: str) -> None:
-    w = waypoints(np.arange(4.0), 0.0, 0.0, 0.0, 0.0)
-    with pytest.raises(ValueError, match=f"{key} has 3 values, t_s has 4"):
-        replace(w, **{key: np.zeros(3, dtype=bool)})
+def test_a_span_goes_on_over_missed_ticks_and_ends_at_longer_gaps() -> None:
+    timeline = Timeline(np.arange(40, dtype=np.int64) * 100_000_000, 0)
+    tick = np.array([2, 3, 3 + MAX_MISSES + 1, 3 + 2 * (MAX_MISSES + 1) + 1])
+    last = (3 + MAX_MISSES + 1) / 10
+    alone = float(timeline.seconds(timeline.t_ns[tick[-1:]])[0])
+    assert spans_of_ticks(tick, timeline) == (pytest.approx((0.2, last)), (alone, alone))
+
+
+def agent() -> Agent:
+    t = np.arange(0.0, 4.0)
+    zero = np.zeros(4)
+    w = Waypoints(t, 10 * t, zero, zero, zero, np.full(4, 10.0), np.ones(4, bool), np.full(4, 0.1))
+    return Agent("car-1", "car", (4.5, 1.8, 1.5), w, observed_by={"vehicle": ((1.0, 3.0),), "road": ((0.0, 2.0),)})
+
+
+def test_edits_in_time_move_the_spans(tmp_path: Path) -> None:
+    log = open_log(SAMPLE)
+    source = Scenario("s", 0, 3.0, (agent(),), log.map, (), (), {})
+    moved = edit(source, [Shift("car-1", 1.0), Speed("car-1", 2.0)]).scenario.agents[0]
+    # Later by 1 s, then twice as fast from the first waypoint on, which is at 1 s.
+    assert moved.observed_by == {"vehicle": ((1.5, 2.5),), "road": ((1.0, 2.0),)}
+    path = tmp_path / "s.json"
+    replace(source, agents=(moved,)).save(path)
+    assert Scenario.load(path).agents[0].observed_by == moved.observed_by

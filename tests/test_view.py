@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +41,6 @@ def agent(id: str, x_m: Array, y_m: float, yaw_rad: float = 0.0, **changes: Any)
     columns = {"x_m": x, "y_m": np.full(n, y_m), "z_m": np.zeros(n), "yaw_rad": np.full(n, yaw_rad), "speed_mps": speed}
     w = Waypoints(t_s=np.arange(float(n)), observed=np.ones(n, bool), sigma_xy_m=np.zeros(n), **columns)
     return Agent(**{"id": id, "category": "car", "size_m": (4.0, 2.0, 1.6), "waypoints": w, **changes})
-
-
-def filled(source: Agent, first: int, last: int) -> Agent:
-    """The agent with waypoints that nobody observed."""
-    observed = np.ones(len(source.waypoints), bool)
-    observed[first : last + 1] = False
-    return replace(source, waypoints=replace(source.waypoints, observed=observed))
 
 
 def made(*agents: Agent, name: str = "made") -> Scenario:
@@ -103,16 +95,6 @@ def test_agents_have_the_colors_of_the_pictures() -> None:
         assert entries[role.agent.id]["color"] == role.color
     assert entries["ego"]["ego"]
     assert [e["id"] for e in entries.values() if e["stationary"]] == [a.id for a in roles.stationary]
-
-
-def test_the_style_has_the_colors_of_the_pictures() -> None:
-    css = resources.files("log2sim.visualization.page").joinpath("style.css").read_text(encoding="utf-8")
-    light = dict(re.findall(r"--([\w-]+): (#\w{6})", css[: css.index("@media")]))
-    wanted = {
-        "paper": style.PAPER, "ink": style.INK, "muted": style.MUTED, "grid": style.GRID, "frame": style.FRAME,
-        "parked-face": style.PARKED_FACE, "parked-edge": style.PARKED_EDGE,
-    }  # fmt: skip
-    assert {k: light[k] for k in wanted} == wanted
 
 
 def test_the_page_asks_for_nothing_from_outside() -> None:
@@ -290,19 +272,6 @@ def test_boxes_have_their_size_color_and_heading(browser: Browser, tmp_path: Pat
     assert pixel(browser, just_in) == rgb(style.INK)
 
 
-def test_what_nobody_observed_is_pale(browser: Browser, tmp_path: Path) -> None:
-    page = page_with(
-        tmp_path, filled(agent("ego", np.linspace(0, 12, 5), 0.0), 2, 2), agent("car", np.arange(5.0), 9.0)
-    )
-    opened(browser, page, "#t=0.5&agent=ego")
-    behind = np.array([-1.2, 0.6]) * browser.run("return log2sim.pixelsPerMeter")
-    assert pixel(browser, place_of(browser, "ego") + behind) == rgb(style.INK)
-    assert "Observedyes" in text_of(browser, "agent-now")
-    browser.run("log2sim.time = 1.5")
-    assert min(pixel(browser, place_of(browser, "ego") + behind)) > 150
-    assert "Observedno, interpolated" in text_of(browser, "agent-now")
-
-
 def doubtful_scene() -> Scenario:
     """A car that is doubtful from 1 to 2 s, a parked one all the time, one of low confidence and one without a doubt."""
     car, unsure, sure = (
@@ -349,12 +318,6 @@ def test_doubtful_agents_are_hatched_while_the_doubt_holds(browser: Browser, tmp
     assert len(striped(browser, "sure")) == 1
     browser.run("log2sim.time = 2.5")
     assert len(striped(browser, "car")) == 1
-
-
-def test_stripes_are_dark_on_a_dark_page(browser: Browser, tmp_path: Path) -> None:
-    write_page(doubtful_scene(), tmp_path / "page.html")
-    opened(browser, tmp_path / "page.html", "#t=1.5", dark=True)
-    assert max(striped(browser, "car")[0]) < 80
 
 
 def test_the_panel_says_how_far_an_agent_can_be_trusted(browser: Browser, tmp_path: Path) -> None:
@@ -411,26 +374,6 @@ def test_a_click_on_an_agent_shows_its_panel(browser: Browser, sample: Path) -> 
     browser.mouse((20.0, 300.0))
     assert browser.run("return log2sim.chosen") is None
     assert browser.run("return document.getElementById('details').hidden")
-
-
-def test_the_plots_seek_where_they_are_clicked(browser: Browser, sample: Path) -> None:
-    opened(browser, sample, "#t=0&agent=ego")
-    box = browser.run("return document.querySelector('.plot canvas').getBoundingClientRect().toJSON()")
-    x = box["x"] + 34 + (box["width"] - 42) / 2
-    browser.mouse((x, box["y"] + 40))
-    assert time_of(browser) == pytest.approx(2.6, abs=0.03)
-    browser.mouse((x, box["y"] + 40), (x + 30, box["y"] + 40))
-    assert time_of(browser) > 3.0
-
-
-def test_scrubbing_changes_the_time(browser: Browser, sample: Path) -> None:
-    opened(browser, sample)
-    box = browser.run("return document.getElementById('scrub').getBoundingClientRect().toJSON()")
-    y = box["y"] + box["height"] / 2
-    browser.mouse((box["x"] + 9, y), (box["x"] + box["width"] / 2, y))
-    assert time_of(browser) == pytest.approx(2.6, abs=0.1)
-    browser.wait(f"document.getElementById('time').textContent === '{time_of(browser):.2f}'")
-    browser.wait(f"location.hash === '#t={time_of(browser):.2f}'")
 
 
 def test_a_link_names_the_moment_and_the_agent(browser: Browser, sample: Path) -> None:
@@ -517,31 +460,6 @@ def test_following_keeps_the_agent_in_the_middle(browser: Browser, sample: Path)
     assert not pressed(browser, "follow")
 
 
-def test_mouse_and_wheel_move_the_map(browser: Browser, sample: Path) -> None:
-    opened(browser, sample)
-    before, scale = place_of(browser, "ego"), browser.run("return log2sim.pixelsPerMeter")
-    browser.mouse((500, 600), (520, 590), (600, 560))
-    np.testing.assert_allclose(place_of(browser, "ego") - before, [100, -40], atol=1)
-    held = place_of(browser, "bus_1")
-    browser.wheel(*held, -400)
-    assert browser.run("return log2sim.pixelsPerMeter") > 1.5 * scale
-    np.testing.assert_allclose(place_of(browser, "bus_1"), held, atol=1.5)
-
-
-def test_fingers_choose_drag_and_pinch(browser: Browser, sample: Path) -> None:
-    opened(browser, sample, "#t=2", size=(390, 780))
-    browser.touch([tuple(place_of(browser, "bus_1"))])
-    assert browser.run("return log2sim.chosen") == "bus_1"
-    assert browser.run("return document.getElementById('details').clientHeight") > 100
-    browser.run("log2sim.choose(null)")
-    pixel(browser, np.zeros(2))  # the map is as high again as without the panel
-    before, scale = place_of(browser, "ego"), browser.run("return log2sim.pixelsPerMeter")
-    browser.touch([(100, 500), (110, 480), (130, 440)])
-    np.testing.assert_allclose(place_of(browser, "ego") - before, [30, -60], atol=1)
-    browser.touch([(150, 400), (120, 400), (100, 400)], [(250, 400), (280, 400), (300, 400)])
-    assert browser.run("return log2sim.pixelsPerMeter") == pytest.approx(2 * scale, rel=0.01)
-
-
 def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
     opened(browser, sample, "#t=2")
     behind = np.array([-1.5, 0.0]) * browser.run("return log2sim.pixelsPerMeter")
@@ -551,31 +469,6 @@ def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
     assert pixel(browser, place) == (251, 252, 253)
     browser.press("s")
     assert pixel(browser, place) == rgb(style.INK)
-
-
-def test_predictions_show_where_an_agent_is_expected(browser: Browser, tmp_path: Path) -> None:
-    world = made(agent("car", 5.0 * np.arange(5.0), 0.0))
-    write_page(world, tmp_path / "page.html", predict_s=2.0)
-    opened(browser, tmp_path / "page.html", "#t=2.1")
-    car, scale = place_of(browser, "car"), browser.run("return log2sim.pixelsPerMeter")
-    beside = car + np.array([10.0 * scale, 0.3 * scale])  # within the ellipse, off the dots
-    ground = pixel(browser, car + np.array([6.0 * scale, 3.0 * scale]))
-    assert pixel(browser, beside) != ground
-    browser.press("d")
-    assert not pressed(browser, "layer-predictions")
-    assert pixel(browser, beside) == ground
-    browser.press("d")
-    browser.run("log2sim.time = 1.9")
-    assert pixel(browser, beside - np.array([1.0 * scale, 0.0])) != ground  # it moves with the car
-
-
-def test_a_layer_that_is_not_there_has_no_button(browser: Browser, tmp_path: Path) -> None:
-    opened(browser, page_with(tmp_path, agent("car", np.arange(5.0), 0.0)))
-    assert browser.run("return [...document.querySelectorAll('#layers button')].map((b) => b.textContent)") == [
-        "Scenario", "Trails", "Names",
-    ]  # fmt: skip
-    browser.press("t", "r", "f")
-    assert not pressed(browser, "follow")  # there is nobody to follow
 
 
 def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_path: Path) -> None:
@@ -616,16 +509,6 @@ def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_p
     assert any(np.abs(np.subtract(c, rgb("#C62828"))).max() < 60 for c in colors)
 
 
-def test_a_truth_that_starts_earlier_stands_at_the_same_moments() -> None:
-    truth = Scenario.load(TRUTH)
-    later = replace(truth, t0_ns=truth.t0_ns + 50_000_000)
-    document = page_document(later, truth=truth)
-    own, known = (next(e for e in document["layers"][k] if e["id"] == "ego") for k in ("scenario", "truth"))
-    first = [e["t_s"][0] / SCALES["t_s"] for e in (own, known)]
-    assert first[1] - first[0] == pytest.approx(-0.05)
-    assert document["begin_s"] == 0.0
-
-
 def test_plots_show_how_far_truth_and_replay_are(browser: Browser, tmp_path: Path) -> None:
     ways = {
         name: agent("ego", np.linspace(0, 20, 5), y)
@@ -653,18 +536,6 @@ def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
     assert text_of(browser, "more") == "No agent matches."
 
 
-def test_an_agent_chosen_from_the_list_comes_into_sight(browser: Browser, tmp_path: Path) -> None:
-    opened(browser, page_with(tmp_path, agent("ego", np.arange(5.0), 0.0), agent("far", np.arange(5.0), 50.0)), "#t=3")
-    browser.press(*"++++++++")
-    size = browser.run("const m = document.getElementById('map'); return [m.clientWidth, m.clientHeight]")
-    assert (place_of(browser, "far") < 0).any()
-    browser.run("[...document.querySelectorAll('#agents button')].at(-1).click()")
-    np.testing.assert_allclose(place_of(browser, "far"), np.array(size) / 2, atol=1e-6)
-    before = place_of(browser, "far")
-    browser.run("[...document.querySelectorAll('#agents button')].at(-1).click()")
-    np.testing.assert_array_equal(place_of(browser, "far"), before)
-
-
 @pytest.mark.parametrize(("size", "first"), [((1200, 800), True), ((390, 780), False)], ids=["wide", "narrow"])
 def test_the_list_is_put_away_and_an_agent_shown_all_the_same(
     browser: Browser, sample: Path, size: tuple[int, int], first: bool
@@ -682,26 +553,6 @@ def test_the_list_is_put_away_and_an_agent_shown_all_the_same(
     assert (np.array(browser.run(inside)) <= size).all()
 
 
-def test_dark_systems_get_a_dark_page(browser: Browser, sample: Path) -> None:
-    light = pixel(opened(browser, sample), np.array([3.0, 300.0]))
-    dark = pixel(opened(browser, sample, dark=True), np.array([3.0, 300.0]))
-    assert light == (251, 252, 253)
-    assert max(dark) < 40
-    browser.cdp("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
-    browser.wait("!matchMedia('(prefers-color-scheme: dark)').matches")
-    pixel(browser, np.zeros(2))
-    assert pixel(browser, np.array([3.0, 300.0])) == light  # at once, without loading it again
-
-
-def test_names_from_the_file_stay_text(browser: Browser, tmp_path: Path) -> None:
-    opened(browser, page_with(tmp_path, agent(EVIL, np.arange(5.0), 0.0), name=EVIL), "#agent=x")
-    browser.run("log2sim.choose(arguments[0])", EVIL)
-    assert browser.run("return window.hacked") is None
-    assert browser.run("return document.querySelectorAll('img, iframe').length") == 0
-    assert [text_of(browser, id) for id in ("name", "agent-id")] == [EVIL, EVIL]
-    assert browser.run("return document.title") == EVIL
-
-
 def test_the_policy_lets_nothing_out(chromium: Browser, sample: Path) -> None:
     opened(chromium, sample)
     script = "const done = arguments[0]; fetch('http://127.0.0.1:9/').then(() => done('sent'), (e) => done(e.name))"
@@ -714,17 +565,6 @@ def test_the_policy_lets_nothing_out(chromium: Browser, sample: Path) -> None:
     refused = [entry["message"] for entry in chromium.log("browser")]
     assert len([m for m in refused if "Content Security Policy" in m]) >= 3
     chromium.requests()
-
-
-@pytest.mark.parametrize(
-    "agents", [(), (agent("one", np.array([2.0]), 1.0, static=True),), (agent("two", np.array([2.0]), 1.0),)]
-)
-def test_pages_with_next_to_nothing_open(browser: Browser, tmp_path: Path, agents: tuple[Agent, ...]) -> None:
-    opened(browser, page_with(tmp_path, *agents))
-    browser.press("n", " ", "f", "+", END)
-    assert time_of(browser) == 4.0
-    there = [a.id for a in agents if browser.run("return log2sim.placeOf(arguments[0])", a.id)]
-    assert there == [a.id for a in agents if a.static]  # what stands has one pose for good
 
 
 def test_a_map_of_the_ground_is_embedded_where_it_lies_and_stays_small(monkeypatch: pytest.MonkeyPatch) -> None:

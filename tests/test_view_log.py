@@ -11,29 +11,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
-from command_line import names, run
+from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import Solid, camera_ahead, outline_px
 
-from log2sim.datatypes import Agent, Doubt, Lidar, Log, MapFrame, Scenario, Stream, Sweep, Waypoints
-from log2sim.errors import ConfigError
-from log2sim.geometry import Camera, box_corners, project
+from log2sim.datatypes import Agent, Doubt, Lidar, Log, Scenario, Stream, Sweep, Waypoints
+from log2sim.geometry import Camera
 from log2sim.visualization.page.writer import write_page
 from log2sim.visualization.recording import (
-    CORNERS,
     MIN_HEIGHT_M,
-    SEGMENTS,
     UNIT_M,
-    OutlineProjector,
     PointsAbove,
     Recorded,
-    choose_cameras,
-    outline_of,
     pack,
     records_within,
     take_at_rate,
@@ -124,19 +117,6 @@ def test_records_are_taken_at_a_rate_or_evenly() -> None:
     assert take_evenly(3, 9).tolist() == [0, 1, 2]
 
 
-def test_cameras_are_in_the_order_in_which_they_look() -> None:
-    def ego(name: str, yaw_deg: float) -> Camera:
-        return camera_ahead(name, mount="ego", yaw_rad=np.radians(yaw_deg))
-
-    log = roadside(ego("back", 178.0), ego("front", 0.0), ego("left", 60.0), camera_ahead("pole"), ego("right", -60.0))
-    assert choose_cameras(log, scene()) == ("left", "front", "right", "back", "pole")
-    used = scene(cameras=({"name": "front", "used": True}, {"name": "left", "used": False}))
-    assert choose_cameras(log, used) == ("front",)
-    assert choose_cameras(log, used, ("right", "left")) == ("left", "right")
-    with pytest.raises(ConfigError, match="no camera 'rear'; the log has: back, front"):
-        choose_cameras(log, used, ("rear",))
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 1.0]))
 def test_points_come_back_one_of_each_cell_the_highest(seed: int, cell_m: float) -> None:
@@ -152,62 +132,6 @@ def test_points_come_back_one_of_each_cell_the_highest(seed: int, cell_m: float)
     np.testing.assert_allclose(rows[:, :2], xy[kept], atol=UNIT_M / 2 + 1e-9)
     np.testing.assert_allclose(rows[:, 2] / 255 * (5.0 - MIN_HEIGHT_M) + MIN_HEIGHT_M, height[kept], atol=0.02)
     assert not rows[:, 3].any()
-
-
-def test_outlines_are_where_a_pinhole_camera_shows_the_boxes() -> None:
-    camera = camera_ahead("front")
-    projector = OutlineProjector(roadside(camera), scene())
-    found = projector.outlines("front", START_NS + 5 * STEP_NS)
-    assert [projector.agents[row[0]].id for row in found] == ["parked", "car"]  # the farthest first
-    for row, solid in zip(found, (Solid((18.0, 6.0, 0.75), CAR_SIZE), Solid((16.0, 0.0, 0.75), CAR_SIZE))):
-        assert row[1] == CORNERS
-        uv = np.array(row[2:]).reshape(8, 2)
-        expected = outline_px(camera, camera.mount_T_cam, solid)
-        np.testing.assert_allclose([*uv.min(axis=0), *uv.max(axis=0)], expected, atol=0.5)
-    assert not projector.outlines("front", START_NS + 25 * STEP_NS)[1:]  # the car is gone, the parked one is not
-
-
-def test_a_box_is_drawn_as_corners_only_where_its_edges_are_straight() -> None:
-    straight = camera_ahead()
-    bent = Camera("bent", 1200, 600, straight.K, "map", np.eye(4), "brown", (-0.3, 0.08, 0.0, 0.0))
-    near = box_corners([0.0, 0.0, 5.0], [4.0, 2.0, 2.0], 0.0)[0]
-    far = near + np.array([0.0, 0.0, 60.0])
-    assert outline_of(straight, near)[0] == CORNERS
-    assert outline_of(bent, far)[0] == CORNERS
-    kind, lines = outline_of(bent, near)
-    assert kind == SEGMENTS
-    ends = project(bent, near)[0]
-    assert min(np.hypot(*(lines.reshape(-1, 2) - ends[0]).T)) < 1e-6
-    assert outline_of(straight, near - [0.0, 0.0, 5.0])[0] == SEGMENTS  # a part is behind the camera
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("max_bytes", [260_000, 1_200_000])
-def test_the_page_keeps_to_its_size_and_uses_it(tmp_path: Path, max_bytes: int) -> None:
-    log = roadside(camera_of("a"), camera_of("b", yaw_rad=0.5))
-    notes = write_page(scene(), tmp_path / "page.html", recorded=Recorded(log, max_bytes))
-    size = (tmp_path / "page.html").stat().st_size
-    assert size <= max_bytes
-    assert size > 0.35 * max_bytes
-    document = document_of(tmp_path / "page.html")["recording"]
-    assert tuple(document["notes"]) == notes
-    write_page(scene(), tmp_path / "log.html", recorded=log)  # with all that fits into a page of the usual size
-    assert "pictures" in document_of(tmp_path / "log.html")["recording"]
-    shown = document["pictures"]["cameras"]
-    assert [camera["name"] for camera in shown] == ["a", "b"]
-    for camera in shown:
-        for t_s, jpeg in zip(camera["t_s"], camera["jpeg"], strict=True):
-            image = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_COLOR)
-            assert image.shape[1] == document["pictures"]["width_px"]
-            assert image.mean(axis=(0, 1))[1] == pytest.approx(20 + 10 * round(t_s * 10), abs=3)
-
-
-def test_a_size_that_is_too_small_is_refused(tmp_path: Path) -> None:
-    log = roadside(camera_of("a"))
-    for max_bytes in (50_000, 118_000):
-        with pytest.raises(ConfigError, match=r"--max-mb: .* MB"):
-            write_page(scene(), tmp_path / "page.html", recorded=Recorded(log, max_bytes))
-    assert names(tmp_path) == []
 
 
 def test_view_shows_a_log(log_folder: Path, tmp_path: Path) -> None:
@@ -315,36 +239,6 @@ def test_boxes_are_drawn_where_the_camera_shows_the_agents(browser: Browser, pag
     assert np.abs(colors(browser, ".tile canvas", (u0 + u1) / 2, v1, 2) - wanted).max(axis=1).min() > 60
 
 
-def test_an_agent_is_chosen_in_a_picture_and_marked_in_all(browser: Browser, page: Path) -> None:
-    opened(browser, page, "#t=1")
-    shows(browser, 1.0)
-    box = outline_px(camera_of(), camera_of().mount_T_cam, Solid((20.0, 0.0, 0.75), CAR_SIZE))
-    place = browser.run("return document.querySelector('.tile canvas').getBoundingClientRect().toJSON()")
-    scale = place["width"] / 600
-    x, y = place["x"] + (box[0] + box[2]) / 2 * scale, place["y"] + (box[1] + box[3]) / 2 * scale
-    browser.mouse((x, y), click=False)
-    browser.wait("document.getElementById('map').classList.contains('over')")
-    browser.mouse((x, y))
-    assert browser.run("return log2sim.chosen") == "car"
-    browser.mouse((place["x"] + 5, place["y"] + 5))
-    assert browser.run("return log2sim.chosen") is None
-
-
-def test_one_camera_is_shown_large_or_none(browser: Browser, page: Path) -> None:
-    opened(browser, page, "#t=1")
-    wide = "return [...document.querySelectorAll('.tile')].map((t) => t.getBoundingClientRect().width)"
-    small = browser.run(wide)
-    browser.press("c")
-    large = browser.run(wide)
-    assert large[0] > 1.3 * small[0]
-    assert large[1] == 0
-    browser.press("c", "c")
-    assert browser.run(wide) == small
-    browser.press("i")
-    assert browser.run(wide) == [0, 0]
-    assert browser.run("return document.getElementById('layer-pictures').getAttribute('aria-pressed')") == "false"
-
-
 def test_points_are_where_the_lidar_measured_them(browser: Browser, page: Path) -> None:
     opened(browser, page, "#t=1")
     browser.wait("log2sim.points !== null")
@@ -364,36 +258,3 @@ def test_points_are_where_the_lidar_measured_them(browser: Browser, page: Path) 
     assert browser.run("return document.getElementById('points-color').textContent") == "by intensity"
     browser.press("x")
     assert saturated() < 30
-
-
-def test_everything_fits_on_a_phone_and_under_a_finger(browser: Browser, page: Path) -> None:
-    opened(browser, page, "#t=1", size=(390, 780))
-    shows(browser, 1.0)
-    small = """return [...document.querySelectorAll('button, input, summary')].filter((e) => e.getClientRects().length).map((e) => {
-        const { width, height } = e.getBoundingClientRect();
-        return [e.id || e.textContent, width, height];
-    }).filter(([, width, height]) => Math.min(width, height) < 43.99)"""
-    for step in ("", "layers-toggle", "layers-toggle", "list-toggle", "metrics-toggle"):
-        if step:
-            browser.run("document.getElementById(arguments[0]).click()", step)
-        assert browser.run(small) == []
-        assert browser.run("return document.documentElement.scrollWidth") <= 390
-    assert browser.run("return document.getElementById('figures').textContent") == "Metrics<b>recall</b> 0.9"
-    browser.run("document.getElementById('metrics').close(); log2sim.choose('parked')")
-    assert browser.run(small) == []
-    assert "Confidence" in browser.run("return document.getElementById('agent-now').innerText")
-    assert browser.run("return document.getElementById('agent-doubts').textContent") == "rays pass through it empty"
-
-
-def test_the_north_is_shown_only_where_the_map_knows_it(browser: Browser, tmp_path: Path) -> None:
-    dark = []
-    for frame in (MapFrame(), MapFrame(projection="+proj=utm +zone=32")):
-        write_page(scene(map=frame), tmp_path / "page.html", overwrite=True)
-        opened(browser, tmp_path / "page.html", "#agent=parked")
-        height = browser.run("return document.getElementById('map').clientHeight")
-        dark.append(colors(browser, "#map", 21, height - 54, 3).min())
-        assert ("north" in browser.run("return document.getElementById('agent-now').textContent")) == bool(
-            frame.projection
-        )
-    assert dark[0] > 150
-    assert dark[1] < 80

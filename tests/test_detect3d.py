@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lidar_networks import NAMES, empty_maps, encode, info
+from lidar_training.clouds import draw_example
+from numpy.typing import NDArray
 
+from log2sim.config import LidarConfig
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.protocols import Criterion, match
 from log2sim.geometry import box_corners_bev, overlap_area, wrap_angle
 from log2sim.perception.detect3d.boxes import (
-    MAX_PEAKS,
     MIN_HEAT,
     LevelBoxes,
     Rectangles,
     decode_centers,
+    decode_votes,
     headings,
+    mean_shift,
     peaks,
     shared_area,
     sigmoid,
     suppress,
 )
+from log2sim.perception.detect3d.detectors import open_shipped
 
 LOW = np.array([-20.0, -12.0])
+
+
 SIZES = {
     "car": (4.4, 1.8, 1.5), "truck": (8.0, 2.5, 3.2), "bus": (12.0, 2.6, 3.1), "motorcycle": (2.1, 0.8, 1.5),
     "cyclist": (1.8, 0.6, 1.7), "pedestrian": (0.6, 0.7, 1.75),
@@ -43,18 +54,6 @@ def test_boxes_encoded_into_maps_come_back() -> None:
     np.testing.assert_allclose(wrap_angle(found.yaw_rad - expected[:, 6]), 0, atol=1e-6)
     np.testing.assert_allclose(found.heat, 5.0 - np.arange(6))
     np.testing.assert_allclose(found.heading_score, 1.0, atol=1e-6)
-
-
-def test_cells_around_a_peak_that_mean_the_same_object_are_averaged_by_their_heat() -> None:
-    maps = empty_maps(16, 16)
-    encode(maps, (-18.0, -10.0, 0.8, 4.4, 1.8, 1.5, 0.0), "car", low=LOW, logit=2.0, cells=1)
-    # One of the nine cells is 0.9 m higher, one is of another object, one is hardly hot.
-    maps[10, 3, 3] += 0.9
-    maps[8, 3, 5] += 2.0
-    maps[0, 5, 5], maps[10, 5, 5] = -9.0, 9.0
-    (found,) = decode_centers(maps, info(), LOW).center_m
-    hot = 1 / (1 + np.exp(-2.0))
-    np.testing.assert_allclose(found, [-18.0, -10.0, 0.8 + 0.9 * 0.5 / (hot + 6 * 0.5)], atol=1e-5)
 
 
 def test_maps_of_another_layout_are_read_by_their_description() -> None:
@@ -82,25 +81,6 @@ def test_the_heading_points_to_the_likelier_side_and_knows_how_likely_that_is(ya
     assert -np.pi <= found[0] < np.pi
 
 
-def test_a_direction_longer_than_one_is_certain_and_no_more() -> None:
-    assert headings(np.array([[0.0], [1.0]]), np.array([[0.0], [7.0]]))[1].tolist() == [1.0]
-
-
-def test_values_that_no_object_has_are_cut_off_and_nan_is_left_out() -> None:
-    maps = empty_maps(16, 16)
-    encode(maps, (-18.0, -10.0, 1.0, 4.4, 1.8, 1.5, 0.0), "car", low=LOW)
-    encode(maps, (-15.0, -8.0, 1.0, 4.4, 1.8, 1.5, 0.0), "car", low=LOW, logit=9.0)
-    encode(maps, (-18.0, -8.0, 1.0, 4.4, 1.8, 1.5, 0.0), "car", low=LOW)
-    maps[8:14, 4, 4] = 1e9, -1e9, 1e9, 1e9, 1e9, -1e9
-    maps[11, 10, 8] = np.nan
-    maps[8, 4, 8] = np.inf
-    maps[2, 0, 0] = np.nan
-    found = decode_centers(maps, info(), LOW)
-    assert len(found) == 1
-    assert np.all(np.abs(found.center_m) <= [40, 40, 5])
-    assert np.all((found.size_m >= 0.1 - 1e-9) & (found.size_m <= 30 + 1e-9))
-
-
 def test_peaks_are_greatest_among_their_neighbors_and_strongest_first() -> None:
     rng = np.random.default_rng(1)
     heat = rng.normal(0, 1, (2, 30, 20)).astype(np.float32)
@@ -114,11 +94,6 @@ def test_peaks_are_greatest_among_their_neighbors_and_strongest_first() -> None:
     assert np.all(np.diff(heat.reshape(2, -1)[group, flat]) <= 0)
 
 
-def test_no_more_peaks_are_decoded_than_a_sensor_sees_objects() -> None:
-    assert len(peaks(np.full((3, 200, 200), 5.0, np.float32))[0]) == MAX_PEAKS
-    assert len(decode_centers(empty_maps(32, 32), info(), LOW)) == 0
-
-
 def random_rectangles(rng: np.random.Generator, n: int) -> Rectangles:
     return Rectangles(rng.uniform(-2, 2, (n, 2)), rng.uniform(0.3, 6, (n, 2)), rng.uniform(-4, 4, n))
 
@@ -129,16 +104,6 @@ def test_shared_area_is_that_of_the_polygons() -> None:
     expected = overlap_area(*(box_corners_bev(r.xy_m, r.size_m[:, 0], r.size_m[:, 1], r.yaw_rad) for r in (a, b)))
     assert (expected == 0).sum() > 20
     np.testing.assert_allclose(shared_area(a, b), expected, atol=1e-4)
-
-
-def test_rectangles_with_edges_on_each_other_share_what_they_share() -> None:
-    unit = Rectangles(np.zeros((5, 2)), np.tile([4.0, 2.0], (5, 1)), np.array([0.0, 0.3, -2.0, 0.0, 0.0]))
-    turned = Rectangles(unit.xy_m, unit.size_m, unit.yaw_rad + np.array([0, np.pi, 0, 0, 0]))
-    half = Rectangles(np.array([[1.0, 0.5]] * 5), unit.size_m / 2, np.zeros(5))
-    np.testing.assert_allclose(shared_area(unit, turned), 8.0, atol=1e-4)
-    np.testing.assert_allclose(shared_area(unit, half)[[0, 3, 4]], 2.0, atol=1e-4)
-    beside = Rectangles(np.array([[4.0, 0.0]] * 5), unit.size_m, np.zeros(5))
-    np.testing.assert_allclose(shared_area(unit, beside)[[0, 3]], 0.0, atol=1e-4)
 
 
 def rectangles(*rows: tuple[float, ...]) -> Rectangles:
@@ -161,21 +126,11 @@ def test_a_suppressed_box_suppresses_nothing() -> None:
     assert chosen(row, [0.9, 0.8, 0.7], [0, 0, 0]) == [0, 2]
 
 
-def test_slender_boxes_that_cross_are_one_object() -> None:
-    crossing = rectangles((0, 0, 4.0, 0.5, 0), (0.1, 0, 4.0, 0.5, np.pi / 2))
-    assert shared_area(crossing.take(np.array([0])), crossing.take(np.array([1])))[0] / 3.75 < 0.2
-    assert chosen(crossing, [0.9, 0.8], [1, 1]) == [0]
-
-
 def test_a_person_inside_a_car_goes_and_one_beside_it_stays() -> None:
     scene = rectangles((0, 0, 4.4, 1.8, 0), (1, 0.2, 0.6, 0.6, 0), (0.5, 1.1, 0.6, 0.6, 0))
     assert chosen(scene, [0.9, 0.8, 0.8], [0, 2, 2]) == [0, 2]
     assert chosen(scene, [0.7, 0.8, 0.6], [0, 2, 2]) == [1, 2]
     assert chosen(scene, [0.9, 0.8, 0.8], [0, 2, 2], across=False) == [0, 2, 1]
-
-
-def test_people_side_by_side_stay() -> None:
-    assert len(chosen(rectangles((0, 0, 0.6, 0.6, 0), (0, 0.55, 0.6, 0.6, 0)), [0.9, 0.8], [2, 2])) == 2
 
 
 def test_the_order_of_boxes_does_not_matter() -> None:
@@ -188,20 +143,117 @@ def test_the_order_of_boxes_does_not_matter() -> None:
     assert 5 < len(kept) < 60
 
 
-def test_nothing_is_suppressed_where_there_is_nothing() -> None:
-    assert chosen(Rectangles(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)), [], []) == []
-    assert chosen(rectangles((0, 0, 1, 1, 0)), [0.1], [0]) == [0]
+LOW_VOTES = np.array([-10.0, -10.0])
 
 
-def test_the_score_is_the_calibrated_sum() -> None:
-    weights = [0.5, 2.0, -1.0, 0.25, -0.3]
-    described = info(calibration={"vehicle": [0.0] * 5, "two_wheeler": weights, "pedestrian": [0.0] * 5})
-    one = np.ones(2)
-    boxes = LevelBoxes(
-        np.ones((2, 3)), np.ones((2, 3)), one, one, np.array([1, 0]), np.array(["cyclist", "car"]), 0.7 * one, 0.2 * one
-    )
-    logit = 0.5 + 2 * 0.7 - 0.2 + 0.25 * np.log(41) - 0.3 * 2.5
-    terms = boxes.terms(np.array([40, 40]), np.array([25.0, 25.0]))
-    np.testing.assert_allclose(boxes.score(described, terms), [1 / (1 + np.exp(-logit)), 0.5])
-    np.testing.assert_allclose(boxes.score(described, terms[:2])[0], 1 / (1 + np.exp(-1.9)))
-    assert sigmoid(np.array([-1e9, 1e9])).tolist() == pytest.approx([0, 1])
+CAR = (4.4, 1.8, 1.5)
+
+
+def grid_of(maps: NDArray[np.float32], top_m: float = 1.5) -> NDArray[np.float32]:
+    """The grid, two cells a cell of the maps, of a cloud with points of one height everywhere."""
+    grid = np.zeros((12, 2 * maps.shape[1], 2 * maps.shape[2]), np.float32)
+    grid[0] = top_m / 2
+    return grid
+
+
+def decode(maps: NDArray[np.float32], top_m: float = 1.5) -> LevelBoxes:
+    return decode_votes(maps, grid_of(maps, top_m), info(), LOW_VOTES)
+
+
+def test_two_objects_become_two_boxes_as_encoded() -> None:
+    maps = empty_maps(40, 40)
+    boxes = [(-4.2, -3.1, 0.8, *CAR, 0.7), (5.3, 4.4, 0.9, 0.6, 0.7, 1.75, -2.0)]
+    encode(maps, boxes[0], "car", low=LOW_VOTES, cells=3)
+    encode(maps, boxes[1], "pedestrian", low=LOW_VOTES, cells=1)
+    found = decode(maps)
+    order = np.argsort(found.group)
+    found = found.take(order)
+    assert found.category.tolist() == ["car", "pedestrian"]
+    np.testing.assert_allclose(np.column_stack([found.center_m, found.size_m, found.yaw_rad]), boxes, atol=1e-4)
+    np.testing.assert_allclose(found.heading_score, 1.0, atol=1e-5)
+    assert np.all(sigmoid(found.heat) > 0.999)
+
+
+def test_the_majority_decides_and_the_score_is_its_mean_probability() -> None:
+    maps = empty_maps(40, 40)
+    encode(maps, (0.2, 0.2, 0.8, *CAR, 0.0), "car", low=LOW_VOTES, cells=1)
+    maps[19:23, 19:22, 19:22] = 0
+    maps[20, 19:22, 19:22] = np.log(6.0)
+    maps[19:23, 19, 19:21] = np.array([0, 0, np.log(6.0), 0])[:, None]
+    found = decode(maps)
+    assert found.category.tolist() == ["car"]
+    # Six ninths of the cells give the class 6 / 9, one third of the remaining ones 1 / 9.
+    assert sigmoid(found.heat)[0] == pytest.approx((7 * 6 / 9 + 2 * 1 / 9) / 9)
+
+
+def exact_mode(vote: NDArray[np.float64], start: NDArray[np.float64], h: float) -> NDArray[np.float64]:
+    """Mean shift by its definition."""
+    x = start
+    for _ in range(200):
+        weight = np.exp(-np.sum((vote - x) ** 2, axis=1) / (2 * h * h))
+        x = weight @ vote / weight.sum()
+    return x
+
+
+def test_mean_shift_finds_the_modes_of_the_definition() -> None:
+    rng = np.random.default_rng(6)
+    centers = np.array([[0.0, 0.0], [4.0, 1.0], [-3.0, 5.0]])
+    vote = np.concatenate([c + rng.normal(0, 0.3, (30, 2)) for c in centers]) + 1000.0
+    mode, index = mean_shift(vote, 0.9)
+    for k in range(3):
+        own = index[30 * k : 30 * (k + 1)]
+        expected = exact_mode(vote, vote[30 * k], 0.9)
+        assert np.linalg.norm(mode[own] - expected, axis=1).max() < 0.25
+
+
+VEHICLES = ("car", "truck", "bus")
+
+
+def vehicles(boxes: SceneBoxes) -> SceneBoxes:
+    return boxes.take(np.isin(boxes.category, VEHICLES))
+
+
+def found_in(example, detector) -> SceneBoxes:
+    found = detector.detect(example.cloud)
+    rows = np.column_stack([found.center_m, found.size_m, found.yaw_rad])
+    return SceneBoxes.of(rows, found.category, found.score, points=found.points)
+
+
+@pytest.fixture(scope="module", params=["vehicle", "roadside"])
+def scenes(request):
+    detector = open_shipped(request.param, LidarConfig())
+    examples = [draw_example(request.param, (31, k)) for k in range(10)]
+    return detector, examples, [found_in(e, detector) for e in examples]
+
+
+def test_most_vehicles_with_many_points_are_found_and_few_are_invented(scenes) -> None:
+    _, examples, found = scenes
+    sure = SceneBoxes.join([vehicles(f).take(vehicles(f).score >= 0.5) for f in found])
+    truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
+    near = truth.ignoring((truth.points < 50) | (truth.range_m > 25))
+    matches = match(sure, near, Criterion("iou_bev", 0.5))
+    assert matches.truths > 40
+    assert matches.right.sum() / matches.truths > 0.8
+    assert matches.right.sum() / (matches.right | matches.false).sum() > 0.8
+
+
+def test_most_headings_point_forward(scenes) -> None:
+    _, examples, found = scenes
+    sure = SceneBoxes.join([vehicles(f).take(vehicles(f).score >= 0.5) for f in found])
+    truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
+    matches = match(sure, truth, Criterion("iou_bev", 0.5))
+    off = wrap_angle(sure.box[matches.right, 6] - truth.box[matches.truth[matches.right], 6])
+    assert np.mean(np.abs(off) < np.pi / 2) > 0.75
+
+
+def test_a_turned_scene_gives_turned_boxes(scenes) -> None:
+    """By a quarter turn, which maps cells onto cells."""
+    detector, examples, found = scenes
+    cloud = examples[0].cloud
+    xyz = np.column_stack([-cloud.xyz[:, 1], cloud.xyz[:, 0], cloud.xyz[:, 2]])
+    sensor = np.array([-cloud.sensor[1], cloud.sensor[0], cloud.sensor[2]], np.float32)
+    turned = detector.detect(replace(cloud, xyz=xyz, sensor=sensor))
+    sure = found[0].take(found[0].score > 0.6)
+    away = np.hypot(turned.center_m[:, 0] + sure.box[:, None, 1], turned.center_m[:, 1] - sure.box[:, None, 0])
+    assert len(sure) > 3
+    assert np.mean(away.min(axis=1) < 1.0) > 0.8
