@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from log_encoders import ros
 from rosbags.typesys import get_types_from_msg
@@ -113,6 +113,7 @@ def test_the_stamp_is_the_start_or_the_end_of_the_turn(stamp: Any, first_ms: flo
     st.integers(0, 1 << 32), st.integers(0, 1 << 32), st.integers(0, 64), st.integers(0, 1 << 33),
     st.lists(st.tuples(st.sampled_from(["x", "y", "z", "t", ""]), st.integers(0, 1 << 31), st.integers(0, 9), st.integers(0, 1 << 31)), max_size=5),
 )  # fmt: skip
+@example(2, 1, 0, 1, [])
 def test_contradicting_layouts_are_errors_of_the_record(height, width, step, row_step, fields) -> None:
     message = SimpleNamespace(
         height=height, width=width, point_step=step, row_step=row_step, is_bigendian=False, data=np.zeros(96, np.uint8),

@@ -244,7 +244,7 @@ def point_table(message: Any, where: str) -> NDArray[Any]:
         raise RecordError(f"{where}: {height * width} points, more than the {MAX_SWEEP_POINTS} that a sweep may have")
     dtype = _dtype(message, step, where)
     needed = (height - 1) * row_step + width * step if height and width else 0
-    if row_step < width * step or len(data) < needed:
+    if row_step < width * step or len(data) < needed or (needed and not step):
         raise RecordError(
             f"{where}: {len(data)} bytes for {height} x {width} points of {step} bytes (rows of {row_step}), "
             f"expected at least {needed}"
