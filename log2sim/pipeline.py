@@ -112,7 +112,7 @@ def reconstruct(
     progress : callable, optional
         Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
     cache : bool
-        Whether what the detector finds in pictures is taken from the user's cache, and kept there.
+        Whether what is detected and measured is taken from the user's cache, and kept there.
     jobs : int, optional
         Processes that share the ticks; the result is the same for any number. None for as many as there are usable cores, and one
         with a detector of another package or program, which need not work in a forked process.
