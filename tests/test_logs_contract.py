@@ -17,6 +17,7 @@ from log_encoders.world import RED, labels_at, world_log
 from log2sim.datatypes import CATEGORIES, Labels, Log, Stream, Sweep
 from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError
 from log2sim.files import plugins
+from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
 from log2sim.logs.opening import open_log
@@ -469,12 +470,20 @@ def is_readable(stream: Stream, i: int) -> bool:
     return True
 
 
-@pytest.mark.matrix
-def test_threads_read_what_one_reads(name: str, path: Path, log: Log) -> None:
+@pytest.mark.parametrize("share", ["threads", "processes"])
+def test_records_that_are_read_at_once_are_those_that_are_read_one_by_one(
+    name: str, path: Path, log: Log, share: str
+) -> None:
     fresh = open_log(path, format=name)
     asked = [(s, i) for s, stream in fresh.streams.items() for i in range(len(stream.t_ns))] * 2
+    for stream in fresh.streams.values():  # a process that is forked has the files open that this one opened
+        stream.read(0)
+
+    def read(record: tuple[str, int]) -> np.ndarray:
+        return content(fresh.streams[record[0]].read(record[1]))
+
     with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda record: content(fresh.streams[record[0]].read(record[1])), asked))
+        found = list(pool.map(read, asked) if share == "threads" else map_in_processes(read, asked, 3))
     expected = [content(log.streams[s].read(i)) for s, i in asked]
     assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
 
