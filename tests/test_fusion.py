@@ -61,6 +61,17 @@ def test_one_object_in_two_cameras_becomes_one_row_from_all_of_its_points():
     assert fused.bottom_m[0] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_rows_of_one_sweep_are_never_one_object_even_where_they_share_points():
+    """A detector in the sweep has told touching vehicles apart; cameras that saw the same points have not."""
+    for cameras, count in ((("a", "b"), 1), (("a", ""), 1), (("", ""), 2)):
+        pair = [row(FRONT, camera=cameras[0], score=0.6), row(REAR, camera=cameras[1], score=0.8)]
+        fused = fuse_tick(join(*pair))
+        assert len(fused) == count, cameras
+    for whole, kept in zip(pair[::-1], (fused.take([0]), fused.take([1]))):
+        np.testing.assert_array_equal(kept.center_m, whole.center_m)
+        assert len(kept.cluster[0]) == len(whole.cluster[0])
+
+
 def test_one_object_found_twice_by_one_camera_keeps_the_surer_row_as_it_is():
     sure, unsure = row(CAR_POINTS, score=0.9), row(CAR_POINTS[::2], "truck", score=0.5)
     fused = fuse_tick(join(unsure, sure))

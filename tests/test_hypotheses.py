@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 from test_size import measured
 from worlds import measured_row, scan, standing
 
+from log2sim.agents import hypotheses
 from log2sim.agents.hypotheses import explain_track, main_place
 from log2sim.agents.smooth.fixed_interval import (
     PLACE_SIGMA_M,
@@ -246,6 +247,17 @@ def seen_in_passing(category: str, way: str, rate_hz: float, seed: int = 0, ego_
 def test_what_starts_or_stops_moves_and_what_stands_does_not(category, way, rate_hz):
     track = seen_in_passing(category, way, rate_hz, seed=int(rate_hz))
     assert [part.static for part in explain_track(track)] == [way == "stands"]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_odds_of_a_start_are_an_average_over_its_time_not_a_sum_over_those_tried(way, monkeypatch):
+    track, odds = seen_in_passing("car", way, 5.0, seed=5), []
+    for times_tried in (24, 96, 384):
+        monkeypatch.setattr(hypotheses, "TIMES", times_tried)
+        odds.append(hypotheses.motion_of_ends(track)[1])
+    # Sums would grow by log(4) each.
+    assert np.isfinite(odds).all()
+    assert odds == pytest.approx([odds[0]] * 3, abs=0.2)
 
 
 def test_what_is_seen_of_one_end_only_may_grow():

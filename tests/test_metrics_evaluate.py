@@ -206,6 +206,17 @@ def test_what_is_labeled_counts_or_has_one_reason_not_to():
     assert (plain["labeled"], plain["counted"], plain["hit"], plain["hit_recall"]) == (155, 155, None, None)
 
 
+def test_points_counted_in_a_label_are_of_its_time_only():
+    """Simplification leaves a label a second, or the first and last of what stands; points are known for 0.25 s about each."""
+    every_second = agent("a", 0.0, t_s=np.arange(4.0), quality={"waypoints_left_out": 27})
+    ends = agent("a", 0.0, t_s=np.array([0.0, 3.0]), static=True)
+    for labels, hit in ((every_second, 3 + 5 + 5 + 3), (ends, 3 + 3)):
+        truth = scenario(moved(labels, lidar_points=np.full(len(labels.waypoints), 100.0)))
+        covered = evaluate(scenario(agent("x", 0.0)), truth)["coverage"]
+        assert (covered["labeled"], covered["counted"]) == (31, 31)
+        assert (covered["hit"], covered["hit_matched"]) == (hit, hit)
+
+
 def test_a_truth_in_another_projection_is_reprojected():
     """The scenario in UTM zone 32, its truth on the sphere of KITTI's drives and in zone 33, the headings turned to each grid."""
     from pyproj import Transformer

@@ -90,6 +90,22 @@ def test_hota_equals_that_of_trackeval(seed):
     assert found.ass_a == pytest.approx(expected["AssA"].mean(), abs=1e-12)
 
 
+def test_hota_matches_the_identity_that_is_right_most_often_though_another_is_nearer():
+    """One object for ten ticks: x is 1.2 m off for the first seven, y 0.2 m for two more, and both are there at the last."""
+    x, y = np.full((2, 10), np.nan)
+    x[[*range(7), 9]], y[7:] = 1.2, 0.2
+    other = np.stack([np.stack([x, 0 * x], axis=-1), np.stack([y, 0 * y], axis=-1)])
+    truth = np.zeros((1, 10, 2))
+    found = hota(pairs_of(truth, other), there(truth), there(other))
+    # Similarities are 0.4 and 0.9. At 8 of the 19 thresholds x has 8 ticks of 10 and y 2 of the 11 of it or the object; at
+    # the next 10 y is left.
+    of_x, of_y = 8 / 10, 2 / 11
+    low, high = (8 * of_x + 2 * of_y) / 10, of_y
+    assert found.ass_a == pytest.approx((8 * low + 10 * high) / 19)
+    assert found.det_a == pytest.approx((8 * 10 / 11 + 10 * 2 / 19) / 19)
+    assert found.hota == pytest.approx((8 * np.sqrt(low * 10 / 11) + 10 * np.sqrt(high * 2 / 19)) / 19)
+
+
 def test_assignment_equals_the_dense_solver():
     from scipy.optimize import linear_sum_assignment
 

@@ -199,6 +199,18 @@ def test_what_never_moves_keeps_its_hint_and_place(hint: float | None) -> None:
     assert (path.curvature_1pm == 0).all()
 
 
+@pytest.mark.parametrize("motion", [MotionModel(), MotionModel(holonomic=True), MotionModel(heading_rad=0.4)])
+def test_what_stands_all_along_is_at_the_mean_of_its_positions_whatever_it_is(motion: MotionModel) -> None:
+    for rate_hz, sigma in ((2, 0.3), (10, 0.1), (10, 0.3)):
+        t = np.arange(0, 10, 1 / rate_hz)
+        xy = np.random.default_rng(1).normal([40.0, -7.0], sigma, (len(t), 2))
+        path = smooth_track(t, xy, sigma_m=sigma, motion=motion)
+        of_mean = sigma / np.sqrt(len(t))
+        np.testing.assert_allclose(path.xy_m, np.tile(xy.mean(axis=0), (len(t), 1)), atol=0.1 * of_mean)
+        np.testing.assert_allclose(np.sqrt(path.covariance[:, [0, 1], [0, 1]]), of_mean, rtol=0.05)
+        assert np.hypot(*path.velocity_mps.T).max() < 1e-3
+
+
 def test_a_vehicle_does_not_slide_sideways() -> None:
     for maneuver in MANEUVERS.values():
         t = DT * np.arange(80)
