@@ -31,7 +31,7 @@ from log2sim.errors import NothingToReconstruct
 from log2sim.files.processes import default_jobs
 from log2sim.files.stages import StageClock
 from log2sim.geometry import NS_PER_S
-from log2sim.localization.choice import GIVEN, PoseChoice, localize, refine
+from log2sim.localization.choice import GIVEN, PoseChoice, localize, refine_for_map
 from log2sim.localization.mounts import check_calibration
 from log2sim.localization.roadside import register_road
 from log2sim.logs.checks import say_without_pose
@@ -150,7 +150,7 @@ def start(
         log, faults = check_calibration(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.sensor for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
-        log, poses = refine(log, poses, faults)
+        poses = refine_for_map(log, poses, faults)
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.sensor for fault in road.faults if fault.treatment == "left_out"])

@@ -19,6 +19,7 @@ from log2sim.batch.folder import BatchFolder, Row, make_jobs
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 120
+Start = Callable[[Path, Path], subprocess.Popen[str]]
 # Ends when its standard input does, so that it never outlives the test.
 SCHEDULER = """
 import sys
@@ -31,17 +32,6 @@ if __name__ == "__main__":
 """
 
 pytestmark = pytest.mark.slow
-
-
-def start(root: Path, out: Path, site: Path) -> subprocess.Popen[str]:
-    """Start a batch on two workers in a group of processes of its own, as a terminal does."""
-    pytest.importorskip("distributed")
-    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, "-m", "log2sim", "batch", str(root), "--out", str(out), "--jobs", "2", *FAST],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
 
 
 def wait_until(is_so: Callable[[], bool], process: subprocess.Popen[str]) -> None:
@@ -76,13 +66,36 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "site"
 
 
+@pytest.fixture
+def start(site: Path, interruptible: None) -> Iterator[Start]:
+    """Start a batch on two workers in a group of processes of its own, as a terminal does; none outlives the test."""
+    pytest.importorskip("distributed")
+    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(root: Path, out: Path) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "log2sim", "batch", str(root), "--out", str(out), "--jobs", "2", *FAST]
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, "PYTHONPATH": path},
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+
 def test_workers_that_die_lose_no_log_but_the_one_that_kills_them(
-    tiny_folder: Path, tmp_path: Path, site: Path
+    tiny_folder: Path, tmp_path: Path, start: Start
 ) -> None:
     root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"abcd"), tmp_path / "out"
     tell(root / "y-killed-once", "die-once", tiny_folder)
     tell(root / "z-killer", "die", tiny_folder)
-    process = start(root, out, site)
+    process = start(root, out)
     wait_until(lambda: any(out.glob("logs/[a-d]/row.json")), process)
     workers = workers_of(process)
     assert len(workers) == 2
@@ -102,13 +115,13 @@ def test_workers_that_die_lose_no_log_but_the_one_that_kills_them(
 
 
 def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
-    tiny_folder: Path, tmp_path: Path, site: Path
+    tiny_folder: Path, tmp_path: Path, start: Start
 ) -> None:
     root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"abc"), tmp_path / "out"
     waiting = [root / name for name in ("x-waits", "y-waits", "z-waits")]
     for log in waiting:
         tell(log, "wait", tiny_folder)
-    process = start(root, out, site)
+    process = start(root, out)
     # Both workers are at a log that does not end: interrupted, the batch does not wait for them.
     wait_until(lambda: sum((log / "opened").exists() for log in waiting) == 2, process)
     os.killpg(process.pid, signal.SIGINT)
@@ -123,7 +136,7 @@ def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
 
     for log in waiting:
         (log / "go").touch()
-    again = start(root, out, site)
+    again = start(root, out)
     printed, errors = again.communicate(timeout=LIMIT_S)
     assert again.returncode == 0, errors
     assert f"{len(first)} of them done before" in printed

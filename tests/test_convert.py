@@ -136,7 +136,10 @@ def test_a_part_that_is_none_is_refused(
     assert names(tmp_path) == []
 
 
-def test_nothing_is_lost_or_left_behind(log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("importing", [False, True])
+def test_nothing_is_lost_or_left_behind(
+    log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, importing: bool
+) -> None:
     before = names(tmp_path)
     for out, words in ((log_folder, "exists already"), (tmp_path, "exists already")):
         assert words in run("convert", log_folder, "--out", out).line
@@ -144,6 +147,8 @@ def test_nothing_is_lost_or_left_behind(log_folder: Path, tmp_path: Path, monkey
     assert "no log folder" in run("convert", log_folder, "--out", tmp_path, "--overwrite").line
 
     def interrupted(data: bytes, folder: Path, i: int, t_ns: int) -> str:
+        if i == 3 and importing:  # as compiled libraries do
+            raise ImportError("initialization failed") from KeyboardInterrupt()
         if i == 3:
             raise KeyboardInterrupt
         return f"{folder.name}/{i}"

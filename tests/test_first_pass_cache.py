@@ -338,6 +338,7 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tiny_folder: Path, folder: P
         "import os, signal, sys, test_first_pass_cache as t\n"
         "from log2sim import open_log\n"
         "from log2sim.files import plugins\n"
+        "t.first_pass.PART_TICKS = 1\n"
         "def kill(seeing):\n"
         "    if len(seeing.seen) == 4: os.kill(os.getpid(), signal.SIGKILL)\n"
         "t.STATED['before'] = kill\n"

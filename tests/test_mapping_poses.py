@@ -8,8 +8,9 @@ import pytest
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.localization.choice import localize, localize_like, refine
-from log2sim.localization.pose_refinement import Keyframe, refine_poses, solve_twists
+from log2sim.localization.choice import localize, refine_for_map
+from log2sim.localization.pose_refinement import Keyframe, place_as_given, refine_poses, solve_twists
+from log2sim.localization.replaced import replace_poses
 from log2sim.localization.surfaces import Registration, exp_of, log_of
 
 T_NS = np.arange(0, 41) * 100_000_000 + 10**18
@@ -76,20 +77,25 @@ def test_drift_is_taken_out(frame: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_takes_refined_poses_where_those_of_the_log_drift_and_finds_them_again() -> None:
+def test_the_ground_is_drawn_by_refined_poses_and_put_back_where_the_agents_are() -> None:
     """A sweep in the map, as some logs have it, lies where its refined pose puts it."""
     log = street_log(drifted(), "map")
-    found, choice = refine(*localize(log, Config()))
-    assert found.ego is not None
-    assert choice.refined
+    given, choice = localize(log, Config())
+    choice = refine_for_map(given, choice)
+    assert given is log
+    assert choice.for_map is not None
+    drawn = replace_poses(log, choice.for_map)
+    assert drawn.ego is not None
     local = apply(inverse(drifted()[30]), log.streams["top"].read(30).xyz_m)
-    np.testing.assert_allclose(found.streams["top"].read(30).xyz_m, apply(found.ego.map_T_ego[30], local), atol=1e-6)
-    again = localize_like(log, {"poses": choice.to_provenance()})
-    assert again.ego is not None
-    np.testing.assert_array_equal(again.ego.map_T_ego, found.ego.map_T_ego)
-    assert localize_like(log, {"poses": {"source": "given"}}) is log  # as of earlier versions
+    on_map = apply(drawn.ego.map_T_ego[30], local)
+    np.testing.assert_allclose(drawn.streams["top"].read(30).xyz_m, on_map, atol=1e-6)
+    near = np.array([[3.0, 1.5, -0.2], [-1.0, -4.0, 0.0]])
+    for k in (0, 30):
+        back = place_as_given(apply(drawn.ego.map_T_ego[k], near), drawn, log)
+        np.testing.assert_allclose(back, apply(drifted()[k], near), atol=0.06)
+    assert np.linalg.norm(drawn.ego.map_T_ego[:, :3, 3] - drifted()[:, :3, 3], axis=1).max() > 0.2
     late = Fault("time_offset", "top", "", "kept")
-    assert refine(*localize(log, Config()), [late])[0] is log  # the sweeps of such a LiDAR show another motion
+    assert refine_for_map(log, choice, [late]) is choice  # the sweeps of such a LiDAR show another motion
 
 
 def test_one_false_registration_changes_little() -> None:

@@ -130,21 +130,6 @@ def test_truth_at_other_instants_is_interpolated():
     assert (result["counts"]["truth_ticks"], result["precision"]) == (60, 1.0)
 
 
-def test_labels_move_with_an_ego_whose_poses_a_run_has_refined():
-    """Seen from the ego all is as labeled, while the ego drifts by 0.9 m to the side."""
-    ours = replace(
-        world(),
-        agents=tuple(moved(a, 0.0, 0.3 * T_S) for a in world().agents),
-        provenance={"poses": {"source": "given", "refined": True}},
-    )
-    labels = replace(world(), provenance={"source": "labels"})
-    assert evaluate(ours, labels)["position_rmse_m"] == pytest.approx(0.0, abs=1e-6)
-    for other in (world(), replace(world(), provenance={"source": "synthetic"})):
-        assert evaluate(ours, other)["position_rmse_m"] > 0.3
-    as_given = replace(ours, provenance={"poses": {"source": "given"}})
-    assert evaluate(as_given, labels)["position_rmse_m"] > 0.3
-
-
 def test_rotation_and_order_make_no_difference():
     def rotated(s, angle):
         c, n = np.cos(angle), np.sin(angle)

@@ -147,6 +147,7 @@ def test_a_process_that_dies_is_an_error_and_no_endless_wait() -> None:
         list(map_in_processes(lambda k: os.kill(os.getpid(), signal.SIGKILL), range(4), 2))
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_processes_end_with_the_one_that_started_them(number: int) -> None:
     code = (
@@ -163,7 +164,7 @@ def test_processes_end_with_the_one_that_started_them(number: int) -> None:
         assert started.stdout is not None
         children = [Path(f"/proc/{int(started.stdout.readline())}") for _ in range(2)]
         started.send_signal(number)
-        started.wait()
+        assert started.wait(timeout=20) == -number
     deadline = time.monotonic() + 20
     while any(child.exists() for child in children) and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -120,6 +120,8 @@ def _run(ended: Ended) -> NoReturn:
     except Exception as error:
         format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
         if format_message is None:
+            if _is_interruption(error):
+                _end(INTERRUPTED, ended)
             if debug:
                 raise
             fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
@@ -127,6 +129,17 @@ def _run(ended: Ended) -> NoReturn:
             sys.stderr.write(format_message() + "\n")
             sys.exit(2)
         fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
+    _end(code, ended)
+
+
+def _is_interruption(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C is behind an error: libraries that are being imported then raise an ImportError from it."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _end(code: Any, ended: Ended) -> NoReturn:
     if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
         word, code = ("terminated", SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
         fail(f"{word}; no incomplete file was left", code)

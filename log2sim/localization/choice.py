@@ -58,7 +58,6 @@ class PoseChoice:
     during_ns: tuple[int, int] | None = None
     faults: tuple[Fault, ...] = ()  # faults of given poses
     checked: bool = True  # whether given poses were checked, and repaired where that was needed
-    refined: bool = False  # whether given poses, which drift, were replaced by those that sweeps show
     # Poses by which the ground is drawn, where given ones drift by less than agents are misplaced anyway
     for_map: PoseTrack | None = None
 
@@ -83,7 +82,7 @@ class PoseChoice:
         """Return what `localize_like` needs to find the same poses again."""
         during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
         unchecked = {} if self.checked else {"check": False}
-        return {"source": self.source, **during, **unchecked, **({"refined": True} if self.refined else {})}
+        return {"source": self.source, **during, **unchecked}
 
 
 GIVEN = PoseChoice("given", "given", "the log's own poses")
@@ -126,9 +125,6 @@ def _median(values: Array) -> float | None:
 
 # Without given poses odometry is still taken where up to this share of its poses is poorly held or predicted.
 MAX_UNSURE_SHARE_ALONE = 0.5
-# Given poses are replaced by refined ones where they drift by more, RMS; less changes agents by no more than chance does, in
-# simulated streets and recorded drives, and markings alone need better.
-MIN_DRIFT_M = 0.1
 LIDAR_FAULTS = ("time_offset", "lidar_rotation", "lidar_translation")
 # Sweeps this long before and after the time that is used are registered too.
 MARGIN_S = 1.0
@@ -167,8 +163,7 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
     if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
         window = (int(during[0]), int(during[1]))
     check = entry.get("check") is not False
-    log, choice = _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))
-    return refine(log, replace(choice, during_ns=window), again=True)[0] if entry.get("refined") is True else log
+    return _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,23 +202,17 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     return log, replace(choice, faults=faults) if faults else choice
 
 
-def refine(
-    log: Log, choice: PoseChoice, faults: Sequence[Fault] = (), *, again: bool = False
-) -> tuple[Log, PoseChoice]:
-    """Replace given poses that drift by those that the sweeps of a LiDAR show.
+def refine_for_map(log: Log, choice: PoseChoice, faults: Sequence[Fault] = ()) -> PoseChoice:
+    """Return a choice with the poses by which sweeps lie on each other, where those of the log can be refined.
 
-    `faults`: of its clock and mount, by which its sweeps show a wrong motion; then nothing is replaced, nor where poses are not
-    to be checked. `again`: poses were replaced before, so that they are whatever they drift by.
+    The ground is drawn by them. Agents keep the given poses: by refined ones their positions were nearer to the labels on a KITTI
+    drive, but their sizes and speeds worse, and most simulated drives were worse throughout. `faults`: of a LiDAR's clock and
+    mount, by which its sweeps show a wrong motion; then nothing is refined.
     """
     wrong = any(fault.treatment == "kept" and fault.kind in LIDAR_FAULTS for fault in faults)
-    refined = None if choice.source != "given" or not choice.checked or wrong else refine_poses(log, choice.during_ns)
-    if refined is None or log.ego is None:
-        return log, choice
-    moved_m = np.linalg.norm(refined.map_T_ego[:, :3, 3] - log.ego.map_T_ego[:, :3, 3], axis=1)
-    if np.sqrt(np.mean(moved_m**2)) < MIN_DRIFT_M and not again:
-        return log, replace(choice, for_map=refined)
-    note = f"poses of the log are moved by up to {moved_m.max():.2f} m, by which surfaces in sweeps lie on each other"
-    return replace_poses(log, refined), replace(choice, refined=True, notes=(*choice.notes, note))
+    if choice.source != "given" or not choice.checked or wrong:
+        return choice
+    return replace(choice, for_map=refine_poses(log, choice.during_ns))
 
 
 def _choose(request: _Request) -> tuple[Log, PoseChoice]:

@@ -79,6 +79,21 @@ def refine_poses(log: Log, during_ns: tuple[int, int] | None = None) -> PoseTrac
     return corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists)
 
 
+def place_as_given(points_m: Array, refined: Log, given: Log) -> Array:
+    """Return points (N, 3), m, of a map made by refined poses where they lie by the given poses, which agents have.
+
+    Each moves with the ego as it was nearest to it, so lanes and the agents on them stay together.
+    """
+    if refined.ego is None or given.ego is None or refined.ego is given.ego or not len(points_m):
+        return points_m
+    from scipy.spatial import cKDTree
+
+    nearest = cKDTree(refined.ego.map_T_ego[:, :2, 3]).query(points_m[:, :2])[1]
+    given_T_refined = given.ego.map_T_ego @ inverse(refined.ego.map_T_ego)
+    rotation, translation = given_T_refined[nearest, :3, :3], given_T_refined[nearest, :3, 3]
+    return np.asarray(np.einsum("nij,nj->ni", rotation, points_m) + translation)
+
+
 def _told(covariance: Array, measured: Array) -> Array | None:
     """Return the information (6, 6) of a registration along the directions that its surfaces hold, none along others.
 

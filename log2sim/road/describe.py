@@ -16,6 +16,7 @@ from log2sim.datatypes import Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
 from log2sim.localization.choice import PoseChoice
+from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
 from log2sim.perception.traffic_light_boxes import LightBox
@@ -69,6 +70,7 @@ def describe(
             ground = builder.build()
             markings, borders, notes = find_markings(ground)
             features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
+            features = features.moved(lambda points_m: place_as_given(points_m, drawn, log))
         if features is not None:
             lanes, notes = infer_lanes(features.markings, features.borders, scenario)
             features = replace(features, lanes=lanes, notes=(*features.notes, *notes))

@@ -73,7 +73,20 @@ def commands_for(kind: str, path: Path, out: Path, variant: int) -> list[list[ob
         looks: Sequence[list[object]] = ([["inspect", path]], [["validate", path]], [], [])[variant % 4]
         return [
             *looks,
-            ["reconstruct", path, "--detector", detector, "--out", out / "s.json", "--report", out / "r.json"],
+            # Neither the user's cache nor other processes: both are outside of what the watch allows.
+            [
+                "reconstruct",
+                path,
+                "--detector",
+                detector,
+                "--no-cache",
+                "--jobs",
+                1,
+                "--out",
+                out / "s.json",
+                "--report",
+                out / "r.json",
+            ],
         ]
     if kind == XOSC:
         return [["import", path, "--out", out / "s.json"]]

@@ -228,7 +228,7 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
     if theirs.projection and ours.projection:
         if theirs.projection == ours.projection:
             apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
-            return _with_ego(truth, scenario), _placement("same_map", apart_m)
+            return truth, _placement("same_map", apart_m)
         altitudes = theirs.altitude_m, ours.altitude_m
         rise_m = 0.0 if altitudes[0] is None or altitudes[1] is None else altitudes[0] - altitudes[1]
         target = on_map(theirs, ours.projection, ours.offset_m)
@@ -242,29 +242,12 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
     else:
         apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
         if apart_m is None or apart_m <= GATE_M:
-            return _with_ego(truth, scenario), _placement("same_map", apart_m)
+            return truth, _placement("same_map", apart_m)
         method = "ego_path"
         near = far = _fit_egos(truth, scenario)
     moved = _moved(truth, near, far)
     moved = replace(moved, map=scenario.map)
     return moved, _placement(method, _ego_apart_m(moved, scenario, np.zeros(3)))
-
-
-def _with_ego(truth: Scenario, scenario: Scenario) -> Scenario:
-    """Move labels with the ego where a run has refined its poses: they were measured from there, by those of the log."""
-    poses = scenario.provenance.get("poses")
-    refined = isinstance(poses, dict) and poses.get("refined") is True
-    ego = scenario.ego
-    if not refined or truth.provenance.get("source") != "labels" or truth.ego is None or ego is None:
-        return truth
-    w, since_s = ego.waypoints, (truth.t0_ns - scenario.t0_ns) / NS_PER_S
-    shift_m = truth.shift_to(scenario)
-
-    def to_refined(_states: Array, t_s: Array) -> Array:
-        s = ego.at(np.clip(t_s + since_s, w.t_s[0], w.t_s[-1]))
-        return np.asarray(np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1) - [*shift_m, 0.0])
-
-    return _moved(truth, _around(truth.ego, to_refined), lambda states, _t_s: states)
 
 
 def describe_placement(placement: dict[str, Any]) -> str | None:
