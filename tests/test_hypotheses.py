@@ -149,7 +149,7 @@ def test_neither_map_nor_clock_matters(turn):
 
 def test_the_evidence_is_the_likelihood_of_the_gaussian_process():
     t = np.array([0.0, 0.3, 0.5, 1.2, 2.0])
-    variance = np.array([0.1, 0.2, 0.1, 0.3, 0.1])
+    variance = np.array([0.1, 0.2, 0.1, 0.3, 0.1])[:, None] * [1.0, 4.0]
     rng = np.random.default_rng(3)
     xy = np.column_stack([5.0 * t, 1.0 - t]) + rng.normal(0, 0.1, (5, 2))
     motion = MotionPriorSigmas(8.0, 2.5)
@@ -158,18 +158,28 @@ def test_the_evidence_is_the_likelihood_of_the_gaussian_process():
     dt = steps[1] - steps[0]
     response = np.where(np.sign(steps) == np.sign(t - 1.0)[:, None], np.abs(t - 1.0)[:, None] - np.abs(steps), 0.0)
     response = np.maximum(response, 0.0)
-    noise = np.sqrt(np.outer(variance, variance))
+    noise = np.sqrt(variance.T[:, :, None] * variance.T[:, None, :])
     noise = noise * (REPEATED_SHARE * np.exp(-np.abs(t[:, None] - t) / VIEW_S) + (1 - REPEATED_SHARE) * np.eye(5))
     for prior, covariance in (
         (STANDING, noise + PLACE_SIGMA_M**2),
         (motion, noise + PLACE_SIGMA_M**2 + 64.0 * np.outer(t - 1, t - 1) + 6.25 * response @ response.T * dt),
     ):
         middle = np.median(xy, axis=0) if prior is STANDING else xy[3]
-        expected = sum(multivariate_normal(np.zeros(5), covariance).logpdf(xy[:, k] - middle[k]) for k in range(2))
+        expected = sum(multivariate_normal(np.zeros(5), covariance[k]).logpdf(xy[:, k] - middle[k]) for k in range(2))
         found = marginal_likelihood(Positions(t, xy, variance), prior)
         if found.inlier.all():
             assert found.log == pytest.approx(expected, abs=0.05)
         assert prior is STANDING or found.inlier.all()
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 1.2])
+def test_a_walk_across_the_rays_of_a_camera_that_stands_is_told_from_standing(speed_mps):
+    t = np.arange(0, 1, 0.1)
+    xy = np.column_stack([0 * t, speed_mps * t]) + np.random.default_rng(5).normal(0, 0.03, (len(t), 2))
+    track = track_of(t, xy, "pedestrian")
+    m = replace(track.measurements, source=np.full(10, "topdown"), covariance=np.tile(np.diag([0.5, 0.06]), (10, 1, 1)))
+    (part,) = explain_track(replace(track, measurements=m))
+    assert part.static == (speed_mps == 0)
 
 
 TRUCK = (18.0, 2.55, 3.8)

@@ -86,7 +86,7 @@ def _observed_ends(t: Array, ends: Ends, origin: Array, axis: int, sigma_m: floa
         if len(seen) < MIN_START_ROWS:
             continue
         place = np.column_stack([(along + origin)[seen, axis], np.zeros(len(seen))])
-        positions = Positions(t[seen], place, variance[seen, axis, side])
+        positions = Positions(t[seen], place, variance[seen, axis, side, None].repeat(2, axis=1))
         # What no motion of a vehicle explains is an outlier of each hypothesis.
         motion = MotionPriorSigmas(FIRST_SPEED_MPS["vehicle"], ACCELERATION_MPS2["vehicle"])
         kept = positions.take(marginal_likelihood(positions, motion).inlier)
@@ -141,6 +141,8 @@ PLACE_GATE = CHI2_2DOF_99 * 2 * (1 - REPEATED_SHARE)
 NEXT_OBJECT_LOG, CHANGE_LOG = float(np.log(0.02)), float(np.log(0.1))
 # One object stays what it is unless several are e^3 = 20 times as likely.
 MIN_LOG_ODDS = 3.0
+# A camera that moves less than this stands.
+SAME_VIEW_M = 0.1
 # A track is split where that is best out of so many times.
 MAX_SPLITS = 24
 
@@ -222,10 +224,25 @@ def _spread(count: int) -> NDArray[np.intp]:
 def _positions_of(track: Track, rows: NDArray[np.intp]) -> Positions:
     m = track.measurements
     t = (m.t_ns[rows] - m.t_ns[0]) / NS_PER_S
-    variance: Array = np.trace(m.covariance[rows], axis1=1, axis2=2) / 2
+    axes = _axes(track)
+    if axes is None:
+        axes, variance = np.eye(2), (np.trace(m.covariance[rows], axis1=1, axis2=2) / 2)[:, None].repeat(2, axis=1)
+    else:
+        variance = np.einsum("ia,nij,ja->na", axes, m.covariance[rows], axes)
     # Frames that share a sweep measure the same points at the same time.
     t = t + 1e-4 * np.arange(len(t))
-    return Positions(t, m.center_m[rows, :2], variance + CENTER_SIGMA_M[GROUP_OF[track.category]] ** 2)
+    return Positions(t, m.center_m[rows, :2] @ axes, variance + CENTER_SIGMA_M[GROUP_OF[track.category]] ** 2)
+
+
+def _axes(track: Track) -> Array | None:
+    """Return the axes (2, 2), in columns, of the errors of a camera that stands: small across its rays, large along them.
+
+    None if the sensor moves, and its rays turn, or is a LiDAR.
+    """
+    m = track.measurements
+    if np.any(m.source == "lidar") or np.ptp(m.sensor_m, axis=0).max() > SAME_VIEW_M:
+        return None
+    return np.linalg.eigh(m.covariance.mean(axis=0))[1].astype(np.float64)
 
 
 def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
@@ -234,7 +251,9 @@ def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
     if len(places) == 0:
         return -np.inf, []
     axis = track.measurements.yaw_rad[np.isfinite(track.measurements.yaw_rad)]
-    objects = _objects_at(places, float(np.median(axis)) if len(axis) else 0.0, MIN_SIZE_M[track.category][:2])
+    axes = _axes(track)
+    in_map = places if axes is None else places @ axes.T
+    objects = _objects_at(in_map, float(np.median(axis)) if len(axis) else 0.0, MIN_SIZE_M[track.category][:2])
     label, count = _labels(few, places, objects), int(objects.max()) + 1
     seen = label[label >= 0]
     log = OUTLIER_LOG * int((label < 0).sum()) + NEXT_OBJECT_LOG * (count - 1)
@@ -268,9 +287,8 @@ def _places(p: Positions) -> Array:
     left, places = np.arange(len(p)), []
     while len(left) >= MIN_ROWS:
         q = p.take(left)
-        squared = ((q.xy_m[:, None] - q.xy_m[None]) ** 2).sum(axis=2) / np.minimum(
-            q.variance[:, None], q.variance[None]
-        )
+        variance = np.minimum(q.variance[:, None], q.variance[None])
+        squared = ((q.xy_m[:, None] - q.xy_m[None]) ** 2 / variance).sum(axis=2)
         near = squared[np.argmax((squared < PLACE_GATE).sum(axis=1))] < PLACE_GATE
         if near.sum() < MIN_ROWS:
             break
@@ -293,7 +311,7 @@ def _objects_at(places: Array, axis_rad: float, size_m: tuple[float, ...]) -> ND
 
 def _labels(p: Positions, places: Array, objects: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the index (n,) of the object at whose place each position is, -1 for none."""
-    squared = ((p.xy_m[:, None] - places[None]) ** 2).sum(axis=2) / p.variance[:, None]
+    squared = ((p.xy_m[:, None] - places[None]) ** 2 / p.variance[:, None]).sum(axis=2)
     nearest = np.argmin(squared, axis=1)
     return np.where(squared[np.arange(len(p)), nearest] < PLACE_GATE, objects[nearest], -1)
 

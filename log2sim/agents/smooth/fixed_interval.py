@@ -64,8 +64,9 @@ class Positions:
     t_s : (n,) float64, s
         In rising order.
     xy_m : (n, 2) float64, m
-    variance : (n,) float64, m2
-        Of a position in each direction, changing views included.
+        Along any two axes.
+    variance : (n, 2) float64, m2
+        Of a position along each of them, changing views included.
     """
 
     t_s: Array
@@ -145,21 +146,24 @@ def _likelihoods(p: Positions, motion: MotionPriorSigmas) -> tuple[float, Array]
     s = p.t_s - (p.t_s[0] + p.t_s[-1]) / 2
     middle = np.median(p.xy_m, axis=0) if motion.speed_mps == 0 else p.xy_m[np.argmin(np.abs(s))]
     z = p.xy_m - middle
-    k = noise_of(p) + PLACE_SIGMA_M**2 + motion.speed_mps**2 * np.outer(s, s)
+    k = PLACE_SIGMA_M**2 + motion.speed_mps**2 * np.outer(s, s)
     if motion.acceleration_mps2:
         near = np.minimum(np.abs(s)[:, None], np.abs(s)[None, :]) * (np.sign(s)[:, None] == np.sign(s)[None, :])
         far = np.maximum(np.abs(s)[:, None], np.abs(s)[None, :])
         k += motion.acceleration_mps2**2 * near**2 * (far / 2 - near / 6)
-    inverse = np.linalg.inv(k)
-    weighted, variance = inverse @ z, 1.0 / np.diag(inverse)
-    log = -0.5 * float(np.vdot(z, weighted)) - float(np.linalg.slogdet(k)[1]) - len(p) * float(np.log(2 * np.pi))
-    each = -np.log(2 * np.pi * variance) - 0.5 * variance * (weighted**2).sum(axis=1)
+    log, each = 0.0, np.zeros(len(p))
+    for axis in range(2):
+        covariance = k + noise_of(p, axis)
+        inverse = np.linalg.inv(covariance)
+        weighted, variance = inverse @ z[:, axis], 1.0 / np.diag(inverse)
+        log -= 0.5 * float(z[:, axis] @ weighted + np.linalg.slogdet(covariance)[1] + len(p) * np.log(2 * np.pi))
+        each -= 0.5 * (np.log(2 * np.pi * variance) + variance * weighted**2)
     return log, each
 
 
-def noise_of(p: Positions) -> Array:
-    """Return the covariance (n, n), m2, of the errors: a part that repeats while the view stays the same, and one that does not."""
-    sigma = np.sqrt(p.variance)
+def noise_of(p: Positions, axis: int = 0) -> Array:
+    """Return the covariance (n, n), m2, of the errors along an axis: a part repeats while the view stays the same, one does not."""
+    sigma = np.sqrt(p.variance[:, axis])
     repeated = np.exp(-np.abs(p.t_s[:, None] - p.t_s[None, :]) / VIEW_S)
     return np.outer(sigma, sigma) * (REPEATED_SHARE * repeated + (1 - REPEATED_SHARE) * np.eye(len(p)))
 
