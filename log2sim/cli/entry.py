@@ -19,6 +19,7 @@ from log2sim.cli import (
     edit,
     evaluate,
     export,
+    help,
     import_,
     inspect,
     map,
@@ -90,6 +91,7 @@ for command in (
     bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
+add_command(app, help.help_, "help")
 add_command(app, import_.import_, "import")
 add_command(app, map.map_, "map")
 
