@@ -87,7 +87,12 @@ def test_every_command_is_documented() -> None:
 
 def test_links_lead_to_files_and_headings() -> None:
     wrong = []
-    for page in (ROOT / "README.md", ROOT / "BENCHMARKS.md", ROOT / "log2sim/README.md", *(ROOT / "samples/cookbook").glob("*.md")):
+    for page in (
+        ROOT / "README.md",
+        ROOT / "BENCHMARKS.md",
+        ROOT / "log2sim/README.md",
+        *(ROOT / "samples/cookbook").glob("*.md"),
+    ):
         for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
             path, _, heading = target.partition("#")
             linked = page.parent / path if path else page

@@ -31,7 +31,7 @@ from log2sim.cli import (
     validate,
     view,
 )
-from log2sim.cli.options import fail, say
+from log2sim.cli.options import fail, printable, say
 from log2sim.cli.shared import (
     DEBUG,
     SIGNAL_CODE,
@@ -128,7 +128,7 @@ def _run(ended: Ended) -> NoReturn:
                 raise
             fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
         if not arguments:
-            sys.stderr.write(format_message() + "\n")
+            sys.stderr.write(printable(format_message()) + "\n")
             sys.exit(2)
         fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     _end(code, ended)
