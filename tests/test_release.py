@@ -57,7 +57,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip("needs git to tell the files of the checkout from others")
     folder = tmp_path_factory.mktemp("release") / "log2sim"
     listed = call("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=ROOT)
-    wanted = ("log2sim/", "schemas/", "pyproject.toml", "README.md", "LICENSE", ".gitignore")
+    wanted = ("log2sim/", "schemas/", "samples/cookbook/", "pyproject.toml", "README.md", "LICENSE", ".gitignore")
     for name in filter(None, listed.split("\0")):
         if name.startswith(wanted) and (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -118,6 +118,7 @@ BASE_ONLY: dict[str, str | None] = {
     "doctor": None,
     "config": None,
     "cache": None,
+    "help doubts": None,
     "inspect LOG": None,
     "inspect LOG --overlay moment.png": None,
     "inspect BAG": "ros",
@@ -198,9 +199,9 @@ def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folde
 
 @pytest.mark.slow
 def test_examples_have_the_types_that_they_use(tmp_path: Path) -> None:
-    blocks = re.findall(
-        r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    )
+    pages = [ROOT / "README.md", *sorted((ROOT / "samples/cookbook").glob("*.md"))]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     files = [tmp_path / f"readme_{k}.py" for k in range(len(blocks))]
     for file, block in zip(files, blocks):
         file.write_text(block, encoding="utf-8")
