@@ -206,8 +206,8 @@ class AzimuthIndex:
         rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
         slope = z / np.maximum(range_m, 1e-3)
-        unsorted = azimuth, range_m, slope
-        return cls(*(column.take(order) for column in unsorted), ~ground.take(order), rank, unsorted)
+        obstacle, unsorted = ~ground.take(order), (azimuth, range_m, slope)
+        return cls(azimuth.take(order), range_m.take(order), slope.take(order), obstacle, rank, unsorted)
 
     def ends_visible(self, members: Sequence[NDArray[np.intp]]) -> NDArray[np.bool_]:
         """Decide which of the right and the left end (R, 2) of clusters are ends of their objects.
@@ -479,12 +479,12 @@ class Cloud:
     @cached_property
     def obstacle_columns(self) -> NDArray[np.float32]:
         """The points at `obstacles` as rows x, y, z (3, n), shared by all cameras."""
-        return np.ascontiguousarray(self.xyz[self.obstacles].T)
+        return self.columns.take(self.obstacles, axis=1)
 
     @cached_property
     def azimuth_index(self) -> AzimuthIndex:
         """The points sorted by azimuth around the sensor."""
-        return AzimuthIndex.of(self.xyz, self.sensor, self.ground)
+        return AzimuthIndex.of(self.columns.T, self.sensor, self.ground)
 
     @cached_property
     def ground_sample(self) -> NDArray[np.intp]:
@@ -589,11 +589,11 @@ def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array
     xyz = [np.ascontiguousarray(sweep.xyz_m[:, axis]) for axis in range(3)]
     rotation = map_T_lidar[:, :3, :3].astype(np.result_type(sweep.xyz_m, np.float32))
     position, moved = map_T_lidar[:-1, :3, 3], np.diff(map_T_lidar[:, :3, 3], axis=0)
-    out = np.empty((len(t_ns), 3))
+    out = np.empty((3, len(t_ns)))
     for row in range(3):
         rotated = sum(rotation[:, row, axis].take(k) * xyz[axis] for axis in range(3))
-        out[:, row] = rotated + position[:, row].take(k) + moved[:, row].take(k) * place
-    return out
+        out[row] = rotated + position[:, row].take(k) + moved[:, row].take(k) * place
+    return out.T
 
 
 def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
@@ -732,21 +732,22 @@ def assemble_cloud(
         # Halfway through the sweep: a sensor at 30 m/s is 3 m away from there at its begin or end.
         middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
-        local = (mapped[0] - origin).astype(np.float32)
-        near = np.flatnonzero(np.logical_and.reduce([np.abs(local[:, axis]) <= max_range_m for axis in range(3)]))
+        # Values of one coordinate side by side, as what follows goes through them.
+        local = [(mapped[0][:, axis] - origin[axis]).astype(np.float32) for axis in range(3)]
+        near = np.flatnonzero(np.logical_and.reduce([np.abs(column) <= max_range_m for column in local]))
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
-        parts.append((local.take(near, axis=0), t_s.take(near), position))
+        parts.append((np.stack([column.take(near) for column in local]), t_s.take(near), position))
         place = _follow_sensor(log, name, stamp, t_s, origin)
         sensors.append(CloudSensor(len(near), *place, end_of(log.lidars[name])))
     if not parts:
         return None
-    xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-    surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
-    height = xyz[:, 2] - surface.at(xyz[:, :2])
+    columns, t_s = np.concatenate([p[0] for p in parts], axis=1), np.concatenate([p[1] for p in parts])
+    surface = estimate_ground(columns.T, np.zeros(2), ground_z - float(origin[2]))
+    height = columns[2] - surface.at(columns[:2].T)
     # A distant LiDAR without points in range must not shift the viewpoint.
-    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
-    ground = np.abs(height) <= ON_GROUND_M
+    sensor = np.mean([p[2] for p in parts if p[0].size] or [p[2] for p in parts], axis=0).astype(np.float32)
+    ground, xyz = np.abs(height) <= ON_GROUND_M, np.ascontiguousarray(columns.T)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
 
 
@@ -799,7 +800,9 @@ def _first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np
         np.zeros(len(voxel), dtype=bool),
         np.empty(1 << TABLE_BITS, dtype=np.int32),
     )
-    factor = np.array([0x9E3779B97F4A7C15], dtype=np.uint64)  # multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)
+    factor = np.array(
+        [0x9E3779B97F4A7C15], dtype=np.uint64
+    )  # multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)
     while len(left):
         place = ((voxel[left] * factor) >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
         table[place[::-1]] = left[::-1]
