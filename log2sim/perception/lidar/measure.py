@@ -452,7 +452,7 @@ def _other_view(cloud: Cloud, members: Index, t_ns: int) -> OtherView:
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
     """Project the cloud's points at `index`: which of them the camera sees (n,), pixels (n, 2) and depths (n,)."""
-    visible = project_points(view, cloud.origin, np.ascontiguousarray(cloud.xyz[index].T))
+    visible = project_points(view, cloud.origin, cloud.columns.take(index, axis=1))
     uv = np.stack([visible.u, visible.v], axis=1).astype(np.float64)
     return visible.index, uv, visible.depth.astype(np.float64)
 
