@@ -139,6 +139,7 @@ BASE_ONLY: dict[str, str | None] = {
     "evaluate boxes.json --truth LOG": None,
     "predict s.json": None,
     "edit s.json --drop-doubtful --out edited.json": None,
+    "correct s.json CORRECTIONS --out corrected.json": None,
     "replay s.json --out replay.json": None,
     "replay s.json --simulator carla": "carla",
     "plot s.json --out plot.svg": None,
@@ -155,7 +156,7 @@ BASE_ONLY: dict[str, str | None] = {
     "export s.json --to rerun --out rerun": "rerun",
     "import openscenario/scenario.xosc --out imported.json": None,
 }
-"""Commands, and the extra that each needs. LOG, BAG and FEATHER stand for paths."""
+"""Commands, and the extra that each needs. LOG, BAG, FEATHER and CORRECTIONS stand for paths."""
 
 
 @pytest.mark.slow
@@ -166,10 +167,13 @@ def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folde
     feather = tmp_path / "av2" / "city_SE3_egovehicle.feather"
     (feather.parent / "calibration").mkdir(parents=True)
     feather.write_bytes(b"ARROW1\0\0ARROW1")
+    corrections = tmp_path / "corrections.json"
+    corrections.write_text('{"format": "log2sim-corrections", "version": 1, "corrections": []}')
     paths = {
         "LOG": str(tiny_folder),
         "BAG": str(ros.encode(tiny_log()[0], tmp_path / "bag")),
         "FEATHER": str(feather.parent),
+        "CORRECTIONS": str(corrections),
     }
     commands = [[paths.get(word, word) for word in line.split()] for line in BASE_ONLY]
     program = Path(__file__).with_name("base_only.py")

@@ -327,7 +327,7 @@ class Finding:
     treatment: Treatment = "kept"
     start_s: float | None = None
     end_s: float | None = None
-    values: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict, hash=False)
     other: str = ""
     case: str = ""
     text: str | None = None

@@ -100,9 +100,9 @@ def read_csv_table(
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         rows = [(reader.line_num, row) for row in reader if row]
     except UnicodeDecodeError as problem:
-        line = data.count(b"\n", 0, problem.start) + 1
+        number = data.count(b"\n", 0, problem.start) + 1
         raise LogError(
-            f"{path}, line {line}: not text in UTF-8: byte 0x{data[problem.start]:02x}; save the table as UTF-8"
+            f"{path}, line {number}: not text in UTF-8: byte 0x{data[problem.start]:02x}; save the table as UTF-8"
         ) from None
     except csv.Error as problem:
         raise LogError(f"{path}: not a CSV table: {problem}") from None
