@@ -58,6 +58,7 @@ class Studio:
         self.result: Corrected = correct(scenario, self.document)
         self._token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
+        self._page: tuple[Corrected, bytes] | None = None  # pictures take seconds to gather
         studio = self
 
         class Handler(_Handler):
@@ -82,6 +83,8 @@ class Studio:
     def page(self) -> bytes:
         """Return the page with the scenario as it is corrected now."""
         with self._lock:
+            if self._page is not None and self._page[0] is self.result:
+                return self._page[1]
             document = page_document(self.result.scenario, background=self.background)
             ego = self.scenario.ego
             document["studio"] = {
@@ -94,7 +97,8 @@ class Studio:
                 # The height of the ground where an agent is added, by where the ego stands.
                 "ground_m": None if ego is None else float(ego.waypoints.z_m[0]) - ego.size_m[2] / 2,
             }
-            return make_page(document, self.result.scenario, self.recorded)
+            self._page = self.result, make_page(document, self.result.scenario, self.recorded)
+            return self._page[1]
 
     def keep(self, body: bytes) -> dict[str, Any]:
         """Apply a document of corrections, write it to the file, and return what the page shows of the scenario then.
