@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Fault, Log, Sweep
+from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, Camera
-from log2sim.perception.sync import Schedule
+from log2sim.logs.records import decode_image
 
 Motion = Literal["drives", "stands", "unclear"]
 
@@ -91,10 +92,9 @@ def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[i
 Gap = tuple[int, int]
 
 
-def missing_records(log: Log, schedule: Schedule) -> Iterator[Fault]:
-    """List the interruptions of the streams that a run uses, from its first to its last tick."""
-    start_ns, end_ns = int(schedule.t_ns[0]), int(schedule.t_ns[-1])
-    for name in dict.fromkeys([*schedule.frames, *schedule.sweeps]):
+def missing_records(log: Log, sensors: Iterable[str], start_ns: int, end_ns: int) -> Iterator[Fault]:
+    """List the interruptions of the streams of sensors between two stamps."""
+    for name in sensors:
         gaps = gaps_of(log.streams[name].t_ns, start_ns, end_ns)
         for some in [gaps] if len(gaps) > MAX_SPANS else [[gap] for gap in gaps]:
             yield _interruption(log, name, some, start_ns, end_ns)
@@ -621,12 +621,11 @@ class RecordWatch:
             return camera.assume_unchanged(look.t_ns)
         return camera.judge(look.t_ns, look.shown, found=look.found)
 
-    def faults(self, schedule: Schedule) -> tuple[Fault, ...]:
-        """List what was found, a fault for each span of each sensor."""
-        t0_ns = int(schedule.t_ns[0])
-        found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, t0_ns)]
-        found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, t0_ns)]
-        return (*found, *missing_records(self._log, schedule))
+    def faults(self, sensors: Iterable[str], start_ns: int, end_ns: int) -> tuple[Fault, ...]:
+        """List what was found, a fault for each span of each sensor, and what is missing of some sensors between two stamps."""
+        found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, start_ns)]
+        found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, start_ns)]
+        return (*found, *missing_records(self._log, sensors, start_ns, end_ns))
 
 
 def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Fault]:
@@ -678,3 +677,112 @@ def _when(span: Span, t0_ns: int) -> str:
 
 def _counts(span: Span) -> dict[str, float]:
     return {"count": float(span.count)}
+
+
+# A picture is shrunk where it is wider than asked for by more than this: less is not worth the time.
+MAX_OVERSIZE = 4 / 3
+
+
+class RecordSource:
+    """The records of a log: the one door to them for all stages, which counts those that cannot be read and judges what they show.
+
+    `log`: an opened log keeps the sweeps that were read last, so that stages which look at the same ones share them.
+    `watch`: which records repeat others or show nothing, also as stages before found it.
+
+    Attributes
+    ----------
+    read : dict of str to int
+        How many records of each stream were read.
+    failed : dict of str to list of str
+        Messages of the records that could not be read, by stream.
+    looks : dict of (str, int) to Look
+        What was judged, by sensor and stamp, in this order.
+    """
+
+    def __init__(self, log: Log, watch: RecordWatch | None = None) -> None:
+        self.log = log
+        self.read: dict[str, int] = {}
+        self.failed: dict[str, list[str]] = {}
+        self.watch = RecordWatch(log) if watch is None else watch
+        self.looks: dict[tuple[str, int], Look] = {}
+
+    def require(self, stream: str, index: int) -> Any:
+        """Read a record: a picture (H, W, 3) uint8 BGR, or a `Sweep`; raise `RecordError` when it cannot be read."""
+        return self._counted(stream, lambda: self.log.streams[stream].read(index))
+
+    def get(self, stream: str, index: int) -> Any | None:
+        """Read a record; None when it cannot be read."""
+        try:
+            return self.require(stream, index)
+        except RecordError:
+            return None
+
+    def picture(self, camera: str, index: int, least_px: int, *, gray: bool = False) -> NDArray[np.uint8] | None:
+        """Read a picture at a width, px, from a least one to a third more, if it is wider: (H, W, 3) BGR or (H, W); None if it cannot be.
+
+        A JPEG is decoded at that size, in half the time of the whole.
+        """
+        stream, size_px = (
+            self.log.streams[camera],
+            (self.log.cameras[camera].width_px, self.log.cameras[camera].height_px),
+        )
+
+        def decode() -> NDArray[np.uint8]:
+            if stream.encoded is None:
+                image = stream.read(index)
+                return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if gray else image
+            return decode_image(
+                stream.encoded(index), f"{camera}: record {index}", size_px, least_px=least_px, gray=gray
+            )
+
+        try:
+            image = self._counted(camera, decode)
+        except RecordError:
+            return None
+        scale = least_px / image.shape[1]
+        if scale < 1 / MAX_OVERSIZE:
+            image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        return image
+
+    def _counted(self, stream: str, read: Callable[[], Any]) -> Any:
+        try:
+            record = read()
+            if isinstance(record, Sweep) and not len(record.xyz_m):
+                raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
+        except RecordError as error:
+            self.add({}, {stream: [str(error)]})
+            raise
+        self.count(stream)
+        return record
+
+    def count(self, stream: str) -> None:
+        """Count a record of a stream as read, also one whose content is known already."""
+        self.read[stream] = self.read.get(stream, 0) + 1
+
+    def add(self, read: Mapping[str, int], failed: Mapping[str, Sequence[str]]) -> None:
+        """Add what another source of the log counted; a record that was requested again failed again."""
+        for stream, number in read.items():
+            self.read[stream] = self.read.get(stream, 0) + number
+        for stream, problems in failed.items():
+            known = self.failed.setdefault(stream, [])
+            known += [problem for problem in problems if problem not in known]
+
+    def is_live(self, sensor: str, index: int, shown: Thumbnail | SweepSketch | None, *, found: bool = False) -> bool:
+        """Judge a record by what is kept of it: whether it shows what is there."""
+        look = Look(sensor, int(self.log.streams[sensor].t_ns[index]), shown, found, "")
+        state = self.watch.judge(look)
+        self.looks[sensor, look.t_ns] = replace(look, state=state)
+        return state == "live"
+
+    def require_some(self) -> None:
+        """Raise `LogError` for a stream of which records were requested and none could be read."""
+        for stream, problems in self.failed.items():
+            if not self.read.get(stream):
+                raise LogError(
+                    f"stream '{stream}': none of the {len(problems)} records asked for can be read, "
+                    f"the first because {problems[0]}. Mend or remove the stream; `log2sim validate` lists all problems"
+                )
+
+    def summary(self) -> dict[str, Any]:
+        """Summarize the unreadable records for the report: count and first message by stream."""
+        return {s: {"count": len(p), "first": p[0]} for s, p in sorted(self.failed.items())}

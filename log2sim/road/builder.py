@@ -16,8 +16,9 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.frames import RecordReader, look_again, work_ahead
+from log2sim.perception.frames import look_again, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.records import RecordSource
 from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
 from log2sim.road.pictures import ColorRaster, Image, StandingPictures, View, find_hidden, sample_nearest, warp_onto
 from log2sim.road.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
@@ -166,11 +167,11 @@ class GroundMapBuilder:
         log: Log,
         scenario: Scenario,
         settings: MapConfig,
-        reader: RecordReader | None = None,
+        reader: RecordSource | None = None,
         progress: Progress | None = None,
     ) -> None:
         self._log, self._scenario = log, scenario
-        self._reader, self._progress = reader or RecordReader(log), progress or (lambda done, total: None)
+        self._reader, self._progress = reader or RecordSource(log), progress or (lambda done, total: None)
         self._path = path_of(log, scenario)
         roadside = roadside_places(log, scenario)
         extent = extent_of(self._path, roadside)
@@ -334,7 +335,7 @@ def map_ground(
     log: Log,
     scenario: Scenario,
     settings: MapConfig | None = None,
-    reader: RecordReader | None = None,
+    reader: RecordSource | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
     *,
     refine: bool = True,
@@ -345,7 +346,7 @@ def map_ground(
     ----------
     scenario : Scenario
         Its agents are left out of the map; its span of time is what is mapped.
-    reader : RecordReader, optional
+    reader : RecordSource, optional
         Counts the records that cannot be read.
     progress : callable, optional
         Called as `progress(stage, done, total)`.
@@ -357,7 +358,7 @@ def map_ground(
     LogError
         When no pose is known, or no record that is wanted can be read.
     """
-    reader, settings = reader or RecordReader(log), settings or MapConfig()
+    reader, settings = reader or RecordSource(log), settings or MapConfig()
     if refine:
         end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
         refined = refine_poses(log, (scenario.t0_ns, end_ns))

@@ -18,7 +18,8 @@ from log2sim.files.stages import StageClock
 from log2sim.localization.choice import PoseChoice
 from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
+from log2sim.perception.frames import PictureConsumer, look_again
+from log2sim.perception.records import RecordSource
 from log2sim.perception.traffic_light_boxes import LightBox
 from log2sim.plan import Decision, Outcome, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
@@ -54,7 +55,7 @@ def describe(
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if poses.for_map is None else replace_poses(log, poses.for_map)
-    reader = RecordReader(drawn)
+    reader = RecordSource(drawn)
     builder, features = None, MapFeatures() if plan.keeps(Stage.LANES) else None
     if features is not None:
         try:
