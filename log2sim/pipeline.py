@@ -231,13 +231,13 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
             **({"faults": faults} if faults else {}),
         },
     )
-    description = describe(scenario, log, config, plan, run.poses, observations.lights, clock, run.progress)
+    description = describe(scenario, log, config, plan, run.poses, observations, clock, run.progress)
     outcomes = (*stage_outcomes(plan, observations, homographies, agents, clock), *description.outcomes)
     scenario = replace(description.scenario, stages=tuple(outcome.to_dict() for outcome in outcomes))
     cache = run.detectors.cache
     report = {
         **report_of(log, config, schedule, observations, measurements, homographies, outcomes, scenario, clock),
-        "unreadable": {**description.unreadable, **observations.unreadable},
+        "unreadable": observations.unreadable,
         **description.figures,
         "poses": run.poses.to_dict(),
         "faults": faults,

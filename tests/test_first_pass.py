@@ -313,7 +313,7 @@ def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
     log = log_of(reads)
     first, second = Wants(left=[3, 1, 1], right2=[1]), Wants(left=[3, 4])
     steps: list[tuple[int, int]] = []
-    assert look_again(log, RecordSource(log), [first, second], lambda *step: steps.append(step)) == 4
+    assert look_again(RecordSource(log), [first, second], lambda *step: steps.append(step)) == 4
     assert first.got == [("left", 1, 1), ("right2", 1, 1), ("left", 3, 3)]
     assert second.got == [("left", 3, 3), ("left", 4, 4)]
     assert sorted(reads) == [("left", 1), ("left", 3), ("left", 4), ("right2", 1)]

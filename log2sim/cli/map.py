@@ -81,9 +81,9 @@ def map_(
     opened, loaded, note = _agents_of(opened, scenario)
     for line in (*opened.notes, *((note,) if note else ())):
         say(f"note: {line}", quiet=quiet)
-    reader = RecordSource(opened)
+    records = RecordSource(opened)
     with progress(quiet=quiet) as report_progress:
-        whole = map_ground(opened, loaded, settings, reader, report_progress)
+        whole = map_ground(opened, loaded, settings, records, report_progress)
     ground = whole.around(known_cells(whole, chosen))
     with together():
         write_map(ground, out, chosen, opened.map, overwrite=overwrite)
@@ -91,7 +91,7 @@ def map_(
             write_world_file(ground, world, opened.map, overwrite=overwrite)
     notes = [
         *ground.notes,
-        *(f"{name}: {u['count']} records could not be read" for name, u in reader.summary().items()),
+        *(f"{name}: {u['count']} records could not be read" for name, u in records.summary().items()),
     ]
     problem = geokeys_of(opened.map).problem
     notes += [f"no place on Earth: {problem}"] if problem else []

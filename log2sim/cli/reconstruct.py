@@ -313,7 +313,7 @@ def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     from log2sim.road.builder import map_ground
     from log2sim.road.map_files import write_map
 
-    reader = RecordSource(result.log)
-    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), reader)
+    records = RecordSource(result.log)
+    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), records)
     write_map(ground.around(ground.coverage), path, overwrite=overwrite)
-    result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
+    result.report["unreadable"] = {**records.summary(), **result.report["unreadable"]}

@@ -25,6 +25,8 @@ Item = TypeVar("Item")
 Out = TypeVar("Out")
 
 BACKGROUND_THREADS = 2
+# More than any picture has, for whole ones.
+MAX_WIDTH_PX = 1 << 16
 # Results that are made ahead of the one in use, which bounds the memory.
 AHEAD = 6
 
@@ -161,38 +163,28 @@ class PictureConsumer(Protocol):
 
 
 def look_again(
-    log: Log,
-    reader: RecordSource,
+    records: RecordSource,
     consumers: Sequence[PictureConsumer],
     progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    least_px: int = MAX_WIDTH_PX,
 ) -> int:
     """Give every consumer the pictures that it wants; return how many were decoded.
 
-    Pictures that cannot be read, that are black, or that repeat an earlier one are left out.
+    Pictures that cannot be read, that are black, or that repeat an earlier one are left out, as they were judged before, or
+    else now. They are decoded a few ahead in threads, see `RecordSource.picture` for `least_px`.
     """
-    wanted = [consumer.frames() for consumer in consumers]
     takers: dict[tuple[str, int], list[PictureConsumer]] = {}
-    for consumer, frames in zip(consumers, wanted, strict=True):
-        for camera, indices in frames.items():
+    for consumer in consumers:
+        for camera, indices in consumer.frames().items():
             for index in np.unique(indices).tolist():
                 takers.setdefault((camera, index), []).append(consumer)
-    order = sorted(takers, key=lambda key: (int(log.streams[key[0]].t_ns[key[1]]), key[0]))
-    for done, (camera, index, image, thumbnail) in enumerate(_decoded(reader, order)):
-        stamp_ns = int(log.streams[camera].t_ns[index])
-        if image is not None and reader.watch.cameras[camera].judge(stamp_ns, thumbnail) == "live":
+    streams = records.log.streams
+    order = sorted(takers, key=lambda key: (int(streams[key[0]].t_ns[key[1]]), key[0]))
+    images = work_ahead(lambda key: records.picture(*key, least_px), order)
+    for done, ((camera, index), image) in enumerate(zip(order, images, strict=True)):
+        if image is not None and records.watch.is_live(camera, int(streams[camera].t_ns[index]), image):
             for consumer in takers[camera, index]:
                 consumer.add(camera, index, image)
         progress(done + 1, len(order))
     return len(order)
-
-
-def _decoded(
-    reader: RecordSource, order: Sequence[tuple[str, int]]
-) -> Iterator[tuple[str, int, NDArray[np.uint8] | None, Thumbnail]]:
-    """Yield camera, index, picture (None where it cannot be read) and thumbnail, decoded a few ahead in threads."""
-
-    def decode(key: tuple[str, int]) -> tuple[str, int, NDArray[np.uint8] | None, Thumbnail]:
-        image = reader.get(*key)
-        return *key, image, np.zeros((0, 0), np.float32) if image is None else shrink(image)
-
-    return work_ahead(decode, order)

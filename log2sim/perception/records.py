@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -621,6 +622,11 @@ class RecordWatch:
             return camera.assume_unchanged(look.t_ns)
         return camera.judge(look.t_ns, look.shown, found=look.found)
 
+    def is_live(self, camera: str, t_ns: int, image: NDArray[np.uint8]) -> bool:
+        """Return whether a picture (H, W, 3) shows what is there, as it was judged before, or else now."""
+        known = self.cameras[camera].states.get(t_ns)
+        return (known or self.cameras[camera].judge(t_ns, shrink(image))) == "live"
+
     def faults(self, sensors: Iterable[str], start_ns: int, end_ns: int) -> tuple[Fault, ...]:
         """List what was found, a fault for each span of each sensor, and what is missing of some sensors between two stamps."""
         found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, start_ns)]
@@ -705,6 +711,12 @@ class RecordSource:
         self.failed: dict[str, list[str]] = {}
         self.watch = RecordWatch(log) if watch is None else watch
         self.looks: dict[tuple[str, int], Look] = {}
+
+    def of(self, log: Log) -> RecordSource:
+        """Return the source of the same records in a log with other poses or mounts, which counts and judges along with this one."""
+        other = copy(self)
+        other.log = log
+        return other
 
     def require(self, stream: str, index: int) -> Any:
         """Read a record: a picture (H, W, 3) uint8 BGR, or a `Sweep`; raise `RecordError` when it cannot be read."""

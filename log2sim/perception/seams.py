@@ -17,7 +17,7 @@ from log2sim.perception.homography.rig import Rig, RigRows, cam_of_ground, heigh
 from log2sim.perception.homography.rig_fit import MOUNT_SIGMA_RAD, RigFit
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.observe_tick import base_pose
-from log2sim.perception.records import RecordSource, shrink
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule
 
 # Structure coarser than this is shading, m. Structure finer than this is smoothed: a pixel of a camera of 1000 px focal length,
@@ -572,7 +572,7 @@ class SeamPictures:
             for camera, index in schedule.frames.items():
                 image = reader.get(camera, int(index[tick])) if index[tick] >= 0 else None
                 t_ns = int(log.streams[camera].t_ns[index[tick]])
-                if image is not None and reader.watch.cameras[camera].judge(t_ns, shrink(image)) == "live":
+                if image is not None and reader.watch.is_live(camera, t_ns, image):
                     images[camera, tick] = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         return cls(log, schedule, observed, images)
 

@@ -255,7 +255,7 @@ def picture_document(
     probes = _probe(log, within, projector, reader)
     size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
     pictures = ShrunkPictures(chosen, size.width_px)
-    look_again(log, reader, [pictures], progress)
+    look_again(reader, [pictures], progress, least_px=size.width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     _thin_out(entries, budget_bytes)
