@@ -648,17 +648,10 @@ def _sparse_sweeps(name: str, t_ns: NDArray[np.int64], points: NDArray[np.int64]
         yield replace(_finding("sparse_sweeps", name, "kept", span, t0_ns, **values), case="some")
 
 
-def _when(span: Span, t0_ns: int) -> str:
-    """Say how many records a span holds, and when: "12 from 2.00 to 3.10 s"."""
-    start_s, end_s = ((t - t0_ns) / NS_PER_S for t in (span.start_ns, span.end_ns))
-    if span.total == 1:
-        return f"1 at {start_s:.2f} s"
-    counted = f"{span.count}" if span.count == span.total else f"{span.count} of {span.total}"
-    return f"{counted} from {start_s:.2f} to {end_s:.2f} s"
-
-
-def _counts(span: Span) -> dict[str, float]:
-    return {"count": float(span.count)}
+def _finding(kind: str, name: str, treatment: Treatment, span: Span, t0_ns: int, **values: float) -> Finding:
+    start_s, end_s = ((t_ns - t0_ns) / NS_PER_S for t_ns in (span.start_ns, span.end_ns))
+    counts = {"count": float(span.count), "total": float(span.total)}
+    return Finding(kind, name, treatment, start_s, end_s, counts | values)
 
 
 # A picture is shrunk where it is wider than asked for by more than this: less is not worth the time.
