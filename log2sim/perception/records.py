@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Finding, Log, Sweep
+from log2sim.datatypes import Finding, Log, Sweep, Treatment
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.logs.records import decode_image
