@@ -122,8 +122,7 @@ def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -
         import cv2
         import simplejpeg
 
-        scale = min(1.0, MAX_IMAGE_PX / camera.width_px)
-        small = camera.resized(round(camera.width_px * scale), round(camera.height_px * scale))
+        small = _downscaled(camera, min(1.0, MAX_IMAGE_PX / camera.width_px))
         if small is not camera:
             size = (small.width_px, small.height_px)
             image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -133,6 +132,18 @@ def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -
             return CameraFrame(t_ns, small, None, jpeg, ())
         return CameraFrame(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
     return ThinnedSweep(t_ns, name, _points_map(log, name, record))
+
+
+def _downscaled(camera: Camera, scale: float) -> Camera:
+    """Return the camera of the same image in another size; the center of the first pixel is (0, 0) in both."""
+    if scale == 1.0:
+        return camera
+    width, height = round(camera.width_px * scale), round(camera.height_px * scale)
+    K = camera.K.copy()
+    for axis, (new, old) in enumerate(((width, camera.width_px), (height, camera.height_px))):
+        K[axis] *= new / old
+        K[axis, 2] += (new / old - 1) / 2
+    return replace(camera, width_px=width, height_px=height, K=K)
 
 
 def _outlines(scenario: Scenario, camera: Camera, cam_T_map: Array, t_ns: int) -> Iterator[tuple[Agent, Array]]:

@@ -9,7 +9,7 @@ a third row that is positive below the horizon its sign tells which pixels see t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -85,16 +85,6 @@ class Camera:
     def rectified(self) -> bool:
         """Whether the images are free of lens distortion."""
         return not _is_distorted(self)
-
-    def resized(self, width_px: int, height_px: int) -> Camera:
-        """Return the camera of its images in another size; the center of the first pixel is (0, 0) in both."""
-        if (width_px, height_px) == (self.width_px, self.height_px):
-            return self
-        K = self.K.copy()
-        for axis, scale in enumerate((width_px / self.width_px, height_px / self.height_px)):
-            K[axis] *= scale
-            K[axis, 2] += (scale - 1) / 2
-        return replace(self, width_px=width_px, height_px=height_px, K=K)
 
 
 def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Array, NDArray[np.bool_]]:

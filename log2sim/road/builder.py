@@ -35,8 +35,6 @@ from log2sim.road.surface import (
 # A camera 1.5 m above the road resolves it to 5 cm with 1000 px of focal length up to 9 m away: every place is seen so at least
 # three times from pictures 2 m apart.
 PICTURE_STEP_M = 2.0
-# Pictures are decoded at this width or somewhat more: so wide, cameras of usual fields of view have 500 to 1000 px of focal length.
-LEAST_PX = 960
 # Rings of a sweep are 0.1 to 1 m apart on the ground: small steps of the ego fill the gaps between them.
 SWEEP_STEP_M = 0.1
 # So many points for each meter of the way are a return a centimeter on rings of 60 m, on 30 rings: more make no finer map. Of a
@@ -197,13 +195,12 @@ class GroundMapBuilder:
         return self._frames
 
     def add(self, camera: str, index: int, image_bgr: Image) -> None:
-        """Add a picture (H, W, 3), of any size."""
+        """Add a picture (H, W, 3)."""
         t_ns = int(self._log.streams[camera].t_ns[index])
         map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
         if self._colors is None or not known[0]:
             return
-        height_px, width_px = image_bgr.shape[:2]
-        view = View(self._log.cameras[camera].resized(width_px, height_px), map_T_cam[0], t_ns, self._log)
+        view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
         users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
         if view.camera.mount == "map":
             self._standing.setdefault(camera, (view, StandingPictures()))[1].add(image_bgr, users)
@@ -364,6 +361,6 @@ def map_ground(
         log = log if refined is None else replace_poses(log, refined)
     records = records.of(log)
     builder = GroundMapBuilder(log, scenario, settings, records, partial(progress, "map: sweeps"))
-    look_again(records, [builder], partial(progress, "map: pictures"), least_px=LEAST_PX)
+    look_again(records, [builder], partial(progress, "map: pictures"))
     records.require_some()
     return builder.build()

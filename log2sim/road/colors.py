@@ -436,7 +436,7 @@ class _Scene:
         rows = np.flatnonzero(weight)
         if len(rows) < MIN_PAINT_PIXELS:
             return None
-        height_px = float(found.box_px[0, 3] - found.box_px[0, 1]) * self.image.shape[1] / self.view.camera.width_px
+        height_px = float(found.box_px[0, 3] - found.box_px[0, 1])
         surface = Surface(self._pixels(uv[rows]), weight[rows], hits.facing[rows], height_px)
         light = estimate_light(self._linear_below, self._linear_above, self._road(row, map_T_cam))
         veil = veil_of(self._pixels(uv[clear]), light)
@@ -507,8 +507,7 @@ class _Scene:
     def _pixels(self, uv: Array) -> Array:
         """Return linear RGB (N, 3) of pixels (N, 2)."""
         height, width = self.image.shape[:2]
-        scale = width / self.view.camera.width_px
-        u, v = np.clip(scale * uv[:, 0], 0, width - 1).astype(int), np.clip(scale * uv[:, 1], 0, height - 1).astype(int)
+        u, v = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
         return linear_values(self.image[v, u, ::-1])
 
 

@@ -22,7 +22,7 @@ from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import PictureConsumer, look_again
 from log2sim.perception.records import RecordSource
 from log2sim.plan import Decision, Outcome, Plan, Stage
-from log2sim.road.builder import LEAST_PX, GroundMapBuilder
+from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
 from log2sim.road.lane_graph import infer_lanes
 from log2sim.road.markings import find_markings
@@ -64,7 +64,7 @@ def describe(
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
     with clock.stage("pictures", progress):
-        look_again(records, consumers, lambda done, total: progress("pictures", done, total), least_px=LEAST_PX)
+        look_again(records, consumers, lambda done, total: progress("pictures", done, total))
     with clock.stage("lanes", progress):
         if builder is not None:
             ground = builder.build()
