@@ -28,6 +28,7 @@ from log2sim.cli import (
     predict,
     reconstruct,
     replay,
+    studio,
     synth,
     validate,
     view,
@@ -89,7 +90,7 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, correct.correct, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, correct.correct, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, help.help_, "help")

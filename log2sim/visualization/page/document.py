@@ -346,7 +346,7 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
         "id": agent.id,
         "category": agent.category,
         "group": GROUP_OF[agent.category],
-        "size_m": [round(float(v), 3) for v in agent.size_m[:2]],
+        "size_m": [round(float(v), 3) for v in agent.size_m],
         "stationary": stationary,
         "permanent": static and len(columns.t_s) == 1,  # one pose during the whole scenario
         **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k in WAYPOINT_COLUMNS},
