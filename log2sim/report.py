@@ -112,7 +112,7 @@ def conclude(
         Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(scenario.others),
     }
     planned = (d for d in run.plan.decisions if d.stage not in DESCRIBING)
-    stages = (*(found.get(d.stage, lambda d: d)(d) for d in planned), *decisions)
+    stages = (*(found[d.stage](d) if d.stage in found else d for d in planned), *decisions)
     scenario = replace(scenario, stages=tuple(stage.to_dict() for stage in stages))
     from_lidar = [rows.source == "lidar" for end in measurements for rows in end]
     report = {
