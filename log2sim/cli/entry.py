@@ -19,6 +19,7 @@ from log2sim.cli import (
     edit,
     evaluate,
     export,
+    find,
     import_,
     inspect,
     map,
@@ -27,6 +28,7 @@ from log2sim.cli import (
     reconstruct,
     replay,
     synth,
+    tag,
     validate,
     view,
 )
@@ -87,7 +89,7 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, tag.tag, find.find, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, import_.import_, "import")
