@@ -37,6 +37,9 @@ NEAR_TTC_S, NEAR_PET_S, NEAR_DRAC_MPS2 = 1.5, 1.0, 3.35
 JOINING_RAD = np.radians(25.0)
 """Who comes into a lane with more than that turns into it; lane changes have less than 10 degrees."""
 
+KEEPING_MPS = 0.5
+"""Lateral speed of who keeps a lane: a third to a half of those in lane changes."""
+
 ONCOMING_RAD = np.radians(135.0)
 WINDOW = round(4.0 / TICK_S)  # ticks around a lane's edge in which a lane change is looked at
 
@@ -132,7 +135,7 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         if measures["time_headway_s"] > LEADING_S:
             continue
         joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD
-        if not joins and not _other_moves(traffic, b, r, o, (begin, crossing, end)):
+        if not joins and not _is_change_of(traffic, b, r, o, crossing):
             continue
         outer, inner = (off[begin : crossing + 1], off[crossing : end + 1]) if enters else (off[crossing : end + 1], off[begin : crossing + 1])
         sigma = float(b.sigma_m[o, crossing])
@@ -143,22 +146,15 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
                      side=np.sign(-lateral if enters else lateral), **measures)  # fmt: skip
 
 
-def _other_moves(traffic: Traffic, b: Beside, r: int, o: int, span: tuple[int, int, int]) -> bool:
-    """Return whether it is `o` that changes lanes, and not the path of `r` that does there.
-
-    Who changes lanes turns and turns back; the middle of its courses is off those between before and after, which on a road of
-    constant curvature is so for nobody else.
-    """
+def _is_change_of(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> bool:
+    """Return whether it is `o` that crosses the edge of a lane at a tick, and not the path of `r` that does, now or on its way there."""
     found = traffic.path(r)
     if found is None:
         return False
-    line, station = found
-    ticks = np.array(span)
-    at = station[ticks] + b.ahead_m[o, ticks]
-    course = np.unwrap(traffic.course_rad[o, ticks])
-    share = (at[1] - at[0]) / (at[2] - at[0]) if at[2] > at[0] else 0.5
-    own, path = (c[1] - (1 - share) * c[0] - share * c[2] for c in (course, line.heading_at(at)))
-    return abs(own) >= abs(path)
+    arrives = found.station_m <= found.station_m[n] + b.ahead_m[o, n]  # False for NaN
+    last = max(int(np.flatnonzero(arrives)[-1]), n)
+    own = np.abs(traffic.drift_mps[r, n : last + 1])
+    return bool(np.nanmax(own, initial=0.0) < KEEPING_MPS and not abs(traffic.drift_mps[o, n]) <= own[-1])
 
 
 def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:

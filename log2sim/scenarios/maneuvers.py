@@ -13,7 +13,7 @@ import numpy as np
 from log2sim.datatypes import STANDSTILL_MPS, Tag
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S
-from log2sim.scenarios.traffic import HALF_LANE_M, Beside, Mask, Traffic, latched, probability_above, runs, turned
+from log2sim.scenarios.traffic import HALF_LANE_M, LANE_CHANGE_S, Beside, Mask, Traffic, latched, probability_above, runs, turned
 
 COMFORTABLE_MPS2 = 3.4
 """Deceleration that most drivers find comfortable (AASHTO, "Green Book" 2018, 3.2.2)."""
@@ -26,9 +26,6 @@ TURN_RAD, BACK_RAD = np.radians(60.0), np.radians(150.0)
 
 TURN_WITHIN_M = 40.0
 """Within which a vehicle turns at a junction: a quarter of a circle of 25 m."""
-
-LANE_CHANGE_S = 8.0
-"""Longest lane change: 95 of 100 take less (Toledo and Zohar 2007)."""
 
 LATERAL_MPS = 0.2
 """Lateral speed at which a lane change begins and ends: drivers who keep a lane are slower (de Gelder et al. 2020)."""
