@@ -14,8 +14,8 @@ from log2sim.datatypes import Tag
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.prediction.motion_table import TICK_S
 from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
-from log2sim.scenarios.maneuvers import MOVING_MPS, lateral_extent, tag_of
-from log2sim.scenarios.traffic import Beside, Traffic, latched, probability_above, runs
+from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
+from log2sim.scenarios.traffic import SIDE_M, Beside, Traffic, latched, probability_above, runs
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import CROSSING_RAD, post_encroachment_times, time_to_touch
 
@@ -86,11 +86,11 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     ahead = (b.leader == o) & (own >= MOVING_MPS)
     ttc = time_to_collision(gap, closing)
     headway = time_headway(gap, own)
-    for i, j in runs(ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0), round(1.0 / TICK_S)):
+    for i, j in runs(ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0), round(1.0 / TICK_S), BREAK):
         n = i + int(np.argmin(headway[i : j + 1]))
         sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
         yield tag_of(traffic, "following", r, (i, n, j), sure, o, duration_s=(j - i) * TICK_S, **_lane_measures(traffic, b, r, o, n))
-    for i, j in runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S)):
+    for i, j in runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(ttc[i : j + 1]))
         sigma_mps = np.hypot(traffic.sigma_speed_mps[r, n], traffic.sigma_speed_mps[o, n])
         sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]) * probability_above(closing[n], 0.0, sigma_mps)
@@ -112,7 +112,7 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
 
 def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `o` comes into the lane of `r` ahead of it, or leaves it there."""
-    known = np.isfinite(b.aside_m[o]) & (b.ahead_m[o] > 0) & b.same_way[o]
+    known = np.isfinite(b.aside_m[o]) & (b.ahead_m[o] > 0)
     inside = b.in_lane[o]
     off = np.abs(b.aside_m[o])
     for n in (np.flatnonzero(inside[1:] != inside[:-1]) + 1).tolist():
@@ -120,7 +120,7 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         beyond = ~(off[:n] < b.half_m) if enters else ~(off[:n] > b.half_m)
         crossing = int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0
         first, last = max(crossing - WINDOW, 0), min(max(crossing, n) + WINDOW, len(known) - 1)
-        if crossing == 0 or not known[crossing - 1 : n + 1].all():
+        if crossing == 0 or not known[crossing - 1 : n + 1].all() or not b.same_way[o, n if enters else crossing - 1]:
             continue
         while not known[first]:
             first += 1
@@ -180,14 +180,14 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
 
 def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `o` comes toward `r` where `r` will drive, within `CROSSING_S`."""
-    width = traffic.table.size_m[[r, o], 1].sum() / 2
+    width = traffic.table.size_m[[r, o], 1].sum() / 2 - SIDE_M
     speed, own = traffic.speed_mps[o], traffic.speed_mps[r]
     ttc = time_to_collision(b.gap_m[o], own + speed)
     state = (np.abs(b.turn_rad[o]) > ONCOMING_RAD) & (np.abs(b.aside_m[o]) < width) & (b.ahead_m[o] > 0) & (ttc < CROSSING_S)
-    for i, j in runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S)):
+    for i, j in runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S), BREAK):
         n = i + int(np.argmin(np.where(ttc[i : j + 1] > 0, ttc[i : j + 1], np.inf)))
         sure = probability_above(width - np.abs(b.aside_m[o, i : j + 1].min()), 0.0, b.sigma_m[o, n])
-        yield tag_of(traffic, "oncoming_in_lane", o, (i, n, j), sure, r, gap_m=b.gap_m[o, n], ttc_s=ttc[n], relative_speed_mps=own[n] + speed[n], overlap_m=width - abs(b.aside_m[o, n]))  # fmt: skip
+        yield tag_of(traffic, "oncoming_in_lane", o, (i, n, j), sure, r, gap_m=b.gap_m[o, n], ttc_s=ttc[n], relative_speed_mps=own[n] + speed[n], overlap_m=width + SIDE_M - abs(b.aside_m[o, n]))  # fmt: skip
 
 
 def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:

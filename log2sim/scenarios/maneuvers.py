@@ -27,6 +27,9 @@ TURN_RAD, BACK_RAD = np.radians(60.0), np.radians(150.0)
 TURN_WITHIN_M = 40.0
 """Within which a vehicle turns at a junction: a quarter of a circle of 25 m."""
 
+BREAK = round(0.5 / TICK_S)
+"""Ticks that an activity may be interrupted for."""
+
 LATERAL_MPS = 0.2
 """Lateral speed at which a lane change begins and ends: drivers who keep a lane are slower (de Gelder et al. 2020)."""
 
@@ -145,9 +148,8 @@ def _starts_and_stops(traffic: Traffic, k: int) -> Iterator[Tag]:
     for i, j in runs(stands, round(1.0 / TICK_S)):
         place = traffic.place_m[k, i : j + 1]
         still = probability_above(1.0, float(np.median(speed[i : j + 1])), float(np.median(sigma[i : j + 1])))
-        middle = (i + j) // 2
         yield tag_of(traffic, "standing", k, (i, i, j), still, duration_s=(j - i) * TICK_S)
-        yield from _waits(traffic, k, (i, middle, j), still, place[len(place) // 2])
+        yield from _waits(traffic, k, (i, i, j), still, place[len(place) // 2])
         # Before it stands it slowed down from when it was last not slowing, and likewise after.
         slowing = np.flatnonzero(~(traffic.accel_mps2[k, :i] < -0.1)) if i else np.zeros(0, dtype=np.intp)
         begin = int(slowing[-1]) + 1 if len(slowing) else 0
@@ -212,10 +214,10 @@ def _turns(traffic: Traffic, k: int) -> Iterator[Tag]:
 
 
 def _hard_braking(traffic: Traffic, k: int) -> Iterator[Tag]:
-    """Find where an agent decelerates by more than `COMFORTABLE_MPS2` for at least 0.3 s."""
+    """Find where an agent decelerates by more than `COMFORTABLE_MPS2` for at least 0.5 s."""
     accel, speed = traffic.accel_mps2[k], traffic.speed_mps[k]
     hard: Mask = (accel < -COMFORTABLE_MPS2) & np.isfinite(accel)
-    for i, j in runs(hard, round(0.3 / TICK_S)):
+    for i, j in runs(hard, round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(accel[i : j + 1]))
         # Two speeds half a second apart, whose errors are independent, tell the deceleration.
         sigma = np.sqrt(2.0) * traffic.sigma_speed_mps[k, n] / max((j - i) * TICK_S, 0.5)

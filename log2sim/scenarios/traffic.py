@@ -350,10 +350,13 @@ def latched(on: Mask, off: Mask, start: Mask) -> Mask:
     return np.asarray(np.where(last >= 0, held == 1, start))
 
 
-def runs(state: Mask, least: int = 1) -> list[tuple[int, int]]:
-    """Return first and last tick of each time (T,) that a state lasts for at least so many ticks."""
+def runs(state: Mask, least: int = 1, bridged: int = 0) -> list[tuple[int, int]]:
+    """Return first and last tick of each time (T,) that a state lasts for at least so many ticks, breaks of up to `bridged` included."""
     edge = np.diff(np.concatenate([[False], state, [False]]).astype(np.int8))
-    return [(i, j - 1) for i, j in zip(np.flatnonzero(edge > 0).tolist(), np.flatnonzero(edge < 0).tolist()) if j - i >= least]
+    begin, end = np.flatnonzero(edge > 0), np.flatnonzero(edge < 0)
+    apart = begin[1:] - end[:-1] > bridged
+    begin, end = begin[np.concatenate([[True], apart])[: len(begin)]], end[np.concatenate([apart, [True]])[: len(end)]]
+    return [(i, j - 1) for i, j in zip(begin.tolist(), end.tolist()) if j - i >= least]
 
 
 def probability_above(value: Array | float, limit: float, sigma: Array | float) -> float:

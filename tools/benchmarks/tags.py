@@ -13,12 +13,12 @@ import itertools
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from entry import parser_of
 
-from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario, Tag, Waypoints
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios.tagging import find_tags
 
@@ -160,6 +160,243 @@ def _agent(id: str, x: np.ndarray, y: np.ndarray, t: np.ndarray, speed: np.ndarr
     return Agent(id, category, size, w, static=static)
 
 
+def route(points: Sequence[tuple[float, float]], radius_m: float) -> np.ndarray:
+    """Points (K, 2) 5 cm apart on a polyline whose corners are arcs."""
+    corners = [complex(*p) for p in points]
+    parts = [np.array(corners[:1])]
+    for before, at, after in zip(corners, corners[1:], corners[2:]):
+        one, two = (at - before) / abs(at - before), (after - at) / abs(after - at)
+        turn = float(np.angle(two / one))
+        cut = radius_m * abs(np.tan(turn / 2))
+        angle = np.linspace(0.0, turn, max(int(abs(turn) * radius_m / 0.05), 2))
+        side = 1j * np.sign(turn)
+        center = at - one * cut + one * side * radius_m
+        parts.append(center - one * np.exp(1j * angle) * side * radius_m)
+    parts.append(np.array(corners[-1:]))
+    line = np.concatenate(parts)
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line)))])
+    kept = np.concatenate([[True], np.diff(way) > 1e-9])
+    at = np.arange(0.0, way[-1], 0.05)
+    line = np.interp(at, way[kept], line[kept])
+    return np.column_stack([line.real, line.imag])
+
+
+@dataclass
+class Stage:
+    """A scripted scene: agents on routes with stations over time; mirrored for traffic on the left."""
+
+    rng: np.random.Generator
+    rate_hz: float
+    mirrored: bool
+    noise_m: float
+    duration_s: float = 12.0
+    agents: list[Agent] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Set the fine times."""
+        self.t = np.arange(0.0, self.duration_s + FINE_S / 2, FINE_S)
+
+    def add(self, id: str, line: np.ndarray, speed: np.ndarray | float, start_m: float = 0.0, category: str = "car",
+            size: tuple = CAR, begin_s: float = 0.0) -> np.ndarray:  # fmt: skip
+        """Add an agent and return its stations; the route is long enough for it."""
+        pace = np.broadcast_to(np.asarray(speed, dtype=float), self.t.shape)
+        s = start_m + np.concatenate([[0.0], np.cumsum((pace[1:] + pace[:-1]) / 2) * FINE_S])
+        at = np.arange(len(line)) * 0.05
+        assert s[-1] <= at[-1] + 0.1, id
+        x, y = (np.interp(s, at, c) for c in line.T)
+        y = -y if self.mirrored else y
+        agent = _agent(id, x, y, self.t, pace.copy(), self.rate_hz, self.noise_m, self.rng, category, size, begin_s)
+        if not pace.any():
+            heading = np.arctan2(*((line[1] - line[0]) * [1, -1 if self.mirrored else 1])[::-1])
+            w = agent.waypoints
+            agent = replace(agent, waypoints=replace(w, yaw_rad=np.full(len(w), heading)))
+        self.agents.append(agent)
+        return s
+
+    def world(self, name: str, events: Sequence[Event], tags: tuple[str, ...], **parts: object) -> World:
+        """Return the world."""
+        side = "left" if self.mirrored else "right"
+        label = f"{name}, {self.rate_hz:g} Hz, {side}"
+        return World(Scenario(label, 0, self.duration_s, tuple(self.agents), **parts), list(events), tags)
+
+
+JUNCTION_TAGS = ("turning", "u_turn", "turning_across", "crossing_path", "merging", "stepping_out", "oncoming_in_lane", "stopping",
+                 "starting", "standing", "standing_at_light", "standing_at_crosswalk", "following", "approaching", "near_miss",
+                 "cut_in", "cut_out", "overtaking", "hard_braking")  # fmt: skip
+
+
+def ramp(t: np.ndarray, begin_s: float, accel: float, low: float, high: float, before: float) -> np.ndarray:
+    """Speed that changes from a time on at a rate, within limits."""
+    return np.clip(before + accel * np.maximum(t - begin_s, 0.0), low, high)
+
+
+def turn_across(stage: Stage) -> World:
+    """A car turns to the far side before an oncoming one, or behind it."""
+    rng = stage.rng
+    v, u = rng.uniform(5.0, 8.0), rng.uniform(8.0, 13.0)
+    line = route([(-80, -1.75), (1.75, -1.75), (1.75, 90)], 8.0)
+    s = stage.add("ego", line, v, start_m=rng.uniform(20, 40))
+    # Where the ego is in the oncoming lane: its center at y = 1.75.
+    xy = np.stack([np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T])
+    there = stage.t[np.argmax(xy[1] > 1.75)]
+    gap = rng.choice([-1.0, 1.0]) * rng.uniform(1.8, 3.5)  # when the oncoming one is there, later or earlier
+    x_there = xy[0][np.argmax(xy[1] > 1.75)]
+    begin = x_there + u * (there + gap)
+    stage.add("car-1", route([(250, 1.75), (-250, 1.75)], 5.0), u, start_m=250 - begin)
+    last = there + max(gap, 0.0) < stage.t[-1] - 1.0
+    first, second = ("ego", "car-1") if gap > 0 else ("car-1", "ego")
+    turned = stage.t[np.argmax(np.abs(s - (s[np.argmax(xy[1] > 0)])) < 0.2)]
+    events = [
+        Event("turning", "ego", None, turned), Event("turning_across", "ego", "car-1", there, sure=last), Event("crossing_path", first, second, there + min(gap, 0.0), sure=last),
+        Event("oncoming_in_lane", "car-1", "ego", there, sure=False), *(Event("near_miss", first, second, there + d, sure=False) for d in (0.0, gap)),
+    ]  # fmt: skip
+    return stage.world("turn across", events, JUNCTION_TAGS)
+
+
+def crossing(stage: Stage) -> World:
+    """Two cars cross at a right angle."""
+    rng = stage.rng
+    v, u = rng.uniform(6.0, 12.0, 2)
+    there, gap = rng.uniform(4.0, 6.0), rng.uniform(0.5, 6.5)  # between the moments at which their centers cross
+    stage.add("ego", route([(-200, 0), (300, 0)], 5.0), v, start_m=200 - v * there)
+    stage.add("car-1", route([(0, -200), (0, 300)], 5.0), u, start_m=200 - u * (there + gap))
+    # The ego has left the crossing when its rear has passed the width of the other, which comes with its front.
+    pet = gap - (CAR[0] + CAR[1]) / 2 / v - (CAR[0] + CAR[1]) / 2 / u
+    events = [Event("crossing_path", "ego", "car-1", there, sure=not _near(pet, 5.0) and pet > 0)] if pet < 5.5 else []
+    events += [Event("near_miss", "ego", "car-1", there, sure=0 < pet < 0.9)] if pet < 1.3 else []
+    return stage.world(f"crossing, PET {pet:.2f} s", events, JUNCTION_TAGS if pet > 0 else ())
+
+
+def merge(stage: Stage) -> World:
+    """A car turns into the road of another ahead of it."""
+    rng = stage.rng
+    v, u = rng.uniform(8.0, 11.0), rng.uniform(5.0, 6.5)
+    line = route([(0, -60), (0, -1.75), (150, -1.75)], 7.0)
+    start = rng.uniform(20.0, 35.0)
+    s = stage.add("car-1", line, u, start_m=start)
+    xy = np.stack([np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T])
+    enters = stage.t[np.argmax(xy[1] > -3.5)]
+    turns = stage.t[np.argmax(s > 60 - 1.75 - 7.0 + 5.5)]
+    behind = rng.uniform(14.0, 25.0)
+    speed = ramp(stage.t, enters - 0.5, -rng.uniform(1.0, 2.0), u, v, v)
+    way = np.interp(enters, stage.t, np.cumsum(speed) * FINE_S)
+    stage.add("ego", route([(-200, -1.75), (300, -1.75)], 5.0), speed, start_m=200 - behind - way)
+    events = [
+        Event("merging", "car-1", "ego", enters), Event("turning", "car-1", None, turns),
+        *(Event(tag, "ego", "car-1", t, sure=False) for tag in ("following", "approaching") for t in (enters, enters + 2, enters + 4)),
+        Event("crossing_path", "car-1", "ego", enters, sure=False), Event("near_miss", "ego", "car-1", enters, sure=False),
+        Event("near_miss", "car-1", "ego", enters, sure=False),
+    ]  # fmt: skip
+    return stage.world("merge", events, JUNCTION_TAGS)
+
+
+def step_out(stage: Stage) -> World:
+    """Somebody steps out between parked cars, or walks the same way in the open."""
+    rng = stage.rng
+    hidden = rng.random() < 0.6
+    v, walk = rng.uniform(7.0, 11.0), rng.uniform(1.2, 1.8)
+    enters = rng.uniform(4.0, 6.0)  # the lane of the ego, whose center is 2.6 m from the parked cars' middle
+    ahead = rng.uniform(10.0, 20.0)
+    stage.add("ego", route([(-200, 0), (300, 0)], 5.0), v, start_m=200 - ahead - v * enters)
+    if hidden:
+        for k in range(4):
+            stage.add(f"parked-{k}", route([(-24.0 + 5.6 * k, -2.9), (0, -2.9)], 1.0), 0.0)
+    stage.add("pedestrian-1", route([(0.2, -40), (0.2, 40)], 1.0), walk, start_m=40 - 1.75 - walk * enters, category="pedestrian", size=PERSON)
+    events = [Event("stepping_out", "pedestrian-1", "ego", enters)] if hidden else []
+    events += [Event(tag, a, b, enters + d, sure=False) for tag in ("crossing_path", "near_miss") for a, b in (("ego", "pedestrian-1"), ("pedestrian-1", "ego")) for d in (0, 1.5)]
+    return stage.world(f"step out, {'hidden' if hidden else 'seen'}", events, JUNCTION_TAGS)
+
+
+def wait_at_light(stage: Stage) -> World:
+    """A car brakes for a red light behind a crosswalk, stands, and starts; another follows it."""
+    rng = stage.rng
+    v, decel = rng.uniform(8.0, 12.0), rng.uniform(1.5, 2.6)
+    brakes = rng.uniform(1.0, 2.0)
+    stops = brakes + v / decel
+    goes = stops + rng.uniform(2.0, 3.0)
+    stage.duration_s = goes + 4.0
+    stage.__post_init__()
+    speed = np.where(stage.t < goes, ramp(stage.t, brakes, -decel, 0.0, v, v), ramp(stage.t, goes, 1.8, 0.0, 12.0, 0.0))
+    way = float(np.cumsum(speed)[np.searchsorted(stage.t, stops)] * FINE_S)
+    line = route([(-300, 0), (300, 0)], 5.0)
+    stage.add("ego", line, speed, start_m=300 - way)  # it stands with its center at x = 0
+    sign = -1.0 if stage.mirrored else 1.0
+    light = Signal("light", np.array([12.0, sign * 3.0, 4.0]), np.pi, np.array([0.0, goes]), np.array(["red", "green"]))
+    outline = np.array([[4.0, -5, 0], [7.0, -5, 0], [7.0, 5, 0], [4.0, 5, 0]])
+    walk = MapFeatures(markings=(Marking("walk", "crosswalk", outline, 3.0),))
+    events = [
+        Event("stopping", "ego", None, stops), Event("standing", "ego", None, stops), Event("starting", "ego", None, goes),
+        Event("standing_at_light", "ego", None, stops), Event("standing_at_crosswalk", "ego", None, stops),
+    ]  # fmt: skip
+    return stage.world("light", events, JUNCTION_TAGS, signals=(light,), map_features=walk)
+
+
+def follow(stage: Stage) -> World:
+    """A car follows another, or comes nearer to it, which stands for a queue."""
+    rng = stage.rng
+    u = rng.uniform(6.0, 14.0)
+    nears = rng.random() < 0.5
+    v = u + (rng.uniform(3.0, 5.0) if nears else rng.uniform(-0.8, 0.8))
+    gap = rng.uniform(40.0, 50.0) if nears else v * rng.uniform(0.8, 2.0)
+    stage.add("car-1", route([(0, 0), (600, 0)], 5.0), u, start_m=100 + gap + CAR[0])
+    speed = np.full(len(stage.t), v)
+    if nears:  # it brakes to the speed of the other when 10 m are left
+        speed = ramp(stage.t, (gap - 18) / (v - u), -1.5, u, v, v)
+    stage.add("ego", route([(0, 0), (600, 0)], 5.0), speed, start_m=100)
+    ttc = [Event("approaching", "ego", "car-1", t) for t in ((gap - 18) / (v - u),)] if nears else []
+    events = [*ttc, *(Event("following", "ego", "car-1", t, sure=not nears and t == 6.0) for t in (0.5, 3.0, 6.0, 9.0, 11.5))]
+    if not nears:  # one event over all the time, whose moment may be any
+        events = [Event("following", "ego", "car-1", 0.0 if v < u else 12.0)]
+    return stage.world(f"follow, {'nears' if nears else 'follows'}", events, JUNCTION_TAGS)
+
+
+def turn_back(stage: Stage) -> World:
+    """A car turns back within the road."""
+    rng = stage.rng
+    v, radius = rng.uniform(3.5, 5.0), rng.uniform(5.0, 7.0)
+    line = route([(-80, -radius), (30, -radius), (30, radius), (-120, radius)], radius - 0.01)
+    s = stage.add("ego", line, v, start_m=110 - radius - v * 4.0)
+    middle = stage.t[np.argmax(s > 110 - radius + np.pi * radius / 2)]
+    return stage.world("turn back", [Event("u_turn", "ego", None, middle)], JUNCTION_TAGS)
+
+
+def oncoming(stage: Stage) -> World:
+    """A car passes a slower one in the lane of oncoming traffic."""
+    rng = stage.rng
+    v, u, w = rng.uniform(13.0, 16.0), rng.uniform(6.0, 8.0), rng.uniform(8.0, 12.0)
+    out_s, lasts = 2.0, 2.5
+    d = 3.5 * quintic((stage.t - out_s) / lasts) - 3.5 * quintic((stage.t - out_s - lasts - 2.5) / lasts)
+    back = out_s + lasts * 1.5 + 2.5
+    s = np.cumsum(np.full(len(stage.t), v)) * FINE_S
+    beside = out_s + lasts + 1.0
+    x0 = -v * beside + u * beside  # beside the slower one then
+    x, y = x0 + s, -1.75 + d
+    stage.agents.append(_agent("car-1", x, -y if stage.mirrored else y, stage.t, None, stage.rate_hz, stage.noise_m, stage.rng))
+    stage.add("car-2", route([(0, -1.75), (400, -1.75)], 5.0), u, start_m=0.0)
+    # The oncoming one meets it two to three seconds after it is back.
+    meet = back + rng.uniform(1.5, 2.5)
+    at = x0 + v * meet
+    stage.add("ego", route([(at + w * meet, 1.75), (at - 300, 1.75)], 5.0), w)
+    closing = v + w
+    events = [
+        Event("overtaking", "car-1", "car-2", beside), Event("oncoming_in_lane", "car-1", "ego", back - 1.0, sure=closing * (meet - back) / closing < 4.0),
+        *(Event(tag, a, b, t, sure=False) for a, b in (("car-1", "ego"), ("ego", "car-1")) for tag in ("oncoming_in_lane", "near_miss", "crossing_path") for t in (beside, back, meet)),
+        *(Event(tag, a, b, t, sure=False) for a, b in (("car-1", "car-2"), ("car-2", "car-1")) for tag in ("cut_in", "cut_out", "approaching", "near_miss", "following") for t in (1.0, 2.0, 3.25, beside, back - 1, back, back + 2)),
+    ]  # fmt: skip
+    return stage.world("oncoming", events, JUNCTION_TAGS)
+
+
+SCRIPTS = (turn_across, crossing, merge, step_out, wait_at_light, follow, turn_back, oncoming)
+
+
+def scripted(count: int, noise_m: float, first: int = 0):
+    """Yield scripted scenes with random parameters, at several rates and on both sides of traffic."""
+    for seed in range(first, first + count):
+        for k, script in enumerate(SCRIPTS):
+            rng = np.random.default_rng([seed, k])
+            yield script(Stage(rng, float(rng.choice([2.0, 5.0, 10.0, 20.0])), bool(seed % 2), noise_m))
+
+
 def _near(value: float, limit: float) -> bool:
     return abs(value - limit) < 0.1 * limit
 
@@ -211,7 +448,7 @@ def score(worlds: Sequence[World], found: Sequence[Sequence[Tag]]) -> dict[str, 
             fits = [e for e in left if (e.tag, e.agent) == (tag.tag, tag.agent) and e.other in (tag.other, None) and abs(e.t_s - tag.t_s) <= WITHIN_S]
             row = counts[tag.tag]
             if fits:
-                best = min(fits, key=lambda e: abs(e.t_s - tag.t_s))
+                best = min(fits, key=lambda e: (not e.sure, abs(e.t_s - tag.t_s)))
                 left.remove(best)
                 if best.sure:
                     row[0] += 1
@@ -231,10 +468,10 @@ def f1(true: int, invented: int, missed: int) -> float:
     return 2 * true / max(2 * true + invented + missed, 1)
 
 
-def variants(count: int, noise_m: float):
+def variants(count: int, noise_m: float, first: int = 0):
     """Yield random traffic of all kinds."""
     kinds = list(itertools.product((2.0, 5.0, 10.0, 20.0), (0.0, 1 / 400, WINDING), (True, False), (False, True)))
-    for seed in range(count):
+    for seed in range(first, first + count):
         rate_hz, bend, right, lanes = kinds[(seed * 7) % len(kinds)]
         yield traffic(seed, rate_hz=rate_hz, bend_1pm=bend, keeps_right=right, lanes=lanes, noise_m=noise_m)
 
@@ -243,10 +480,12 @@ def main(arguments: list[str] | None = None) -> None:
     """Print a table."""
     parser = parser_of(__doc__)
     parser.add_argument("--worlds", type=int, default=48)
+    parser.add_argument("--scripted", type=int, default=12, help="of each scripted scene")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of places, m")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--wrong", action="store_true", help="list what was wrong")
     asked = parser.parse_args(arguments)
-    worlds = list(variants(asked.worlds, asked.noise))
+    worlds = [*variants(asked.worlds, asked.noise, asked.first), *scripted(asked.scripted, asked.noise, asked.first)]
     begin = time.process_time()
     found = [find_tags(w.scenario) for w in worlds]
     spent = time.process_time() - begin
