@@ -15,7 +15,7 @@ from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.prediction.motion_table import TICK_S
 from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
 from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
-from log2sim.scenarios.traffic import SIDE_M, Beside, Traffic, latched, probability_above, runs
+from log2sim.scenarios.traffic import SAME_WAY_RAD, SIDE_M, Beside, Traffic, latched, probability_above, runs, turned
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import CROSSING_RAD, post_encroachment_times, time_to_touch
 
@@ -83,7 +83,7 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         return
     own, speed = traffic.speed_mps[r], traffic.speed_mps[o] * np.cos(b.turn_rad[o])
     closing, gap = own - speed, b.gap_m[o]
-    ahead = (b.leader == o) & (own >= MOVING_MPS)
+    ahead = (b.leader == o) & (own >= MOVING_MPS) & (gap > 0)
     ttc = time_to_collision(gap, closing)
     headway = time_headway(gap, own)
     for i, j in runs(ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0), round(1.0 / TICK_S), BREAK):
@@ -134,8 +134,10 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
             continue
         if measures["time_headway_s"] > LEADING_S:
             continue
-        joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD
-        if not joins and not _is_change_of(traffic, b, r, o, crossing):
+        # Who joins turns itself; who was there before the other turned in behind it does not.
+        turn = abs(turned(traffic.course_rad[o], begin, end))
+        joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD and turn > JOINING_RAD
+        if not joins and (turn > JOINING_RAD or not _is_change_of(traffic, b, r, o, crossing)):
             continue
         outer, inner = (off[begin : crossing + 1], off[crossing : end + 1]) if enters else (off[crossing : end + 1], off[begin : crossing + 1])
         sigma = float(b.sigma_m[o, crossing])
@@ -244,7 +246,7 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
         if pet > CROSSING_S or min(speed_a, speed_c) < 0.5 or not (traffic.wheeled[a] or traffic.wheeled[c]):
             continue
         angle = float(abs(wrap_angle(traffic.course_rad[a, i] - traffic.course_rad[c, j])))
-        if angle < CROSSING_RAD:
+        if not SAME_WAY_RAD <= angle <= ONCOMING_RAD + CROSSING_RAD:
             continue
         begin, ttc, touch = _planar_ttc(traffic, a, c, j)
         sigma_s = float(np.hypot(traffic.sigma_m[a, i] / speed_a, traffic.sigma_m[c, j] / speed_c))

@@ -18,6 +18,9 @@ from log2sim.scenarios.traffic import HALF_LANE_M, LANE_CHANGE_S, Beside, Mask, 
 COMFORTABLE_MPS2 = 3.4
 """Deceleration that most drivers find comfortable (AASHTO, "Green Book" 2018, 3.2.2)."""
 
+MAX_BRAKING_MPS2 = 11.0
+"""No brakes decelerate harder on tires for the road (ABS tests on dry asphalt: 9 to 11 m/s2)."""
+
 MOVING_MPS = 2.0
 """Who is faster moves on: faster than people walk, and than smoothed speeds of who stands may be off."""
 
@@ -219,6 +222,8 @@ def _hard_braking(traffic: Traffic, k: int) -> Iterator[Tag]:
     hard: Mask = (accel < -COMFORTABLE_MPS2) & np.isfinite(accel)
     for i, j in runs(hard, round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(accel[i : j + 1]))
+        if -accel[n] > MAX_BRAKING_MPS2:  # it is the log that jumps
+            continue
         # Two speeds half a second apart, whose errors are independent, tell the deceleration.
         sigma = np.sqrt(2.0) * traffic.sigma_speed_mps[k, n] / max((j - i) * TICK_S, 0.5)
         yield tag_of(traffic, "hard_braking", k, (i, n, j), probability_above(-accel[n], COMFORTABLE_MPS2, sigma), deceleration_mps2=-accel[n], speed_mps=speed[i], speed_change_mps=speed[i] - speed[j], duration_s=(j - i) * TICK_S)  # fmt: skip

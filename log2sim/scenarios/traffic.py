@@ -30,6 +30,9 @@ STEP_M = 0.5
 HALF_LANE_M = 1.75
 """Half the width of a lane where none is known: 3.5 m, between streets (3.0 to 3.5 m) and motorways (3.5 to 3.75 m; RAA 2008)."""
 
+HALF_TRACK_M = 1.0
+"""The same of a track for bicycles (ERA 2010: 2.0 m)."""
+
 SIDE_M = 0.3
 """Beyond a lane's edge, on either side, until which an agent has not crossed it: drivers keep their lane to this standard deviation."""
 
@@ -298,6 +301,8 @@ class Traffic:
 
     def half_lane_m(self, r: int) -> float:
         """Return half the width of the lane that an agent drives in most; the usual one where none is known."""
+        if self.table.category[r] in ("cyclist", "bicycle"):
+            return HALF_TRACK_M
         inside = self.lane_of[r][self.lane_of[r] >= 0] if self.lanes else np.zeros(0, dtype=np.intp)
         return float(np.median(self.lanes[np.bincount(inside).argmax()][0].width_m)) / 2 if len(inside) else HALF_LANE_M
 
