@@ -17,16 +17,29 @@ MAX_LISTED = 40
 
 
 def find(
-    path: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch, or one scenario.json.")],
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch, or one scenario.json."),
+    ],
     condition: Annotated[
-        str, typer.Argument(metavar="CONDITION", help="Such as 'cut_in and ttc_s < 2 and ego.speed_mps > 10'; without one, all tags are counted.")
+        str,
+        typer.Argument(
+            metavar="CONDITION",
+            help="Such as 'cut_in and ttc_s < 2 and ego.speed_mps > 10'; without one, all tags are counted.",
+        ),
     ] = "",
     out: Annotated[Path | None, write_to("FILE.html", "Page of the hits to write, with pictures.")] = None,
     table: Annotated[Path | None, option("Parquet file of the hits to write.", "FILE.parquet")] = None,
-    open_: Annotated[int | None, option("Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)] = None,
-    probability: Annotated[float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)] = 0.5,
+    open_: Annotated[
+        int | None, option("Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)
+    ] = None,
+    probability: Annotated[
+        float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
+    ] = 0.5,
     fields: Annotated[bool, option("List the fields of these scenarios' tags.", None, "--fields")] = False,
-    fresh: Annotated[bool, option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")] = False,
+    fresh: Annotated[
+        bool, option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")
+    ] = False,
     jobs: Annotated[int | None, option("Processes that tag.", "N", min=1, default="one for each core")] = None,
     scheduler: Annotated[
         str | None, option("Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")
@@ -75,7 +88,10 @@ def find(
 
         say(json.dumps(list(found.rows), ensure_ascii=False))
     for k, row in enumerate(found.rows[:MAX_LISTED]):
-        say(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}", quiet=quiet or as_json)
+        say(
+            f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}",
+            quiet=quiet or as_json,
+        )
     more = len(found.rows) - MAX_LISTED
     if more > 0:
         say(f"and {more} more; --out and --table have all", quiet=quiet or as_json)
@@ -135,7 +151,11 @@ def _opened(index: Index, row: Row, number: int, out: Path | None) -> str:
     from log2sim.datatypes import Scenario
     from log2sim.visualization.page.writer import write_page
 
-    page = out.with_name(f"{out.stem}-{number}.html") if out is not None else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{number}.html"
+    page = (
+        out.with_name(f"{out.stem}-{number}.html")
+        if out is not None
+        else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{number}.html"
+    )
     write_page(Scenario.load(index.folder / row["file"]), page, overwrite=True)
     address = f"{page.resolve().as_uri()}#t={row['t_s']:.2f}&agent={quote(row['agent'])}"
     webbrowser.open(address)

@@ -13,7 +13,11 @@ def tag(
     scenario: ScenarioPath,
     out: Annotated[Path | None, write_to("FILE", "Scenario file to write, with the tags in it.")] = None,
     criticality: Annotated[
-        Path | None, option("Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.", "FILE.csv")
+        Path | None,
+        option(
+            "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
+            "FILE.csv",
+        ),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

@@ -165,6 +165,7 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
         agents=tuple(agents.values()),
         duration_s=max(scenario.duration_s, end_s),
         provenance={**scenario.provenance, "edits": _history(scenario, edits)},
+        tags=None,
     )
     # What is wrong with the edited scenario and not with its source, a line each, with agent, time and value.
     source = {a.id: a for a in scenario.agents}

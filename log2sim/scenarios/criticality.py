@@ -55,7 +55,9 @@ def braking_required(gap_m: Array, closing_mps: Array, accel_ahead_mps2: Array) 
     return np.maximum(deceleration_to_avoid(gap_m, closing_mps) - np.where(closing_mps > 0, accel_ahead_mps2, 0.0), 0.0)
 
 
-def brake_threat_number(gap_m: Array, closing_mps: Array, accel_ahead_mps2: Array, available_mps2: float = BRAKES_MPS2) -> Array:
+def brake_threat_number(
+    gap_m: Array, closing_mps: Array, accel_ahead_mps2: Array, available_mps2: float = BRAKES_MPS2
+) -> Array:
     """Compute BTN (Brannstrom et al. 2008): deceleration required by the one available; from 1 on braking alone does not help."""
     return braking_required(gap_m, closing_mps, accel_ahead_mps2) / available_mps2
 

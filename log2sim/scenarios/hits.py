@@ -48,7 +48,9 @@ def write_hits(path: Path, index: Index, condition: str, rows: Sequence[Row]) ->
                 loaded = {row["file"]: None}
         scenario = loaded[row["file"]]
         picture = thumbnail(scenario, row) if scenario is not None else ""
-        cards.append(f"<article>{picture}<b>{k + 1}. {html.escape(say_hit(row))}</b><br><small>{html.escape(row['file'])}</small><br>{html.escape(say_quantities(row))}</article>")
+        cards.append(
+            f"<article>{picture}<b>{k + 1}. {html.escape(say_hit(row))}</b><br><small>{html.escape(row['file'])}</small><br>{html.escape(say_quantities(row))}</article>"
+        )
     more = f" The first {MAX_PICTURES} are shown." if len(rows) > MAX_PICTURES else ""
     digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
     page = (
@@ -93,11 +95,9 @@ def thumbnail(scenario: Scenario, row: Row) -> str:
     def near(xy_m: Array) -> bool:
         return bool(np.abs(xy_m[:, :2] - center).max(axis=1).min() < sum(WINDOW_M))
 
-    lines = []
     features = scenario.map_features
-    for item in (*features.markings, *features.borders, *features.lanes) if features is not None else ():
-        if near(item.points_m):
-            lines.append(f'<polyline points="{points(item.points_m)}"/>')
+    drawn = (*features.markings, *features.borders, *features.lanes) if features is not None else ()
+    lines = [f'<polyline points="{points(item.points_m)}"/>' for item in drawn if near(item.points_m)]
     roles = {row["agent"]: "agent", row.get("other"): "other"}
     for agent, now in states.values():
         role = roles.get(agent.id)

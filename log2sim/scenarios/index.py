@@ -76,7 +76,9 @@ def rows_of(scenario: Scenario, file: str) -> list[Row]:
             agent = agents.get(id or "")
             if agent is None:
                 continue
-            before, now, after = agent.at([tag.t_s - TICK_S, tag.t_s, tag.t_s + TICK_S], margin_s=1e-3).speed_mps.tolist()
+            before, now, after = agent.at(
+                [tag.t_s - TICK_S, tag.t_s, tag.t_s + TICK_S], margin_s=1e-3
+            ).speed_mps.tolist()
             ends = (before if np.isfinite(before) else now), (after if np.isfinite(after) else now)
             span_s = TICK_S * (np.isfinite(before) + np.isfinite(after))
             row[f"{role}.category"], row[f"{role}.confidence"] = agent.category, agent.confidence
@@ -135,7 +137,12 @@ def _begins_as_scenario(path: Path) -> bool:
 
 
 def open_index(
-    path: Path, *, fresh: bool = False, jobs: int | None = None, map_files: MapFiles | None = None, progress: Progress | None = None
+    path: Path,
+    *,
+    fresh: bool = False,
+    jobs: int | None = None,
+    map_files: MapFiles | None = None,
+    progress: Progress | None = None,
 ) -> Index:
     """Open the index of a folder, after files that are new, changed or gone were brought up to date in it; of one file it is only made.
 
@@ -157,14 +164,16 @@ def open_index(
     MissingExtra
         Without pyarrow.
     """
-    pa = import_arrow()
+    import_arrow()
     import pyarrow.parquet as pq
 
     if path.is_file():
         return Index(path.parent, table_of_rows(rows_of(Scenario.load(path), path.name)), 1)
     files = {str(p.relative_to(path)): _stamp(p) for p in find_scenarios(path)} if path.is_dir() else {}
     if not files:
-        raise ScenarioError(f"{path}: holds no scenario; expected a scenario.json, or a folder with some, such as that of log2sim batch")
+        raise ScenarioError(
+            f"{path}: holds no scenario; expected a scenario.json, or a folder with some, such as that of log2sim batch"
+        )
     known, old = ({}, None) if fresh else _read(path / INDEX_FILE)
     problems = dict(known.get("problems", {}))
     stamps = known.get("files", {})
@@ -174,7 +183,9 @@ def open_index(
     kept = [] if old is None else [r for r in old.to_pylist() if r["file"] in files and r["file"] not in missing]
     rows = [{k: v for k, v in row.items() if v is not None} for row in kept]
     problems = {name: text for name, text in problems.items() if name in files and name not in missing}
-    run = map_files or (lambda work, names: map_in_processes(work, names, min(jobs or default_jobs(), max(len(names) // 8, 1))))
+    run = map_files or (
+        lambda work, names: map_in_processes(work, names, min(jobs or default_jobs(), max(len(names) // 8, 1)))
+    )
     for k, done in enumerate(run(index_file, [str(path / name) for name in missing])):
         name = str(Path(done.file).relative_to(path))
         rows += [{**row, "file": name} for row in done.rows]
@@ -185,7 +196,9 @@ def open_index(
     table = table_of_rows(rows)
     about = {"version": INDEX_VERSION, "tags": sorted(TAGS), "files": files, "problems": problems}
     with replaced(path / INDEX_FILE) as temporary:
-        pq.write_table(table.replace_schema_metadata({KEY: json.dumps(about).encode()}), temporary, row_group_size=20_000)
+        pq.write_table(
+            table.replace_schema_metadata({KEY: json.dumps(about).encode()}), temporary, row_group_size=20_000
+        )
     return Index(path, table, len(files), _listed(problems))
 
 

@@ -86,14 +86,29 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     ahead = (b.leader == o) & (own >= MOVING_MPS) & (gap > 0)
     ttc = time_to_collision(gap, closing)
     headway = time_headway(gap, own)
-    for i, j in runs(ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0), round(1.0 / TICK_S), BREAK):
+    for i, j in runs(
+        ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0),
+        round(1.0 / TICK_S),
+        BREAK,
+    ):
         n = i + int(np.argmin(headway[i : j + 1]))
         sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
-        yield tag_of(traffic, "following", r, (i, n, j), sure, o, duration_s=(j - i) * TICK_S, **_lane_measures(traffic, b, r, o, n))
+        yield tag_of(
+            traffic,
+            "following",
+            r,
+            (i, n, j),
+            sure,
+            o,
+            duration_s=(j - i) * TICK_S,
+            **_lane_measures(traffic, b, r, o, n),
+        )
     for i, j in runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(ttc[i : j + 1]))
         sigma_mps = np.hypot(traffic.sigma_speed_mps[r, n], traffic.sigma_speed_mps[o, n])
-        sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]) * probability_above(closing[n], 0.0, sigma_mps)
+        sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]) * probability_above(
+            closing[n], 0.0, sigma_mps
+        )
         yield tag_of(traffic, "approaching", r, (i, n, j), sure, o, **_lane_measures(traffic, b, r, o, n))
     drac = deceleration_to_avoid(gap, closing)
     on_course = np.abs(b.aside_m[o]) < (traffic.table.size_m[r, 1] + traffic.table.size_m[o, 1]) / 2
@@ -106,8 +121,18 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         peak = i + int(np.argmax(drac[i : j + 1]))
         sigma_drac = drac[peak] * np.hypot(2 * sigma_mps / closing[peak], sigma_m / max(gap[peak], 0.1))
         sure = max(by_time, probability_above(drac[peak], NEAR_DRAC_MPS2, sigma_drac))
-        sure *= probability_above((traffic.table.size_m[[r, o], 1].sum()) / 2 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
-        yield tag_of(traffic, "near_miss", r, (i, n, j), sure, o, **{**_lane_measures(traffic, b, r, o, n), "drac_mps2": drac[peak]})
+        sure *= probability_above(
+            (traffic.table.size_m[[r, o], 1].sum()) / 2 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]
+        )
+        yield tag_of(
+            traffic,
+            "near_miss",
+            r,
+            (i, n, j),
+            sure,
+            o,
+            **{**_lane_measures(traffic, b, r, o, n), "drac_mps2": drac[peak]},
+        )
 
 
 def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
@@ -129,7 +154,11 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         begin, end, lateral = lateral_extent(b.aside_m[o, first : last + 1], crossing - first)
         begin, end = first + begin, first + end
         measures = _lane_measures(traffic, b, r, o, crossing)
-        led = (b.leader[crossing - 1 : min(crossing + WINDOW, len(known))] if enters else b.leader[max(crossing - WINDOW, 0) : crossing + 1]) == o
+        led = (
+            b.leader[crossing - 1 : min(crossing + WINDOW, len(known))]
+            if enters
+            else b.leader[max(crossing - WINDOW, 0) : crossing + 1]
+        ) == o
         if min(traffic.speed_mps[r, crossing], traffic.speed_mps[o, crossing]) < MOVING_MPS or not led.any():
             continue
         if measures["time_headway_s"] > LEADING_S:
@@ -139,10 +168,18 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD and turn > JOINING_RAD
         if not joins and (turn > JOINING_RAD or not _is_change_of(traffic, b, r, o, crossing)):
             continue
-        outer, inner = (off[begin : crossing + 1], off[crossing : end + 1]) if enters else (off[crossing : end + 1], off[begin : crossing + 1])
+        outer, inner = (
+            (off[begin : crossing + 1], off[crossing : end + 1])
+            if enters
+            else (off[crossing : end + 1], off[begin : crossing + 1])
+        )
         sigma = float(b.sigma_m[o, crossing])
-        sure = probability_above(np.nanmax(outer), b.half_m, sigma) * probability_above(-np.nanmin(inner), -b.half_m, sigma)
-        sure *= probability_above(b.ahead_m[o, crossing], 0.0, np.hypot(traffic.sigma_m[r, crossing], traffic.sigma_m[o, crossing]))
+        sure = probability_above(np.nanmax(outer), b.half_m, sigma) * probability_above(
+            -np.nanmin(inner), -b.half_m, sigma
+        )
+        sure *= probability_above(
+            b.ahead_m[o, crossing], 0.0, np.hypot(traffic.sigma_m[r, crossing], traffic.sigma_m[o, crossing])
+        )
         tag = "merging" if joins else "cut_in" if enters else "cut_out"
         yield tag_of(traffic, tag, o, (begin, crossing, end), sure, r, lateral_speed_mps=abs(lateral), duration_s=(end - begin) * TICK_S,
                      side=np.sign(-lateral if enters else lateral), **measures)  # fmt: skip
@@ -167,7 +204,11 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     for n in (np.flatnonzero(passed[1:] & ~passed[:-1]) + 1).tolist():
         start = int(np.flatnonzero(ahead[:n] < -reach)[-1])
         part = slice(start, n + 1)
-        if not (np.isfinite(ahead[part]).all() and b.same_way[o, part].all() and (traffic.speed_mps[r, part] >= MOVING_MPS).all()):
+        if not (
+            np.isfinite(ahead[part]).all()
+            and b.same_way[o, part].all()
+            and (traffic.speed_mps[r, part] >= MOVING_MPS).all()
+        ):
             continue
         aside = b.aside_m[o, part]
         if np.abs(aside).max() > 4.5 * b.half_m:  # two lanes beside: farther is another carriageway
@@ -185,7 +226,12 @@ def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     width = traffic.table.size_m[[r, o], 1].sum() / 2 - SIDE_M
     speed, own = traffic.speed_mps[o], traffic.speed_mps[r]
     ttc = time_to_collision(b.gap_m[o], own + speed)
-    state = (np.abs(b.turn_rad[o]) > ONCOMING_RAD) & (np.abs(b.aside_m[o]) < width) & (b.ahead_m[o] > 0) & (ttc < CROSSING_S)
+    state = (
+        (np.abs(b.turn_rad[o]) > ONCOMING_RAD)
+        & (np.abs(b.aside_m[o]) < width)
+        & (b.ahead_m[o] > 0)
+        & (ttc < CROSSING_S)
+    )
     for i, j in runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S), BREAK):
         n = i + int(np.argmin(np.where(ttc[i : j + 1] > 0, ttc[i : j + 1], np.inf)))
         sure = probability_above(width - np.abs(b.aside_m[o, i : j + 1].min()), 0.0, b.sigma_m[o, n])
@@ -198,7 +244,12 @@ def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     for n in (np.flatnonzero(inside[1:] & ~inside[:-1]) + 1).tolist():
         speed = traffic.speed_mps[r, n]
         arrives_s = float(time_headway(b.ahead_m[o, n], speed))
-        if not (np.isfinite(b.ahead_m[o, n - 1 : n + 1]).all() and b.ahead_m[o, n] > 0 and speed >= MOVING_MPS and arrives_s < CROSSING_S):
+        if not (
+            np.isfinite(b.ahead_m[o, n - 1 : n + 1]).all()
+            and b.ahead_m[o, n] > 0
+            and speed >= MOVING_MPS
+            and arrives_s < CROSSING_S
+        ):
             continue
         ticks = np.arange(max(n - WINDOW, 0), n + 1)
         ticks = ticks[np.isfinite(traffic.place_m[r, ticks])]
@@ -206,7 +257,9 @@ def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         first = int(present[0])
         velocity = (traffic.place_m[o, n] - traffic.place_m[o, first]) / (n - first) if n > first else 0.0
         # Before it was seen first it walked the same way.
-        place = np.where(ticks < first, traffic.place_m[o, first] + (ticks - first) * velocity, traffic.place_m[o, ticks])
+        place = np.where(
+            ticks < first, traffic.place_m[o, first] + (ticks - first) * velocity, traffic.place_m[o, ticks]
+        )
         hidden = _hidden(traffic, traffic.place_m[r, ticks], place, ticks, (r, o))
         if not hidden.any() or hidden[-1]:
             continue
@@ -222,13 +275,19 @@ def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tupl
 
     t = traffic.table
     hidden = np.zeros(len(ticks), dtype=bool)
-    sight = shapely.linestrings(np.stack([np.column_stack([eye.real, eye.imag]), np.column_stack([place.real, place.imag])], axis=1))
+    sight = shapely.linestrings(
+        np.stack([np.column_stack([eye.real, eye.imag]), np.column_stack([place.real, place.imag])], axis=1)
+    )
     for k in range(len(traffic.ids)):
         # Half as wide as it is, since who is hidden in part is seen.
-        there = np.flatnonzero(t.present[k, ticks] & (t.size_m[k, 2] > 1.0)) if k not in pair and traffic.wheeled[k] else []
+        there = (
+            np.flatnonzero(t.present[k, ticks] & (t.size_m[k, 2] > 1.0)) if k not in pair and traffic.wheeled[k] else []
+        )
         if len(there):
             rows = ticks[there]
-            boxes = shapely.polygons(box_corners_bev(t.xy_m[k, rows], t.size_m[k, 0], t.size_m[k, 1] / 2, t.yaw_rad[k, rows]))
+            boxes = shapely.polygons(
+                box_corners_bev(t.xy_m[k, rows], t.size_m[k, 0], t.size_m[k, 1] / 2, t.yaw_rad[k, rows])
+            )
             hidden[there] |= shapely.intersects(sight[there], boxes)
     return hidden
 
@@ -236,10 +295,14 @@ def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tupl
 def _crossings(traffic: Traffic) -> Iterator[Tag]:
     """Find whose paths cross, who turns across the path of oncoming traffic, and near misses there."""
     t = traffic.table
-    boxes = BoxTracks(t.center_m[..., 0].T, t.center_m[..., 1].T, t.center_m[..., 2].T, t.yaw_rad.T, t.speed_mps.T, t.size_m)
+    boxes = BoxTracks(
+        t.center_m[..., 0].T, t.center_m[..., 1].T, t.center_m[..., 2].T, t.yaw_rad.T, t.speed_mps.T, t.size_m
+    )
     found = post_encroachment_times(boxes, TICK_S)
     last = len(t.t_s) - 1
-    for a, c, left, came in zip(found.first.tolist(), found.second.tolist(), found.left_row.tolist(), found.came_row.tolist()):
+    for a, c, left, came in zip(
+        found.first.tolist(), found.second.tolist(), found.left_row.tolist(), found.came_row.tolist()
+    ):
         pet = (came - left) * TICK_S
         i, j = min(int(left), last), min(int(np.ceil(came)), last)
         speed_a, speed_c = traffic.speed_mps[a, i], traffic.speed_mps[c, j]
@@ -260,7 +323,10 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
         for one, two, n in ((a, c, i), (c, a, j)):
             if traffic.wheeled[one] and traffic.wheeled[two] and _turns_across(traffic, one, two, n, begin):
                 yield tag_of(traffic, "turning_across", one, (min(begin, i), n, j), sure, two, **measures)
-        near = max(probability_above(NEAR_PET_S - pet, 0.0, sigma_s), probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s) if np.isfinite(ttc) else 0.0)
+        near = max(
+            probability_above(NEAR_PET_S - pet, 0.0, sigma_s),
+            probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s) if np.isfinite(ttc) else 0.0,
+        )
         if pet < NEAR_PET_S or ttc < NEAR_TTC_S:
             yield tag_of(traffic, "near_miss", a, (min(touch, i), i, j), near, c, **measures)
 
@@ -290,4 +356,8 @@ def _turns_across(traffic: Traffic, one: int, two: int, n: int, begin: int) -> b
     came = abs(wrap_angle(course[one, known] - course[two, known]))
     first = int(known[np.argmax(came)])
     straight = abs(float(wrap_angle(course[two, known[-1]] - course[two, first]))) < np.radians(30)
-    return bool(came.max() > ONCOMING_RAD and straight and abs(float(wrap_angle(course[one, n] - course[one, first]))) > np.radians(25))
+    return bool(
+        came.max() > ONCOMING_RAD
+        and straight
+        and abs(float(wrap_angle(course[one, n] - course[one, first]))) > np.radians(25)
+    )

@@ -6,6 +6,7 @@ Op den Camp, De Schutter, "Real-world scenario mining for the assessment of auto
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,7 +14,15 @@ import numpy as np
 from log2sim.datatypes import STANDSTILL_MPS, Tag
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S
-from log2sim.scenarios.traffic import HALF_LANE_M, LANE_CHANGE_S, Beside, Mask, Traffic, latched, probability_above, runs, turned
+from log2sim.scenarios.traffic import (
+    LANE_CHANGE_S,
+    Mask,
+    Traffic,
+    latched,
+    probability_above,
+    runs,
+    turned,
+)
 
 COMFORTABLE_MPS2 = 3.4
 """Deceleration that most drivers find comfortable (AASHTO, "Green Book" 2018, 3.2.2)."""
@@ -72,14 +81,16 @@ def _lanes(traffic: Traffic, k: int) -> Iterator[Tag]:
     lane_of = traffic.lane_of[k]
     changes = np.flatnonzero(np.diff(lane_of)) + 1
     edges = [0, *changes.tolist(), len(lane_of)]
-    stays = [(i, j - 1, int(lane_of[i])) for i, j in zip(edges, edges[1:]) if lane_of[i] >= 0]
+    stays = [(i, j - 1, int(lane_of[i])) for i, j in itertools.pairwise(edges) if lane_of[i] >= 0]
     for i, j, lane in stays:
         at = _in_lane(traffic, k, lane, i, j)
         inside = probability_above(np.median(at[1] - np.abs(at[0])), 0.0, np.median(traffic.sigma_m[k, i : j + 1]))
-        yield tag_of(traffic, "in_lane", k, (i, i, j), inside * traffic.lanes[lane][0].confidence, lane=traffic.lanes[lane][0].id)
+        yield tag_of(
+            traffic, "in_lane", k, (i, i, j), inside * traffic.lanes[lane][0].confidence, lane=traffic.lanes[lane][0].id
+        )
     # Beyond 1 s an agent is in a lane; who crosses an edge for less keeps to its own.
     kept = [stay for stay in stays if (stay[1] - stay[0]) * TICK_S >= 1.0]
-    for (_, i, one), (j, _, two) in zip(kept, kept[1:]):
+    for (_, i, one), (j, _, two) in itertools.pairwise(kept):
         if one != two and (j - i) * TICK_S < LANE_CHANGE_S and _are_beside(traffic, one, two):
             yield from _change_between(traffic, k, one, two, (i, j))
 
@@ -93,13 +104,18 @@ def _are_beside(traffic: Traffic, one: int, two: int) -> bool:
         return False
     # One goes on where the other's neighbor ends.
     beside = {a.left_lane, a.right_lane, a.opposite}
-    return bool(beside & {*b.predecessors, *b.successors}) or bool({b.left_lane, b.right_lane, b.opposite} & {*a.predecessors, *a.successors})
+    return bool(beside & {*b.predecessors, *b.successors}) or bool(
+        {b.left_lane, b.right_lane, b.opposite} & {*a.predecessors, *a.successors}
+    )
 
 
 def _change_between(traffic: Traffic, k: int, one: int, two: int, edge: tuple[int, int]) -> Iterator[Tag]:
     """Describe a lane change: it begins and ends where the lateral speed does, and crosses where the center does."""
     crossing = (edge[0] + edge[1] + 1) // 2
-    first, last = max(crossing - round(LANE_CHANGE_S / TICK_S), 0), min(crossing + round(LANE_CHANGE_S / TICK_S), len(traffic.table.t_s) - 1)
+    first, last = (
+        max(crossing - round(LANE_CHANGE_S / TICK_S), 0),
+        min(crossing + round(LANE_CHANGE_S / TICK_S), len(traffic.table.t_s) - 1),
+    )
     aside, _ = _in_lane(traffic, k, two, first, last)
     begin, end, lateral = lateral_extent(aside, crossing - first)
     before = _in_lane(traffic, k, one, edge[0] - 5 if edge[0] >= 5 else 0, edge[0])
@@ -118,9 +134,14 @@ def _in_lane(traffic: Traffic, k: int, lane: int, first: int, last: int) -> tupl
     """Return how far to the left of a lane's middle an agent is, and half the lane's width, at ticks from one to another."""
     place = traffic.place_m[k, first : last + 1]
     known, line = traffic.lanes[lane]
-    at = line.project(np.column_stack([np.nan_to_num(place.real), np.nan_to_num(place.imag)]), np.nan_to_num(traffic.course_rad[k, first : last + 1]))
+    at = line.project(
+        np.column_stack([np.nan_to_num(place.real), np.nan_to_num(place.imag)]),
+        np.nan_to_num(traffic.course_rad[k, first : last + 1]),
+    )
     share = at.s_m / max(line.length_m, 1e-9)
-    return np.where(np.isfinite(place), at.aside_m, np.nan), np.interp(share, np.linspace(0, 1, len(known.width_m)), known.width_m) / 2
+    return np.where(np.isfinite(place), at.aside_m, np.nan), np.interp(
+        share, np.linspace(0, 1, len(known.width_m)), known.width_m
+    ) / 2
 
 
 def lateral_extent(aside_m: Array, crossing: int) -> tuple[int, int, float]:
@@ -132,14 +153,6 @@ def lateral_extent(aside_m: Array, crossing: int) -> tuple[int, int, float]:
     begin = int(before[-1]) + 1 if len(before) else 0
     end = crossing + int(after[0]) - 1 if len(after) else len(slow) - 1
     return min(begin, crossing), max(end, crossing), float(lateral[crossing])
-
-
-def pair_lane_change(traffic: Traffic, other: Beside, k: int, crossing: int, *, half_m: float = HALF_LANE_M) -> tuple[int, int, float, float]:
-    """Return begin, end, lateral speed and width, m, of the change of agent `k` across the edge of another's lane."""
-    first = max(crossing - round(LANE_CHANGE_S / TICK_S), 0)
-    aside = other.aside_m[k, first : crossing + round(LANE_CHANGE_S / TICK_S)]
-    begin, end, lateral = lateral_extent(aside, crossing - first)
-    return first + begin, first + end, lateral, float(abs(aside[end] - aside[begin]))
 
 
 def _starts_and_stops(traffic: Traffic, k: int) -> Iterator[Tag]:
@@ -203,13 +216,17 @@ def _turns(traffic: Traffic, k: int) -> Iterator[Tag]:
         tight = bend * sign > 1.0 / 50.0
         gaps = runs(~tight)
         for i, j in gaps:
-            if 0 < i and j < len(tight) - 1 and (j - i + 1) * TICK_S <= 1.0:
+            if i > 0 and j < len(tight) - 1 and (j - i + 1) * TICK_S <= 1.0:
                 tight[i : j + 1] = True
         for i, j in runs(tight):
             angle = turned(course, max(i - 1, 0), j)
             way_m = float(speed[i : j + 1].sum() * TICK_S)
             radius_m = way_m / abs(angle) if angle else np.inf
-            if not np.isfinite(angle) or abs(angle) < TURN_RAD or way_m > TURN_WITHIN_M * max(1.0, abs(angle) / (np.pi / 2)):
+            if (
+                not np.isfinite(angle)
+                or abs(angle) < TURN_RAD
+                or way_m > TURN_WITHIN_M * max(1.0, abs(angle) / (np.pi / 2))
+            ):
                 continue
             tag, limit = ("u_turn", BACK_RAD) if abs(angle) >= BACK_RAD else ("turning", TURN_RAD)
             sigma = np.sqrt(2.0) * np.median(traffic.sigma_m[k, i : j + 1]) / max(way_m / 2, 1.0)

@@ -7,6 +7,7 @@ pyarrow cannot; it runs within this process, needs no server, and reads tables o
 from __future__ import annotations
 
 import ast
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from typing import Any
 from log2sim.datatypes import TAGS
 from log2sim.errors import ConfigError, MissingExtra
 from log2sim.files.plugins import nearest
-from log2sim.scenarios.index import NUMBERS, ROLES, TEXTS, Index, Row
+from log2sim.scenarios.index import ROLES, TEXTS, Index, Row
 
 MAX_LETTERS, MAX_NODES = 2000, 200
 
@@ -64,11 +65,15 @@ class Condition:
     def __init__(self, text: str, columns: Sequence[str]) -> None:
         self.text, self.columns = text.strip(), list(columns)
         if not self.text or len(self.text) > MAX_LETTERS:
-            raise ConfigError(f"condition: has {len(self.text)} letters, expected 1 to {MAX_LETTERS}, such as 'cut_in and ttc_s < 2'")
+            raise ConfigError(
+                f"condition: has {len(self.text)} letters, expected 1 to {MAX_LETTERS}, such as 'cut_in and ttc_s < 2'"
+            )
         try:
             self.tree = ast.parse(self.text, mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
-            raise ConfigError(f"condition '{self.text}': {problem.args[0]}; expected such as 'cut_in and ttc_s < 2'") from None
+            raise ConfigError(
+                f"condition '{self.text}': {problem.args[0]}; expected such as 'cut_in and ttc_s < 2'"
+            ) from None
         if sum(1 for _ in ast.walk(self.tree)) > MAX_NODES:
             raise ConfigError(f"condition: has more than {MAX_NODES} parts; ask for less at once")
         self.parts = _conjuncts(self.tree)
@@ -106,7 +111,13 @@ class Condition:
             return _Sql(f"({left.text} {ARITHMETIC[type(node.op)]} {divisor})", left.values + right.values, "number")
         if isinstance(node, ast.Compare):
             return self._comparison(node)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "abs" and len(node.args) == 1 and not node.keywords:
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id == "abs"
+            and len(node.args) == 1
+            and not node.keywords
+        ):
             part = self._number(node.args[0])
             return _Sql(f"abs({part.text})", part.values, "number")
         if isinstance(node, ast.Constant) and type(node.value) in (int, float, str):
@@ -115,7 +126,10 @@ class Condition:
             return self._name(node.id)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             return self._attribute(node.value.id, node.attr)
-        raise self._wrong(node, "is not understood; expected tags, fields, numbers and texts with and, or, not, < <= > >= == != in + - * /")
+        raise self._wrong(
+            node,
+            "is not understood; expected tags, fields, numbers and texts with and, or, not, < <= > >= == != in + - * /",
+        )
 
     def _number(self, node: ast.expr) -> _Sql:
         part = self._sql(node)
@@ -135,7 +149,9 @@ class Condition:
                 others = [self._sql(right)]
                 texts.append(f"{one.text} {COMPARISONS[type(op)]} {others[0].text}")
             else:
-                raise self._wrong(node, "compares in a way that is not understood; expected < <= > >= == != or in (A, B)")
+                raise self._wrong(
+                    node, "compares in a way that is not understood; expected < <= > >= == != or in (A, B)"
+                )
             if any(o.kind != one.kind or o.kind == "truth" for o in others):
                 raise self._wrong(node, "compares a number with a text, or what is neither; texts need quotes")
             values += [*one.values, *(v for o in others for v in o.values)]
@@ -150,13 +166,17 @@ class Condition:
         if name in self.columns and "." not in name:
             return _Sql(f'e."{name}"', kind="text" if name in TEXTS else "number")
         known = [*TAGS, *(c for c in self.columns if "." not in c), *ROLES]
-        raise ConfigError(f"condition: '{name}' is neither a tag nor a field{nearest(name, known)}; log2sim find --help lists tags, `log2sim find FOLDER --fields` fields")
+        raise ConfigError(
+            f"condition: '{name}' is neither a tag nor a field{nearest(name, known)}; log2sim find --help lists tags, `log2sim find FOLDER --fields` fields"
+        )
 
     def _attribute(self, of: str, name: str) -> _Sql:
         if of in ROLES:
             known = [c.partition(".")[2] for c in self.columns if c.startswith(f"{of}.")]
             if name not in known:
-                raise ConfigError(f"condition: {of} has no field '{name}'{nearest(name, known)}; it has {', '.join(known)}")
+                raise ConfigError(
+                    f"condition: {of} has no field '{name}'{nearest(name, known)}; it has {', '.join(known)}"
+                )
             return _Sql(f'e."{of}.{name}"', kind="text" if name == "category" else "number")
         if of in TAGS:
             known = [c for c in self.columns if "." not in c]
@@ -195,7 +215,7 @@ def _main_tags(node: ast.expr) -> list[str]:
         return [node.id]
     if isinstance(node, ast.BoolOp):
         found = [_main_tags(value) for value in node.values]
-        return sum(found, []) if isinstance(node.op, ast.Or) else next((f for f in found if f), [])
+        return [*itertools.chain(*found)] if isinstance(node.op, ast.Or) else next((f for f in found if f), [])
     return []
 
 
@@ -278,6 +298,14 @@ def _nearest_value(connection: Any, condition: Condition, part: ast.expr, rest: 
     except ConfigError:
         return ""
     # Values stand in the order of the text: of what is selected, of joins, of the condition.
-    query, values = condition.select(f"{one.text}, e.tag, e.agent, e.file, e.t_s", rest, f"AND {one.text} IS NOT NULL ORDER BY abs({one.text} - {two.text}), e.row LIMIT 1")
+    query, values = condition.select(
+        f"{one.text}, e.tag, e.agent, e.file, e.t_s",
+        rest,
+        f"AND {one.text} IS NOT NULL ORDER BY abs({one.text} - {two.text}), e.row LIMIT 1",
+    )
     row = connection.execute(query, [*one.values, *values, *one.values, *one.values, *two.values]).fetchone()
-    return "" if row is None else f"{ast.unparse(part.left)} = {row[0]:.4g}: {row[1]} of {row[2]} in {row[3]} at {row[4]:.1f} s"
+    return (
+        ""
+        if row is None
+        else f"{ast.unparse(part.left)} = {row[0]:.4g}: {row[1]} of {row[2]} in {row[3]} at {row[4]:.1f} s"
+    )

@@ -39,7 +39,17 @@ def tag(scenario: Scenario) -> Scenario:
     return replace(scenario, tags=find_tags(scenario))
 
 
-MEASURES = ("gap_m", "relative_speed_mps", "ttc_s", "time_headway_s", "drac_mps2", "mdrac_mps2", "braking_required_mps2", "btn", "stn")
+MEASURES = (
+    "gap_m",
+    "relative_speed_mps",
+    "ttc_s",
+    "time_headway_s",
+    "drac_mps2",
+    "mdrac_mps2",
+    "braking_required_mps2",
+    "btn",
+    "stn",
+)
 """Columns of `criticality_table` after agent, other and t_s; see `log2sim.scenarios.criticality`."""
 
 
@@ -82,4 +92,9 @@ def write_criticality(path: Path, table: dict[str, Array]) -> None:
         writer = csv.writer(file)
         writer.writerow(table)
         for row in zip(*table.values()):
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) and np.isfinite(v) else "" if isinstance(v, float) else v for v in row])
+            writer.writerow(
+                [
+                    f"{v:.6g}" if isinstance(v, float) and np.isfinite(v) else "" if isinstance(v, float) else v
+                    for v in row
+                ]
+            )

@@ -147,7 +147,9 @@ class Traffic:
         # Of who hardly moves the box tells the course, of all others the velocity.
         self.course_rad = np.angle(np.where(self.speed_mps > 1.0, velocity, heading))
         self.sigma_m = t.sigma_m
-        self.sigma_speed_mps = np.stack([_sigma_speed(t, k) for k in range(len(t.agents))]) if len(t.agents) else t.sigma_m
+        self.sigma_speed_mps = (
+            np.stack([_sigma_speed(t, k) for k in range(len(t.agents))]) if len(t.agents) else t.sigma_m
+        )
         self._paths: dict[int, Path | None] = {}
 
     def path(self, k: int) -> Path | None:
@@ -165,7 +167,9 @@ class Traffic:
     def _continued(self, k: int) -> Path:
         """Continue a path at both ends by `EXTENSION_M`: beside a lane or where others drove on, else on a circle."""
         ticks, line = self._driven[k]
-        guides = [line for _, line in self.lanes] + [d.line for j, d in self._driven.items() if j != k and self.wheeled[j]]
+        guides = [line for _, line in self.lanes] + [
+            d.line for j, d in self._driven.items() if j != k and self.wheeled[j]
+        ]
         points, known_m = line.points_m[:, 0] + 1j * line.points_m[:, 1], []
         for sign in (1.0, -1.0):  # ahead, then back: the line is turned around for it
             reversed_ = points[::-1] if sign < 0 else points
@@ -201,7 +205,10 @@ class Traffic:
             beyond = np.maximum(np.maximum(found.begin_m - at.s_m[on], at.s_m[on] - found.end_m), 0.0)
             heading_sigma = np.sqrt(2.0) * self.sigma_m[r, n] / FITTED_M  # of the line through its last places
             sigma[a, n] = np.sqrt(
-                self.sigma_m[a, n] ** 2 + self.sigma_m[r, n] ** 2 + (heading_sigma * beyond) ** 2 + (BEND_SIGMA_1PM * beyond**2 / 2) ** 2
+                self.sigma_m[a, n] ** 2
+                + self.sigma_m[r, n] ** 2
+                + (heading_sigma * beyond) ** 2
+                + (BEND_SIGMA_1PM * beyond**2 / 2) ** 2
             )
         length = self.table.size_m[:, 0]
         gap = np.abs(ahead) - ((length + length[r]) / 2)[:, None]
@@ -245,16 +252,27 @@ class Traffic:
         turn = rate(np.unwrap(np.nan_to_num(self.course_rad), axis=1))
         for k in [k for k in self._driven if self.wheeled[k]]:
             ticks = self._driven[k].ticks
-            ticks = ticks[np.unique(np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.place_m[k, ticks])))]) // 4.0, return_index=True)[1]]
+            ticks = ticks[
+                np.unique(
+                    np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.place_m[k, ticks])))]) // 4.0,
+                    return_index=True,
+                )[1]
+            ]
             place, speed = self.place_m[k, ticks], np.maximum(self.speed_mps[k, ticks], 1.0)
-            points.append(np.column_stack([place.real, place.imag, self.course_rad[k, ticks], turn[k, ticks] / speed, np.full(len(ticks), k)]))
+            points.append(
+                np.column_stack(
+                    [place.real, place.imag, self.course_rad[k, ticks], turn[k, ticks] / speed, np.full(len(ticks), k)]
+                )
+            )
         x, y, heading, bend, who = np.concatenate(points).T
         a, n = np.nonzero(np.isfinite(self.course_rad) & self.wheeled[:, None] & (self.speed_mps > 1.0))
         count = min(48, len(x))
         if count < 2 or not len(a):
             return out
         place, course = self.place_m[a, n], self.course_rad[a, n]
-        distance, near = cKDTree(np.column_stack([x, y])).query(np.column_stack([place.real, place.imag]), count, distance_upper_bound=12.0)
+        distance, near = cKDTree(np.column_stack([x, y])).query(
+            np.column_stack([place.real, place.imag]), count, distance_upper_bound=12.0
+        )
         known = np.isfinite(distance)
         near = np.where(known, near, 0)
         along = ((place[:, None] - x[near] - 1j * y[near]) * np.exp(-1j * heading[near])).real
@@ -263,7 +281,9 @@ class Traffic:
         # One vote for each vehicle: of its points the nearest.
         order = np.argsort(np.where(known, who[near], np.inf), axis=1, kind="stable")
         sorted_who = np.take_along_axis(np.where(known, who[near], np.nan), order, axis=1)
-        first = np.concatenate([np.ones((len(a), 1), dtype=bool), sorted_who[:, 1:] != sorted_who[:, :-1]], axis=1) & np.isfinite(sorted_who)
+        first = np.concatenate(
+            [np.ones((len(a), 1), dtype=bool), sorted_who[:, 1:] != sorted_who[:, :-1]], axis=1
+        ) & np.isfinite(sorted_who)
         votes = np.where(first, np.take_along_axis(turn, order, axis=1), np.nan)
         enough = first.sum(axis=1) >= 2
         votes = np.concatenate([votes[enough], np.zeros((enough.sum(), 1))], axis=1)
@@ -322,14 +342,18 @@ def smoothed(table: MotionTable) -> tuple[Complex, Complex]:
             continue
         w = agent.waypoints
         sampled = w.speed_mps * np.exp(1j * w.yaw_rad)
-        jumps = np.abs(np.diff(sampled, 2)) / np.sqrt(6.0) / 1.18 if len(w) > 4 else np.zeros(1)  # the median of two axes' errors is 1.18 sigma
+        jumps = (
+            np.abs(np.diff(sampled, 2)) / np.sqrt(6.0) / 1.18 if len(w) > 4 else np.zeros(1)
+        )  # the median of two axes' errors is 1.18 sigma
         interval_s = float(np.median(np.diff(w.t_s))) if len(w) > 1 else 0.0
         half_s = float(np.clip(np.median(jumps) ** 2 * interval_s / (2.0 * SMOOTH_TO_MPS**2), SMOOTH_S, SMOOTH_NOISY_S))
         for piece in np.unique(table.piece[k][table.present[k]]).tolist():
             rows = np.flatnonzero(table.piece[k] == piece)
             window = min(2 * round(half_s / TICK_S) + 1, len(rows) - (len(rows) + 1) % 2)
             if window > 3:
-                place[k, rows] = place[k, rows[0]] + _parabolas(place[k, rows] - place[k, rows[0]], window, savgol_filter)
+                place[k, rows] = place[k, rows[0]] + _parabolas(
+                    place[k, rows] - place[k, rows[0]], window, savgol_filter
+                )
                 velocity[k, rows] = _parabolas(velocity[k, rows], window, savgol_filter)
     return place, velocity
 
@@ -399,7 +423,9 @@ def _driven_of(place: Complex, course: Array, piece: Index) -> Driven | None:
     if len(kept) < 4:
         return None
     point = place[kept]
-    return Driven(np.array(kept), Polyline.through(np.column_stack([point.real, point.imag, np.zeros(len(kept))]), STEP_M))
+    return Driven(
+        np.array(kept), Polyline.through(np.column_stack([point.real, point.imag, np.zeros(len(kept))]), STEP_M)
+    )
 
 
 def _continuation(point: Complex, guides: Sequence[Polyline], sign: float) -> tuple[Complex, float]:

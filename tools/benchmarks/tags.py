@@ -106,7 +106,9 @@ def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_ri
         if speed.min() > 5.0 and not any(_touch(new, old) for old in vehicles):
             vehicles.append(new)
     sign = 1.0 if keeps_right else -1.0
-    agents = tuple(_agent(v.id, *_on_road(v.s, sign * v.d, bend_1pm), t, v.speed, rate_hz, noise_m, rng) for v in vehicles)
+    agents = tuple(
+        _agent(v.id, *_on_road(v.s, sign * v.d, bend_1pm), t, v.speed, rate_hz, noise_m, rng) for v in vehicles
+    )
     features = MapFeatures(lanes=_map_lanes(bend_1pm, sign)) if lanes else None
     name = f"traffic {seed}, {rate_hz:g} Hz, bend {bend_1pm:g}, {'right' if keeps_right else 'left'}, {'lanes' if lanes else 'no lanes'}"
     scenario = Scenario(name, 0, duration_s, agents, map_features=features)
@@ -123,7 +125,9 @@ def _on_road(s: np.ndarray, d: np.ndarray, bend: float) -> tuple[np.ndarray, np.
     at = np.arange(-300.0, 1200.0, 0.1)
     curvature = np.sin(2 * np.pi * at / 500.0) / 300.0 if bend == WINDING else np.full(len(at), bend)
     heading = np.cumsum(curvature) * 0.1
-    x, y, h = (np.interp(s, at, c) for c in (np.cumsum(np.cos(heading)) * 0.1, np.cumsum(np.sin(heading)) * 0.1, heading))
+    x, y, h = (
+        np.interp(s, at, c) for c in (np.cumsum(np.cos(heading)) * 0.1, np.cumsum(np.sin(heading)) * 0.1, heading)
+    )
     return x - d * np.sin(h), y + d * np.cos(h)
 
 
@@ -149,13 +153,20 @@ def _agent(id: str, x: np.ndarray, y: np.ndarray, t: np.ndarray, speed: np.ndarr
     at = at[at >= begin_s]
     columns = [np.interp(at, t, c) for c in (x, y, yaw, pace)]
     n = len(at)
-    noise = [noise_m * rng.standard_normal(n), noise_m * rng.standard_normal(n), 0.02 * rng.standard_normal(n), 0.3 * rng.standard_normal(n)]
+    noise = [
+        noise_m * rng.standard_normal(n),
+        noise_m * rng.standard_normal(n),
+        0.02 * rng.standard_normal(n),
+        0.3 * rng.standard_normal(n),
+    ]
     if noise_m:
         columns = [c + e for c, e in zip(columns, noise)]
     xs, ys, yaws, speeds = columns
     sigma = np.full(n, noise_m)
     known = {"sigma_yaw_rad": np.full(n, 0.02), "sigma_speed_mps": np.full(n, 0.3)} if noise_m else {}
-    w = Waypoints(at, xs, ys, np.full(n, size[2] / 2), wrap_angle(yaws), np.maximum(speeds, 0.0), np.ones(n, bool), sigma, **known)
+    w = Waypoints(
+        at, xs, ys, np.full(n, size[2] / 2), wrap_angle(yaws), np.maximum(speeds, 0.0), np.ones(n, bool), sigma, **known
+    )
     static = bool(not moves.any())
     return Agent(id, category, size, w, static=static)
 
@@ -301,9 +312,21 @@ def step_out(stage: Stage) -> World:
     if hidden:
         for k in range(4):
             stage.add(f"parked-{k}", route([(-24.0 + 5.6 * k, -2.9), (0, -2.9)], 1.0), 0.0)
-    stage.add("pedestrian-1", route([(0.2, -40), (0.2, 40)], 1.0), walk, start_m=40 - 1.75 - walk * enters, category="pedestrian", size=PERSON)
+    stage.add(
+        "pedestrian-1",
+        route([(0.2, -40), (0.2, 40)], 1.0),
+        walk,
+        start_m=40 - 1.75 - walk * enters,
+        category="pedestrian",
+        size=PERSON,
+    )
     events = [Event("stepping_out", "pedestrian-1", "ego", enters)] if hidden else []
-    events += [Event(tag, a, b, enters + d, sure=False) for tag in ("crossing_path", "near_miss") for a, b in (("ego", "pedestrian-1"), ("pedestrian-1", "ego")) for d in (0, 1.5)]
+    events += [
+        Event(tag, a, b, enters + d, sure=False)
+        for tag in ("crossing_path", "near_miss")
+        for a, b in (("ego", "pedestrian-1"), ("pedestrian-1", "ego"))
+        for d in (0, 1.5)
+    ]
     return stage.world(f"step out, {'hidden' if hidden else 'seen'}", events, JUNCTION_TAGS)
 
 
@@ -344,7 +367,10 @@ def follow(stage: Stage) -> World:
         speed = ramp(stage.t, (gap - 18) / (v - u), -1.5, u, v, v)
     stage.add("ego", route([(0, 0), (600, 0)], 5.0), speed, start_m=100)
     ttc = [Event("approaching", "ego", "car-1", t) for t in ((gap - 18) / (v - u),)] if nears else []
-    events = [*ttc, *(Event("following", "ego", "car-1", t, sure=not nears and t == 6.0) for t in (0.5, 3.0, 6.0, 9.0, 11.5))]
+    events = [
+        *ttc,
+        *(Event("following", "ego", "car-1", t, sure=not nears and t == 6.0) for t in (0.5, 3.0, 6.0, 9.0, 11.5)),
+    ]
     if not nears:  # one event over all the time, whose moment may be any
         events = [Event("following", "ego", "car-1", 0.0 if v < u else 12.0)]
     return stage.world(f"follow, {'nears' if nears else 'follows'}", events, JUNCTION_TAGS)
@@ -371,7 +397,9 @@ def oncoming(stage: Stage) -> World:
     beside = out_s + lasts + 1.0
     x0 = -v * beside + u * beside  # beside the slower one then
     x, y = x0 + s, -1.75 + d
-    stage.agents.append(_agent("car-1", x, -y if stage.mirrored else y, stage.t, None, stage.rate_hz, stage.noise_m, stage.rng))
+    stage.agents.append(
+        _agent("car-1", x, -y if stage.mirrored else y, stage.t, None, stage.rate_hz, stage.noise_m, stage.rng)
+    )
     stage.add("car-2", route([(0, -1.75), (400, -1.75)], 5.0), u, start_m=0.0)
     # The oncoming one meets it two to three seconds after it is back.
     meet = back + rng.uniform(1.5, 2.5)
@@ -415,8 +443,14 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
                 behind = [o for o in vehicles if o is not v and o.s[n] < v.s[n] and _in(o, lane, n, target)]
                 for k, o in enumerate(sorted(behind, key=lambda o: -o.s[n])):
                     headway = (v.s[n] - o.s[n] - CAR[0]) / o.speed[n]
-                    busy = any(abs(at - b) < 5.0 for b, *_ in o.changes)  # who changes lanes as well may be called either
-                    between = [b for b in vehicles if b not in (o, v) and o.s[n] < b.s[n] < v.s[n] + 5.0 and abs(b.d[n] - target * LANE_M) < LANE_M]
+                    busy = any(
+                        abs(at - b) < 5.0 for b, *_ in o.changes
+                    )  # who changes lanes as well may be called either
+                    between = [
+                        b
+                        for b in vehicles
+                        if b not in (o, v) and o.s[n] < b.s[n] < v.s[n] + 5.0 and abs(b.d[n] - target * LANE_M) < LANE_M
+                    ]
                     if k == 0 and headway <= 4.0 * 1.1:
                         yield Event(tag, v.id, o.id, at, sure=not (_near(headway, 4.0) or busy or between))
                     elif headway < 4.4:
@@ -431,7 +465,13 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
                 beside = np.abs(a.d - b.d)[before[-1] : n].max()
                 middle = t[before[-1] + int(np.argmin(np.abs(ahead[before[-1] : n])))]
                 # Passing ends too near to the end of the log to be told from driving beside.
-                yield Event("overtaking", a.id, b.id, middle, sure=beside < 2.1 * LANE_M and t[n] < t[-1] - 0.2 and t[before[-1]] > 0.2)
+                yield Event(
+                    "overtaking",
+                    a.id,
+                    b.id,
+                    middle,
+                    sure=beside < 2.1 * LANE_M and t[n] < t[-1] - 0.2 and t[before[-1]] > 0.2,
+                )
 
 
 def _in(o: Vehicle, lane: dict[str, np.ndarray], n: int, target: int) -> bool:
@@ -445,7 +485,13 @@ def score(worlds: Sequence[World], found: Sequence[Sequence[Tag]]) -> dict[str, 
     for world, tags in zip(worlds, found):
         left = list(world.events)
         for tag in (g for g in tags if g.tag in world.tags and g.probability >= 0.5):
-            fits = [e for e in left if (e.tag, e.agent) == (tag.tag, tag.agent) and e.other in (tag.other, None) and abs(e.t_s - tag.t_s) <= WITHIN_S]
+            fits = [
+                e
+                for e in left
+                if (e.tag, e.agent) == (tag.tag, tag.agent)
+                and e.other in (tag.other, None)
+                and abs(e.t_s - tag.t_s) <= WITHIN_S
+            ]
             row = counts[tag.tag]
             if fits:
                 best = min(fits, key=lambda e: (not e.sure, abs(e.t_s - tag.t_s)))
@@ -455,7 +501,9 @@ def score(worlds: Sequence[World], found: Sequence[Sequence[Tag]]) -> dict[str, 
                     row[3].append(abs(best.t_s - tag.t_s))
             else:
                 row[1] += 1
-                row[4].append(f"invented {world.scenario.name}: {tag.tag} {tag.agent} {tag.other} {tag.start_s}-{tag.t_s}-{tag.end_s} p {tag.probability} {dict(tag.quantities)}")
+                row[4].append(
+                    f"invented {world.scenario.name}: {tag.tag} {tag.agent} {tag.other} {tag.start_s}-{tag.t_s}-{tag.end_s} p {tag.probability} {dict(tag.quantities)}"
+                )
         for event in left:
             if event.sure:
                 counts[event.tag][2] += 1
@@ -489,7 +537,9 @@ def main(arguments: list[str] | None = None) -> None:
     begin = time.process_time()
     found = [find_tags(w.scenario) for w in worlds]
     spent = time.process_time() - begin
-    print(f"{'tag':22} {'true':>5} {'invented':>8} {'missed':>6} {'precision':>9} {'recall':>6} {'F1':>6} {'error s':>7}")
+    print(
+        f"{'tag':22} {'true':>5} {'invented':>8} {'missed':>6} {'precision':>9} {'recall':>6} {'F1':>6} {'error s':>7}"
+    )
     for tag, (true, invented, missed, error_s, wrong) in sorted(score(worlds, found).items()):
         print(
             f"{tag:22} {true:5} {invented:8} {missed:6} {true / max(true + invented, 1):9.3f} {true / max(true + missed, 1):6.3f} "
