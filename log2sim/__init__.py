@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from log2sim.pipeline import reconstruct
     from log2sim.prediction.prediction import predict_scenario
     from log2sim.road.builder import map_ground
+    from log2sim.scenarios.logical import fit as fit_logical
     from log2sim.scenarios.query import ask as find_situations
     from log2sim.scenarios.tagging import tag as tag_scenario
     from log2sim.simulation.runner import replay
@@ -46,6 +47,7 @@ _PLACES = {
     "export_scenario": "log2sim.export.exporters:export",
     "import_scenario": "log2sim.export.openscenario.read:load",
     "find_situations": "log2sim.scenarios.query:ask",
+    "fit_logical": "log2sim.scenarios.logical:fit",
     "map_ground": "log2sim.road.builder:map_ground",
     "open_log": "log2sim.logs.opening:open_log",
     "plot": "log2sim.visualization.plot.scene:plot",
@@ -65,7 +67,7 @@ _PLACES = {
 
 __all__ = [
     "Config", "Log2SimError", "Scenario", "__version__", "bench", "detect_log", "edit_scenario", "evaluate", "examine_installation",
-    "export_scenario", "find_situations", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
+    "export_scenario", "find_situations", "fit_logical", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
     "replay", "show_progress", "summarize_log", "tag_scenario", "validate_log", "view", "write_log", "write_synthetic",
 ]  # fmt: skip
 

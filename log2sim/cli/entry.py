@@ -30,6 +30,7 @@ from log2sim.cli import (
     synth,
     tag,
     validate,
+    vary,
     view,
 )
 from log2sim.cli.options import fail, say
@@ -89,7 +90,7 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, tag.tag, find.find, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, tag.tag, find.find, vary.vary, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, import_.import_, "import")

@@ -21,7 +21,7 @@ REACTION_S = 1.0
 def _ratio(over: Array, under: Array) -> Array:
     """Divide where the denominator is positive; infinite elsewhere."""
     over, under = np.broadcast_arrays(np.asarray(over, dtype=np.float64), np.asarray(under, dtype=np.float64))
-    return np.divide(over, under, out=np.full(over.shape, np.inf), where=under > 0)
+    return np.asarray(np.divide(over, under, out=np.full(over.shape, np.inf), where=under > 0))
 
 
 def time_to_collision(gap_m: Array, closing_mps: Array) -> Array:

@@ -165,8 +165,6 @@ def open_index(
         Without pyarrow.
     """
     import_arrow()
-    import pyarrow.parquet as pq
-
     if path.is_file():
         return Index(path.parent, table_of_rows(rows_of(Scenario.load(path), path.name)), 1)
     files = {str(p.relative_to(path)): _stamp(p) for p in find_scenarios(path)} if path.is_dir() else {}
@@ -195,10 +193,8 @@ def open_index(
             progress(k + 1, len(missing))
     table = table_of_rows(rows)
     about = {"version": INDEX_VERSION, "tags": sorted(TAGS), "files": files, "problems": problems}
-    with replaced(path / INDEX_FILE) as temporary:
-        pq.write_table(
-            table.replace_schema_metadata({KEY: json.dumps(about).encode()}), temporary, row_group_size=20_000
-        )
+    table_with_files = table.replace_schema_metadata({KEY: json.dumps(about).encode()})
+    _write(path / INDEX_FILE, table_with_files, row_group_size=20_000)
     return Index(path, table, len(files), _listed(problems))
 
 
@@ -227,8 +223,16 @@ def _read(path: Path) -> tuple[dict[str, Any], Any]:
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
     """Write rows as a Parquet file with the columns of an index."""
-    import_arrow()
+    _write(path, table_of_rows(rows))
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows of any columns, all the same, as a Parquet file."""
+    _write(path, import_arrow().Table.from_pylist(list(rows)))
+
+
+def _write(path: Path, table: Any, **options: Any) -> None:
     import pyarrow.parquet as pq
 
     with replaced(path) as temporary:
-        pq.write_table(table_of_rows(rows), temporary)
+        pq.write_table(table, temporary, **options)
