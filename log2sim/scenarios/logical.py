@@ -38,17 +38,17 @@ class Timing(NamedTuple):
 
     quantity: str
     sign: float
-    by_speed: bool  # a distance: it is divided by the agent's speed
+    role: str = ""  # whose speed divides a distance: who passes the agent's place meanwhile, or the agent itself
 
 
 TIMING: Mapping[str, Timing | None] = {
-    "cut_in": Timing("gap_m", -1.0, True),
-    "cut_out": Timing("gap_m", -1.0, True),
-    "merging": Timing("gap_m", -1.0, True),
-    "following": Timing("gap_m", 1.0, True),
-    "approaching": Timing("gap_m", 1.0, True),
-    "crossing_path": Timing("pet_s", -1.0, False),
-    "stepping_out": Timing("ttc_s", -1.0, False),
+    "cut_in": Timing("gap_m", -1.0, "other"),
+    "cut_out": Timing("gap_m", -1.0, "other"),
+    "merging": Timing("gap_m", -1.0, "other"),
+    "following": Timing("gap_m", 1.0, "agent"),
+    "approaching": Timing("gap_m", 1.0, "agent"),
+    "crossing_path": Timing("pet_s", -1.0),
+    "stepping_out": Timing("ttc_s", -1.0),
     "overtaking": None,
     "lane_change": None,
     "hard_braking": None,
@@ -249,7 +249,7 @@ class Base:
             timing = TIMING[self.row["tag"]]
             if role == "agent" and timing is not None:
                 later_s = timing.sign * (wanted[timing.quantity] - self.row[timing.quantity])
-                later_s /= wanted["agent.speed_mps"] if timing.by_speed else 1.0
+                later_s /= wanted[f"{timing.role}.speed_mps"] if timing.role else 1.0
             out[self.row[role]] = (1.0 / faster, moment_s * (1.0 - 1.0 / faster) + later_s)
         return out
 
