@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -219,6 +220,10 @@ def reconstruct(
             help="What of the vehicle's and the road's LiDARs is joined.",
         ),
     ] = None,
+    corrections: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Corrections by hand to apply to the result, see log2sim correct."),
+    ] = None,
     config: ConfigFile = None,
     settings: Settings = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.", show_default="0")] = None,
@@ -269,6 +274,7 @@ def reconstruct(
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
         from log2sim.config import Config
+        from log2sim.edit.corrections import correct, load_corrections
         from log2sim.errors import ConfigError, MissingExtra
         from log2sim.logs.opening import open_log
         from log2sim.perception.detect3d.detectors import describe_weakness
@@ -277,6 +283,7 @@ def reconstruct(
         from log2sim.plan import IMAGE_DETECTOR, choose_detector
 
         chosen = Config.load(config, settings or (), **changes)
+        by_hand = None if corrections is None else load_corrections(corrections)
         check_detectors(chosen)
         opened = open_log(log, format=format, sequence=sequence)
     if topdown is not None and not opened.cameras:
@@ -290,6 +297,11 @@ def reconstruct(
         say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs)
+    if by_hand is not None:
+        corrected = correct(result.scenario, by_hand)
+        result = replace(result, scenario=corrected.scenario)
+        for line in corrected.lost:
+            say(f"warning: {line}", quiet=quiet)
     for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):
         say(line, quiet=quiet)
     with together():

@@ -7,6 +7,7 @@ import hashlib
 import html
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +97,7 @@ def thumbnail(scenario: Scenario, row: Row) -> str:
         return bool(np.abs(xy_m[:, :2] - center).max(axis=1).min() < sum(WINDOW_M))
 
     features = scenario.map_features
-    drawn = (*features.markings, *features.borders, *features.lanes) if features is not None else ()
+    drawn: tuple[Any, ...] = (*features.markings, *features.borders, *features.lanes) if features is not None else ()
     lines = [f'<polyline points="{points(item.points_m)}"/>' for item in drawn if near(item.points_m)]
     roles = {row["agent"]: "agent", row.get("other"): "other"}
     for agent, now in states.values():

@@ -279,11 +279,10 @@ def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tupl
         np.stack([np.column_stack([eye.real, eye.imag]), np.column_stack([place.real, place.imag])], axis=1)
     )
     for k in range(len(traffic.ids)):
-        # Half as wide as it is, since who is hidden in part is seen.
-        there = (
-            np.flatnonzero(t.present[k, ticks] & (t.size_m[k, 2] > 1.0)) if k not in pair and traffic.wheeled[k] else []
-        )
-        if len(there):
+        if k in pair or not traffic.wheeled[k] or t.size_m[k, 2] <= 1.0:
+            continue
+        there = np.flatnonzero(t.present[k, ticks])
+        if len(there):  # half as wide as it is, since who is hidden in part is seen
             rows = ticks[there]
             boxes = shapely.polygons(
                 box_corners_bev(t.xy_m[k, rows], t.size_m[k, 0], t.size_m[k, 1] / 2, t.yaw_rad[k, rows])

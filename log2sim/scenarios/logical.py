@@ -316,7 +316,7 @@ def _continued(traffic: Traffic, k: int, begin_s: float, end_s: float) -> Agent:
 
 def _window(agent: Agent, duration_s: float) -> Agent:
     """Return an agent from 0 to a time."""
-    t = np.linspace(0.0, duration_s, max(round(duration_s / TICK_S), 1) + 1)
+    t = np.asarray(np.linspace(0.0, duration_s, max(round(duration_s / TICK_S), 1) + 1), dtype=np.float64)
     state = agent.trajectory.at(t)
     w = Waypoints(t, *state[:3], state.yaw_rad, state.speed_mps, np.ones(len(t), dtype=bool), np.zeros(len(t)))
     return replace(agent, waypoints=w)
@@ -353,6 +353,6 @@ def write_openscenario(base: Base, timings: Sequence[Mapping[str, tuple[float, f
     for timing_of in timings:
         chosen = element("ParameterValueSet", sets)
         for id, pair in parameters.items():
-            for name, value in zip(pair, timing_of[id]):
-                element("ParameterAssignment", chosen, parameterRef=name, value=number(value, 9))
+            for name, given in zip(pair, timing_of[id]):
+                element("ParameterAssignment", chosen, parameterRef=name, value=number(given, 9))
     write(distribution, folder / "variations.xosc")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -65,14 +66,14 @@ def single_tags(traffic: Traffic) -> Iterator[Tag]:
 
 
 def tag_of(traffic: Traffic, tag: str, agent: int, span: tuple[int, int, int], probability: float, other: int | None = None,
-           lane: str | None = None, **quantities: float) -> Tag:  # fmt: skip
-    """Make a tag of first, defining and last tick; probabilities of the agents themselves are multiplied to its own, and infinite quantities left out."""
+           **quantities: float) -> Tag:  # fmt: skip
+    """Make a tag of first, defining and last tick; its probability is times that of the agents, and infinite quantities are left out."""
     start, t, end = (round(float(traffic.table.t_s[n]), 3) for n in span)
     sure = traffic.confidence[agent] * (1.0 if other is None else traffic.confidence[other])
     known = {name: round(float(value), 4) for name, value in quantities.items() if np.isfinite(value)}
     return Tag(
         tag, traffic.ids[agent], start, t, end, round(float(np.clip(probability * sure, 0.0, 1.0)), 4),
-        None if other is None else traffic.ids[other], lane, known,
+        None if other is None else traffic.ids[other], None, known,
     )  # fmt: skip
 
 
@@ -85,9 +86,8 @@ def _lanes(traffic: Traffic, k: int) -> Iterator[Tag]:
     for i, j, lane in stays:
         at = _in_lane(traffic, k, lane, i, j)
         inside = probability_above(np.median(at[1] - np.abs(at[0])), 0.0, np.median(traffic.sigma_m[k, i : j + 1]))
-        yield tag_of(
-            traffic, "in_lane", k, (i, i, j), inside * traffic.lanes[lane][0].confidence, lane=traffic.lanes[lane][0].id
-        )
+        known = traffic.lanes[lane][0]
+        yield replace(tag_of(traffic, "in_lane", k, (i, i, j), inside * known.confidence), lane=known.id)
     # Beyond 1 s an agent is in a lane; who crosses an edge for less keeps to its own.
     kept = [stay for stay in stays if (stay[1] - stay[0]) * TICK_S >= 1.0]
     for (_, i, one), (j, _, two) in itertools.pairwise(kept):
@@ -123,10 +123,14 @@ def _change_between(traffic: Traffic, k: int, one: int, two: int, edge: tuple[in
     sigma = traffic.sigma_m[k, crossing]
     certain = min(probability_above(np.max(half - np.abs(off)), 0.0, sigma) for off, half in (before, after))
     lane = traffic.lanes[two][0]
-    yield tag_of(
-        traffic, "lane_change", k, (first + begin, crossing, first + end), certain * lane.confidence * traffic.lanes[one][0].confidence,
-        lane=lane.id, lateral_speed_mps=lateral, speed_mps=traffic.speed_mps[k, crossing], duration_s=(end - begin) * TICK_S,
-        lateral_m=aside[end] - aside[begin],
+    certain *= lane.confidence * traffic.lanes[one][0].confidence
+    span = (first + begin, crossing, first + end)
+    yield replace(
+        tag_of(
+            traffic, "lane_change", k, span, certain, lateral_speed_mps=lateral, speed_mps=traffic.speed_mps[k, crossing],
+            duration_s=(end - begin) * TICK_S, lateral_m=aside[end] - aside[begin],
+        ),
+        lane=lane.id,
     )  # fmt: skip
 
 

@@ -281,8 +281,8 @@ def _closest(connection: Any, condition: Condition, parts: list[ast.expr]) -> li
         sentences.append(said + (f", the nearest with {nearest_value}" if nearest_value else ""))
     if sentences:
         return sentences
-    said = [f"'{_source(condition, part)}' {count([part])}" for part in parts]
-    return [f"each alone: {', '.join(said)}"]
+    alone = [f"'{_source(condition, part)}' {count([part])}" for part in parts]
+    return [f"each alone: {', '.join(alone)}"]
 
 
 def _source(condition: Condition, part: ast.expr) -> str:

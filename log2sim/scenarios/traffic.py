@@ -403,10 +403,10 @@ def _sigma_speed(table: MotionTable, k: int) -> Array:
     """Return the standard deviation (T,) of speeds; where the scenario has none, that of a slope over a second of places."""
     w = table.agents[k].waypoints
     if w.sigma_speed_mps is not None:
-        return np.interp(table.t_s, w.t_s, w.sigma_speed_mps)
+        return np.asarray(np.interp(table.t_s, w.t_s, w.sigma_speed_mps))
     interval_s = float(np.median(np.diff(w.t_s))) if len(w) > 1 else 1.0
     count = max(1.0 / interval_s, 2.0)
-    return table.sigma_m[k] * np.sqrt(12.0 / (count * (count**2 - 1.0))) / interval_s
+    return np.asarray(table.sigma_m[k] * np.sqrt(12.0 / (count * (count**2 - 1.0))) / interval_s)
 
 
 def _driven_of(place: Complex, course: Array, piece: Index) -> Driven | None:
