@@ -31,6 +31,7 @@ from log2sim.cli import (
     replay,
     synth,
     tag,
+    test_,
     validate,
     vary,
     view,
@@ -97,6 +98,7 @@ for command in (
     add_command(app, command)
 add_command(app, help.help_, "help")
 add_command(app, import_.import_, "import")
+add_command(app, test_.run_test, "test")
 add_command(app, map.map_, "map")
 
 

@@ -27,7 +27,8 @@ from log2sim.scenarios.tagging import find_tags
 from log2sim.scenarios.traffic import Traffic
 
 MIN_HITS = 5  # of which a distribution is fitted
-BEFORE_S, AFTER_S = 4.0, 5.0  # of a situation that a concrete scenario shows
+# A concrete scenario shows a situation with a second before and after it, at least and at most so long before and after its moment.
+BEFORE_S, AFTER_S = (3.0, 6.0), (4.0, 8.0)
 PAD_S = 20.0  # for which agents are continued before and after, so that a slower or later one is there throughout
 GRID = 1024  # points of a marginal distribution
 SAMPLERS = ("sobol", "lhs", "random")
@@ -223,7 +224,8 @@ class Base:
             Where its agents are not in the scenario.
         """
         ids = [id for id in (row["agent"], row.get("other")) if id is not None]
-        begin_s, end_s = row["start_s"] - BEFORE_S, row["end_s"] + AFTER_S
+        begin_s = row["t_s"] - float(np.clip(row["t_s"] - row["start_s"] + 1.0, *BEFORE_S))
+        end_s = row["t_s"] + float(np.clip(row["end_s"] - row["t_s"] + 1.0, *AFTER_S))
         traffic = Traffic(scenario)
         if not set(ids) <= set(traffic.ids):
             raise ConfigError(f"{row['file']}: has no agents {', '.join(ids)}; index it again with --fresh")
@@ -298,7 +300,8 @@ def _continued(traffic: Traffic, k: int, begin_s: float, end_s: float) -> Agent:
     agent, found = traffic.table.agents[k], traffic.path(k)
     if found is None:
         raise ConfigError(f"vary: agent '{agent.id}' stands, so that its motion cannot be changed")
-    t = np.arange(round((begin_s - PAD_S) / TICK_S), round((end_s + PAD_S) / TICK_S) + 1) * TICK_S
+    first, last = round((begin_s - PAD_S) / TICK_S), round((end_s + PAD_S) / TICK_S)
+    t: Array = np.arange(first, last + 1, dtype=np.float64) * TICK_S
     there = np.flatnonzero(np.isfinite(found.station_m))
     first_s, last_s = traffic.table.t_s[there[[0, -1]]]
     state = agent.trajectory.at(np.clip(t, first_s, last_s))
@@ -316,7 +319,7 @@ def _continued(traffic: Traffic, k: int, begin_s: float, end_s: float) -> Agent:
 
 def _window(agent: Agent, duration_s: float) -> Agent:
     """Return an agent from 0 to a time."""
-    t = np.asarray(np.linspace(0.0, duration_s, max(round(duration_s / TICK_S), 1) + 1), dtype=np.float64)
+    t = np.linspace(0.0, duration_s, max(round(duration_s / TICK_S), 1) + 1)
     state = agent.trajectory.at(t)
     w = Waypoints(t, *state[:3], state.yaw_rad, state.speed_mps, np.ones(len(t), dtype=bool), np.zeros(len(t)))
     return replace(agent, waypoints=w)
