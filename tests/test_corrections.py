@@ -13,7 +13,7 @@ import pytest
 from command_line import run
 from test_edit import circling, parked, scenario, straight
 
-from log2sim.datatypes import Doubt, MapFeatures, MapFrame, Marking, Scenario
+from log2sim.datatypes import Finding, MapFeatures, MapFrame, Marking, Scenario
 from log2sim.edit.corrections import correct, load_corrections
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check
@@ -99,7 +99,7 @@ def test_merged_tracks_of_the_same_time_are_averaged_by_their_variances() -> Non
 
 
 def test_split_flip_size_category_confirm_color_and_delete() -> None:
-    doubts = (Doubt("heading_ambiguous", "front and back may be swapped"), Doubt("jump", "is 3 m off"))
+    doubts = (Finding("heading_ambiguous"), Finding("jump", text="is 3 m off"))
     source = replace(parked(), doubts=doubts, confidence=0.2, quarantined=True)
     here = at(1.0, 30.0, -3.0)
     out = after(
@@ -113,7 +113,7 @@ def test_split_flip_size_category_confirm_color_and_delete() -> None:
     assert changed.waypoints.yaw_rad[0] == pytest.approx(0.4 - math.pi)
     assert changed.waypoints.z_m[0] == pytest.approx(0.8 + 0.2)  # its wheels stay on the ground
     assert (changed.category, changed.size_m, changed.color["name"]) == ("truck", (5.0, 2.0, 2.0), "red")
-    assert [d.flag for d in changed.doubts] == ["jump"]
+    assert [d.kind for d in changed.doubts] == ["jump"]
     parts = [out["car-7"].waypoints, out["car-1"].waypoints]
     assert parts[0].t_s[-1] < 2.0 <= parts[1].t_s[0]
     certain = after(out, {"kind": "confirm", "agent": here})["parked"]

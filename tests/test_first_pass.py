@@ -251,8 +251,8 @@ def test_a_repeated_sweep_counts_as_not_recorded_and_is_told():
     out, _ = run(with_records(log, top=lambda i: sweep((0, 1, 1, 3)[i])))
     assert [cloud is None for cloud in out.obstacles] == [False, False, True, False]
     assert set(out.measurements[2].source) == {""}  # seen by the camera alone
-    assert [(f.kind, f.sensor, f.treatment, f.start_ns) for f in out.faults] == [
-        ("repeated_sweeps", "top", "left_out", STAMPS[2])
+    assert [(f.kind, f.subject, f.treatment, f.start_s) for f in out.faults] == [
+        ("repeated_sweeps", "top", "left_out", (STAMPS[2] - STAMPS[0]) / 1e9)
     ]
 
 

@@ -14,7 +14,7 @@ from command_line import run
 from log2sim.datatypes import EGO, Scenario
 from log2sim.errors import ConfigError
 from log2sim.scenarios import Base, ask, choose_base, fit, open_index
-from log2sim.scenarios.failure import Outcome, judge, parse_limits, report_page, search, with_ego
+from log2sim.scenarios.failure import Outcome, judge_run, parse_limits, report_page, search, with_ego
 from log2sim.simulation.policy import Controls
 
 pytest.importorskip("duckdb")
@@ -75,21 +75,21 @@ def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
     def keeps(seen):
         return Controls(0.0, 0.0)
 
-    hit = judge(base, logical, keeps, {}, "scenario", near)
-    free = judge(base, logical, keeps, {}, "scenario", far)
+    hit = judge_run(base, logical, keeps, {}, "scenario", near)
+    free = judge_run(base, logical, keeps, {}, "scenario", far)
     assert hit.margin < 0
     assert hit.values["impact_mps"] > 1
     assert free.margin > 10
     assert free.margin == free.values["min_gap_m"]
     # 30 m of room and no more are a failure once that is the limit.
-    assert judge(
+    assert judge_run(
         base, logical, keeps, {"min_gap_m": free.values["min_gap_m"] + 1}, "scenario", far
     ).margin == pytest.approx(-1)
 
     def raises(seen):
         raise ZeroDivisionError("of my own")
 
-    wrong = judge(base, logical, raises, {}, "scenario", far)
+    wrong = judge_run(base, logical, raises, {}, "scenario", far)
     assert wrong.margin < -100
     assert "of my own" in wrong.problem
     values = np.stack([near, far, far])

@@ -195,7 +195,7 @@ def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folde
     assert not wrong, "\n".join(f"{line}: {code} {err}" for line, (code, err) in wrong.items())
     assert {line.split()[0] for line in BASE_ONLY} == {
         (c.name or c.callback.__name__).rstrip("_") for c in app.registered_commands if c.callback is not None
-    }
+    } - {"studio"}  # it serves until it is interrupted
     formats = {line.split()[3] for line in BASE_ONLY if line.startswith("export")}
     assert formats == set(BUILT_IN["export"])
     assert not list((tmp_path / "cache").glob("**/*.onnx"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,12 +80,6 @@ def known_ticks(report: dict[str, Any]) -> list[str]:
     return [f"{counted(found, 'tick')} known from earlier runs"] if found else []
 
 
-def cache_notes(report: dict[str, Any]) -> list[str]:
-    """Say why the first pass was not kept, where it should have been."""
-    cache = report["detection_cache"]
-    return [f"the first pass is not kept for later runs: {cache['problem']}"] if cache and cache["problem"] else []
-
-
 def described(scenario: Scenario) -> list[str]:
     """Count what was found beside the agents; nothing of what was not found or not looked for."""
     features = scenario.map_features
@@ -137,32 +130,10 @@ def look_line(log: Path, sequence: str | None, out: Path) -> str:
     return shlex.join(["log2sim", "view", str(out), "--log", str(log), *chosen, "-o", page])
 
 
-def pose_notes(poses: dict[str, Any]) -> list[str]:
-    """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
-    if poses["source"] == "none":
-        return []
-    chosen = (
-        [] if poses["source"] == poses["requested"] == "given" else [f"poses: {poses['source']} ({poses['reason']})"]
-    )
-    return [*chosen, *(f"note: {note}" for note in poses["notes"])]
-
-
-def fault_lines(faults: Sequence[dict[str, Any]]) -> list[str]:
-    """Say what is wrong with the sensors and poses of a log, a line for each fault."""
-    return [f"note: {fault['sensor']}: {fault['message']}" for fault in faults]
-
-
-def unused_records(report: dict[str, Any]) -> list[str]:
-    """List what a run could not use of a log, a line for each stream."""
-    unreadable = report["unreadable"].items()
-    without_pose = report["without_pose"].items()
-    return [
-        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unreadable),
-        *(
-            f"{name}: {count} frames skipped, since no ego pose is known at their stamps"
-            for name, count in without_pose
-        ),
-    ]
+def pose_lines(poses: dict[str, Any]) -> list[str]:
+    """Say which poses were used and why; nothing of the log's own where no others were asked for."""
+    own = poses["source"] == "none" or poses["source"] == poses["requested"] == "given"
+    return [] if own else [f"poses: {poses['source']} ({poses['reason']})"]
 
 
 def reconstruct(
@@ -281,6 +252,7 @@ def reconstruct(
         from log2sim.perception.run_detectors import check_detectors
         from log2sim.pipeline import reconstruct as run
         from log2sim.plan import IMAGE_DETECTOR, choose_detector
+        from log2sim.report import unused_records
 
         chosen = Config.load(config, settings or (), **changes)
         by_hand = None if corrections is None else load_corrections(corrections)
@@ -302,16 +274,15 @@ def reconstruct(
         result = replace(result, scenario=corrected.scenario)
         for line in corrected.lost:
             say(f"warning: {line}", quiet=quiet)
-    for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):
-        say(line, quiet=quiet)
     with together():
         if topdown is not None:
             _write_topdown(result, topdown, overwrite=overwrite)
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
-    for note in (*unused_records(result.report), *cache_notes(result.report)):
-        say(f"note: {note}", quiet=quiet)
+    findings = (*result.findings, *unused_records(result.report))
+    for line in (*pose_lines(result.report["poses"]), *(f"note: {finding}" for finding in findings)):
+        say(line, quiet=quiet)
     say_written(report, topdown, quiet=quiet)
     for line in summarize(result, look_line(log, sequence, out), out, verbose=verbose):
         say(line, quiet=quiet)

@@ -255,7 +255,7 @@ def nearest_agent(agents: Sequence[Agent], t_s: float, x_m: float, y_m: float) -
 
 def settled(agent: Agent, kind: str) -> Agent:
     """Return the agent without the doubts that a kind of correction settles."""
-    return replace(agent, doubts=tuple(d for d in agent.doubts if d.flag not in SETTLED.get(kind, ())))
+    return replace(agent, doubts=tuple(d for d in agent.doubts if d.kind not in SETTLED.get(kind, ())))
 
 
 def _changed(agent: Agent, kind: str, entry: Mapping[str, Any]) -> Agent:

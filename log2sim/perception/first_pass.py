@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles, OtherView, Rays, Sweep
+from log2sim.datatypes import Boxes3D, Detections, Finding, Log, Measurements, Obstacles, OtherView, Rays, Sweep
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.packing import pack
@@ -273,7 +273,7 @@ class Observations:
         By camera.
     unseen : mapping of str to list of int
         Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched.
-    faults : tuple of Fault
+    faults : tuple of Finding
         Of the records.
     lights : list of LightBox
         Traffic lights in frames, which are no agents.
@@ -290,7 +290,7 @@ class Observations:
     frames_detected: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
     unseen: dict[str, list[int]] = field(default_factory=dict)
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Finding, ...] = ()
     lights: list[LightBox] = field(default_factory=list)
 
     @property

@@ -118,7 +118,7 @@ def drive(base: Base, logical: Logical, policy: Policy, agents: str, values: Arr
     return made, replay(made, mode="exact", dt_s=STEP_S, ego=policy, agents=agents)
 
 
-def judge(
+def judge_run(
     base: Base, logical: Logical, policy: Policy, limits: Mapping[str, float], agents: str, values: Array
 ) -> Outcome:
     """Run a policy and say how far it was from a failure: a collision, a figure beyond its limit, or an error of its own.
@@ -239,7 +239,7 @@ def runner(
     base: Base, logical: Logical, policy: Policy, limits: Mapping[str, float], agents: str
 ) -> Callable[[Array], Outcome]:
     """Return a function that judges the policy at parameters (D,), for processes."""
-    return partial(judge, base, logical, policy, limits, agents)
+    return partial(judge_run, base, logical, policy, limits, agents)
 
 
 def describe(
