@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from log2sim.cli.options import Quiet, choose, counted, option, say, write_to
+
+if TYPE_CHECKING:
+    from log2sim.geometry import Array
+    from log2sim.scenarios.failure import Outcome
 
 
 def run_test(
@@ -69,11 +73,12 @@ def run_test(
     logical = fit(rows)
     chosen = choose_base(logical, rows)
     base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
-    outcomes, values = [], []
+    outcomes: list[Outcome] = []
+    values: list[Array] = []
     work = runner(base, logical, driver, limits, agents)
     with progress(quiet=quiet) as report_progress:
 
-        def margins(scores: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        def margins(scores: Array) -> Array:
             drawn = logical.from_scores(scores)
             values.extend(drawn)
             for outcome in map_in_processes(work, list(drawn), jobs or default_jobs()):
