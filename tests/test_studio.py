@@ -18,7 +18,7 @@ from browser import CHROMIUM, DRIVER, Browser, browsing
 from command_line import run
 from test_edit import parked, scenario, straight
 
-from log2sim.datatypes import Doubt, Scenario
+from log2sim.datatypes import Finding, Scenario
 from log2sim.edit.corrections import load_corrections
 from log2sim.errors import ScenarioError
 from log2sim.visualization.studio import Studio
@@ -32,9 +32,7 @@ def world() -> Scenario:
         type(whole)(**{**vars_of(whole), "id": name, "waypoints": w.take(part)})
         for name, part in (("car-1", w.t_s < 1.5), ("car-2", w.t_s > 2.0))
     )
-    doubtful = type(whole)(
-        **{**vars_of(parked("car-3")), "doubts": (Doubt("heading_ambiguous", "front and back may be swapped"),)}
-    )
+    doubtful = type(whole)(**{**vars_of(parked("car-3")), "doubts": (Finding("heading_ambiguous"),)})
     return scenario(straight("ego", speed_mps=5.0), first, last, doubtful)
 
 
