@@ -102,7 +102,7 @@ def decide(candidate: AgentCandidate, usual_rate: float) -> list[Finding] | None
     through = (s.through_share or 0.0) if known else 0.0
     undetected = missing_nats(s, usual_rate)
     against = {
-        "points of something nearer": CERTAIN_NATS * (s.image_height_share is not None and s.image_height_share < MIN_IMAGE_HEIGHT_SHARE),
+        "points of something nearer": CERTAIN_NATS * ((s.image_height_share or 1.0) < MIN_IMAGE_HEIGHT_SHARE),
         "rays do not end in it": CERTAIN_NATS * s.unreached,
         "rays pass through": CERTAIN_NATS * (through > EMPTY_SHARE),
         "part of something longer": CERTAIN_NATS * (s.in_structure > MOSTLY),

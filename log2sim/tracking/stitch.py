@@ -43,7 +43,11 @@ def decide_category(m: Measurements, *, whole_boxes: bool = False) -> str:
         return category
     if category == "pedestrian" and _speed_mps(m) > MAX_PEDESTRIAN_SPEED_MPS:
         return "cyclist"
-    if category == "bicycle" and (m.category != category).mean() >= MIN_RIDER_SHARE and _displacement_m(m) > MIN_RIDDEN_M:
+    if (
+        category == "bicycle"
+        and (m.category != category).mean() >= MIN_RIDER_SHARE
+        and _displacement_m(m) > MIN_RIDDEN_M
+    ):
         return "cyclist"
     return category
 
@@ -69,7 +73,6 @@ def _most_scored(names: NDArray[np.str_], score: Array) -> str:
     """Return the name, of names (n,), with the largest sum of scores (n,)."""
     unique, index = np.unique(names, return_inverse=True)
     return str(unique[np.argmax(np.bincount(index, weights=score))])
-
 
 
 def _displacement_m(m: Measurements) -> float:
