@@ -34,7 +34,7 @@ from log2sim.cli.options import (
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
-    from log2sim.pipeline import Result
+    from log2sim.report import Result
 
 
 # Stages without which something is missing in a scenario; the others save time.

@@ -20,9 +20,9 @@ from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import outside_ego
 from log2sim.perception.sync import sweep_middle_ns
-from log2sim.pipeline import Run, start
+from log2sim.pipeline import start
 from log2sim.plan import FusionLevel
-from log2sim.report import unreadable_records
+from log2sim.report import Run, unreadable_records
 
 
 @dataclass(frozen=True, eq=False)
