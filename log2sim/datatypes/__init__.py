@@ -72,6 +72,7 @@ from log2sim.datatypes.map_features import (
     RoadBorder,
 )
 from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Signal, count_agents, count_categories
+from log2sim.datatypes.tag import TAGS, Tag
 
 __all__ = [
     "BORDER_KINDS",
@@ -95,6 +96,7 @@ __all__ = [
     "SIGNAL_STATES",
     "STANDSTILL_DRIFT_M",
     "STANDSTILL_MPS",
+    "TAGS",
     "TUPLES",
     "TYPICAL_SIZE_M",
     "VEHICLE",
@@ -129,6 +131,7 @@ __all__ = [
     "Span",
     "Stream",
     "Sweep",
+    "Tag",
     "Tick",
     "Track",
     "Trajectory",

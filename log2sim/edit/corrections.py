@@ -127,7 +127,7 @@ class _Work:
         end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
         duration_s = max(self.scenario.duration_s, end_s)
         return replace(
-            self.scenario, agents=agents, map_features=features, provenance=provenance, duration_s=duration_s
+            self.scenario, agents=agents, map_features=features, provenance=provenance, duration_s=duration_s, tags=None
         )
 
     def apply(self, number: int, entry: Mapping[str, Any]) -> str:

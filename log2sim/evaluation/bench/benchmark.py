@@ -61,7 +61,7 @@ from log2sim.visualization.plot.style import (
     printable_label,
 )
 
-__all__ = ["Benchmark", "Panel", "Scope", "bench"]
+__all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
 
 
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
