@@ -238,6 +238,7 @@ def picture_document(
     log: Log,
     scenario: Scenario,
     cameras: tuple[str, ...],
+    *,
     budget_bytes: int,
     reader: RecordSource,
     progress: Callable[[int, int], None],
@@ -407,7 +408,9 @@ def point_document(
         return None
     known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in probes])
     bright = max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
-    spacing, chosen = _fit_points(log.streams[main].t_ns, within, scenario.t0_ns, probes, bright, budget_bytes)
+    spacing, chosen = _fit_points(
+        log.streams[main].t_ns, within, scenario.t0_ns, probes=probes, bright=bright, budget_bytes=budget_bytes
+    )
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
         if (points := sweeps.at(main, i)) is not None:
@@ -452,6 +455,7 @@ def _fit_points(
     t_ns: NDArray[np.int64],
     within: NDArray[np.int64],
     start_ns: int,
+    *,
     probes: list[PointsAbove],
     bright: float,
     budget_bytes: int,
@@ -554,7 +558,12 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     pictures = None
     if cameras:
         pictures = picture_document(
-            log, scenario, cameras, left, reader, lambda done, total: report("page: pictures", done, total)
+            log,
+            scenario,
+            cameras,
+            budget_bytes=left,
+            reader=reader,
+            progress=lambda done, total: report("page: pictures", done, total),
         )
     reader.require_some()
     if pictures is not None and not pictures["cameras"]:
