@@ -712,7 +712,8 @@ class RecordSource:
 
         A JPEG is decoded at that size, in two thirds of the time of the whole.
         """
-        image, stream = None, self.log.streams[camera]
+        image: NDArray[np.uint8] | None = None
+        stream = self.log.streams[camera]
         width_px, height_px = self.log.cameras[camera].width_px, self.log.cameras[camera].height_px
         if stream.encoded is not None and (gray or least_px < width_px):
             with suppress(RecordError):  # which is told when it is read whole

@@ -217,7 +217,8 @@ class GroundMapBuilder:
         if view.camera.mount == "ego":
             kept &= ~covered([self._users.ego_at(view.t_ns)], self.raster, warp.rows, warp.columns)
             hiding = self._hiding_at(view.t_ns)
-            kept &= True if hiding is None else ~find_hidden(view, warp, hiding)
+            if hiding is not None:
+                kept &= ~find_hidden(view, warp, hiding)
         colors.add(view.camera.name, image, warp.take(kept))
 
     def build(self) -> GroundMap:
