@@ -23,7 +23,7 @@ from log2sim.perception.homography.estimate import (
     MIN_TESTED_FEET,
 )
 from log2sim.perception.homography.fit import MIN_INLIER_SHARE, MIN_INLIERS, HomographyFit, PitchRoll, refused_fit
-from log2sim.perception.homography.normalized import CHI2_2DOF_99
+from log2sim.perception.homography.normalized import CHI2_2DOF_99, MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
 from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, MIN_SIGNIFICANCE_SIGMA, HeldOutErrors
 from log2sim.perception.homography.rig import (
     OF_CAMERA,
@@ -53,8 +53,6 @@ GATES = (16 * CHI2_2DOF_99, 6 * CHI2_2DOF_99, 2 * CHI2_2DOF_99, CHI2_2DOF_99, CH
 LAST_GATES = 4
 # Of the shifts that single feet of a camera ask for so many are tried.
 MAX_CANDIDATES = 48
-# The assumed noise counts as a prior worth this many feet; an estimate departs from it by this factor at most.
-NOISE_PRIOR_ROWS, MAX_NOISE_FACTOR = 20.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
