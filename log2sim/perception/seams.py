@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, distort, inverse
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography.rig import Rig, RigRows, cam_of_ground, heights_of, rotation_of
 from log2sim.perception.homography.rig_fit import MOUNT_SIGMA_RAD, RigFit
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.observe_tick import base_pose
-from log2sim.perception.records import shrink
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule
 
 # Structure coarser than this is shading, m. Structure finer than this is smoothed: a pixel of a camera of 1000 px focal length,
@@ -278,32 +277,20 @@ class Seam:
         return float(np.hypot(*self.offset_m))
 
 
-@dataclass(frozen=True, eq=False)
-class SeamView:
-    """A place at a tick, and what of it is hidden from either camera.
-
-    Attributes
-    ----------
-    hidden : mapping of str to (R, C) bool
-        Cells that do not show the ground, by camera.
-    """
-
-    place: SeamPlace
-    tick: int
-    hidden: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
-
-
 def measure_seam(
-    view: SeamView, images: Mapping[str, NDArray[np.uint8]], cameras: Mapping[str, Camera],
+    place: SeamPlace,
+    tick: int,
+    hidden: Mapping[str, NDArray[np.bool_]],
+    images: Mapping[str, NDArray[np.uint8]],
+    cameras: Mapping[str, Camera],
     homographies: Mapping[str, Array],
-) -> Seam | None:  # fmt: skip
-    """Register what two cameras show of a place; None where that is not possible."""
-    place, tick = view.place, view.tick
+) -> Seam | None:
+    """Register what two cameras show of a place but where it is hidden (R, C) from either; None where that is not possible."""
     xy, patches = place.cells(), []
     for name in (place.first, place.second):
         patch = draw_patch(images[name], cameras[name], homographies[name], xy)
-        patches.append(np.where(view.hidden[name], np.nan, patch).astype(np.float32) if view.hidden else patch)
-    found: Offset | None = register_patches(patches[0], patches[1], CELL_M)
+        patches.append(np.where(hidden[name], np.nan, patch).astype(np.float32))
+    found = register_patches(patches[0], patches[1], CELL_M)
     if found is None:
         return None
     axes = place.axes
@@ -322,14 +309,6 @@ def misalignment_m(seam: Seam, homographies: Mapping[str, Array]) -> float:
         return float("inf")
     xy = q[:, :2] / q[:, 2:]
     return float(np.hypot(*(xy[1] - xy[0])))
-
-
-def summarize_seams(seams: Sequence[Seam]) -> dict[str, float]:
-    """Compute the median misalignment, m, of each pair of cameras, named first|second."""
-    pairs: dict[str, list[float]] = {}
-    for seam in seams:
-        pairs.setdefault(f"{seam.place.first}|{seam.place.second}", []).append(seam.distance_m)
-    return {pair: float(np.median(lengths)) for pair, lengths in pairs.items()}
 
 
 # The road is not a plane: cameras half a meter apart and 1.6 m high show 0.05 m of height 0.015 m apart. Together with what the
@@ -565,7 +544,7 @@ class SeamPictures:
 
     @classmethod
     def read(
-        cls, log: Log, schedule: Schedule, observed: Observations, reader: RecordReader, ticks: Sequence[int]
+        cls, log: Log, schedule: Schedule, observed: Observations, reader: RecordSource, ticks: Sequence[int]
     ) -> SeamPictures:
         """Read the pictures of some ticks; black, frozen and unreadable ones are left out."""
         images = {}
@@ -573,7 +552,7 @@ class SeamPictures:
             for camera, index in schedule.frames.items():
                 image = reader.get(camera, int(index[tick])) if index[tick] >= 0 else None
                 t_ns = int(log.streams[camera].t_ns[index[tick]])
-                if image is not None and reader.watch.cameras[camera].judge(t_ns, shrink(image)) == "live":
+                if image is not None and reader.watch.is_live(camera, t_ns, image):
                     images[camera, tick] = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         return cls(log, schedule, observed, images)
 
@@ -598,7 +577,7 @@ class SeamPictures:
                 if hidden is None:
                     covered += 1
                     continue
-                seam = measure_seam(SeamView(place, tick, hidden), images, cameras, roads)
+                seam = measure_seam(place, tick, hidden, images, cameras, roads)
                 if seam is not None:
                     seams.append(seam)
         return SeamSurvey(tuple(seams), places, covered)
@@ -631,17 +610,6 @@ def roads_at(log: Log, schedule: Schedule, homographies: Mapping[str, CameraHomo
             level = np.array([[*moved[0, :2], moved[0, 3]], [*moved[1, :2], moved[1, 3]], [0.0, 0.0, 1.0]])
             out[name] = level @ h
     return out
-
-
-def turn_mounts(log: Log, homographies: Mapping[str, CameraHomography]) -> Log:
-    """Return the log with the mounts of its cameras turned as their homographies ask for."""
-    cameras = dict(log.cameras)
-    for name, ground in homographies.items():
-        if ground.rig is not None and ground.rig.state is not None:
-            turn = np.eye(4)
-            turn[:3, :3] = rotation_of(ground.rig.state.mount[name]).T
-            cameras[name] = replace(cameras[name], mount_T_cam=cameras[name].mount_T_cam @ turn)
-    return log.changed(cameras=cameras)
 
 
 def ticks_of(schedule: Schedule, count: int = TICKS, *, held_out: bool = False) -> list[int]:
