@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from log2sim.logs.validation import validate_log
     from log2sim.pipeline import reconstruct
     from log2sim.prediction.prediction import predict_scenario
+    from log2sim.resim.simulate import resimulate
     from log2sim.road.builder import map_ground
     from log2sim.simulation.runner import replay
     from log2sim.synth.synthesis import write_synthetic
@@ -50,6 +51,7 @@ _PLACES = {
     "reconstruct": "log2sim.pipeline:reconstruct",
     "reconstruct_all": "log2sim.batch.run:reconstruct_all",
     "replay": "log2sim.simulation.runner:replay",
+    "resimulate": "log2sim.resim.simulate:resimulate",
     "show_progress": "log2sim.visualization.progress:show_progress",
     "summarize_log": "log2sim.logs.excerpt:summarize",
     "validate_log": "log2sim.logs.validation:validate_log",
@@ -62,7 +64,7 @@ _PLACES = {
 __all__ = [
     "Config", "Log2SimError", "Scenario", "__version__", "bench", "detect_log", "edit_scenario", "evaluate", "examine_installation",
     "export_scenario", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
-    "replay", "show_progress", "summarize_log", "validate_log", "view", "write_log", "write_synthetic",
+    "replay", "resimulate", "show_progress", "summarize_log", "validate_log", "view", "write_log", "write_synthetic",
 ]  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from log2sim.cli import (
     predict,
     reconstruct,
     replay,
+    resimulate,
     synth,
     validate,
     view,
@@ -87,7 +88,7 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, resimulate.resimulate, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, import_.import_, "import")

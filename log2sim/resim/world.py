@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
+from log2sim.localization.pose_refinement import refine_poses
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import Floats, Pattern, Rays, Shots, all_shots, bin_of, find_pattern, poses_of, rays_in_map, recorded_shots
@@ -31,6 +32,7 @@ COVERED_M = 0.25  # around a disc of an agent, where none is added
 CHECKED_SWEEPS = 40  # of each LiDAR: enough rays for the share of each disc
 SAME_SURFACE_M = 0.1  # across it, between where a ray met and where it should
 MIN_SHARE = 0.2
+SAME_PLACE_M = 0.5
 PRIOR_RAYS = 2.0
 
 Progress = Callable[[str, int, int], None]
@@ -55,7 +57,10 @@ class World:
     Attributes
     ----------
     shift_m : (3,) float64, m
-        The background is in the map less this.
+        The background is in its own map less this.
+    given, refined : PoseTrack or None
+        Poses of the ego by which agents are placed, and at the same stamps those by which surfaces lie on each other: its
+        background is in the map of the latter.
     background : Surfels
     agents : mapping of str to Surfels
         By id, in the frame of the agent.
@@ -66,6 +71,8 @@ class World:
     """
 
     shift_m: Array
+    given: PoseTrack | None
+    refined: PoseTrack | None
     background: Surfels
     agents: Mapping[str, Surfels]
     models: Mapping[str, Model]
@@ -91,9 +98,12 @@ def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
 
 def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
     """Put the agents of a scenario into the background, each disc where it is when the sensor looks there."""
-    parts = [world.background]
-    center = [world.background.center_m - (rays.shift_m - world.shift_m).astype(np.float32)]
-    normal, ids = [world.background.normal], []
+    parts, ids = [world.background], []
+    move = _given_T_refined(world, rays)
+    rotation = move[:3, :3].astype(np.float32)
+    offset = move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m
+    center = [world.background.center_m @ rotation.T + offset.astype(np.float32)]
+    normal = [world.background.normal @ rotation.T]
     t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
     sensor = rays.bin_T_map[len(rays.bin_T_map) // 2]
     for agent in scenario.others:
@@ -114,6 +124,18 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
         ids.append(agent.id)
     first = np.cumsum([0, *(len(p) for p in parts)])
     return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
+
+
+def _given_T_refined(world: World, rays: Rays) -> Array:
+    """Return the pose (4, 4) of the map of the background in that of the agents, as it was where the ego is now."""
+    if world.given is None or world.refined is None:
+        return np.eye(4)
+    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
+    distance = np.linalg.norm(world.given.map_T_ego[:, :3, 3] - here, axis=1)
+    # Of several times at which it was there, the one nearest to now.
+    late = np.where(distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - rays.t_ns[0]), np.iinfo(np.int64).max)
+    k = int(late.argmin())
+    return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
 
 
 def _turned(surfels: Surfels, yaw: Array, position: Array) -> tuple[Array, Array]:
@@ -152,6 +174,8 @@ def build_world(
     """
     models: dict[str, Model] = {}
     background, own = SurfelGrid(), {agent.id: SurfelGrid() for agent in scenario.others}
+    refined = refine_poses(log)
+    surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
     done, total = 0, sum(len(log.streams[name].t_ns) for name in lidars)
     for name in lidars:
@@ -169,7 +193,7 @@ def build_world(
                 scale = float(known.mean()) if len(known) and known.mean() > 0 else np.nan
                 top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
             far = max(far, float(shots.range_m.max()))
-            noise.append(_add_sweep(log, scenario, name, shots, pattern, scale, shift, background, own))
+            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, own))
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
         if name in models:
             level = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
@@ -180,7 +204,7 @@ def build_world(
     agents = {agent.id: completed(agent, seen[agent.id]) for agent in scenario.others}
     unseen = [id for id, surfels in seen.items() if not len(surfels)]
     notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
-    world = World(shift, background.surfels(), agents, models, notes)
+    world = World(shift, log.ego if refined is not None else None, refined, background.surfels(), agents, models, notes)
     return _weighed(log, scenario, world, leave_out, progress)
 
 
@@ -197,6 +221,7 @@ def _readable(log: Log, name: str, i: int) -> Shots | None:
 
 def _add_sweep(
     log: Log,
+    surveyed: Log,
     scenario: Scenario,
     name: str,
     shots: Shots,
@@ -239,7 +264,12 @@ def _add_sweep(
         if len(rows):
             axes = local(normal[near])[taken].astype(np.float32)
             own[agent.id].add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
-    background.add(points[free] - shift, normal[free].astype(np.float32), surface.radius_m[free], intensity[free])
+    poses, moment, _ = poses_of(surveyed, name, shots.t_ns[free])
+    rotation = poses[moment, :3, :3]
+    points = np.einsum("nij,nj->ni", rotation, shots.direction[free] * shots.range_m[free, None])
+    points += poses[moment, :3, 3] - shift
+    normal = np.einsum("nij,nj->ni", rotation, surface.normal[free])
+    background.add(points, normal.astype(np.float32), surface.radius_m[free], intensity[free])
     return surface.noise_m
 
 
@@ -286,7 +316,7 @@ def _weighed(
         usable = [i for i in range(len(log.streams[name].t_ns)) if not leave_out(name, i)]
         chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, CHECKED_SWEEPS).astype(int))]
         for done, i in enumerate(chosen):
-            progress(f"check the world by {name}", done + 1, len(chosen))
+            progress(f"rays of {name} through the world", done + 1, len(chosen))
             shots = _readable(log, name, i)
             if shots is None:
                 continue
