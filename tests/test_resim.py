@@ -15,9 +15,11 @@ from log2sim.logs.opening import open_log
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
-from log2sim.resim.simulate import Simulation, resimulate, simulate
+from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
 from log2sim.resim.surfels import Surfels, smallest_axis
 from log2sim.resim.world import World, build_world
+from log2sim.simulation.policy import Controls, Observation
+from log2sim.simulation.runner import replay
 from log2sim.synth import Scene, load_scene, synthesize
 
 SCENES = Path(__file__).resolve().parents[1] / "samples" / "scenes"
@@ -129,7 +131,10 @@ def test_an_agent_leaves_no_copy_and_stands_where_it_is_moved(recorded: tuple[Lo
     log, truth = recorded
     (name,) = log.lidars
     t_s = (log.streams[name].t_ns - truth.t0_ns) / NS_PER_S - 0.05
-    there = max(truth.others, key=lambda a: count_in_box(points_of(Simulation(log, world, truth), name, 12, log), truth, a.id, t_s[12]))
+    there = max(
+        truth.others,
+        key=lambda a: count_in_box(points_of(Simulation(log, world, truth), name, 12, log), truth, a.id, t_s[12]),
+    )
     before = count_in_box(points_of(Simulation(log, world, truth), name, 12, log), truth, there.id, t_s[12])
     assert before > 50
     without = replace(truth, agents=tuple(a for a in truth.agents if a.id != there.id))
@@ -160,7 +165,13 @@ def test_rays_that_did_not_return_are_found_between_those_that_did(recorded: tup
 
 
 def test_a_body_fills_its_box(recorded: tuple[Log, Scenario]) -> None:
-    for category, size in (("car", (4.5, 1.8, 1.5)), ("truck", (8, 2.4, 3)), ("bus", (12, 2.5, 3)), ("pedestrian", (0.6, 0.6, 1.7)), ("cyclist", (1.8, 0.6, 1.7))):
+    for category, size in (
+        ("car", (4.5, 1.8, 1.5)),
+        ("truck", (8, 2.4, 3)),
+        ("bus", (12, 2.5, 3)),
+        ("pedestrian", (0.6, 0.6, 1.7)),
+        ("cyclist", (1.8, 0.6, 1.7)),
+    ):
         agent = replace(recorded[1].others[0], category=category, size_m=size)
         np.testing.assert_allclose(np.ptp(body_of(agent).center_m, axis=0), size, atol=0.25)
 
@@ -188,3 +199,23 @@ def test_what_cannot_be_simulated_is_said_and_nothing_written(recorded: tuple[Lo
     with pytest.raises(ConfigError, match="ego is not there"):
         resimulate(log, truth, replace(truth, agents=(late, *truth.others)), tmp_path / "out")
     assert not any(tmp_path.iterdir())
+
+
+def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], world: World) -> None:
+    log, truth = recorded
+    (name,) = log.lidars
+    ahead: list[float] = []
+
+    def drive(observation: Observation) -> Controls:
+        if len(ahead) < 2 and observation.t_s >= len(ahead) * 1.5:
+            # The house beside the street: 10 m to the left of the path, wherever along it the ego is.
+            points = observation.sweep(name).xyz_m
+            beside = (np.abs(points[:, 0]) < 5) & (points[:, 1] > 3) & (points[:, 2] > 0)
+            ahead.append(float(np.median(points[beside, 1])))
+        return Controls(0.0, 0.0)
+
+    replay(truth, ego=with_sensors(drive, Simulation(log, world, truth)), dt_s=0.05)
+    assert len(ahead) == 2
+    np.testing.assert_allclose(ahead, 10 + 1.8, atol=0.3)
+    with pytest.raises(ConfigError, match="no sensors are simulated"):
+        replay(truth, ego=lambda observation: observation.sweep(name), dt_s=0.05)  # type: ignore[arg-type,return-value]

@@ -45,9 +45,7 @@ def resimulate(
     names = tuple(name.strip() for name in sensors.split(",")) if sensors else ()
     with progress(quiet=quiet) as report:
         recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
-        notes = run(
-            recorded, source, now, out, sensors=names, seed=seed, overwrite=overwrite, progress=report
-        )
+        notes = run(recorded, source, now, out, sensors=names, seed=seed, overwrite=overwrite, progress=report)
     for note in notes:
         say(f"note: {note}", quiet=quiet)
     say_written(out, quiet=quiet)

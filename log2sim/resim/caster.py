@@ -90,7 +90,9 @@ def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floa
     across = c * turned[:, 1] - s * turned[:, 0]
     upward = (flat_m * turned[:, 2] - seen[:, 2] * (c * turned[:, 0] + s * turned[:, 1])) / np.maximum(distance, 0.01)
     free = np.maximum(distance - radius - rays.spread_m, 0.1)
-    half_az = (radius * np.sqrt(np.maximum(1 - across**2, 0)) + rays.spread_m) / np.maximum(free * flat_m / np.maximum(distance, 0.01), 0.1)
+    half_az = (radius * np.sqrt(np.maximum(1 - across**2, 0)) + rays.spread_m) / np.maximum(
+        free * flat_m / np.maximum(distance, 0.01), 0.1
+    )
     half_el = (radius * np.sqrt(np.maximum(1 - upward**2, 0)) + rays.spread_m) / free
     half_az, half_el = np.minimum(half_az, MAX_HALF_WIDTH_RAD), np.minimum(half_el, MAX_HALF_WIDTH_RAD)
     near = distance > MIN_RANGE_M / 2

@@ -23,6 +23,7 @@ ELEVATION_BIN_RAD = np.deg2rad(0.02)
 MIN_LINE_SHARE = 0.65  # of points within a quarter of the gap of a line; a half of them where there are no lines
 MIN_LINE_WIDTH_RAD = np.deg2rad(0.06)  # angles of points are not better where poses were taken off them
 MAX_LINES = 300
+MIN_DOWN_RAD = np.deg2rad(5.0)  # below the horizon: a street is not steeper
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +66,8 @@ class Pattern:
         Between firings of a line.
     gap_rad : float
         Usual angle between lines; `step_rad` without lines.
-    covered : (360,) bool
-        Whole degrees of azimuth from -180 on in which anything came back.
+    covered : (L + 1, 120) bool
+        Lines by 3 degrees of azimuth from -180 on in which rays may come back; the last row is of any line.
     """
 
     level_R_sensor: Array
@@ -122,11 +123,20 @@ def find_pattern(log: Log, name: str) -> Pattern:
     sweeps = [recorded_shots(log, name, stream.read(int(i))) for i in chosen]
     direction = np.concatenate([s.direction[s.range_m > MIN_PATTERN_RANGE_M] for s in sweeps]).astype(np.float64)
     azimuth, elevation = angles_of(direction)
-    covered = np.bincount(_degree(azimuth), minlength=360) > 0
     some = np.random.default_rng(0).permutation(len(direction))[:40_000]
     along, across = _tilt(azimuth[some], elevation[some])
     rotation = rotation_from_rpy(across, along, 0.0)
-    lines = _lines(angles_of(direction @ rotation.T)[1])
+    elevation = angles_of(direction @ rotation.T)[1]
+    lines = _lines(elevation)
+    covered = np.zeros((len(lines) + 1, 120), dtype=bool)
+    covered[:, _cell(azimuth)] = True
+    if len(lines):
+        # What looks down and never comes back is hidden by the vehicle; what looks up may meet something yet.
+        seen = np.zeros_like(covered)
+        every = np.concatenate([s.direction for s in sweeps]) @ rotation.T
+        a, e = angles_of(every)
+        seen[_nearest(lines, e), _cell(a)] = True
+        covered[:-1] &= seen[:-1] | (lines > -MIN_DOWN_RAD)[:, None]
     # Firings of one line follow each other; without lines, points do.
     a, e = angles_of(sweeps[len(sweeps) // 2].direction @ rotation.T)
     line = _nearest(lines, e) if len(lines) else np.zeros(len(a), np.intp)
@@ -137,8 +147,8 @@ def find_pattern(log: Log, name: str) -> Pattern:
     return Pattern(rotation, lines, step, float(np.median(np.diff(lines))) if len(lines) > 1 else step, covered)
 
 
-def _degree(azimuth: NDArray[Any]) -> NDArray[np.int64]:
-    return np.clip(np.degrees(azimuth) + 180, 0, 359).astype(np.int64)
+def _cell(azimuth: NDArray[Any]) -> NDArray[np.int64]:
+    return np.clip((np.degrees(azimuth) + 180) / 3, 0, 119).astype(np.int64)
 
 
 def _tilt(azimuth: Array, elevation: Array) -> tuple[float, float]:
@@ -202,12 +212,12 @@ def all_shots(shots: Shots, pattern: Pattern) -> Shots:
     nth = np.arange(len(which)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
     fill_a = begin[which] + nth * width[which] / (missing[which] + 1)
     fill_e = lines[own[which]]
-    inside = pattern.covered[_degree(fill_a)] & ~empty[own[which]]
+    inside = pattern.covered[own[which], _cell(fill_a)] & ~empty[own[which]]
     fill_a, fill_e = fill_a[inside], fill_e[inside]
     # Lines that are no straight ones in these angles may look like two, either with gaps where the other has points.
-    scale = np.array([1 / pattern.step_rad, 1 / (0.6 * pattern.gap_rad)])
-    taken = cKDTree(np.column_stack([azimuth, elevation]) * scale)
-    alone = np.isinf(taken.query(np.column_stack([fill_a, fill_e]) * scale, distance_upper_bound=0.7)[0])
+    rows = [np.interp(e, lines, np.arange(len(lines))) for e in (elevation, fill_e)]
+    taken = cKDTree(np.column_stack([azimuth / pattern.step_rad, rows[0]]))
+    alone = np.isinf(taken.query(np.column_stack([fill_a / pattern.step_rad, rows[1]]), distance_upper_bound=0.7)[0])
     fill_a, fill_e = fill_a[alone], fill_e[alone]
     level = np.stack([np.cos(fill_e) * np.cos(fill_a), np.cos(fill_e) * np.sin(fill_a), np.sin(fill_e)], 1)
     # The time of the nearest azimuth: a LiDAR that turns has little else.

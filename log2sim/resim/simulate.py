@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.datatypes import Labels, Log, Scenario, Stream, Sweep
+from log2sim.datatypes import EGO, Labels, Log, Scenario, Stream, Sweep, Waypoints
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.outputs import replaced_folder
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, nearest_index, rotation_from_rpy, wrap_angle, yaw_of
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.surfels import Surfels
 from log2sim.resim.world import Progress, World, build_world, place
+from log2sim.simulation.policy import Controls, Observation, Policy, reset_policy
 
 TRUTH_FILE = "truth.json"
 # An ego that stays this close to its recorded path is where it was: its poses are kept, with all their digits.
@@ -93,8 +94,53 @@ class Simulation:
         if np.isfinite(model.intensity):
             intensity = np.clip(hits.intensity[back] * model.intensity, 0, model.max_intensity).astype(np.float32)
             intensity = np.rint(intensity) if model.whole else intensity
-        sweep = Sweep(stamp_ns, shots.direction[back] * distance[:, None], "lidar", shots.t_ns[back], intensity=intensity)
+        sweep = Sweep(
+            stamp_ns, shots.direction[back] * distance[:, None], "lidar", shots.t_ns[back], intensity=intensity
+        )
         return sweep, np.flatnonzero(known)[back]
+
+
+def with_sensors(policy: Policy, simulation: Simulation) -> Policy:
+    """Return a policy of the ego that also sees: its observations have `sweep(name)`, cast from where it drives now."""
+    return _SeeingPolicy(policy, simulation)
+
+
+@dataclass(frozen=True, eq=False)
+class _SeeingPolicy:
+    inner: Policy
+    simulation: Simulation
+
+    def reset(self, scenario: Scenario) -> None:
+        reset_policy(self.inner, scenario)
+
+    def __call__(self, observation: Observation) -> Controls:
+        return self.inner(replace(observation, look=self.look))
+
+    def look(self, observation: Observation, name: str) -> Sweep:
+        """Cast the rays of the recorded sweep nearest in time, by the speeds of now during the sweep."""
+        log, source = self.simulation.log, self.simulation.scenario
+        if name not in self.simulation.world.models:
+            raise ConfigError(f"sweep '{name}': no such LiDAR; simulated are {', '.join(self.simulation.world.models)}")
+        now_ns = source.t0_ns + round(observation.t_s * NS_PER_S)
+        i = int(nearest_index(log.streams[name].t_ns, [now_ns])[0])
+        shots = self.simulation.shots(name, i)
+        shots = replace(shots, t_ns=shots.t_ns + (now_ns - int(shots.t_ns.max())))
+
+        def steady(x: float, y: float, z: float, yaw: float, vx: float, vy: float, speed: float) -> Waypoints:
+            later_s, one = np.array([-1.0, 1.0]), np.ones(2)
+            t_s, x_m, y_m = observation.t_s + later_s, x + vx * later_s, y + vy * later_s
+            return Waypoints(t_s, x_m, y_m, z * one, yaw * one, speed * one, observed=one > 0, sigma_xy_m=0 * one)
+
+        o, ego = observation.others, observation.ego
+        columns = (o.x_m, o.y_m, o.z_m, o.yaw_rad, o.velocity_x_mps, o.velocity_y_mps, o.speed_mps)
+        moving = {str(id): steady(*(float(c[k]) for c in columns)) for k, id in enumerate(o.id)}
+        heading = ego.speed_mps * np.cos(ego.yaw_rad), ego.speed_mps * np.sin(ego.yaw_rad)
+        moving[EGO] = steady(ego.x_m, ego.y_m, ego.z_m, ego.yaw_rad, *heading, ego.speed_mps)
+        agents = tuple(replace(a, waypoints=moving[a.id], static=False) for a in source.agents if a.id in moving)
+        present = replace(self.simulation, scenario=replace(source, agents=agents))
+        return present.cast(name, shots, present.driven, now_ns, np.random.default_rng([self.simulation.seed, now_ns]))[
+            0
+        ]
 
 
 def ego_poses(log: Log, scenario: Scenario) -> PoseTrack | None:
@@ -171,7 +217,9 @@ def labels_of(scenario: Scenario, t_ns: NDArray[np.int64]) -> Labels:
         there = np.full(len(t_s), agent.is_permanent) | ((t_s >= w.t_s[0]) & (t_s <= w.t_s[-1]))
         at = agent.trajectory.at(t_s)
         for k in np.flatnonzero(there):
-            rows.append((t_ns[k], agent.id, agent.category, (at.x_m[k], at.y_m[k], at.z_m[k]), agent.size_m, at.yaw_rad[k]))
+            rows.append(
+                (t_ns[k], agent.id, agent.category, (at.x_m[k], at.y_m[k], at.z_m[k]), agent.size_m, at.yaw_rad[k])
+            )
     rows.sort(key=lambda row: int(row[0]))
     columns = list(zip(*rows)) if rows else [()] * 6
     return Labels(

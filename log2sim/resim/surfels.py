@@ -168,7 +168,15 @@ class SurfelGrid:
         level = np.clip(np.ceil(np.log2(radius_m / (RADIUS_PER_CELL * CELL_M))), 0, LEVELS - 1).astype(np.int64)
         known = np.isfinite(intensity)
         sums = np.column_stack(
-            [np.ones(len(points)), points, normal, normal.any(axis=1), radius_m, np.where(known, intensity, 0.0), known.astype(np.float64)]
+            [
+                np.ones(len(points)),
+                points,
+                normal,
+                normal.any(axis=1),
+                radius_m,
+                np.where(known, intensity, 0.0),
+                known.astype(np.float64),
+            ]
         )
         self._pending.append(_summed(_keys(points, level), sums))
         if sum(len(k) for k, _ in self._pending) > self.PENDING_ROWS:

@@ -21,7 +21,18 @@ from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import grid_of, meetings
-from log2sim.resim.rays import Floats, Pattern, Rays, Shots, all_shots, bin_of, find_pattern, poses_of, rays_in_map, recorded_shots
+from log2sim.resim.rays import (
+    Floats,
+    Pattern,
+    Rays,
+    Shots,
+    all_shots,
+    bin_of,
+    find_pattern,
+    poses_of,
+    rays_in_map,
+    recorded_shots,
+)
 from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface
 
 # Around the box of an agent, whose edges are not exact: what is left out of the background, and what is taken for the agent.
@@ -29,7 +40,7 @@ LEFT_OUT_M, TAKEN_M = 0.35, 0.15
 GROUND_M = 0.12  # above the bottom of a box; below that it may be the ground
 HELD_S = 0.3  # before the first and after the last waypoint
 COVERED_M = 0.25  # around a disc of an agent, where none is added
-CHECKED_SWEEPS = 40  # of each LiDAR: enough rays for the share of each disc
+CHECKED_SWEEPS = 25  # of each LiDAR: enough rays for the share of each disc
 SAME_SURFACE_M = 0.1  # across it, between where a ray met and where it should
 MIN_SHARE = 0.2
 SAME_PLACE_M = 0.5
@@ -133,7 +144,9 @@ def _given_T_refined(world: World, rays: Rays) -> Array:
     here = rays.origin[len(rays.origin) // 2] + rays.shift_m
     distance = np.linalg.norm(world.given.map_T_ego[:, :3, 3] - here, axis=1)
     # Of several times at which it was there, the one nearest to now.
-    late = np.where(distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - rays.t_ns[0]), np.iinfo(np.int64).max)
+    late = np.where(
+        distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - rays.t_ns[0]), np.iinfo(np.int64).max
+    )
     k = int(late.argmin())
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
 
@@ -199,13 +212,26 @@ def build_world(
             level = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
             models[name] = replace(models[name], noise_m=level, max_range_m=far)
     if shift is None:
-        raise LogError(f"log '{log.name}': no sweep of {', '.join(lidars)} can be used; there is nothing to simulate from")
+        raise LogError(
+            f"log '{log.name}': no sweep of {', '.join(lidars)} can be used; there is nothing to simulate from"
+        )
     seen = {id: grid.surfels() for id, grid in own.items()}
     agents = {agent.id: completed(agent, seen[agent.id]) for agent in scenario.others}
     unseen = [id for id, surfels in seen.items() if not len(surfels)]
     notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
     world = World(shift, log.ego if refined is not None else None, refined, background.surfels(), agents, models, notes)
-    return _weighed(log, scenario, world, leave_out, progress)
+    # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
+    world = _weighed(log, scenario, world, leave_out, progress)
+    trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
+    world = replace(world, background=_trimmed(world.background), agents=trimmed)
+    world = _weighed(log, scenario, world, leave_out, progress)
+    there = {id: surfels.take(surfels.share > MIN_SHARE) for id, surfels in world.agents.items()}
+    return replace(world, background=world.background.take(world.background.share > MIN_SHARE), agents=there)
+
+
+def _trimmed(surfels: Surfels) -> Surfels:
+    """Make discs as large as the part of them that rays end on, and leave out those that rays pass through."""
+    return replace(surfels, radius_m=surfels.radius_m * np.sqrt(surfels.share)).take(surfels.share > MIN_SHARE)
 
 
 def _readable(log: Log, name: str, i: int) -> Shots | None:
@@ -345,8 +371,7 @@ def _weighed(
 
     def judged(surfels: Surfels, at: int) -> Surfels:
         rows = slice(at, at + len(surfels))
-        return replace(surfels, share=share[rows], returned=returned[rows]).take(share[rows] > MIN_SHARE)
+        return replace(surfels, share=share[rows], returned=returned[rows])
 
     agents = {id: judged(world.agents[id], begin[id]) for id in ids}
     return replace(world, background=judged(world.background, 0), agents=agents)
-

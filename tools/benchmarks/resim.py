@@ -54,7 +54,9 @@ def moved_sweep(log: Log, name: str, source: int, target: int) -> Array:
     t_ns = log.streams[name].t_ns
     shots = recorded_shots(log, name, log.streams[name].read(source))
     poses, moment, _ = poses_of(log, name, shots.t_ns)
-    points = np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction * shots.range_m[:, None]) + poses[moment, :3, 3]
+    points = (
+        np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction * shots.range_m[:, None]) + poses[moment, :3, 3]
+    )
     return apply(inverse(log.map_T_sensor(name, t_ns[target : target + 1])[0][0]), points)
 
 
@@ -92,7 +94,9 @@ def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[st
         true_log = synthesize(scene.model_copy(update={"lidar": lidars}), observe=False)[0].changed(ego=log.ego)
         simulation, figures = Simulation(log, world, truth), []
         for i in range(0, len(log.streams[name].t_ns), every):
-            shots = all_shots(recorded_shots(true_log, name, true_log.streams[name].read(i)), world.models[name].pattern)
+            shots = all_shots(
+                recorded_shots(true_log, name, true_log.streams[name].read(i)), world.models[name].pattern
+            )
             sweep, rows = simulation.cast(name, shots, true_log, 0, np.random.default_rng(i))
             figures.append(compare(shots, sweep.xyz_m, rows))
         out.append((f"{off_m:g} m sideways", mean(figures)))
