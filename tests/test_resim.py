@@ -17,7 +17,7 @@ from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
 from log2sim.resim.surfels import Surfels, smallest_axis
-from log2sim.resim.world import World, build_world
+from log2sim.resim.world import World, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import replay
 from log2sim.synth import Scene, load_scene, synthesize
@@ -174,6 +174,23 @@ def test_a_body_fills_its_box(recorded: tuple[Log, Scenario]) -> None:
     ):
         agent = replace(recorded[1].others[0], category=category, size_m=size)
         np.testing.assert_allclose(np.ptp(body_of(agent).center_m, axis=0), size, atol=0.25)
+
+
+def test_the_ground_goes_on_below_what_stands(recorded: tuple[Log, Scenario]) -> None:
+    grid = np.stack(np.meshgrid(np.arange(-6, 6, 0.1), np.arange(-6, 6, 0.1)), -1).reshape(-1, 2)
+    grid = grid[(np.abs(grid) > [2.2, 0.9]).any(axis=1)]
+    slope = np.column_stack([grid, 0.05 * grid[:, 0] - 0.03 * grid[:, 1]])
+    normal = np.array([-0.05, 0.03, 1]) / np.linalg.norm([-0.05, 0.03, 1])
+    at = replace(
+        recorded[1].others[0].waypoints.take([0]), x_m=np.array([100.0]), y_m=np.array([50.0]), z_m=np.array([7.75])
+    )
+    car = replace(
+        recorded[1].others[0], size_m=(4.4, 1.8, 1.5), static=True, waypoints=replace(at, yaw_rad=np.zeros(1))
+    )
+    below = ground_below(car, disc_surfels(slope, np.tile(normal, (len(slope), 1)), 0.1), np.array([100.0, 50, 7]))
+    assert np.ptp(below.center_m[:, :2], axis=0) == pytest.approx([4.2, 1.6], abs=0.3)
+    np.testing.assert_allclose(below.center_m @ normal, 0, atol=1e-5)
+    np.testing.assert_allclose(below.normal @ normal, 1, atol=1e-5)
 
 
 def test_a_simulated_log_opens_with_its_truth(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from log2sim.datatypes import EGO, Labels, Log, Scenario, Stream, Sweep, Waypoints
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.outputs import replaced_folder
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, nearest_index, rotation_from_rpy, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, PoseTrack, nearest_index, rotation_from_rpy, wrap_angle, yaw_of
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, poses_of, rays_in_map, recorded_shots
@@ -216,10 +216,10 @@ def labels_of(scenario: Scenario, t_ns: NDArray[np.int64]) -> Labels:
         w = agent.waypoints
         there = np.full(len(t_s), agent.is_permanent) | ((t_s >= w.t_s[0]) & (t_s <= w.t_s[-1]))
         at = agent.trajectory.at(t_s)
-        for k in np.flatnonzero(there):
-            rows.append(
-                (t_ns[k], agent.id, agent.category, (at.x_m[k], at.y_m[k], at.z_m[k]), agent.size_m, at.yaw_rad[k])
-            )
+        rows += [
+            (t_ns[k], agent.id, agent.category, (at.x_m[k], at.y_m[k], at.z_m[k]), agent.size_m, at.yaw_rad[k])
+            for k in np.flatnonzero(there)
+        ]
     rows.sort(key=lambda row: int(row[0]))
     columns = list(zip(*rows)) if rows else [()] * 6
     return Labels(

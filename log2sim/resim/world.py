@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ from log2sim.resim.rays import (
     rays_in_map,
     recorded_shots,
 )
-from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface
+from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
 
 # Around the box of an agent, whose edges are not exact: what is left out of the background, and what is taken for the agent.
 LEFT_OUT_M, TAKEN_M = 0.35, 0.15
@@ -44,6 +43,8 @@ CHECKED_SWEEPS = 25  # of each LiDAR: enough rays for the share of each disc
 SAME_SURFACE_M = 0.1  # across it, between where a ray met and where it should
 MIN_SHARE = 0.2
 SAME_PLACE_M = 0.5
+# Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
+AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
 PRIOR_RAYS = 2.0
 
 Progress = Callable[[str, int, int], None]
@@ -192,7 +193,7 @@ def build_world(
     shift: Array | None = None
     done, total = 0, sum(len(log.streams[name].t_ns) for name in lidars)
     for name in lidars:
-        pattern, noise, strength, far = find_pattern(log, name), [], [], 1.0
+        pattern, noise, far = find_pattern(log, name), [], 1.0
         for i in range(len(log.streams[name].t_ns)):
             done += 1
             progress("build the world", done, total)
@@ -219,7 +220,9 @@ def build_world(
     agents = {agent.id: completed(agent, seen[agent.id]) for agent in scenario.others}
     unseen = [id for id, surfels in seen.items() if not len(surfels)]
     notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
-    world = World(shift, log.ego if refined is not None else None, refined, background.surfels(), agents, models, notes)
+    standing = background.surfels()
+    standing = joined([standing, *(ground_below(a, standing, shift) for a in scenario.others if a.static)])
+    world = World(shift, log.ego if refined is not None else None, refined, standing, agents, models, notes)
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
     trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
@@ -227,6 +230,32 @@ def build_world(
     world = _weighed(log, scenario, world, leave_out, progress)
     there = {id: surfels.take(surfels.share > MIN_SHARE) for id, surfels in world.agents.items()}
     return replace(world, background=world.background.take(world.background.share > MIN_SHARE), agents=there)
+
+
+def ground_below(agent: Agent, background: Surfels, shift_m: Array) -> Surfels:
+    """Go on with the ground around an agent that stands, which hides what is below it; nothing where there is no ground."""
+    w, half = agent.waypoints, np.array(agent.size_m) / 2
+    c, s = np.cos(w.yaw_rad[0]), np.sin(w.yaw_rad[0])
+    offset = background.center_m - (np.array([w.x_m[0], w.y_m[0], w.z_m[0] - half[2]]) - shift_m)
+    along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+    near = (np.abs(along) < half[0] + AROUND_M) & (np.abs(across) < half[1] + AROUND_M)
+    near &= (np.abs(offset[:, 2]) < MAX_STEP_M) & (background.normal[:, 2] > 0.95)
+    if near.sum() < 20:
+        return no_surfels()
+    columns = np.column_stack([along[near], across[near], np.ones(near.sum())])
+    plane = np.linalg.lstsq(columns, offset[near, 2], rcond=None)[0]
+    steps = [np.arange(-h, h + GROUND_DISC_M, GROUND_DISC_M) for h in half[:2]]
+    cells = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    cells = cells[np.isinf(cKDTree(columns[:, :2]).query(cells, distance_upper_bound=GROUND_DISC_M)[0])]
+    x, y = c * cells[:, 0] - s * cells[:, 1], s * cells[:, 0] + c * cells[:, 1]
+    place = background.center_m[near][0] - offset[near][0]
+    normal = np.array([-c * plane[0] + s * plane[1], -s * plane[0] - c * plane[1], 1.0])
+    one = np.ones(len(cells), np.float32)
+    return Surfels(
+        (np.column_stack([x, y, cells @ plane[:2] + plane[2]]) + place).astype(np.float32),
+        np.tile(normal / np.linalg.norm(normal), (len(cells), 1)).astype(np.float32),
+        one * GROUND_DISC_M, one * np.median(background.intensity[near]), one, one,
+    )  # fmt: skip
 
 
 def _trimmed(surfels: Surfels) -> Surfels:

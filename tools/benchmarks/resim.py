@@ -2,14 +2,17 @@
 
 python tools/bench.py resim samples/crossing out/scenario.json
 python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3
+python tools/bench.py resim samples/crossing out/scenario.json --picture out/sweeps.jpg --without bus-1
 """
 
 from __future__ import annotations
 
 import resource
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from entry import parser_of
 from scipy.spatial import cKDTree
@@ -18,7 +21,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import Array, apply, inverse
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import open_log
-from log2sim.resim.rays import Shots, all_shots, poses_of, recorded_shots
+from log2sim.resim.rays import Shots, all_shots, angles_of, poses_of, recorded_shots
 from log2sim.resim.simulate import Simulation
 from log2sim.resim.world import build_world
 from log2sim.synth import load_scene, synthesize
@@ -80,6 +83,26 @@ def held_out(log: Log, scenario: Scenario, name: str) -> list[tuple[str, Figures
     return [("held out", {**mean(simulated), **speed}), ("nearest sweep, moved", mean(moved))]
 
 
+def picture(log: Log, scenario: Scenario, name: str, index: int, without: str, path: Path) -> None:
+    """Draw ranges of a recorded sweep, of the same simulated, and of the same without an agent."""
+    world = build_world(log, scenario, [name], leave_out=lambda _, i: i == index)
+    rest = replace(scenario, agents=tuple(a for a in scenario.agents if a.id != without))
+    figure, axes = plt.subplots(3, 1, figsize=(11, 5.4), sharex=True, layout="constrained")
+    titles = ("recorded", "simulated from the other sweeps", f"simulated without {without}")
+    shots = Simulation(log, world, scenario).shots(name, index)
+    azimuth, elevation = (np.degrees(a) for a in angles_of(shots.direction))
+    for axis, title, what in zip(axes, titles, (None, scenario, rest), strict=True):
+        rows, distance = np.arange(len(azimuth)), shots.range_m
+        if what is not None:
+            simulation = Simulation(log, world, what)
+            sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(0))
+            distance = np.linalg.norm(sweep.xyz_m, axis=1)
+        axis.scatter(-azimuth[rows], elevation[rows], s=2.5, c=distance, cmap="turbo", vmin=3, vmax=40, linewidths=0)
+        axis.set(title=title, ylabel="elevation, deg", facecolor="black")
+    axes[-1].set(xlabel="azimuth, deg, to the right")
+    figure.savefig(path, dpi=90)
+
+
 def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:
     """Cast from beside the sensor that recorded, and compare with the true sweep from there."""
     scene = load_scene(scene_path).model_copy(update={"camera": ()})
@@ -113,6 +136,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("scenario", type=Path, nargs="?", help="what was reconstructed from it")
     parser.add_argument("--lidar", help="by default the first of the log")
     parser.add_argument("--sideways", type=float, nargs="+", default=[0.0, 0.5, 1.0, 2.0, 3.0], metavar="M")
+    parser.add_argument("--picture", type=Path, help="draw a sweep instead")
+    parser.add_argument("--sweep", type=int, default=22, help="of --picture")
+    parser.add_argument("--without", default="", metavar="AGENT", help="agent that --picture leaves out")
     parser.add_argument("--every", type=int, default=7, help="sweeps of a scene that are compared")
     given = parser.parse_args(argv)
     if given.scenario is None:
@@ -120,7 +146,11 @@ def main(argv: list[str] | None = None) -> int:
     else:
         scenario = Scenario.load(given.scenario)
         log = localize_like(open_log(given.log), scenario.provenance)
-        rows = held_out(log, scenario, given.lidar or next(iter(log.lidars)))
+        name = given.lidar or next(iter(log.lidars))
+        if given.picture is not None:
+            picture(log, scenario, name, given.sweep, given.without, given.picture)
+            return 0
+        rows = held_out(log, scenario, name)
     for label, figures in rows:
         print(f"{label:22s}", ", ".join(f"{key} {value:.3f}" for key, value in figures.items()))
     print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
