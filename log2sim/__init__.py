@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from log2sim.config import Config
     from log2sim.datatypes.scenario import Scenario
     from log2sim.edit.apply import edit as edit_scenario
+    from log2sim.edit.corrections import correct as correct_scenario
     from log2sim.errors import Log2SimError
     from log2sim.evaluation.bench.benchmark import bench
     from log2sim.evaluation.detection.detect_log import detect_log
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
     from log2sim.prediction.prediction import predict_scenario
     from log2sim.resim.simulate import resimulate
     from log2sim.road.builder import map_ground
+    from log2sim.scenarios.failure import search as search_failures
+    from log2sim.scenarios.logical import fit as fit_logical
+    from log2sim.scenarios.query import ask as find_situations
+    from log2sim.scenarios.tagging import tag as tag_scenario
     from log2sim.simulation.runner import replay
     from log2sim.synth.synthesis import write_synthetic
     from log2sim.visualization.page.writer import write_page as view
@@ -39,11 +44,14 @@ _PLACES = {
     "Scenario": "log2sim.datatypes.scenario:Scenario",
     "bench": "log2sim.evaluation.bench.benchmark:bench",
     "detect_log": "log2sim.evaluation.detection.detect_log:detect_log",
+    "correct_scenario": "log2sim.edit.corrections:correct",
     "edit_scenario": "log2sim.edit.apply:edit",
     "evaluate": "log2sim.evaluation.metrics.evaluator:evaluate",
     "examine_installation": "log2sim.cli.doctor:examine",
     "export_scenario": "log2sim.export.exporters:export",
     "import_scenario": "log2sim.export.openscenario.read:load",
+    "find_situations": "log2sim.scenarios.query:ask",
+    "fit_logical": "log2sim.scenarios.logical:fit",
     "map_ground": "log2sim.road.builder:map_ground",
     "open_log": "log2sim.logs.opening:open_log",
     "plot": "log2sim.visualization.plot.scene:plot",
@@ -52,8 +60,10 @@ _PLACES = {
     "reconstruct_all": "log2sim.batch.run:reconstruct_all",
     "replay": "log2sim.simulation.runner:replay",
     "resimulate": "log2sim.resim.simulate:resimulate",
+    "search_failures": "log2sim.scenarios.failure:search",
     "show_progress": "log2sim.visualization.progress:show_progress",
     "summarize_log": "log2sim.logs.excerpt:summarize",
+    "tag_scenario": "log2sim.scenarios.tagging:tag",
     "validate_log": "log2sim.logs.validation:validate_log",
     "view": "log2sim.visualization.page.writer:write_page",
     "write_log": "log2sim.logs.native.writer:write_log",
@@ -62,9 +72,9 @@ _PLACES = {
 """The functions of commands whose names are folders of the package have longer names."""
 
 __all__ = [
-    "Config", "Log2SimError", "Scenario", "__version__", "bench", "detect_log", "edit_scenario", "evaluate", "examine_installation",
-    "export_scenario", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
-    "replay", "resimulate", "show_progress", "summarize_log", "validate_log", "view", "write_log", "write_synthetic",
+    "Config", "Log2SimError", "Scenario", "__version__", "bench", "correct_scenario", "detect_log", "edit_scenario", "evaluate", "examine_installation",
+    "export_scenario", "find_situations", "fit_logical", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
+    "replay", "resimulate", "search_failures", "show_progress", "summarize_log", "tag_scenario", "validate_log", "view", "write_log", "write_synthetic",
 ]  # fmt: skip
 
 

@@ -23,12 +23,12 @@ from log2sim.perception.cooperative import (
     merge_by_covariance,
     take_off_offset,
 )
-from log2sim.perception.first_pass import obstacles_of
 from log2sim.perception.lidar.cloud import (
     Cloud,
     CloudSensor,
     assemble_views,
     join_parts,
+    obstacles_of,
 )
 from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
@@ -169,17 +169,17 @@ def test_every_level_finds_every_object_once(both_ends, level) -> None:
 
 def test_levels_fall_back_where_an_end_has_no_lidar(both_ends) -> None:
     config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
-    assert fusion_level(both_ends, config).level is FusionLevel.BOXES
+    assert fusion_level(both_ends, config)[0] is FusionLevel.BOXES
     images = config.changed(detect={"name": "labels"})
-    choice = fusion_level(both_ends, images)
-    assert choice.level is FusionLevel.POINTS
-    assert "images alone" in choice.reason
+    level, reason = fusion_level(both_ends, images)
+    assert level is FusionLevel.POINTS
+    assert "images alone" in reason
     alone = both_ends.changed(lidars={"post": both_ends.lidars["post"]})
-    choice = fusion_level(alone, config)
-    assert choice.level is None
-    assert "no LiDAR of vehicle" in choice.reason
+    level, reason = fusion_level(alone, config)
+    assert level is None
+    assert "no LiDAR of vehicle" in reason
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
-    assert fusion_level(vehicle, config).reason == ""
+    assert fusion_level(vehicle, config)[1] == ""
 
 
 def track_of(ticks, xy, *, late_s=0.0, end=0, category="car"):

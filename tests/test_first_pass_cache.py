@@ -23,7 +23,8 @@ from log2sim.files.documents import check
 from log2sim.perception import first_pass, first_pass_cache
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.first_pass_cache import open_cache
-from log2sim.pipeline import Run, observe_log, start
+from log2sim.pipeline import observe_log, start
+from log2sim.report import Run
 
 ROOT = Path(__file__).resolve().parents[1]
 TICKS = 6
@@ -236,7 +237,7 @@ def test_what_repeats_is_judged_by_all_before_it_whoever_knows_it(
     for other in runs[1:]:
         assert_same_observations(runs[0], other)
         assert other.unseen == runs[0].unseen
-        assert [f.to_dict(0) for f in other.faults] == [f.to_dict(0) for f in runs[0].faults]
+        assert other.faults == runs[0].faults
 
 
 def recoded(picture: Path) -> bytes:

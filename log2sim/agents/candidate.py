@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.size import TrackGeometry, independent, independent_along
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Doubt, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Finding, Track, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar.measure import logit
@@ -108,14 +108,6 @@ def is_confirmed(track: Track, *, typical: bool, followed: float = 0.0) -> bool:
     if image_confidence(track) >= least:
         return True
     return max(sweep_confidence(track), moving_confidence(track), followed) >= MIN_SWEEP_CONFIDENCE
-
-
-def agent_confidence(track: Track, followed: float = 0.0) -> float:
-    """Return the confidence of an agent in [0, 1] from the scores of its track and its `followed_confidence`."""
-    best = float(_strongest(track.measurements.score).mean())
-    if np.isnan(track.measurements.box_yaw_rad).all():
-        return best
-    return max(sweep_confidence(track), followed, best if image_confidence(track) >= MIN_TRACK_CONFIDENCE else 0.0)
 
 
 def image_confidence(track: Track) -> float:
@@ -257,7 +249,7 @@ class AgentCandidate:
     geometry: TrackGeometry
     support: Support | None = None
 
-    def doubted(self, doubts: Sequence[Doubt]) -> Self:
+    def doubted(self, doubts: Sequence[Finding]) -> Self:
         """Return the candidate with more doubts of its agent."""
         return replace(self, agent=replace(self.agent, doubts=(*self.agent.doubts, *doubts))) if doubts else self
 
@@ -281,17 +273,11 @@ def candidate_of(
         waypoints=waypoints,
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
-        confidence=float(np.clip(agent_confidence(track, followed), 0.0, 1.0)),
         quality=_quality_of(track) | quality,
     )
     return AgentCandidate(
         agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely, followed=followed), track, geometry
     )
-
-
-def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:
-    """Keep the confirmed candidates."""
-    return [c for c in candidates if c.confirmed]
 
 
 def _quality_of(track: Track) -> dict[str, Any]:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from log2sim.datatypes.agent import (
     COLOR_NAMES,
-    FLAGS,
     MARGIN_S,
     MIN_TRUSTED_CONFIDENCE,
     STANDSTILL_DRIFT_M,
     STANDSTILL_MPS,
     Agent,
-    Doubt,
     Trajectory,
     Waypoints,
     list_doubtful,
@@ -39,7 +37,7 @@ from log2sim.datatypes.detections import (
     Rays,
     Track,
 )
-from log2sim.datatypes.faults import FAULT_KINDS, Fault, Treatment
+from log2sim.datatypes.findings import KINDS, Finding, Treatment
 from log2sim.datatypes.log import (
     ENDS,
     ROAD,
@@ -74,6 +72,7 @@ from log2sim.datatypes.map_features import (
     RoadBorder,
 )
 from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Signal, say_agents, say_categories
+from log2sim.datatypes.tag import TAGS, Tag
 
 __all__ = [
     "BORDER_KINDS",
@@ -82,10 +81,9 @@ __all__ = [
     "COLOR_NAMES",
     "EGO",
     "ENDS",
-    "FAULT_KINDS",
-    "FLAGS",
     "GROUPS",
     "GROUP_OF",
+    "KINDS",
     "LANE_LINE_KINDS",
     "LANE_ORIGINS",
     "MARGIN_S",
@@ -98,6 +96,7 @@ __all__ = [
     "SIGNAL_STATES",
     "STANDSTILL_DRIFT_M",
     "STANDSTILL_MPS",
+    "TAGS",
     "TUPLES",
     "TYPICAL_SIZE_M",
     "VEHICLE",
@@ -108,9 +107,8 @@ __all__ = [
     "Boxes3D",
     "Deferred",
     "Detections",
-    "Doubt",
     "EgoVehicle",
-    "Fault",
+    "Finding",
     "Frame",
     "IgnoreRegions",
     "ImageLabels",
@@ -133,6 +131,7 @@ __all__ = [
     "Span",
     "Stream",
     "Sweep",
+    "Tag",
     "Tick",
     "Track",
     "Trajectory",

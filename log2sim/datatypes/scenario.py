@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.log import IgnoreRegions, MapFrame
 from log2sim.datatypes.map_features import MapFeatures
+from log2sim.datatypes.tag import Tag
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.files import plugins
 from log2sim.files.documents import check, read_json, replaced, short_repr, write_json
@@ -214,7 +215,7 @@ def write_parquet(agents: Sequence[Agent], about: Mapping[str, Any], path: Path)
 def _columns_of(agent: Agent) -> dict[str, NDArray[Any]]:
     w, rows = agent.waypoints, len(agent.waypoints)
     length, width, height = agent.size_m
-    doubts = ",".join(dict.fromkeys(doubt.flag for doubt in agent.doubts))
+    doubts = ",".join(dict.fromkeys(doubt.kind for doubt in agent.doubts))
     same: dict[str, Any] = {
         "agent": agent.id, "category": agent.category, "length_m": length, "width_m": width, "height_m": height,
         "static": agent.static, "confidence": agent.confidence, "doubts": doubts, "sigma_yaw_rad": np.nan,
@@ -258,6 +259,8 @@ class Scenario:
         Only in truth: where objects were left without labels; None when the labels are complete.
     map_features : MapFeatures or None
         Markings, borders and lanes; None where they were not looked for.
+    tags : tuple of Tag or None
+        What its road users do; None where that was not looked for.
     """
 
     name: str
@@ -272,6 +275,7 @@ class Scenario:
     map_features: MapFeatures | None = None
     signals: tuple[Signal, ...] = ()
     sensors: tuple[Mapping[str, Any], ...] = ()
+    tags: tuple[Tag, ...] | None = None
 
     def __repr__(self) -> str:
         """Return name, agents and duration in one line."""
@@ -400,7 +404,10 @@ class Scenario:
         sensors = tuple(
             {**s, **{k: s[k] + d for k, d in zip(("x_m", "y_m", "z_m"), (dx, dy, dz))}} for s in self.sensors
         )
-        placed = replace(self, map_features=features, signals=signals, sensors=sensors)
+        tags = self.tags and tuple(
+            replace(g, **{k: getattr(g, k) + later_s for k in ("start_s", "t_s", "end_s")}) for g in self.tags
+        )
+        placed = replace(self, map_features=features, signals=signals, sensors=sensors, tags=tags)
         return replace(placed, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
@@ -484,6 +491,8 @@ class Scenario:
             document["signals"] = [signal.to_dict() for signal in self.signals]
         if self.sensors:
             document["sensors"] = [dict(sensor) for sensor in self.sensors]
+        if self.tags is not None:
+            document["tags"] = [tag.to_dict() for tag in self.tags]
         return document
 
     @classmethod
@@ -518,6 +527,7 @@ class Scenario:
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
             signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
             sensors=tuple(document.get("sensors", ())),
+            tags=tuple(Tag.from_dict(entry) for entry in document["tags"]) if "tags" in document else None,
         )
         for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
             seen: set[str] = set()

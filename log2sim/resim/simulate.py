@@ -301,4 +301,5 @@ def simulate(
     names = [name for name in log.lidars if not sensors or name in sensors]
     if log.ego is None and any(log.lidars[name].mount == "ego" for name in names):
         raise LogError(f"log '{log.name}': has no poses of the ego; reconstruct with poses from its LiDAR first")
+    ego_poses(log, scenario)  # an error, where the ego is not there, comes before the long work
     return Simulation(log, build_world(log, source, names, progress=progress), scenario, seed)

@@ -187,6 +187,7 @@ def build_world(
         Where no sweep of the log can be used.
     """
     models: dict[str, Model] = {}
+    scale, top, whole = np.nan, 0.0, False
     background, own = SurfelGrid(), {agent.id: SurfelGrid() for agent in scenario.others}
     refined = refine_poses(log)
     surveyed = log if refined is None else log.changed(ego=refined)

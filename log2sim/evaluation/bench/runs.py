@@ -39,8 +39,9 @@ from log2sim.perception.homography_stage import CameraHomography, fit_homographi
 from log2sim.perception.run_detectors import Detectors, create_image_detector
 from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
 from log2sim.perception.sync import Schedule, schedule_of
-from log2sim.pipeline import Run, infer_scenario, observe_log, start
+from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.report import Run
 
 
 @dataclass(frozen=True, eq=False)

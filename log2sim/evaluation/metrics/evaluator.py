@@ -55,7 +55,7 @@ from log2sim.geometry import (
 )
 
 if TYPE_CHECKING:
-    from log2sim.pipeline import Result
+    from log2sim.report import Result
 
 
 # Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged.
