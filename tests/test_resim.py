@@ -79,10 +79,10 @@ def test_smallest_axes_are_those_of_an_eigenvalue_solver() -> None:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A street with houses and cars, 3 s long, its LiDAR of fewer rays."""
+    """A street with houses and cars, 2 s long, its LiDAR of fewer rays."""
     bare = load_scene(SCENES / "bare.toml")
-    lidar = bare.lidar[0].model_copy(update={"azimuth_step_deg": 0.6})
-    return bare.model_copy(update={"camera": (), "lidar": (lidar,), "duration_s": 3.0})
+    lidar = bare.lidar[0].model_copy(update={"azimuth_step_deg": 0.8})
+    return bare.model_copy(update={"camera": (), "lidar": (lidar,), "duration_s": 2.0})
 
 
 @pytest.fixture(scope="module")

@@ -54,11 +54,11 @@ def resimulate(
 def _happening(path: Path, source: Scenario) -> Scenario:
     """Read a replay or an edit of a scenario as a scenario in its time and map."""
     from log2sim.datatypes import Scenario
-    from log2sim.errors import ConfigError
+    from log2sim.errors import ScenarioError
     from log2sim.files.documents import read_json
     from log2sim.simulation.result import Replay, to_scenario
 
-    document = read_json(path, ConfigError)
+    document = read_json(path, ScenarioError)
     if isinstance(document, dict) and "replay_version" in document:
         return to_scenario(Replay.load(path), source)
     return Scenario.load(path).aligned_to(source)

@@ -148,7 +148,8 @@ def find_pattern(log: Log, name: str) -> Pattern:
 
 
 def _cell(azimuth: NDArray[Any]) -> NDArray[np.int64]:
-    return np.clip((np.degrees(azimuth) + 180) / 3, 0, 119).astype(np.int64)
+    cell: NDArray[np.int64] = np.clip((np.degrees(azimuth) + 180) / 3, 0, 119).astype(np.int64)
+    return cell
 
 
 def _tilt(azimuth: Array, elevation: Array) -> tuple[float, float]:
@@ -166,7 +167,7 @@ def _tilt(azimuth: Array, elevation: Array) -> tuple[float, float]:
         bin_rad = max(span / 8, np.deg2rad(0.05))
         steps = np.linspace(-span, span, 13)
         tries = [(best[0] + p, best[1] + r) for p in steps for r in steps]
-        best = max(tries, key=lambda t: gathered(*t, bin_rad))
+        best = max(tries, key=lambda t: gathered(t[0], t[1], bin_rad))
         span /= 5
     return best if gathered(*best, np.deg2rad(0.05)) > 1.1 * flat else (0.0, 0.0)
 

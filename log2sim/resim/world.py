@@ -105,7 +105,8 @@ class Placed:
 def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
     """Return when an agent is there; one that stands all the time is."""
     w = agent.waypoints
-    return np.full(len(t_s), agent.is_permanent) | ((t_s >= w.t_s[0] - HELD_S) & (t_s <= w.t_s[-1] + HELD_S))
+    there: NDArray[np.bool_] = (t_s >= w.t_s[0] - HELD_S) & (t_s <= w.t_s[-1] + HELD_S)
+    return there | agent.is_permanent
 
 
 def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
