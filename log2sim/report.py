@@ -124,13 +124,13 @@ def conclude(
         **_times(clock, len(schedule)),
         "plan": [stage.to_report() for stage in stages],
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
-        "without_pose": _without_pose(log, schedule),
+        "without_pose": _frames_without_pose(log, schedule),
         "detections": observations.detections,
         "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
         "measurements": {"total": sum(map(len, from_lidar)), "with_lidar": int(sum(map(np.sum, from_lidar)))},
         "agents": _agent_counts(scenario),
         **figures,
-        "unreadable": {**figures["unreadable"], **observations.unreadable},
+        "unreadable": observations.unreadable,
         "poses": run.poses.to_dict(),
         "faults": [fault.to_dict() for fault in (*run.faults, *observations.faults)],
         "registration": list(run.registration),
@@ -206,7 +206,7 @@ def _times(clock: StageClock, ticks: int) -> dict[str, Any]:
     }
 
 
-def _without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
+def _frames_without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
     """Frames by camera that were left out because the ego's pose is not known at their stamp."""
     counts = {}
     for name, index in schedule.frames.items():

@@ -13,7 +13,7 @@ from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Measurements, Track
-from log2sim.evaluation.detection.detect_log import without_ego
+from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
 from log2sim.perception.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative import (
@@ -365,6 +365,6 @@ def test_the_ego_that_the_road_sees_is_no_detection(both_ends) -> None:
     t_ns = int(both_ends.streams["post"].t_ns[2])
     center = both_ends.ego_centers(both_ends.ego.at(t_ns)[0])[0]
     found = boxes_at((*center, 4.5, 1.8, 1.5, 0.0), (*(center + np.array([9, 3, 0])), 4.5, 1.8, 1.5, 0.0), t_ns=t_ns)
-    assert without_ego(both_ends, found).center_m.tolist() == found.center_m[1:].tolist()
+    assert drop_ego(both_ends, found).center_m.tolist() == found.center_m[1:].tolist()
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
-    assert without_ego(vehicle, found) is found
+    assert drop_ego(vehicle, found) is found

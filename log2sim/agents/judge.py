@@ -101,8 +101,9 @@ def decide(candidate: AgentCandidate, usual_rate: float) -> list[Finding] | None
     known = s.inside + s.through >= MIN_LOOKING_RAYS and s.seen_ticks >= MIN_EMPTY_TICKS
     through = (s.through_share or 0.0) if known else 0.0
     undetected = missing_nats(s, usual_rate)
+    height_share = 1.0 if s.image_height_share is None else s.image_height_share
     against = {
-        "points of something nearer": CERTAIN_NATS * ((s.image_height_share or 1.0) < MIN_IMAGE_HEIGHT_SHARE),
+        "points of something nearer": CERTAIN_NATS * (height_share < MIN_IMAGE_HEIGHT_SHARE),
         "rays do not end in it": CERTAIN_NATS * s.unreached,
         "rays pass through": CERTAIN_NATS * (through > EMPTY_SHARE),
         "part of something longer": CERTAIN_NATS * (s.in_structure > MOSTLY),

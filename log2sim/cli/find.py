@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import AsJson, Overwrite, Quiet, counted, option, say, say_written, write_to
+from log2sim.cli.options import AsJson, Overwrite, Quiet, counted, option, report_written, say, write_to
 from log2sim.cli.shared import format_rows
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def find(
     ] = None,
     probability: Annotated[
         float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
-    ] = 0.5,
+    ] = 0.3,
     fields: Annotated[bool, option("List the fields of these scenarios' tags.", None, "--fields")] = False,
     fresh: Annotated[
         bool, option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")
@@ -102,7 +102,7 @@ def find(
         write_hits(out, index, condition, found.rows)
     if table is not None:
         write_table(table, found.rows)
-    say_written(out, table, quiet=quiet or as_json)
+    report_written(out, table, quiet=quiet or as_json)
     if open_ is not None:
         if open_ > len(found.rows):
             raise ConfigError(f"--open {open_}: there are {counted(len(found.rows), 'hit')}")

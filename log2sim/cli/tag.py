@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, option, say, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, option, report_written, say, write_to
 from log2sim.cli.shared import format_rows
 
 
@@ -53,4 +53,4 @@ def tag(
         tagged.save(out)
     if criticality is not None:
         write_criticality(criticality, criticality_table(tagged))
-    say_written(out, criticality, quiet=quiet)
+    report_written(out, criticality, quiet=quiet)

@@ -185,7 +185,7 @@ def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
     return xarray.Dataset(along, coords=coordinates, attrs=dict(about))
 
 
-def write_parquet(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
+def write_states(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
     """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata.
 
     Raises
@@ -328,7 +328,7 @@ class Scenario:
             return self
         return replace(self, agents=tuple(a for a in self.agents if not a.quarantined))
 
-    def without_doubtful(self) -> Scenario:
+    def drop_doubtful(self) -> Scenario:
         """Return a copy without the doubtful agents; the ego stays."""
         return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or not a.is_doubtful))
 
@@ -459,7 +459,7 @@ class Scenario:
         ConfigError
             When the file cannot be written.
         """
-        write_parquet(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
+        write_states(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/scenario-1.json`."""
@@ -541,7 +541,7 @@ class Scenario:
 PLURALS = {"bus": "buses", "other": "others"}
 
 
-def say_agents(ids: Iterable[str]) -> str:
+def count_agents(ids: Iterable[str]) -> str:
     """Count agents by their ids, as all commands do: "12 agents and the ego", "1 agent", "no agent but the ego"."""
     listed = list(ids)
     others = sum(id != EGO for id in listed)
@@ -550,7 +550,7 @@ def say_agents(ids: Iterable[str]) -> str:
     return f"{others} agent{'s' * (others != 1)} and the ego" if others else "no agent but the ego"
 
 
-def say_categories(agents: Sequence[Agent]) -> str:
+def count_categories(agents: Sequence[Agent]) -> str:
     """Count agents by category, most frequent first, with how many of each are static: "8 cars (3 static), 1 bus"."""
     counts: dict[str, list[int]] = {}
     for agent in agents:
@@ -558,9 +558,9 @@ def say_categories(agents: Sequence[Agent]) -> str:
         count[0] += 1
         count[1] += agent.static
     ordered = sorted(counts.items(), key=lambda entry: (-entry[1][0], entry[0]))
-    return ", ".join(_say_category(category, total, static) for category, (total, static) in ordered)
+    return ", ".join(_count_category(category, total, static) for category, (total, static) in ordered)
 
 
-def _say_category(category: str, total: int, static: int) -> str:
+def _count_category(category: str, total: int, static: int) -> str:
     noun = category if total == 1 else PLURALS.get(category, f"{category}s")
     return f"{total} {noun}" + (f" ({static} static)" if static else "")

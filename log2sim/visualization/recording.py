@@ -28,9 +28,10 @@ from log2sim.geometry import (
     project,
 )
 from log2sim.geometry.boxes import EDGES, NEAR_M
-from log2sim.perception.frames import RecordReader, look_again
+from log2sim.perception.frames import look_again
 from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import sweep_middle_ns
 
 MARGIN_S = 0.05  # records this far outside the scenario are taken too: half a tick of most logs
@@ -150,13 +151,13 @@ class OutlineProjector:
             row = int(rows[i])
             corners = box_corners(center[row], self._size_m[row], yaw[row])[0]
             middle_px = found.box_px[i].reshape(2, 2).mean(axis=0)[None]
-            kind, coordinates = outline_of(view.camera, apply(_cam_T_map(view, middle_px), corners))
+            kind, coordinates = ground_outline(view.camera, apply(_cam_T_map(view, middle_px), corners))
             if len(coordinates):
                 out.append([row, kind, *np.rint(coordinates).astype(np.int64).ravel().tolist()])
         return out
 
 
-def outline_of(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
+def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
     """Return the kind and the coordinates, px, of the outline of a box with corners (8, 3), m, cam frame.
 
     Corners where straight lines between them are right: all in front of the camera, and the lens bends no edge visibly.
@@ -237,8 +238,9 @@ def picture_document(
     log: Log,
     scenario: Scenario,
     cameras: tuple[str, ...],
+    *,
     budget_bytes: int,
-    reader: RecordReader,
+    reader: RecordSource,
     progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
     """Return the pictures of cameras within a budget, with the outlines of the agents in them.
@@ -254,7 +256,7 @@ def picture_document(
     probes = _probe(log, within, projector, reader)
     size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
     pictures = ShrunkPictures(chosen, size.width_px)
-    look_again(log, reader, [pictures], progress)
+    look_again(reader, [pictures], progress, least_px=size.width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     _thin_out(entries, budget_bytes)
@@ -269,7 +271,7 @@ def picture_document(
 
 
 def _probe(
-    log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordReader
+    log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordSource
 ) -> dict[str, dict[int, float]]:
     """Return the mean bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
     widths = sorted({size.width_px for size in SIZES})
@@ -387,7 +389,7 @@ class PointsAbove:
 
 
 def point_document(
-    log: Log, scenario: Scenario, budget_bytes: int, reader: RecordReader, progress: Callable[[int, int], None]
+    log: Log, scenario: Scenario, budget_bytes: int, reader: RecordSource, progress: Callable[[int, int], None]
 ) -> dict[str, Any] | None:
     """Return the points of a log's LiDARs within a budget; None where there are none during the scenario.
 
@@ -406,11 +408,13 @@ def point_document(
         return None
     known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in probes])
     bright = max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
-    spacing, chosen = _fit_points(log.streams[main].t_ns, within, scenario.t0_ns, probes, bright, budget_bytes)
+    spacing, chosen = _fit_points(
+        log.streams[main].t_ns, within, scenario.t0_ns, probes=probes, bright=bright, budget_bytes=budget_bytes
+    )
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
         if (points := sweeps.at(main, i)) is not None:
-            moments.append((points, pack(points, spacing.cell_m, bright)))
+            moments.append((points, pack_recording(points, spacing.cell_m, bright)))
         progress(done + 1, len(chosen))
     while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
         moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
@@ -427,7 +431,7 @@ def point_document(
     }
 
 
-def pack(points: PointsAbove, cell_m: float, bright: float) -> str:
+def pack_recording(points: PointsAbove, cell_m: float, bright: float) -> str:
     """Keep the highest point of each cell and pack the rest as base64 of a zlib stream.
 
     For N points in rows of cells from south to north, each from west to east: low bytes of the steps in x (N), their high
@@ -451,6 +455,7 @@ def _fit_points(
     t_ns: NDArray[np.int64],
     within: NDArray[np.int64],
     start_ns: int,
+    *,
     probes: list[PointsAbove],
     bright: float,
     budget_bytes: int,
@@ -459,7 +464,7 @@ def _fit_points(
     sizes: Mapping[float, float] = {}
     for spacing in SPACINGS:
         if spacing.cell_m not in sizes:
-            mean = np.mean([len(pack(p, spacing.cell_m, bright)) for p in probes])
+            mean = np.mean([len(pack_recording(p, spacing.cell_m, bright)) for p in probes])
             sizes = {**sizes, spacing.cell_m: POINT_SAFETY * float(mean) + BYTES_OF_ENTRY}
         chosen = take_at_rate(t_ns, within, spacing.rate_hz, start_ns)
         if len(chosen) * sizes[spacing.cell_m] <= budget_bytes:
@@ -476,9 +481,9 @@ def _fit_points(
 class _Sweeps:
     """Reads the sweeps of all LiDARs around a moment as points from above."""
 
-    def __init__(self, log: Log, lidars: list[str], reader: RecordReader) -> None:
+    def __init__(self, log: Log, lidars: list[str], reader: RecordSource) -> None:
         self._log, self._reader = log, reader
-        self._middle_ns = {name: sweep_middle_ns(log.streams[name]) for name in lidars}
+        self._middle_ns = {name: sweep_middle_ns(log, name) for name in lidars}
 
     def at(self, main: str, index: int) -> PointsAbove | None:
         """Return the points around a sweep of one LiDAR; None where it cannot be read or has no known pose."""
@@ -543,7 +548,7 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     for a single moment. Raises `LogError` when none of the records asked for can be read.
     """
     log, report = recorded.log, recorded.progress
-    reader = RecordReader(log)
+    reader = RecordSource(log)
     cameras = choose_cameras(log, scenario, recorded.cameras)
     share = POINT_SHARE if cameras else 1.0
     points = point_document(
@@ -553,7 +558,12 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     pictures = None
     if cameras:
         pictures = picture_document(
-            log, scenario, cameras, left, reader, lambda done, total: report("page: pictures", done, total)
+            log,
+            scenario,
+            cameras,
+            budget_bytes=left,
+            reader=reader,
+            progress=lambda done, total: report("page: pictures", done, total),
         )
     reader.require_some()
     if pictures is not None and not pictures["cameras"]:

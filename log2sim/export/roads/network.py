@@ -159,6 +159,7 @@ def road_of_lanes(
     number: int,
     group: Sequence[MapLane],
     opposite: Sequence[MapLane],
+    *,
     headings: tuple[float | None, float | None],
     free: tuple[bool, bool],
     met: Mapping[tuple[str, int], End],
@@ -263,7 +264,7 @@ def _across(reference: Array, line: Polyline, s: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Connection:
+class RoadConnection:
     """A connecting road of a junction."""
 
     junction: int
@@ -273,12 +274,12 @@ class Connection:
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class RoadNetwork:
     """Roads and the junctions between them, by their ids and names."""
 
     roads: tuple[Road, ...]
     junctions: Mapping[int, str]
-    connections: tuple[Connection, ...]
+    connections: tuple[RoadConnection, ...]
 
 
 @dataclass(frozen=True)
@@ -299,7 +300,7 @@ class _Place:
         return -1 - self.start
 
 
-def build_network(lanes: Sequence[MapLane]) -> Network:
+def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
     """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
     refused: set[frozenset[str]] = set()
     while True:
@@ -330,9 +331,9 @@ def build_network(lanes: Sequence[MapLane]) -> Network:
             number,
             group,
             opposite,
-            (headings.get((number, 0)), headings.get((number, -1))),
-            (before is None, after is None),
-            _met([*group, *opposite], place, (before, after), ends),
+            headings=(headings.get((number, 0)), headings.get((number, -1))),
+            free=(before is None, after is None),
+            met=_met([*group, *opposite], place, (before, after), ends),
         )
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
@@ -349,8 +350,8 @@ def build_network(lanes: Sequence[MapLane]) -> Network:
         )
         junction = number_of[str(lane.junction)]
         roads.append(replace(road, junction=junction, before=before, after=after))
-        connections.append(Connection(junction, one.road, road.number, one.lane))
-    return Network(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
+        connections.append(RoadConnection(junction, one.road, road.number, one.lane))
+    return RoadNetwork(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
 
 
 def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list[MapLane]]:

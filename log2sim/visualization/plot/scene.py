@@ -41,7 +41,7 @@ from log2sim.visualization.plot.time_series import TimelineCharts, charts_height
 from log2sim.visualization.plot.viewport import (
     AgentRoles,
     Viewport,
-    assign_roles,
+    assign_view_roles,
     centers_xy,
     choose_viewport,
     is_moving,
@@ -107,9 +107,9 @@ def draw_moving(
     roles: AgentRoles,
     view: Viewport,
     step_s: float,
+    *,
     truth: Scenario | None,
     replay: Any,
-    *,
     ghosts: bool = False,
 ) -> None:
     """Draw the tracks of agents, pale where truth or replay lie over them; with `ghosts` also boxes along those."""
@@ -238,11 +238,11 @@ def plot(
         import matplotlib.pyplot as plt
 
         ax = plt.subplots(figsize=SIZE_IN, layout="constrained")[1]
-    roles = assign_roles(scenario)
+    roles = assign_view_roles(scenario)
     view = _set_view(ax, roles)
     step_s = time_step_s(scenario.duration_s, len(roles.movers), _usual_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
-    draw_moving(ax, roles, view, step_s, aligned, replay)
+    draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
     placed = place_labels(roles, view, step_s, sensors=scenario.sensors)
     draw_labels(ax, placed.labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))

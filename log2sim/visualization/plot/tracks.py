@@ -34,7 +34,7 @@ from log2sim.visualization.plot.selection import (
     cut_scenario,
     select_shown,
 )
-from log2sim.visualization.plot.viewport import AgentRoles, assign_roles
+from log2sim.visualization.plot.viewport import AgentRoles, assign_view_roles
 
 
 def plot_tracks(
@@ -80,7 +80,7 @@ def plot_tracks(
         options=options,
     )
     scenario = cut_scenario(scenario, span)
-    roles = assign_roles(scenario, whole)
+    roles = assign_view_roles(scenario, whole)
     if suffix in MOVING:
         from log2sim.visualization.plot.animation import write_animation
 
@@ -95,7 +95,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
     """Draw a still picture."""
     base = draw_base(scenario, roles, overlays)
     layout, ax, replay = base.layout, base.layout.ax, overlays.replay
-    draw_moving(ax, roles, layout.view, base.step_s, overlays.truth, replay, ghosts=True)
+    draw_moving(ax, roles, layout.view, base.step_s, truth=overlays.truth, replay=replay, ghosts=True)
     if tells_ends(scenario):
         draw_observers(ax, roles, layout.view)
     draw_warnings(ax, warned_places(replay))
