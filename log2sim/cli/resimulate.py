@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, say, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, report_written, say, write_to
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -48,7 +48,7 @@ def resimulate(
         notes = run(recorded, source, now, out, sensors=names, seed=seed, overwrite=overwrite, progress=report)
     for note in notes:
         say(f"note: {note}", quiet=quiet)
-    say_written(out, quiet=quiet)
+    report_written(out, quiet=quiet)
 
 
 def _happening(path: Path, source: Scenario) -> Scenario:
