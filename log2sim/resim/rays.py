@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import Array, inverse, rotation_from_rpy, wrap_angle
+from log2sim.perception.records import RecordSource
 
 Floats = NDArray[np.float32]
 
@@ -120,7 +121,7 @@ def find_pattern(log: Log, name: str) -> Pattern:
     """Read lines, steps and coverage off some sweeps of a LiDAR."""
     stream = log.streams[name]
     chosen = np.unique(np.linspace(0, len(stream.t_ns) - 1, SAMPLED_SWEEPS + 2).astype(int)[1:-1])
-    sweeps = [recorded_shots(log, name, stream.read(int(i))) for i in chosen]
+    sweeps = [recorded_shots(log, name, RecordSource(log).require(name, int(i))) for i in chosen]
     direction = np.concatenate([s.direction[s.range_m > MIN_PATTERN_RANGE_M] for s in sweeps]).astype(np.float64)
     azimuth, elevation = angles_of(direction)
     some = np.random.default_rng(0).permutation(len(direction))[:40_000]

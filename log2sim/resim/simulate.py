@@ -16,6 +16,7 @@ from log2sim.datatypes import EGO, Labels, Log, Scenario, Stream, Sweep, Waypoin
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, PoseTrack, nearest_index, rotation_from_rpy, wrap_angle, yaw_of
+from log2sim.perception.records import RecordSource
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, poses_of, rays_in_map, recorded_shots
@@ -63,7 +64,7 @@ class Simulation:
 
     def shots(self, name: str, i: int) -> Shots:
         """Return the rays of sweep `i` as they were sent."""
-        recorded = recorded_shots(self.log, name, self.log.streams[name].read(i))
+        recorded = recorded_shots(self.log, name, RecordSource(self.log).require(name, i))
         return all_shots(recorded, self.world.models[name].pattern)
 
     def sweep(self, name: str, i: int) -> Sweep:

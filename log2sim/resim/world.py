@@ -18,6 +18,7 @@ from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
+from log2sim.perception.records import RecordSource
 from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import (
@@ -268,7 +269,7 @@ def _trimmed(surfels: Surfels) -> Surfels:
 def _readable(log: Log, name: str, i: int) -> Shots | None:
     """Return the returns of a sweep; None of one that cannot be read, is empty, or whose pose is not known."""
     try:
-        shots = recorded_shots(log, name, log.streams[name].read(i))
+        shots = recorded_shots(log, name, RecordSource(log).require(name, i))
     except RecordError:
         return None
     if not len(shots.t_ns) or not log.map_T_sensor(name, shots.t_ns[[0, -1]])[1].all():
