@@ -189,7 +189,7 @@ def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud
 REACH_M = 60.0
 WALKING_MPS, RIDING_MPS = 1.4, 5.0
 # Shares of what drives on a lane.
-LANE_SHARES = {"car": 0.73, "truck": 0.09, "bus": 0.04, "motorcycle": 0.07, "cyclist": 0.07}
+LANE_SHARES = {"car": 0.71, "truck": 0.08, "bus": 0.04, "motorcycle": 0.07, "cyclist": 0.1}
 
 
 @dataclass(eq=False)
@@ -380,16 +380,17 @@ def _people(out: _Layout, road: Road) -> None:
             out.add_user(
                 "pedestrian", start + k * step + rng.normal(0, 0.1, 2), heading + rng.normal(0, 0.3), margin=0.0
             )
-    for _ in range(rng.poisson(rng.choice([1, 3, 6]))):
+    for _ in range(rng.poisson(rng.choice([1, 4, 8]))):
         xy, direction = road.at(rng.uniform(-40, 40), rng.choice([-1, 1]) * (half + rng.uniform(-2.5, 2.5)))
         yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
         speed = RIDING_MPS * float(rng.random() < 0.8)
         out.add_user(str(rng.choice(["cyclist", "motorcycle"], p=[0.65, 0.35])), xy, yaw, speed=speed, margin=0.1)
     for _ in range(rng.choice(3, p=[0.5, 0.3, 0.2])):
         xy, direction = road.at(rng.uniform(-25, 25), rng.choice([-1, 1]) * (half + rng.uniform(0.2, 4)))
-        step = np.array([np.cos(direction), np.sin(direction)]) * rng.uniform(0.6, 1.1)
         kind = str(rng.choice(["bicycle", "motorcycle"]))
-        for k in range(rng.integers(1, 9)):
+        apart, most = (rng.uniform(0.6, 1.1), 9) if kind == "bicycle" else (rng.uniform(0.9, 2.0), 5)
+        step = np.array([np.cos(direction), np.sin(direction)]) * apart
+        for k in range(rng.integers(1, most)):
             kinds = "parked motorcycle" if kind == "motorcycle" else ""
             out.add_user(kind, xy + k * step, direction + np.pi / 2 + rng.normal(0, 0.1), margin=-0.3, kinds=kinds)
 
@@ -465,6 +466,7 @@ def _fronts(out: _Layout, road: Road) -> None:
 
 
 VEHICLE_LIDARS = ("hdl64e", "pandar64", "os1-64", "os1-128", "vlp32c", "hdl32e", "rslidar-m1", "vlp16")
+SPARSE_SHARE = 0.25
 VEHICLE_LIDAR_SHARES = (0.26, 0.28, 0.12, 0.08, 0.1, 0.09, 0.03, 0.04)
 
 
@@ -549,6 +551,19 @@ def _draw_lidar(mount: Mount, rng: np.random.Generator) -> LidarModel:
             lines = int(rng.choice([32, 40, 64]))
             model = model.model_copy(update={"elevation_deg": tuple(np.linspace(-20, 12, lines).tolist())})
         return model.model_copy(update={"range_m": float(rng.choice([80.0, 120.0, 150.0]))})
+    if rng.random() < SPARSE_SHARE:
+        # Any other spinning or solid-state sensor, of few lines or at a high rate.
+        lines, view = (
+            int(rng.choice([16, 24, 32, 40, 64])),
+            float(rng.choice([180.0, rng.uniform(50, 140)], p=[0.75, 0.25])),
+        )
+        elevation = np.linspace(rng.uniform(-30, -12), rng.uniform(2, 15), lines)
+        return LidarModel(
+            elevation_deg=tuple(elevation.tolist()),
+            azimuth_deg=(-view, view),
+            azimuth_step_deg=float(rng.uniform(0.2, 0.7)),
+            range_m=float(rng.uniform(60, 150)),
+        )
     model = LIDAR_MODELS[str(rng.choice(VEHICLE_LIDARS, p=VEHICLE_LIDAR_SHARES))]
     elevation = np.array(model.elevation_deg) + rng.normal(0, 0.15)
     if rng.random() < 0.08:

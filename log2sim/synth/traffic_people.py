@@ -266,17 +266,20 @@ def pushed_bicycle(rng: Rng) -> Shape:
 
 
 def _rider(rng: Rng, height: float, seat: float, lean: float, foot: float) -> list[Polytope]:
-    """Make a rider with two legs down to `foot`."""
-    parts = _torso(rng, height, base=seat, lean=lean, x=-0.2, reach=rng.uniform(0.25, 0.5))
+    """Make a rider with two legs down to `foot`, or one silhouette of both."""
+    parts = _torso(rng, height, base=seat, lean=lean, x=-0.2, reach=rng.choice([None, rng.uniform(0.25, 0.5)]))
+    if rng.random() < 0.4:
+        wide = rng.uniform(0.3, 0.5)
+        return [*parts, prism([(-0.15, foot), (0.2, foot), (0.2, seat), (-0.3, seat + 0.05)], wide, CLOTH)]
     for side, kick in ((1, rng.uniform(-0.1, 0.15)), (-1, rng.uniform(-0.1, 0.15))):
         knee = prism(
             [(-0.28, seat - 0.05), (0.15 + kick, seat - 0.2), (0.2 + kick, seat - 0.05), (-0.1, seat + 0.1)],
-            0.14,
+            0.15,
             CLOTH,
         )
         shin = prism(
-            [(0.0 + kick / 2, foot), (0.15 + kick / 2, foot), (0.22 + kick, seat - 0.08), (0.08 + kick, seat - 0.08)],
-            0.11,
+            [(kick / 2, foot), (0.15 + kick / 2, foot), (0.22 + kick, seat - 0.08), (0.08 + kick, seat - 0.08)],
+            0.12,
             CLOTH,
         )
         parts += [shifted(knee, 0.0, side * 0.11), shifted(shin, 0.0, side * 0.12)]
@@ -439,7 +442,7 @@ def animal(rng: Rng) -> Shape:
 
 PEOPLE: Kinds = {
     "walking": (0.42, walking), "child": (0.12, child), "coat": (0.08, coat), "bent": (0.06, bent), "seated": (0.08, seated),
-    "laden": (0.08, laden), "cart": (0.04, cart), "pushed bicycle": (0.04, pushed_bicycle), "dog": (0.02, dog),
+    "laden": (0.08, laden), "cart": (0.025, cart), "pushed bicycle": (0.02, pushed_bicycle), "dog": (0.01, dog),
     "suitcase": (0.02, suitcase), "pram": (0.02, pram), "wheelchair": (0.01, wheelchair), "umbrella": (0.01, umbrella),
 }  # fmt: skip
 CYCLISTS: Kinds = {

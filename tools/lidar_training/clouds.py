@@ -145,7 +145,7 @@ def augmented(sample: Sample, rng: np.random.Generator) -> Sample:
     xyz[:, :2] = xyz[:, :2] @ turn
     boxes[:, :2] = boxes[:, :2] @ turn
     boxes[:, 6] += angle
-    share = rng.choice([0.0, rng.uniform(0, 0.5)])
+    share = rng.choice([0.0, rng.uniform(0, 0.5), rng.uniform(0.5, 0.8)], p=[0.5, 0.4, 0.1])
     if share:
         xyz = xyz[rng.random(len(xyz)) >= share]
     # The estimate of the ground errs on real roads by a little more than on simulated ones.

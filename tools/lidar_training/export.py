@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from lidar_training.clouds import Example
 from lidar_training.network import GROUPS, IN_CHANNELS, BevNetwork
@@ -70,6 +71,48 @@ def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
     error = float(np.abs(load_network(path).run(grid) - expected).max())
     if not error < MAX_EXPORT_ERROR:
         raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
+
+
+def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
+    """Read a network back from its ONNX file, with integer weights or without, so that its training can go on.
+
+    Normalization was folded into the convolutions. It is put back with the moments of each layer on some grids (B, 12, H, W): the
+    network computes what it did, and still trains on normalized layers.
+    """
+    import onnx
+
+    graph = onnx.load(path).graph
+    values = {v.name: onnx.numpy_helper.to_array(v) for v in graph.initializer}
+    folded = {}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] in values:
+            value, scale = values[node.input[0]].astype(np.float32), values[node.input[1]]
+            values[node.output[0]] = value * scale.reshape(scale.shape + (1,) * (value.ndim - scale.ndim))
+        elif node.op_type == "Conv":
+            # "/down4/down4.0/down4.0.2/Relu_output_0" is what the layer "down4.0" gives, "maps" what the head gives.
+            name = node.output[0].split("/")[-2].removesuffix(".2") if "/" in node.output[0] else "head"
+            folded[name] = [torch.from_numpy(values[k].copy()) for k in node.input[1:]]
+    network = BevNetwork().eval()
+    network.head.weight.data, network.head.bias.data = folded["head"]
+    layers = {
+        m: name for name, m in network.named_modules() if isinstance(m, nn.Sequential) and isinstance(m[0], nn.Conv2d)
+    }
+
+    def restore(layer: Any, inputs: tuple[Tensor, ...], _: Tensor) -> Tensor:
+        conv, norm, relu = layer
+        conv.weight.data, bias = folded[layers[layer]]
+        product = conv(inputs[0])
+        mean, variance = product.mean((0, 2, 3)), product.var((0, 2, 3), unbiased=False)
+        norm.running_mean, norm.running_var = mean, variance
+        norm.weight.data, norm.bias.data = (variance + norm.eps).sqrt(), mean + bias
+        return relu(norm(product))
+
+    hooks = [layer.register_forward_hook(restore) for layer in layers]
+    with torch.no_grad():
+        network(grids)
+    for hook in hooks:
+        hook.remove()
+    return network
 
 
 def describe(path: Path, info: dict[str, Any]) -> None:
