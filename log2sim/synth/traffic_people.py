@@ -86,7 +86,7 @@ def _upright(rng: Rng, height: float, *, reach: float | None = None, lean: float
 def walking(rng: Rng) -> Shape:
     """Draw somebody who stands or walks, some with hands in front."""
     height = _height(rng)
-    return _person(height, _upright(rng, height, reach=rng.choice([None, rng.uniform(0.15, 0.4)], p=[0.75, 0.25])))
+    return _person(height, _upright(rng, height, reach=rng.uniform(0.15, 0.4) if rng.random() < 0.25 else None))
 
 
 def child(rng: Rng) -> Shape:
@@ -124,7 +124,12 @@ def seated(rng: Rng) -> Shape:
     )
     knee = rng.uniform(0.4, 0.52)
     parts = _torso(
-        rng, height, base=seat, lean=rng.uniform(-0.08, 0.25), x=-0.15, reach=rng.choice([None, rng.uniform(0.15, 0.4)])
+        rng,
+        height,
+        base=seat,
+        lean=rng.uniform(-0.08, 0.25),
+        x=-0.15,
+        reach=rng.uniform(0.15, 0.4) if rng.random() < 0.5 else None,
     )
     parts += [
         box((-0.2, -0.19, seat), (knee - 0.1, 0.19, seat + 0.16), CLOTH),
@@ -267,7 +272,9 @@ def pushed_bicycle(rng: Rng) -> Shape:
 
 def _rider(rng: Rng, height: float, seat: float, lean: float, foot: float) -> list[Polytope]:
     """Make a rider with two legs down to `foot`, or one silhouette of both."""
-    parts = _torso(rng, height, base=seat, lean=lean, x=-0.2, reach=rng.choice([None, rng.uniform(0.25, 0.5)]))
+    parts = _torso(
+        rng, height, base=seat, lean=lean, x=-0.2, reach=rng.uniform(0.25, 0.5) if rng.random() < 0.5 else None
+    )
     if rng.random() < 0.4:
         wide = rng.uniform(0.3, 0.5)
         return [*parts, prism([(-0.15, foot), (0.2, foot), (0.2, seat), (-0.3, seat + 0.05)], wide, CLOTH)]

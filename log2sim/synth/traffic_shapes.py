@@ -566,7 +566,7 @@ def letterbox(rng: np.random.Generator) -> Parts:
 
 def crates(rng: np.random.Generator) -> Parts:
     """Draw stacked crates, sacks or parcels."""
-    parts = []
+    parts: list[Polytope] = []
     for _ in range(rng.integers(1, 5)):
         x, y, w, z = *rng.normal(0, 0.4, 2), rng.uniform(0.15, 0.4), rng.uniform(0.0, 0.6)
         parts.append(
