@@ -240,6 +240,18 @@ class _Layout:
         self.objects.append(TrafficObject(category, place, yaw, size, parts, speed, turn, kind))
         return True
 
+    def one_of(self, shares: dict[str, float]) -> str:
+        """Draw one of some kinds of small things that are not left out; "" where all are."""
+        kinds = {kind: share for kind, share in shares.items() if kind not in self.without}
+        total = sum(kinds.values())
+        return str(self.rng.choice(list(kinds), p=[share / total for share in kinds.values()])) if kinds else ""
+
+    def add_small(self, kind: str, xy: Array, yaw: float, spacing: float = 1.0) -> None:
+        """Add a small thing where its place is free."""
+        if kind:
+            _, radius, draw = clutter.SMALL[kind]
+            self.add_thing(kind, xy, yaw, draw(self.rng), spacing * radius)
+
     def add_thing(self, kind: str, xy: Array, yaw: float, parts: tuple[Polytope, ...], radius: float = 0.0) -> bool:
         """Add clutter; with a radius only where its place is free."""
         circle = np.array([[*xy, radius]])
@@ -404,16 +416,10 @@ def _market(out: _Layout, road: Road) -> None:
         d, s = side * (road.half_width_m + rng.uniform(-1.5, 2.5)), start
         while s < start + rng.uniform(10, 40):
             xy, direction = road.at(s, d + rng.normal(0, 0.15))
-            kind = str(
-                rng.choice(["table", "parasol"], p=[0.8, 0.2])
-                if cafe
-                else rng.choice(["stall", "crates", "clothes rail"], p=[0.8, 0.13, 0.07])
+            kind = out.one_of(
+                {"table": 0.8, "parasol": 0.2} if cafe else {"stall": 0.8, "crates": 0.13, "clothes rail": 0.07}
             )
-            if kind not in out.without:
-                _, radius, draw = clutter.SMALL[kind]
-                out.add_thing(
-                    kind, xy, direction + np.pi * rng.integers(2) + rng.normal(0, 0.1), draw(rng), 0.6 * radius
-                )
+            out.add_small(kind, xy, direction + np.pi * rng.integers(2) + rng.normal(0, 0.1), 0.6)
             for _ in range(rng.poisson(crowd)):
                 away, angle = rng.uniform(0.7, 2.5), rng.uniform(-np.pi, np.pi)
                 place = xy + away * np.array([np.cos(angle), np.sin(angle)])
@@ -425,25 +431,22 @@ def _market(out: _Layout, road: Road) -> None:
 def _roadside(out: _Layout, road: Road) -> None:
     """Scatter small clutter beside the road, some kinds in rows."""
     rng, half = out.rng, road.half_width_m
-    kinds = [kind for kind in clutter.SMALL if kind not in out.without]
-    shares = np.array([clutter.SMALL[kind][0] for kind in kinds])
+    shares = {kind: share for kind, (share, _, _) in clutter.SMALL.items()}
     for side in (-1, 1):
         if rng.random() < 0.6:
-            kind = str(rng.choice(["tree", "pole", "bush", "railing", "planter"], p=[0.3, 0.35, 0.2, 0.1, 0.05]))
-            _, radius, draw = clutter.SMALL[kind]
+            kind = out.one_of({"tree": 0.3, "pole": 0.35, "bush": 0.2, "railing": 0.1, "planter": 0.05})
             step, d = rng.uniform(4, 15), half + rng.uniform(0.4, 3)
             for s in np.arange(-45 + rng.uniform(0, 6), 45, step):
                 xy, direction = road.at(s + rng.normal(0, 0.5), side * d)
                 if not out.on_road(xy):
-                    out.add_thing(kind, xy, direction, draw(rng), radius)
+                    out.add_small(kind, xy, direction)
     for _ in range(rng.poisson(rng.choice([16, 26, 45]))):
-        kind = str(rng.choice(kinds, p=shares / shares.sum()))
-        _, radius, draw = clutter.SMALL[kind]
+        kind = out.one_of(shares)
         d = rng.choice([-1, 1]) * (half + abs(rng.normal(0, 6)) + 0.3)
         xy, direction = road.at(rng.uniform(-42, 42), d)
         if not out.on_road(xy) or kind == "cone":
             yaw = direction + (rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi))
-            out.add_thing(kind, xy, yaw, draw(rng), radius)
+            out.add_small(kind, xy, yaw)
 
 
 def _fronts(out: _Layout, road: Road) -> None:

@@ -89,8 +89,8 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
             value, scale = values[node.input[0]].astype(np.float32), values[node.input[1]]
             values[node.output[0]] = value * scale.reshape(scale.shape + (1,) * (value.ndim - scale.ndim))
         elif node.op_type == "Conv":
-            # "/down4/down4.0/down4.0.2/Relu_output_0" is what the layer "down4.0" gives, "maps" what the head gives.
-            name = node.output[0].split("/")[-2].removesuffix(".2") if "/" in node.output[0] else "head"
+            # "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0", "maps" of the head.
+            name = node.output[0].split("/")[-2].rsplit(".", 1)[0] if "/" in node.output[0] else "head"
             folded[name] = [torch.from_numpy(values[k].copy()) for k in node.input[1:]]
     network = BevNetwork().eval()
     network.head.weight.data, network.head.bias.data = folded["head"]
