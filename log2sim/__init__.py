@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from log2sim.config import Config
     from log2sim.datatypes.scenario import Scenario
     from log2sim.edit.apply import edit as edit_scenario
+    from log2sim.edit.corrections import correct as correct_scenario
     from log2sim.errors import Log2SimError
     from log2sim.evaluation.bench.benchmark import bench
     from log2sim.evaluation.detection.detect_log import detect_log
@@ -38,6 +39,7 @@ _PLACES = {
     "Scenario": "log2sim.datatypes.scenario:Scenario",
     "bench": "log2sim.evaluation.bench.benchmark:bench",
     "detect_log": "log2sim.evaluation.detection.detect_log:detect_log",
+    "correct_scenario": "log2sim.edit.corrections:correct",
     "edit_scenario": "log2sim.edit.apply:edit",
     "evaluate": "log2sim.evaluation.metrics.evaluator:evaluate",
     "examine_installation": "log2sim.cli.doctor:examine",
@@ -60,7 +62,7 @@ _PLACES = {
 """The functions of commands whose names are folders of the package have longer names."""
 
 __all__ = [
-    "Config", "Log2SimError", "Scenario", "__version__", "bench", "detect_log", "edit_scenario", "evaluate", "examine_installation",
+    "Config", "Log2SimError", "Scenario", "__version__", "bench", "correct_scenario", "detect_log", "edit_scenario", "evaluate", "examine_installation",
     "export_scenario", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
     "replay", "show_progress", "summarize_log", "validate_log", "view", "write_log", "write_synthetic",
 ]  # fmt: skip

@@ -94,7 +94,10 @@ class DetectConfig(Section):
         0.0, "Lowest score of a detection that can continue a track; 0: the detector's own.", ge=0.0, le=1.0
     )
     tiles: int = setting(
-        0, "Overlapping tiles that are searched besides the whole image; 0: chosen from the image size.", ge=0, le=64
+        0,
+        "Overlapping tiles that are searched besides the whole image, as one strip where the detector can; 0: chosen from the image size.",
+        ge=0,
+        le=64,
     )
     layout: str = setting("", "Output layout of an ONNX model; empty: recognized from its outputs.")
     input_px: int = setting(

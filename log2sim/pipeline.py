@@ -26,12 +26,13 @@ from log2sim.agents.evidence import Recording
 from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import judge
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log, Measurements, Scenario
+from log2sim.datatypes import Finding, Log, Measurements, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.files.processes import default_jobs
 from log2sim.files.stages import StageClock
 from log2sim.geometry import NS_PER_S
 from log2sim.localization.choice import GIVEN, PoseChoice, localize, refine_for_map
+from log2sim.localization.given_poses import list_faults
 from log2sim.localization.mounts import check_calibration
 from log2sim.localization.roadside import register_road
 from log2sim.logs.checks import say_without_pose
@@ -50,11 +51,12 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What came of a run: the scenario, a report as of `schemas/report-1.json`, and the log as it was used."""
+    """What came of a run: the scenario, a report as of `schemas/report-1.json`, the log as it was used, and what is wrong with it."""
 
     scenario: Scenario
     report: dict[str, Any]
     log: Log
+    findings: tuple[Finding, ...]  # of poses, sensors and records; those of agents are their doubts
 
     def __repr__(self) -> str:
         """Return its scenario and its log in one line."""
@@ -83,7 +85,7 @@ class Run:
     progress: Progress
     jobs: int = 1
     poses: PoseChoice = GIVEN
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Finding, ...] = ()
     registration: Sequence[dict[str, Any]] = ()
 
 
@@ -148,19 +150,20 @@ def start(
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
         log, faults = check_calibration(log, config, sensors, progress=progress)
-        sensors = sensors.without([fault.sensor for fault in faults if fault.treatment == "left_out"])
+        sensors = sensors.without([fault.subject for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
         poses = refine_for_map(log, poses, faults)
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=progress)
-        sensors = sensors.without([fault.sensor for fault in road.faults if fault.treatment == "left_out"])
+        sensors = sensors.without([fault.subject for fault in road.faults if fault.treatment == "left_out"])
     progress("load", 0, 0)
     log = sensors.restrict(road.log)
     detectors = create_detectors(log, config, given, cache=cache)
     with clock.stage("sync"):
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
-    faults = (*poses.faults, *faults, *road.faults)
+    wrong_poses = list_faults(log, poses.stretches, int(schedule.t_ns[0]), int(schedule.t_ns[-1]))
+    faults = (*wrong_poses, *faults, *road.faults)
     jobs = jobs or (default_jobs() if detectors.own else 1)
     return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
 
@@ -217,7 +220,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         reason = say_without_pose(log, schedule.t_ns)
         raise NothingToReconstruct(f"{log.name}: {reason}, and no object was detected in {len(schedule)} ticks")
 
-    faults = [fault.to_dict(timeline.t0_ns) for fault in (*run.faults, *observations.faults)]
+    faults = [fault.to_dict() for fault in (*run.faults, *observations.faults)]
     scenario = Scenario(
         name=log.name,
         t0_ns=timeline.t0_ns,
@@ -244,4 +247,4 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         "registration": list(run.registration),
         "detection_cache": None if cache is None else cache.figures(),
     }
-    return Result(scenario, report, log)
+    return Result(scenario, report, log, (*run.poses.findings, *run.faults, *observations.faults))

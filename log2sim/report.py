@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.agents.estimate import TOLERANCE_M
 from log2sim.config import Config
-from log2sim.datatypes import Agent, Log, Measurements, Scenario
+from log2sim.datatypes import Agent, Finding, Log, Measurements, Scenario
 from log2sim.files.documents import rounded
 from log2sim.files.stages import StageClock
 from log2sim.geometry import NS_PER_S
@@ -143,6 +143,25 @@ def _without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
         if not known.all():
             counts[name] = int(np.sum(~known))
     return counts
+
+
+def unused_records(report: Mapping[str, Any]) -> list[Finding]:
+    """List what a run could not use of its log or keep for later runs, as its report says."""
+    found = unreadable_records(report["unreadable"])
+    found += [
+        Finding("frames_without_pose", name, "left_out", values={"count": float(count)})
+        for name, count in report["without_pose"].items()
+    ]
+    problem = (report["detection_cache"] or {}).get("problem")
+    return [*found, *([Finding("not_cached", "cache", other=problem)] if problem else [])]
+
+
+def unreadable_records(counted: Mapping[str, Any]) -> list[Finding]:
+    """List the streams with records that could not be read, of their number and the first message by stream."""
+    return [
+        Finding("unreadable", name, "left_out", values={"count": float(entry["count"])}, other=entry["first"])
+        for name, entry in counted.items()
+    ]
 
 
 def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:

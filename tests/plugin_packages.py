@@ -7,10 +7,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-_SECTION = re.search(
-    r"^## Extending\n(.*?)^## ", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-)
-SECTION = _SECTION[1] if _SECTION else ""
+PAGE = (ROOT / "samples/cookbook/plugins.md").read_text(encoding="utf-8")
 
 
 def install(folder: Path, name: str, code: str, entries: dict[str, dict[str, str]], version: str = "1.0") -> None:
@@ -24,9 +21,9 @@ def install(folder: Path, name: str, code: str, entries: dict[str, dict[str, str
     (about / "entry_points.txt").write_text("\n".join(lines), encoding="utf-8")
 
 
-def install_readme(folder: Path) -> None:
-    """Lay the package of the section "Extending" into a folder, with all of its examples."""
-    (project,) = re.findall(r"```toml\n(.*?)```", SECTION, re.DOTALL)
+def install_examples(folder: Path) -> None:
+    """Lay the package of the cookbook's page "plugins" into a folder, with all of its examples."""
+    (project,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     about = tomllib.loads(project)["project"]
-    code = "\n\n".join(re.findall(r"```python\n(.*?)```", SECTION, re.DOTALL))
+    code = "\n\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
     install(folder, about["name"], code, about["entry-points"], about["version"])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from log2sim import Config, open_log, pipeline
-from log2sim.datatypes import Fault, Log
+from log2sim.datatypes import Finding, Log
 from log2sim.geometry import (
     Array,
     Camera,
@@ -182,7 +182,7 @@ def with_cameras(log: Log, *cameras: Camera) -> Log:
     return log.changed(cameras={**log.cameras, **{camera.name: camera for camera in cameras}})
 
 
-def checked(log: Log, *, fix: bool = False, of_lidars: tuple[Fault, ...] = ()) -> tuple[Log, tuple[Fault, ...]]:
+def checked(log: Log, *, fix: bool = False, of_lidars: tuple[Finding, ...] = ()) -> tuple[Log, tuple[Finding, ...]]:
     config = choose_detector(
         log, Config().changed(calibration={"fix_mounts": fix}, detect={"name": "ssd-mobilenet-v2"})
     )
@@ -198,7 +198,7 @@ def test_nothing_is_said_of_the_sample(sample: Log) -> None:
 def test_a_turned_camera_is_told_and_corrected(sample: Log) -> None:
     turned = with_cameras(sample, yawed(sample.cameras["front"], 1.0))
     same, (fault,) = checked(turned)
-    assert (fault.kind, fault.sensor, fault.treatment) == ("camera_rotation", "front", "kept")
+    assert (fault.kind, fault.subject, fault.treatment) == ("camera_rotation", "front", "kept")
     assert same is turned
     assert abs(fault.values["yaw_deg"] - 1.0) < 2 * fault.values["yaw_sigma_deg"] < 0.4
     mended, (fault,) = checked(turned, fix=True)
@@ -214,11 +214,11 @@ def test_exchanged_mounts_are_told_by_name_and_given_back(sample: Log) -> None:
         sample, replace(left, mount_T_cam=right.mount_T_cam), replace(right, mount_T_cam=left.mount_T_cam)
     )
     _, faults = checked(swapped)
-    assert [(f.kind, f.sensor, f.treatment) for f in faults] == [
+    assert [(f.kind, f.subject, f.treatment) for f in faults] == [
         ("swapped_cameras", "front_left", "left_out"),
         ("swapped_cameras", "front_right", "left_out"),
     ]
-    assert faults[0].message.startswith("sees front_right's points")
+    assert faults[0].other == "front_right"
     mended, faults = checked(swapped, fix=True)
     assert {f.treatment for f in faults} == {"corrected"}
     for name in ("front_left", "front_right"):
@@ -236,9 +236,9 @@ def test_slips_of_one_mount_are_told_and_mended(sample: Log) -> None:
     inverted = replace(front, mount_T_cam=inverse(front.mount_T_cam))
     lying = replace(left, mount_T_cam=left.mount_T_cam @ inverse(aside))
     mended, faults = checked(with_cameras(sample, inverted, lying), fix=True)
-    assert [(f.kind, f.sensor) for f in faults] == [("wrong_mount", "front"), ("wrong_mount", "front_left")]
-    assert "inverse" in faults[0].message
-    assert "turned by 90 degrees" in faults[1].message
+    assert [(f.kind, f.subject) for f in faults] == [("wrong_mount", "front"), ("wrong_mount", "front_left")]
+    assert [f.case for f in faults] == ["inverted", "turned"]
+    assert faults[1].values == {"turn_deg": 90.0}
     for name in ("front", "front_left"):
         np.testing.assert_allclose(mended.cameras[name].mount_T_cam, sample.cameras[name].mount_T_cam, atol=1e-12)
 
@@ -252,8 +252,8 @@ def test_dark_pictures_say_nothing(sample: Log) -> None:
 
 
 def test_a_run_goes_on_without_cameras_that_are_left_out(sample: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    left_out = Fault("swapped_cameras", "front", "", "left_out")
-    kept = Fault("swapped_cameras", "front_left", "", "kept")
+    left_out = Finding("swapped_cameras", "front", "left_out", case="flow")
+    kept = Finding("swapped_cameras", "front_left", case="flow")
     monkeypatch.setattr(pipeline, "check_calibration", lambda log, *_, **__: (log, (left_out, kept)))
     run = pipeline.start(sample, Config().changed(detect={"name": "labels"}))
     assert run.plan.cameras == ("front_left", "front_right")

@@ -10,7 +10,7 @@ import pytest
 from localization_worlds import HOUSES, drive
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log, Stream
+from log2sim.datatypes import Finding, Log, Stream
 from log2sim.geometry import NS_PER_S, PoseTrack, apply, inverse, rotation_from_rpy
 from log2sim.localization.clocks import OFFSET, PITCH, YAW, check_lidars, fit_clock_and_mount, turn_mount
 from log2sim.localization.replaced import shift_stream
@@ -44,7 +44,7 @@ def turned(log: Log, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> Log:
     return log.changed(lidars={TOP: replace(lidar, mount_T_lidar=turn_mount(lidar.mount_T_lidar, turn))})
 
 
-def check(log: Log, **asked: bool) -> tuple[Log, tuple[Fault, ...]]:
+def check(log: Log, **asked: bool) -> tuple[Log, tuple[Finding, ...]]:
     config = PLAIN.changed(calibration=asked) if asked else PLAIN
     return check_lidars(log, config, Sensors((), tuple(log.lidars)), progress=lambda *_: None)
 
@@ -138,9 +138,7 @@ def test_stamps_at_the_end_of_sweeps_whose_points_have_no_times_are_half_a_turn_
 def test_a_turned_mount_is_corrected_about_the_axes_that_are_certain(lively: Log) -> None:
     log, (fault,) = check(turned(lively, yaw_deg=1.0), fix_mounts=True)
     assert (fault.kind, fault.treatment) == ("lidar_rotation", "corrected")
-    assert "yaw +" in fault.message
-    assert "pitch" not in fault.message
-    assert "heading" not in fault.message
+    assert fault.case == "mount"
     assert fault.values["yaw_deg"] == pytest.approx(1.0, abs=0.1)
     true, mount = lively.lidars[TOP].mount_T_lidar, log.lidars[TOP].mount_T_lidar
     assert np.abs(np.degrees(log_of(inverse(true) @ mount)[3:])).max() < 0.1
@@ -153,7 +151,7 @@ def test_a_heading_by_which_the_ego_drives_askew_is_named(lively: Log) -> None:
     _, (fault,) = check(lively.changed(ego=replace(lively.ego, map_T_ego=lively.ego.map_T_ego @ askew)))
     assert fault.values["yaw_deg"] == pytest.approx(2.0, abs=0.1)
     assert fault.values["course_deg"] == pytest.approx(-2.0, abs=0.3)
-    assert "or the heading of the poses is" in fault.message
+    assert fault.case == "heading"
 
 
 def test_a_mount_at_another_place_is_found_where_the_ego_turns(lively: Log) -> None:
@@ -162,8 +160,6 @@ def test_a_mount_at_another_place_is_found_where_the_ego_turns(lively: Log) -> N
     moved[:2, 3] += [0.8, -1.0]
     log, (fault,) = check(lively.changed(lidars={TOP: replace(true, mount_T_lidar=moved)}), fix_mounts=True)
     assert (fault.kind, fault.treatment) == ("lidar_translation", "corrected")
-    assert "m too far forward" in fault.message
-    assert "m too far right" in fault.message
     assert [fault.values[n] for n in ("x_m", "y_m")] == pytest.approx([0.8, -1.0], abs=0.15)
     assert log.lidars[TOP].mount_T_lidar == pytest.approx(true.mount_T_lidar, abs=0.15)
 

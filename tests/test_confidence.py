@@ -29,7 +29,7 @@ from log2sim.agents.confidence import (
 from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
-from log2sim.datatypes import Doubt, Track
+from log2sim.datatypes import Finding, Track
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
@@ -97,7 +97,7 @@ def test_ratings_are_those_of_a_map_that_is_shifted_and_turned(make):
 def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
     candidate = parked()
     before = rated(candidate).agent.confidence
-    assert rated(candidate.doubted([Doubt("empty", "rays pass through")])).agent.confidence < before
+    assert rated(candidate.doubted([Finding("empty", text="rays pass through")])).agent.confidence < before
     m = candidate.track.measurements
     wild = m.center_m + np.random.default_rng(0).normal(0, 2.0, m.center_m.shape) * [1, 1, 0]
     scattered = replace(candidate, track=replace(candidate.track, measurements=replace(m, center_m=wild)))

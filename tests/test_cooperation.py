@@ -67,7 +67,7 @@ def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: World) -> Non
 @pytest.mark.slow
 def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World) -> None:
     found = register(misplaced(street.log, POLE, 8.0, 90.0))
-    assert [(fault.kind, fault.sensor, fault.treatment) for fault in found.faults] == [
+    assert [(fault.kind, fault.subject, fault.treatment) for fault in found.faults] == [
         ("wrong_road_pose", POLE, "left_out")
     ]
 

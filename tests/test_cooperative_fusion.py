@@ -23,12 +23,12 @@ from log2sim.perception.cooperative import (
     merge_by_covariance,
     take_off_offset,
 )
-from log2sim.perception.first_pass import obstacles_of
 from log2sim.perception.lidar.cloud import (
     Cloud,
     CloudSensor,
     assemble_views,
     join_parts,
+    obstacles_of,
 )
 from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct

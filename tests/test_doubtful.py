@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import ast
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from command_line import run
 from export_worlds import straight, world
-from test_layers import ROOT
 
 from log2sim.agents.moving import motion_doubts, sideways_doubts
-from log2sim.agents.smooth.motion_model import PHRASES
 from log2sim.cli.reconstruct import doubt_lines
 from log2sim.datatypes import (
     CATEGORIES,
-    FLAGS,
+    KINDS,
     MAX_SPEED_MPS,
     Agent,
     Detections,
-    Doubt,
+    Finding,
     Measurements,
     Scenario,
+    Treatment,
     Waypoints,
 )
 from log2sim.edit.apply import edit
@@ -35,15 +34,17 @@ from log2sim.export.openscenario.read import load
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
-THROUGH = Doubt("passes_through", "passes through parked at 1.2 s", 1.0, 1.5)
+THROUGH = Finding("passes_through", text="passes through parked at 1.2 s", start_s=1.0, end_s=1.5)
 
 
-NARROW = Doubt("unlikely_size", "2.8 m wide")
+NARROW = Finding("unlikely_size", text="2.8 m wide")
 
 
 def doubted() -> Scenario:
     """An ego that is doubtful itself, an agent without a doubt, one with two and one of low confidence."""
-    ego = replace(straight("ego"), doubts=(Doubt("acceleration", "brakes with 14 m/s2", 0.0, 0.2),))
+    ego = replace(
+        straight("ego"), doubts=(Finding("acceleration", text="brakes with 14 m/s2", start_s=0.0, end_s=0.2),)
+    )
     phantom = replace(straight("phantom", start=(0.0, 20.0)), doubts=(THROUGH, NARROW), confidence=0.9)
     return world(ego, straight("sure", start=(0.0, 10.0)), phantom, unsure(0.499))
 
@@ -89,7 +90,9 @@ def test_doubts_move_in_time_with_their_agent() -> None:
     assert spans(Shift("phantom", -1.75)) == [(None, None)]  # nothing is left of the time when it passed through
     assert spans(Speed("phantom", 2.0)) == [(0.5, 0.75), (None, None)]
     assert spans(Lateral("phantom", 1.0)) == [(1.0, 1.5), (None, None)]
-    late = replace(straight("late", t_s=np.array([2.0, 3.0])), doubts=(Doubt("jump", "jumps", 2.5, 3.0),))
+    late = replace(
+        straight("late", t_s=np.array([2.0, 3.0])), doubts=(Finding("jump", text="jumps", start_s=2.5, end_s=3.0),)
+    )
     (fast,) = edit(world(late), [Speed("late", 0.5)]).scenario.agents
     assert (fast.doubts[0].start_s, fast.doubts[0].end_s) == (3.0, 4.0)  # from its first waypoint on
 
@@ -118,7 +121,7 @@ def test_openscenario_brings_them_back(revision: str, tmp_path: Path) -> None:
     scenario = doubted()
     phantom = scenario.agents[2]
     w = phantom.waypoints
-    odd = Doubt("in_ego", 'within the ego, "50 %" of $it, ünter < & >', None, 1.0)
+    odd = Finding("in_ego", text='within the ego, "50 %" of $it, ünter < & >', start_s=None, end_s=1.0)
     w = replace(w, sigma_yaw_rad=np.linspace(0, 0.3, len(w)), sigma_speed_mps=np.full(len(w), 0.25))
     before = replace(phantom, waypoints=w, doubts=(*phantom.doubts, odd))
     export(world(straight("ego"), before), "openscenario", tmp_path, Options(revision=revision))
@@ -149,10 +152,10 @@ def test_quarantined_agents_stay_in_the_file_and_out_of_replays_and_exports(tmp_
     assert evaluate(scenario, scenario.active)["quarantined"] == ["unsure"]
 
 
-PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4)
+PASSES = Finding("passes_through", text="passes through car-22 at 1.2 s", start_s=1.0, end_s=1.4)
 
 
-def agent(name: str, *doubts: Doubt, confidence: float = 0.9) -> Agent:
+def agent(name: str, *doubts: Finding, confidence: float = 0.9) -> Agent:
     return replace(straight(name), doubts=doubts, confidence=confidence)
 
 
@@ -161,18 +164,19 @@ def test_the_agents_are_counted_and_named_with_their_reasons() -> None:
     assert line == "2 of 3 agents: car-18 (passes through car-22 at 1.2 s), car-19 (confidence 0.20)"
 
 
-def test_every_flag_that_is_given_is_listed_and_every_listed_one_is_given() -> None:
-    given = set(PHRASES)
-    for file in (ROOT / "log2sim" / "agents").rglob("*.py"):
-        for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if (
-                isinstance(call, ast.Call)
-                and isinstance(call.func, ast.Name)
-                and call.func.id.lower().strip("_s") == "doubt"
-            ):
-                texts = [a.value for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
-                given |= {text for text in texts if text.isidentifier()}
-    assert given == set(FLAGS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_sentence_of_every_kind_is_made_of_its_numbers(kind: str) -> None:
+    words, values = KINDS[kind].words, dict.fromkeys(KINDS[kind].numbers, 2.0)
+    found = [Finding(kind, "top", t, 1.0, 2.0, values, "left") for t in get_args(Treatment)]
+    cases = [] if isinstance(words, str) else [case for case in words if case not in get_args(Treatment)]
+    found = [f for f in found if isinstance(words, str) or f.treatment in words]
+    found += [Finding(kind, "top", values=values, other="left", case=case) for case in cases]
+    assert found
+    for finding in found:
+        assert len(finding.sentence) > 10
+        assert str(finding) == f"top: {finding.to_dict()['message']}"
+    with pytest.raises(ValueError, match="no such numbers"):
+        Finding(kind, values={"nonsense": 1.0})
 
 
 def moving(speed_mps: np.ndarray, sigma_mps: float | None = None, rate_hz: float = 10.0) -> Waypoints:
@@ -189,9 +193,9 @@ def test_what_is_faster_than_its_category_is_doubted_while_it_is(category):
     assert motion_doubts(category, moving(np.full(20, 0.9 * limit))) == ()
     w = moving(np.where(np.arange(20) < 5, 1.2, 0.9) * limit)
     (doubt,) = motion_doubts(category, w)
-    assert doubt.flag == "speed"
+    assert doubt.kind == "speed"
     assert doubt.holds(w.t_s).sum() == 5
-    assert doubt.reason == f"moves at {1.2 * limit:.0f} m/s from 0.0 to 0.4 s"
+    assert doubt.sentence == f"moves at {1.2 * limit:.0f} m/s from 0.0 to 0.4 s"
     assert motion_doubts(category, moving(w.speed_mps, sigma_mps=0.2 * limit)) == ()
 
 
@@ -203,11 +207,11 @@ def test_reversing_out_of_a_driveway_is_driving_and_reversing_fast_or_far_is_not
 
     assert motion_doubts("car", after(8.0, 2.0)) == ()
     (fast,) = motion_doubts("car", after(3.0, 7.4))
-    assert (fast.flag, fast.start_s) == ("reversing", 0.0)
-    assert fast.reason.startswith("reverses at up to 7.4 m/s from 0.0 to ")
+    assert (fast.kind, fast.start_s) == ("reversing", 0.0)
+    assert fast.sentence.startswith("reverses at up to 7.4 m/s from 0.0 to ")
     assert fast.end_s == pytest.approx(3.0, abs=1.01 / rate_hz)
     (far,) = motion_doubts("cyclist", after(25.0, 2.0))
-    assert far.flag == "reversing"
+    assert far.kind == "reversing"
     assert motion_doubts("pedestrian", after(3.0, 4.0)) == ()
 
 
@@ -224,7 +228,7 @@ def test_a_long_side_across_the_way_slides(length_m, turned_deg):
         high_m=np.tile([length_m, 1.5], (10, 1)),
     )
     doubts = sideways_doubts(m, t, np.full(10, 0.4), np.full(10, 3.6))
-    assert [doubt.flag for doubt in doubts] == (["sideways"] if length_m == 6.0 and turned_deg == 90.0 else [])
+    assert [doubt.kind for doubt in doubts] == (["sideways"] if length_m == 6.0 and turned_deg == 90.0 else [])
     assert sideways_doubts(m, t, np.full(10, 0.4), np.full(10, 0.5)) == ()
 
 

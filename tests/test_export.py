@@ -103,13 +103,13 @@ def test_the_table_holds_every_waypoint(scenario: Scenario, tmp_path: Path) -> N
         assert {float(r["width_m"]) for r in own} == {agent.size_m[1]}
 
 
-def test_what_each_format_loses_stands_in_the_readme() -> None:
+def test_what_each_format_loses_stands_in_the_cookbook() -> None:
     """`python tools/formats_table.py` writes it."""
     spec = importlib.util.spec_from_file_location("formats_table", ROOT / "tools" / "formats_table.py")
     assert spec is not None
     assert spec.loader is not None
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert tool.with_table(readme) == readme
+    page = tool.PAGE.read_text(encoding="utf-8")
+    assert tool.with_table(page) == page
     assert tool.table().count("\n") == 2 + len(plugins.BUILT_IN["export"])

@@ -19,7 +19,7 @@ from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rp
 from log2sim.perception.first_pass import observe
 from log2sim.perception.frames import AHEAD, RecordReader, look_again, work_ahead
 from log2sim.perception.fusion import fuse
-from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, sample_rays
+from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, obstacles_of, sample_rays
 from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
@@ -251,8 +251,8 @@ def test_a_repeated_sweep_counts_as_not_recorded_and_is_told():
     out, _ = run(with_records(log, top=lambda i: sweep((0, 1, 1, 3)[i])))
     assert [cloud is None for cloud in out.obstacles] == [False, False, True, False]
     assert set(out.measurements[2].source) == {""}  # seen by the camera alone
-    assert [(f.kind, f.sensor, f.treatment, f.start_ns) for f in out.faults] == [
-        ("repeated_sweeps", "top", "left_out", STAMPS[2])
+    assert [(f.kind, f.subject, f.treatment, f.start_s) for f in out.faults] == [
+        ("repeated_sweeps", "top", "left_out", (STAMPS[2] - STAMPS[0]) / 1e9)
     ]
 
 
@@ -391,6 +391,19 @@ def test_near_and_far_points_keep_their_share() -> None:
     found_azimuth, found_slope = directions(rays)
     assert np.ptp(found_azimuth) == pytest.approx(np.deg2rad(160), abs=2 * CELL_RAD)
     assert np.ptp(found_slope) == pytest.approx(np.deg2rad(4), abs=2 * CELL_RAD)
+
+
+@pytest.mark.parametrize("spread_m", [0.3, 4.0, 60.0])
+def test_of_obstacles_the_first_point_of_every_voxel_is_kept(spread_m: float) -> None:
+    xyz = (
+        np.random.default_rng(3)
+        .uniform([-spread_m, -spread_m, 0.3], [spread_m, spread_m, 4.0], (60_000, 3))
+        .astype(np.float32)
+    )
+    cloud = cloud_of(xyz)
+    near = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < 70]
+    first = np.unique(np.floor(near / np.float32(0.12)), axis=0, return_index=True)[1]
+    np.testing.assert_array_equal(obstacles_of(cloud).xyz, near[np.sort(first)])
 
 
 def test_each_ray_starts_where_its_sensor_was() -> None:

@@ -236,7 +236,7 @@ def test_what_repeats_is_judged_by_all_before_it_whoever_knows_it(
     for other in runs[1:]:
         assert_same_observations(runs[0], other)
         assert other.unseen == runs[0].unseen
-        assert [f.to_dict(0) for f in other.faults] == [f.to_dict(0) for f in runs[0].faults]
+        assert other.faults == runs[0].faults
 
 
 def recoded(picture: Path) -> bytes:

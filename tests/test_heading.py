@@ -69,7 +69,7 @@ def decided(*candidates, path=None):
 
 
 def ambiguous(agent):
-    return [d.flag for d in agent.doubts] == ["heading_ambiguous"]
+    return [d.kind for d in agent.doubts] == ["heading_ambiguous"]
 
 
 @pytest.mark.parametrize("side", [1, -1])

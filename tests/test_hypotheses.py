@@ -136,6 +136,16 @@ def test_what_is_shown_in_between_is_no_object_of_its_own():
     assert 20 <= len(main) <= 33
 
 
+@pytest.mark.parametrize(("off_m", "kept"), [(0.8, 38), (3.5, 30)])
+def test_partial_views_belong_to_a_car_that_stands_and_what_shows_a_neighbor_does_not(off_m, kept):
+    t = times(10.0, 3.8)
+    other = np.arange(38) % 5 == 3
+    other[-1] = True
+    (part,) = explain_track(track_of(t, along(np.where(other, off_m, 0.0)) + view_noise(t, 3, 0.05)))
+    assert part.static
+    assert len(part.at_place or part.track) == kept
+
+
 @pytest.mark.parametrize("turn", [0.7, np.pi / 2, 3.0])
 def test_neither_map_nor_clock_matters(turn):
     t = times(10.0)
@@ -160,16 +170,40 @@ def test_the_evidence_is_the_likelihood_of_the_gaussian_process():
     response = np.maximum(response, 0.0)
     noise = np.sqrt(variance.T[:, :, None] * variance.T[:, None, :])
     noise = noise * (REPEATED_SHARE * np.exp(-np.abs(t[:, None] - t) / VIEW_S) + (1 - REPEATED_SHARE) * np.eye(5))
-    for prior, covariance in (
-        (STANDING, noise + PLACE_SIGMA_M**2),
-        (motion, noise + PLACE_SIGMA_M**2 + 64.0 * np.outer(t - 1, t - 1) + 6.25 * response @ response.T * dt),
-    ):
+    # The noise is 1/4 to 4 times as large as stated, the factor log-normal with a standard deviation of an octave.
+    octaves = np.arange(-2.0, 3.0)
+    weights = np.exp(-0.5 * octaves**2) / np.exp(-0.5 * octaves**2).sum()
+    moves = 64.0 * np.outer(t - 1, t - 1) + 6.25 * response @ response.T * dt
+    for prior, spread in ((STANDING, 0.0), (motion, moves)):
         middle = np.median(xy, axis=0) if prior is STANDING else xy[3]
-        expected = sum(multivariate_normal(np.zeros(5), covariance[k]).logpdf(xy[:, k] - middle[k]) for k in range(2))
+        expected = 0.0
+        for k in range(2):
+            each = [multivariate_normal(np.zeros(5), 4.0**o * noise[k] + PLACE_SIGMA_M**2 + spread) for o in octaves]
+            expected += np.log(weights @ [np.exp(e.logpdf(xy[:, k] - middle[k])) for e in each])
         found = marginal_likelihood(Positions(t, xy, variance), prior)
         if found.inlier.all():
             assert found.log == pytest.approx(expected, abs=0.05)
         assert prior is STANDING or found.inlier.all()
+
+
+@pytest.mark.parametrize("stated", [0.25, 1.0, 6.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_stated_errors_may_be_wrong_by_far(stated, seed):
+    t = times(10.0, 1.0)
+    for speed_mps, sigma_m in ((0.0, 0.2), (1.0, 0.05)):
+        way = along(speed_mps * t) + view_noise(t, seed, sigma_m)
+        (part,) = explain_track(track_of(t, way, "pedestrian", sigma_m * stated))
+        assert part.static == (speed_mps == 0)
+
+
+def test_a_car_whose_points_a_neighbor_joins_at_times_stands():
+    t = times(10.0, 4.0)
+    joined = np.isin(np.arange(40), [0, 2, 6, 7, 11])
+    way = along(np.where(joined, 2.3, 0.0)) + np.random.default_rng(2).normal(0, 0.02, (40, 2))
+    m = (track := track_of(t, way)).measurements
+    covariance = np.where(joined[:, None, None], np.diag([0.28, 0.02]), np.diag([1.4, 0.4]))
+    (part,) = explain_track(replace(track, measurements=replace(m, covariance=covariance)))
+    assert part.static
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 1.2])

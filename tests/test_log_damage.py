@@ -117,9 +117,11 @@ def test_boxes_of_no_frame_are_counted(lost: str) -> None:
 
 # what is changed, words of the line, whether it is refused
 CALIBRATIONS: dict[str, tuple[Callable[[Camera], dict[str, Any]], str, bool]] = {
-    "fx in mm": (lambda c: {"K": c.K * np.array([[0.01], [1], [1]])}, "its focal length fx is ", True),
+    "fx in mm": (lambda c: {"K": c.K * np.array([[0.01, 1, 1], [1, 1, 1], [1, 1, 1]])}, "its focal length fx is ", True),
     "fy": (lambda c: {"K": c.K * np.array([[1, 1, 1], [1, 1e3, 1], [1, 1, 1]])}, "its focal length fy is ", True),
     "cx beside": (lambda c: {"K": c.K + np.array([[0, 0, 1000.0], [0, 0, 0], [0, 0, 0]])}, "its principal point cx is 1239.5 px, 759.5 px outside", False),
+    "cx in widths": (lambda c: {"K": c.K * np.array([[1, 1, 1 / 480], [1, 1, 1], [1, 1, 1]])}, "its principal point cx is ", False),
+    "cy above": (lambda c: {"K": c.K - np.array([[0, 0, 0], [0, 0, 300.0], [0, 0, 0]])}, "its principal point cy is ", False),
     "cy far": (lambda c: {"K": c.K + np.array([[0, 0, 0], [0, 0, -1e5], [0, 0, 0]])}, "its principal point cy is ", True),
     "mount in mm": (lambda c: {"mount_T_cam": c.mount_T_cam + 1700 * np.eye(4, k=3)}, "its mounting is 1701", True),
     "half folded": (lambda c: {"distortion_model": "brown", "distortion": (-1.6, 0.0, 0.0, 0.0)}, "of the pixels have no ray", True),

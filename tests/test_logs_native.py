@@ -232,6 +232,18 @@ def test_a_fault_of_a_table_names_its_line_and_field(folder: Path, fault: str) -
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "words"), [(b"x" * 300 + b".jpg", "longer than"), (b"front/\xff\xfe.jpg", "not text in UTF-8: byte 0xff")]
+)
+def test_a_file_name_that_cannot_be_is_named_by_table_and_line(folder: Path, name: bytes, words: str) -> None:
+    table = folder / "front/index.csv"
+    lines = table.read_bytes().split(b"\n")
+    lines[3] = lines[3].split(b",")[0] + b"," + name
+    table.write_bytes(b"\n".join(lines))
+    with pytest.raises(LogError, match=f"front/index.csv, line 4.*{words}"):
+        open_log(folder)
+
+
 def png_header(width_px: int, height_px: int) -> bytes:
     """The first chunk of a gray PNG file, sound by its check sum."""
     chunk = b"IHDR" + struct.pack(">IIBBBBB", width_px, height_px, 8, 0, 0, 0, 0)
@@ -252,6 +264,7 @@ RECORD_FAULTS = {
     "empty file": ("front", lambda f: f.write_bytes(b""), "neither a JPEG nor a PNG"),
     "wrong size": ("front", lambda f: f.write_bytes(png(61, 40)), "61x40 px, the calibration is for 60x40"),
     "truncated PNG": ("front", lambda f: f.write_bytes(png(60, 40)[:-1000]), "truncated"),
+    "damaged PNG": ("front", lambda f: f.write_bytes(png(60, 40)[:-600] + b"?" + png(60, 40)[-599:]), "check sum"),
     "huge PNG": ("front", lambda f: f.write_bytes(png_header(65536, 65536)), "65536x65536 px, expected 1 to"),
     "missing": ("front", lambda f: f.unlink(), "cannot be read"),
     "truncated npz": ("top", lambda f: f.write_bytes(f.read_bytes()[:100]), "not a readable sweep"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Lidar, Log, Stream, Sweep
+from log2sim.datatypes import Finding, Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.localization.choice import localize, refine_for_map
 from log2sim.localization.pose_refinement import Keyframe, place_as_given, refine_poses, solve_twists
@@ -94,7 +94,7 @@ def test_the_ground_is_drawn_by_refined_poses_and_put_back_where_the_agents_are(
         back = place_as_given(apply(drawn.ego.map_T_ego[k], near), drawn, log)
         np.testing.assert_allclose(back, apply(drifted()[k], near), atol=0.06)
     assert np.linalg.norm(drawn.ego.map_T_ego[:, :3, 3] - drifted()[:, :3, 3], axis=1).max() > 0.2
-    late = Fault("time_offset", "top", "", "kept")
+    late = Finding("time_offset", "top")
     assert refine_for_map(log, choice, [late]) is choice  # the sweeps of such a LiDAR show another motion
 
 

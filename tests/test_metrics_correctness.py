@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
-from log2sim.datatypes import CATEGORIES, Agent, Doubt, Scenario
+from log2sim.datatypes import CATEGORIES, Agent, Finding, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.evaluation.metrics.comparison import Selection, compare, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
@@ -183,10 +183,10 @@ def test_an_agent_is_wrong_when_more_than_a_fifth_of_its_ticks_are(ticks, agents
 def test_doubt_is_a_flag_or_a_confidence_below_one_half():
     ours = [
         agent("right", 0.0, confidence=0.9),
-        agent("flagged", 20.0, confidence=0.9, doubts=(Doubt("curvature", "turns on the spot"),)),
+        agent("flagged", 20.0, confidence=0.9, doubts=(Finding("curvature", text="turns on the spot"),)),
         agent("unsure", 40.0, confidence=0.49),
         agent("sure", 60.0, confidence=0.5),
-        agent("both", 80.0, confidence=0.1, doubts=(Doubt("jump", "jumps"),)),
+        agent("both", 80.0, confidence=0.1, doubts=(Finding("jump", text="jumps"),)),
     ]
     truth = [agent("a", 0.0), agent("b", 20.0)]
     found = judged(ours, truth)
@@ -199,7 +199,7 @@ def test_doubt_is_a_flag_or_a_confidence_below_one_half():
 
 def test_a_doubt_counts_while_it_holds():
     half = np.where(np.arange(TICKS) < 10, 50.0, 0.0)
-    hidden = Doubt("hidden", "hidden at first", None, float(T_S[9]))
+    hidden = Finding("hidden", end_s=float(T_S[9]), text="hidden at first")
     found = judged([agent("x", 0.0, half, doubts=(hidden,))], [agent("a", 0.0)])
     assert (found["doubted"]["wrong_ticks"], found["doubted"]["right_ticks"]) == (1.0, 0.0)
 
@@ -299,7 +299,7 @@ def broken():
     rest = [a for a in world().agents if a.id not in ("a", "b")]
     return scenario(
         *rest, agent("car-18", 10 + 5 * T_S, 3.0, speed=-5.0, yaw=np.pi, **car), agent("car-9", 15.0, -4.0, yaw=-2.0),
-        agent("car-10", 15.0, -4.5, confidence=0.3), agent("ghost", 90.0, doubts=(Doubt("jump", "jumps"),)),
+        agent("car-10", 15.0, -4.5, confidence=0.3), agent("ghost", 90.0, doubts=(Finding("jump", text="jumps"),)),
     )  # fmt: skip
 
 

@@ -75,7 +75,7 @@ def test_who_drives_through_the_middle_of_another_is_doubted_by_name_and_time() 
     assert found[0.0][1] == []
     kept, (doubt,) = found[3.0]
     assert len(kept.waypoints) == 5
-    assert (doubt.flag, doubt.reason, doubt.start_s, doubt.end_s) == (
+    assert (doubt.kind, doubt.sentence, doubt.start_s, doubt.end_s) == (
         "passes_through",
         "passes through car-2 at 2.0 s",
         1.0,

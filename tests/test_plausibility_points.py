@@ -114,7 +114,7 @@ def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
 def test_what_no_ray_reaches_is_refuted_and_what_has_no_point_doubted():
     assert is_refuted(with_support(unreached=True), 0.9)
     (doubt,) = contradict(with_support(pointless=True), 0.9)
-    assert doubt.flag == "hardly_observed"
+    assert doubt.kind == "hardly_observed"
 
 
 VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)

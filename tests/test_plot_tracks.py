@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Doubt, Scenario, Waypoints
+from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Finding, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.simulation.policy import Controls
@@ -211,7 +211,9 @@ def test_a_gif_keeps_every_frame_and_the_colors_that_mean_something(tmp_path: Pa
 
 
 def doubted(agent: Agent, *spans: tuple[float | None, float | None]) -> Agent:
-    return replace(agent, doubts=tuple(Doubt("reversing", "reverses at 7.4 m/s", *span) for span in spans))
+    return replace(
+        agent, doubts=tuple(Finding("reversing", start_s=a, end_s=b, text="reverses at 7.4 m/s") for a, b in spans)
+    )
 
 
 def scene_doubts() -> Scenario:

@@ -1,4 +1,4 @@
-"""Plug-ins of other packages: the examples of README run as installed, and a wrong one is one line that names its package."""
+"""Plug-ins of other packages: the examples of the cookbook run as installed, and a wrong one is one line that names its package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from plugin_packages import SECTION, install, install_readme
+from plugin_packages import PAGE, install, install_examples
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.datatypes import Log
@@ -39,7 +39,7 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def examples(packages: Path) -> Path:
-    install_readme(packages)
+    install_examples(packages)
     return packages
 
 
@@ -56,11 +56,11 @@ def cloud_of(log: Log) -> Cloud:
     return cloud
 
 
-# The examples of README
+# The examples of the cookbook
 
 
 def test_there_is_an_example_of_every_kind(examples: Path) -> None:
-    groups = set(re.findall(r"`log2sim\.(\w+)`", SECTION))
+    groups = set(re.findall(r"`log2sim\.(\w+)`", PAGE))
     assert groups == set(plugins.BUILT_IN)
     for kind in groups:
         (name,) = set(plugins.names(kind)) - set(plugins.BUILT_IN[kind])

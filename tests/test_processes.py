@@ -82,7 +82,7 @@ def test_records_that_repeat_are_told_alike_by_any_number_of_processes(
     alone, shared = seen(damaged(), 1), seen(damaged(), jobs)
     assert content(alone) == content(shared)
     assert alone.unseen == {"front": [1, 2, 3], "left": [2]}
-    assert [f.start_ns for f in shared.faults if f.kind == "repeated_sweeps"] == [STAMPS[2]]
+    assert [f.start_s for f in shared.faults if f.kind == "repeated_sweeps"] == [(STAMPS[2] - STAMPS[0]) / 1e9]
     assert shared.unreadable == alone.unreadable == {"left": {"count": 1, "first": "left 2: torn"}}
 
 

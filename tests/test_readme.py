@@ -1,4 +1,4 @@
-"""What README.md tells people to type works: commands and options exist, links lead somewhere, code imports.
+"""What README.md and the cookbook tell people to type works: commands and options exist, links lead somewhere, code imports.
 
 Blocks marked `sh` and `python` run as printed, in order. Blocks marked `console` need data of the reader's or run the tests
 themselves, and blocks marked `text` are no commands: they are only parsed.
@@ -25,7 +25,8 @@ from log2sim.cli import entry
 from log2sim.logs.ros.messages import read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "samples/cookbook").glob("*.md"))}
+README = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
 GROUP = typer.main.get_command(entry.app)
 
 
@@ -82,6 +83,29 @@ def test_every_command_is_documented() -> None:
         assert command.help, name
         for parameter in command.params:
             assert getattr(parameter, "help", None), f"{name} {parameter.name}"
+
+
+def test_links_lead_to_files_and_headings() -> None:
+    wrong = []
+    for page in (
+        ROOT / "README.md",
+        ROOT / "BENCHMARKS.md",
+        ROOT / "log2sim/README.md",
+        *(ROOT / "samples/cookbook").glob("*.md"),
+    ):
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            path, _, heading = target.partition("#")
+            linked = page.parent / path if path else page
+            if target.startswith("http") or (linked.exists() and (not heading or heading in headings(linked))):
+                continue
+            wrong.append(f"{page.name}: {target}")
+    assert not wrong
+
+
+def headings(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page, as GitHub makes them."""
+    found = re.findall(r"^#+ (.*)", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in found}
 
 
 def test_names_that_python_code_imports_exist() -> None:

@@ -161,7 +161,7 @@ def streams_log(**stamps):
 
 def missing(log):
     schedule = synchronize(log, tuple(log.cameras))
-    return [(f.kind, f.sensor, f.message) for f in RecordWatch(log).faults(schedule)]
+    return [(f.kind, f.subject, f.start_s, f.end_s, f.values) for f in RecordWatch(log).faults(schedule)]
 
 
 def test_missing_records_are_told_with_start_and_length():
@@ -169,6 +169,6 @@ def test_missing_records_are_told_with_start_and_length():
     assert missing(streams_log(front=t, left=t, top=t)) == []
     found = missing(streams_log(front=t, left=np.delete(t, slice(30, 50)), top=np.delete(t, slice(11, 20))))
     assert found == [
-        ("missing_images", "left", "no pictures in the last 2.00 s, after 2.90 s"),
-        ("missing_sweeps", "top", "no sweeps for 1.00 s, from 1.00 to 2.00 s"),
+        ("missing_images", "left", 2.9, 4.9, {"gaps": 1.0, "longest_s": 2.0}),
+        ("missing_sweeps", "top", 1.0, 2.0, {"gaps": 1.0, "longest_s": 1.0}),
     ]

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis.extra.numpy import arrays
 
-from log2sim.datatypes import CATEGORIES, Agent, Doubt, IgnoreRegions, LabelView, MapFrame, Scenario, Waypoints
+from log2sim.datatypes import CATEGORIES, Agent, Finding, IgnoreRegions, LabelView, MapFrame, Scenario, Waypoints
 from log2sim.geometry import Array, Camera, quaternion_from_rotation, rotation_from_rpy
 
 FINITE = st.floats(-1e8, 1e8, allow_subnormal=True)
@@ -24,10 +24,11 @@ def times(count: int) -> st.SearchStrategy[Array]:
     return st.builds(lambda start, step: np.maximum.accumulate(start + np.cumsum(step)), st.floats(-1e3, 3e4), steps)
 
 
-def doubts() -> st.SearchStrategy[Doubt]:
+def doubts() -> st.SearchStrategy[Finding]:
     """Doubts, some of which hold all the time."""
     time = st.none() | st.floats(-1e6, 1e6)
-    return st.builds(Doubt, NAMES, st.text(st.characters(exclude_categories=["Cs"]), max_size=12), time, time)
+    text = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
+    return st.builds(Finding, NAMES, start_s=time, end_s=time, text=text)
 
 
 @st.composite

@@ -17,7 +17,6 @@ from log2sim.agents.smooth.motion_model import (
     MotionModel,
     broken_limits,
     course_is_known,
-    limit_doubts,
     yaw_of_motion,
     yaw_sigma,
 )
@@ -322,11 +321,11 @@ def test_impossible_motion_is_flagged() -> None:
     assert smooth_track(t, turn(t), sigma_m=0.1).broken == ()
     spin = 2.0 * np.column_stack([np.sin(2.0 * t), 1 - np.cos(2.0 * t)])  # 4 m/s on a circle of 2 m
     broken = smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(100.0)).broken
-    assert [limit.start_s < 0.5 < limit.end_s for limit in broken if limit.name == "curvature"] == [True]
+    assert [limit.start_s < 0.5 < limit.end_s for limit in broken if limit.kind == "curvature"] == [True]
     assert smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(1e4, holonomic=True)).broken == ()
     rocket = np.column_stack([10.0 * t**2, 0 * t])
     broken = smooth_track(t, rocket, sigma_m=0.01, motion=MotionModel(100.0)).broken
-    assert "acceleration" in [limit.name for limit in broken]
+    assert "acceleration" in [limit.kind for limit in broken]
 
 
 @pytest.fixture(scope="module")
@@ -488,16 +487,15 @@ def test_limits_that_a_motion_breaks_are_named_with_their_spans() -> None:
     calm = np.zeros((10, 2))
     assert broken_limits(t, calm, zero, zero) == ()
     (hard,) = broken_limits(t, calm + np.array([11.0, 0.0]), zero, zero)
-    assert (hard.name, hard.worst, hard.start_s, hard.end_s) == ("acceleration", 11.0, t[0], t[-1])
+    assert (hard.kind, hard.values["most_mps2"], hard.start_s, hard.end_s) == ("acceleration", 11.0, t[0], t[-1])
     (slide,) = broken_limits(t, calm + np.array([0.0, 9.0]), zero, zero)
-    assert slide.name == "lateral_acceleration"
+    assert slide.kind == "lateral_acceleration"
     (spin,) = broken_limits(t, calm, zero, np.where(t == t[3], 0.4, 0.0))
-    assert (spin.name, spin.worst_s, spin.start_s, spin.end_s) == ("curvature", t[3], t[3], t[3])
+    assert (spin.kind, spin.values["at_s"], spin.start_s, spin.end_s) == ("curvature", t[3], t[3], t[3])
     (jolt,) = broken_limits(t, np.where(t > t[4], 6.0, 0.0)[:, None] * np.array([1.0, 0.0]), zero, zero)
-    assert (jolt.name, jolt.start_s, jolt.end_s) == ("jerk", t[4], t[5])
-    (doubt,) = limit_doubts([spin])
-    assert (doubt.flag, doubt.reason) == ("curvature", f"turns on a circle of 2.5 m at {t[3]:.1f} s")
-    assert doubt.holds(t).tolist() == (t == t[3]).tolist()
+    assert (jolt.kind, jolt.start_s, jolt.end_s) == ("jerk", t[4], t[5])
+    assert spin.sentence == f"turns on a circle of 2.5 m at {t[3]:.1f} s"
+    assert spin.holds(t).tolist() == (t == t[3]).tolist()
 
 
 def test_a_limit_that_noise_may_have_broken_is_not() -> None:

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from command_line import run
@@ -31,6 +32,13 @@ def test_the_readme_and_the_help_name_the_same_exit_codes() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     sentence = readme[readme.index("Exit codes: ") :].split("\n\n")[0]
     assert set(re.findall(r"\b(\d+) [a-z]", sentence)) == in_help == {"0", "1", "2", "3", "4", "5", "6", "7", "130"}
+
+
+def test_names_in_a_log_do_not_steer_the_terminal(tmp_path: Path) -> None:
+    ran = run("inspect", tmp_path / "a\x1b[2Jb\u202ec\x07")
+    assert ran.code == 3
+    assert "a\\x1b[2Jb\\u202ec\\x07" in ran.err
+    assert not set("\x1b\u202e\x07") & set(ran.out + ran.err)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
 from command_line import names, run
 
-from log2sim.datatypes import Agent, Doubt, Scenario, Waypoints
+from log2sim.datatypes import Agent, Finding, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.road.ground_map import GroundMap
@@ -284,10 +284,10 @@ def doubtful_scene() -> Scenario:
         sigma_speed_mps=np.full(5, 0.3),
     )
     quality = {"points_median": 40.4, "detections": 20, "without_lidar": 2, "lidar_only": 1}
-    through = Doubt("passes_through", "passes through parked at 1.2 s", 1.0, 2.0)
+    through = Finding("passes_through", text="passes through parked at 1.2 s", start_s=1.0, end_s=2.0)
     car = replace(car, waypoints=waypoints, quality=quality, doubts=(through,), confidence=0.93)
     parked = replace(
-        agent("parked", np.full(2, 20.0), 0.0, static=True), doubts=(Doubt("empty", "rays pass through it"),)
+        agent("parked", np.full(2, 20.0), 0.0, static=True), doubts=(Finding("empty", text="rays pass through it"),)
     )
     return made(agent("ego", np.linspace(0, 20, 5), 0.0), car, replace(unsure, confidence=0.3), sure, parked)
 

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import Solid, camera_ahead, outline_px
 
-from log2sim.datatypes import Agent, Doubt, Lidar, Log, Scenario, Stream, Sweep, Waypoints
+from log2sim.datatypes import Agent, Finding, Lidar, Log, Scenario, Stream, Sweep, Waypoints
 from log2sim.geometry import Camera
 from log2sim.visualization.page.writer import write_page
 from log2sim.visualization.recording import (
@@ -84,7 +84,7 @@ def roadside(*cameras: Camera) -> Log:
 
 def scene(**changes: Any) -> Scenario:
     """A car that drives away from the camera, and a parked one beside it that is doubtful."""
-    doubt = Doubt("empty", "rays pass through it")
+    doubt = Finding("empty", text="rays pass through it")
     agents = (agent("car", [12.0, 20.0, 28.0], 0.0), agent("parked", [18.0], 6.0, static=True, doubts=(doubt,)))
     return Scenario(name="road", t0_ns=START_NS, duration_s=2.0, agents=agents, **changes)
 

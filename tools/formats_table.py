@@ -1,4 +1,4 @@
-"""Writes README's table of export formats, what each understands and what it loses, between its markers."""
+"""Writes the cookbook's table of export formats, what each understands and what it loses, between its markers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from log2sim.files import plugins
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+PAGE = Path(__file__).resolve().parents[1] / "samples/cookbook/exports.md"
 BEGIN, END = "<!-- formats: begin -->\n", "<!-- formats: end -->\n"
 
 
@@ -21,10 +21,10 @@ def table() -> str:
 
 
 def with_table(text: str) -> str:
-    """README's text with the table of today."""
+    """The page with the table of today."""
     begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     return text[:begin] + table() + text[end:]
 
 
 if __name__ == "__main__":
-    README.write_text(with_table(README.read_text(encoding="utf-8")), encoding="utf-8")
+    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

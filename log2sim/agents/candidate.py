@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.size import TrackGeometry, independent, independent_along
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Doubt, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Finding, Track, Waypoints
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar.measure import logit
@@ -257,7 +257,7 @@ class AgentCandidate:
     geometry: TrackGeometry
     support: Support | None = None
 
-    def doubted(self, doubts: Sequence[Doubt]) -> Self:
+    def doubted(self, doubts: Sequence[Finding]) -> Self:
         """Return the candidate with more doubts of its agent."""
         return replace(self, agent=replace(self.agent, doubts=(*self.agent.doubts, *doubts))) if doubts else self
 

@@ -181,7 +181,7 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline) -> Evidence:
         hidden=1.0 - float(seen_share(candidate, yaw)[0]),
         heading=float(logit(np.clip(heading, 1 - MAX_HEADING_CONFIDENCE, MAX_HEADING_CONFIDENCE))),
         other_category=float((m.category != agent.category).mean()),
-        doubts=float(min(len({d.flag for d in agent.doubts}), MAX_DOUBTS)),
+        doubts=float(min(len({d.kind for d in agent.doubts}), MAX_DOUBTS)),
         moving=float(not agent.static),
         two_wheeler=float(group == "two_wheeler"),
         pedestrian=float(group == "pedestrian"),

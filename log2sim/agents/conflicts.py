@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, spans_of
 from log2sim.agents.evidence import MIN_TICK_RAYS, count_at
-from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Doubt, Obstacles, Waypoints
+from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Finding, Obstacles, Waypoints
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
 # Of a long log, so that the memory does not grow with agents times ticks.
@@ -163,34 +163,33 @@ def _during(agent: Agent, w: Waypoints, first_s: float, last_s: float) -> Waypoi
     return w.take((w.t_s >= first_s - MARGIN_S) & (w.t_s <= last_s + MARGIN_S))
 
 
-def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[list[Doubt]]:
+def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[list[Finding]]:
     """Doubt the less likely one of two named candidates that are in one place, and who touches the ego, while they do so.
 
     Returns a list for each candidate.
     """
     agents = [c.agent for c in candidates] + ([ego] if ego is not None else [])
-    doubts: list[list[Doubt]] = [[] for _ in agents]
+    doubts: list[list[Finding]] = [[] for _ in agents]
     for conflict in find_conflicts(agents, t_s, touching=ROUNDING)[0]:
         a, b = conflict.first, conflict.second
         if b == len(candidates):
-            doubts[a].append(_doubt(conflict, t_s, "in_ego", "touches the ego", agents[a]))
+            doubts[a].append(_doubt(Finding("in_ego"), conflict, t_s, agents[a]))
         elif conflict.depth_m.max() > IN_ONE_PLACE_M:
             weaker, other = (a, b) if candidates[a].evidence <= candidates[b].evidence else (b, a)
-            words = "stands in" if agents[a].static and agents[b].static else "passes through"
-            doubts[weaker].append(
-                _doubt(conflict, t_s, "passes_through", f"{words} {agents[other].id}", agents[weaker])
-            )
+            case = "static" if agents[a].static and agents[b].static else ""
+            found = Finding("passes_through", other=agents[other].id, case=case)
+            doubts[weaker].append(_doubt(found, conflict, t_s, agents[weaker]))
     return doubts[: len(candidates)]
 
 
-def _doubt(conflict: Conflict, t_s: Array, flag: str, words: str, agent: Agent) -> Doubt:
-    """Make a doubt that holds during a conflict, of the whole life where it always holds."""
+def _doubt(found: Finding, conflict: Conflict, t_s: Array, agent: Agent) -> Finding:
+    """Return a finding that holds during a conflict, for the whole life of an agent where it always holds."""
     worst_s, first_s, last_s = (
         float(t_s[k]) for k in (conflict.tick[conflict.share.argmax()], conflict.tick[0], conflict.tick[-1])
     )
     if first_s <= agent.waypoints.t_s[0] + MARGIN_S and last_s >= agent.waypoints.t_s[-1] - MARGIN_S:
-        return Doubt(flag, words)
-    return Doubt(flag, f"{words} at {worst_s:.1f} s", first_s, last_s)
+        return found
+    return replace(found, start_s=first_s, end_s=last_s, values={"at_s": worst_s})
 
 
 # Rays tell whether a place is free up to this distance: a car holds about ten of them there by a LiDAR of 64 lines.

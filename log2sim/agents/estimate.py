@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
-from log2sim.agents.smooth.motion_model import limit_doubts
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
 from log2sim.agents.static import static_candidates
 from log2sim.config import Config
@@ -91,7 +90,7 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
         "ego", "car", vehicle.size_m, waypoints, static=moved < STANDSTILL_DRIFT_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
-        doubts=limit_doubts(path.broken), quality={"source": source},
+        doubts=path.broken, quality={"source": source},
     )  # fmt: skip
 
 

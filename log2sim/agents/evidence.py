@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Support, Timeline
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Doubt, Log, Measurements, Obstacles, Rays
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Finding, Log, Measurements, Obstacles, Rays
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, cross_slab, inverse, project
 from log2sim.perception.boxes import rotate
 from log2sim.perception.sync import Schedule
@@ -48,7 +48,7 @@ class Recording:
 SAME_M = 0.005
 
 
-def doubt_size(agent: Agent) -> list[Doubt]:
+def doubt_size(agent: Agent) -> list[Finding]:
     """Doubt a vehicle that is wider than any on the road, by more than the error of an observed side, or as long as sizes go.
 
     Sizes are limited to those of the category: a vehicle at the greatest length was observed to be longer.
@@ -57,10 +57,10 @@ def doubt_size(agent: Agent) -> list[Doubt]:
     if GROUP_OF[agent.category] != "vehicle":
         return []
     if width_m > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M:
-        return [Doubt("unlikely_size", f"is {width_m:.1f} m wide, road vehicles have at most {MAX_ROAD_WIDTH_M:.1f} m")]
+        return [Finding("unlikely_size", case="width", values={"width_m": width_m, "limit_m": MAX_ROAD_WIDTH_M})]
     longest_m = MAX_SIZE_M[agent.category][0]
     if length_m >= longest_m - SAME_M:
-        return [Doubt("unlikely_size", f"is longer than the {longest_m:.1f} m of the longest {agent.category}")]
+        return [Finding("unlikely_size", case="length", values={"limit_m": longest_m}, other=agent.category)]
     return []
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.moving import course_log_odds, heading_log_odds, motion_doubts
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
-from log2sim.datatypes import GROUP_OF, Doubt, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, Finding, Track, Waypoints
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.boxes import rotate, subsample, top_of
@@ -548,7 +548,5 @@ def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:
         w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=0.0 - w.speed_mps)  # never -0.0
         agent = replace(agent, waypoints=w)
     agent = replace(agent, quality={**agent.quality, "heading_confidence": round(confidence, 3)})
-    doubts = (
-        [Doubt("heading_ambiguous", "front and back may be swapped")] if confidence < MIN_HEADING_CONFIDENCE else []
-    )
+    doubts = [Finding("heading_ambiguous")] if confidence < MIN_HEADING_CONFIDENCE else []
     return replace(candidate, agent=agent).doubted(doubts)

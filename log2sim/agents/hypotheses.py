@@ -141,8 +141,6 @@ PLACE_GATE = CHI2_2DOF_99 * 2 * (1 - REPEATED_SHARE)
 NEXT_OBJECT_LOG, CHANGE_LOG = float(np.log(0.02)), float(np.log(0.1))
 # One object stays what it is unless several are e^3 = 20 times as likely.
 MIN_LOG_ODDS = 3.0
-# A camera that moves less than this stands.
-SAME_VIEW_M = 0.1
 # A track is split where that is best out of so many times.
 MAX_SPLITS = 24
 
@@ -169,20 +167,21 @@ def explain_track(track: Track) -> list[Part]:
 
     Notes
     -----
-    Compared are one object that moves as its kind does, several standing objects of which each measurement shows one, and two
-    objects of which the second is seen after the first.
+    Compared are one object that moves as its kind does, one that stands, standing objects of which each measurement shows one or
+    none, and two objects of which the second is seen after the first.
     """
     if len(track) < MIN_ROWS:
         return [Part(track, static=GROUP_OF[track.category] == "vehicle")]
     positions, rows = _positions(track)
     moving, at_rest = (marginal_likelihood(positions, motion) for motion in (_expected_motion(track), STANDING))
+    log, parts = _standing_parts(track, positions)
     drives, starts = motion_of_ends(track)
     # The center of a long vehicle wanders while more of it comes into view; its ends do not.
-    if at_rest.log >= moving.log or drives < -MIN_LOG_ODDS:
+    is_at_rest = at_rest.log >= moving.log or drives < -MIN_LOG_ODDS
+    if is_at_rest and log <= at_rest.log + MIN_LOG_ODDS:
         return [Part(track, static=starts + STARTS_LOG <= MIN_LOG_ODDS)]
     if len(track) == MIN_ROWS:
         return [Part(track, static=False)]
-    log, parts = _standing_parts(track, positions)
     if parts and log > moving.log:
         return [replace(p, static=motion_of_ends(p.track)[1] + STARTS_LOG <= MIN_LOG_ODDS) for p in parts]
     if not moving.inlier.all():
@@ -225,24 +224,18 @@ def _positions_of(track: Track, rows: NDArray[np.intp]) -> Positions:
     m = track.measurements
     t = (m.t_ns[rows] - m.t_ns[0]) / NS_PER_S
     axes = _axes(track)
-    if axes is None:
-        axes, variance = np.eye(2), (np.trace(m.covariance[rows], axis1=1, axis2=2) / 2)[:, None].repeat(2, axis=1)
-    else:
-        variance = np.einsum("ia,nij,ja->na", axes, m.covariance[rows], axes)
+    variance = np.einsum("ia,nij,ja->na", axes, m.covariance[rows], axes)
     # Frames that share a sweep measure the same points at the same time.
     t = t + 1e-4 * np.arange(len(t))
     return Positions(t, m.center_m[rows, :2] @ axes, variance + CENTER_SIGMA_M[GROUP_OF[track.category]] ** 2)
 
 
-def _axes(track: Track) -> Array | None:
-    """Return the axes (2, 2), in columns, of the errors of a camera that stands: small across its rays, large along them.
-
-    None if the sensor moves, and its rays turn, or is a LiDAR.
-    """
+def _axes(track: Track) -> Array:
+    """Return the axes (2, 2), in columns, along and across the mean ray from the sensors to a track: errors differ along them."""
     m = track.measurements
-    if np.any(m.source == "lidar") or np.ptp(m.sensor_m, axis=0).max() > SAME_VIEW_M:
-        return None
-    return np.linalg.eigh(m.covariance.mean(axis=0))[1].astype(np.float64)
+    along, across = np.median(m.center_m[:, :2] - m.sensor_m[:, :2], axis=0)
+    yaw = np.arctan2(across, along)
+    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
 
 
 def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
@@ -251,15 +244,17 @@ def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
     if len(places) == 0:
         return -np.inf, []
     axis = track.measurements.yaw_rad[np.isfinite(track.measurements.yaw_rad)]
-    axes = _axes(track)
-    in_map = places if axes is None else places @ axes.T
-    objects = _objects_at(in_map, float(np.median(axis)) if len(axis) else 0.0, MIN_SIZE_M[track.category][:2])
-    label, count = _labels(few, places, objects), int(objects.max()) + 1
+    yaw = float(np.median(axis)) if len(axis) else 0.0
+    # From the axes of the errors to shares of half the length and half the width of the smallest object of its kind.
+    body = _axes(track).T @ np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    body = body / (np.array(MIN_SIZE_M[track.category][:2]) / 2)
+    objects = _objects_at(places @ body)
+    label, count = _labels(few, places, objects, body), int(objects.max()) + 1
     seen = label[label >= 0]
     log = OUTLIER_LOG * int((label < 0).sum()) + NEXT_OBJECT_LOG * (count - 1)
     log += CHANGE_LOG * int((np.diff(seen) != 0).sum())
     log += sum(marginal_likelihood(few.take(label == k), STANDING).log for k in range(count) if (label == k).any())
-    return log, _parts_of(track, _labels(_positions_of(track, np.arange(len(track))), places, objects))
+    return log, _parts_of(track, _labels(_positions_of(track, np.arange(len(track))), places, objects, body))
 
 
 def _parts_of(track: Track, label: NDArray[np.intp]) -> list[Part]:
@@ -297,23 +292,28 @@ def _places(p: Positions) -> Array:
     return np.array(places).reshape(-1, 2)
 
 
-def _objects_at(places: Array, axis_rad: float, size_m: tuple[float, ...]) -> NDArray[np.intp]:
-    """Return the index (K,) of the object at each place: places nearer than a length and a width are those of one."""
-    c, s = np.cos(axis_rad), np.sin(axis_rad)
+def _objects_at(places: Array) -> NDArray[np.intp]:
+    """Return the index (K,) of the object at each place: places nearer than a length and a width, 2 each, are those of one."""
     index = np.arange(len(places))
     for k in range(1, len(places)):
-        offsets = (places[:k] - places[k]) @ np.array([[c, -s], [s, c]])
-        shared = np.flatnonzero(np.all(np.abs(offsets) < np.array(size_m), axis=1))
+        shared = np.flatnonzero(np.all(np.abs(places[:k] - places[k]) < 2, axis=1))
         if len(shared):
             index[k] = index[shared[0]]
     return np.unique(index, return_inverse=True)[1]
 
 
-def _labels(p: Positions, places: Array, objects: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the index (n,) of the object at whose place each position is, -1 for none."""
-    squared = ((p.xy_m[:, None] - places[None]) ** 2 / p.variance[:, None]).sum(axis=2)
-    nearest = np.argmin(squared, axis=1)
-    return np.where(squared[np.arange(len(p)), nearest] < PLACE_GATE, objects[nearest], -1)
+def _labels(p: Positions, places: Array, objects: NDArray[np.intp], body: Array | None = None) -> NDArray[np.intp]:
+    """Return the index (n,) of the object at whose place each position is, -1 for none.
+
+    In its `body` are the centers of what shows while the rest of it is hidden.
+    """
+    offset = p.xy_m[:, None] - places[None]
+    squared = (offset**2 / p.variance[:, None]).sum(axis=2)
+    at_place = squared < PLACE_GATE
+    if body is not None:
+        at_place |= np.all(np.abs(offset @ body) < 1, axis=2)
+    nearest = np.argmin(np.where(at_place, squared, np.inf), axis=1)
+    return np.where(at_place.any(axis=1), objects[nearest], -1)
 
 
 def _best_cut(p: Positions, whole: MarginalLikelihood, motion: MotionPriorSigmas) -> int | None:

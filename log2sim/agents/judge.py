@@ -11,7 +11,7 @@ from log2sim.agents.candidate import AgentCandidate, Support, confirm, name_agen
 from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
 from log2sim.agents.evidence import Recording, doubt_size, weigh
 from log2sim.agents.size import independent
-from log2sim.datatypes import GROUP_OF, Agent, AgentTable, Doubt
+from log2sim.datatypes import GROUP_OF, Agent, AgentTable, Finding
 from log2sim.geometry import overlap_of_smaller
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
@@ -108,27 +108,22 @@ def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
     return missing_nats(s, usual_rate) + beside > REFUTED_NATS
 
 
-def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Doubt]:
+def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Finding]:
     """Doubt a candidate through which rays pass, that has no points, or that is seldom detected where it is well seen."""
     s, doubts = candidate.support, []
     if s is None:
         return []
     if _through_more_than(MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS), s):
-        doubts.append(Doubt("empty", f"{s.through_share:.0%} of the LiDAR's rays pass through its place"))
+        doubts.append(Finding("empty", values={"through_share": s.through_share or 0.0}))
     if s.pointless:
-        doubts.append(Doubt("hardly_observed", "the LiDAR looks toward it and has no point of it"))
+        doubts.append(Finding("hardly_observed", case="no_points"))
     if missing_nats(s, usual_rate) > 0:
-        doubts.append(
-            Doubt("hardly_observed", f"is detected at {s.detected_ticks} of {s.shown_ticks} ticks that show it well")
-        )
+        counts = {"detected_ticks": float(s.detected_ticks), "shown_ticks": float(s.shown_ticks)}
+        doubts.append(Finding("hardly_observed", case="any", values=counts))
     elif missing_nats(replace(s, detected_ticks=s.image_ticks), usual_rate) > REFUTED_NATS:
         # Sweeps alone show it, and images next to them hardly ever do.
-        doubts.append(
-            Doubt(
-                "hardly_observed",
-                f"is detected in images at {s.image_ticks} of {s.shown_ticks} ticks that show it well",
-            )
-        )
+        counts = {"detected_ticks": float(s.image_ticks), "shown_ticks": float(s.shown_ticks)}
+        doubts.append(Finding("hardly_observed", case="images", values=counts))
     return doubts
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ from log2sim.agents.candidate import (
 )
 from log2sim.agents.size import TrackGeometry, independent, moving_geometry
 from log2sim.agents.smooth import motion_model
-from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel, limit_doubts
+from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.agents.static import BoxState, LidarMatch, left_free, track_with_lidar
 from log2sim.config import TrackConfig
@@ -30,7 +30,7 @@ from log2sim.datatypes import (
     TYPICAL_SIZE_M,
     Boxes3D,
     BoxEvidence,
-    Doubt,
+    Finding,
     Measurements,
     Obstacles,
     Track,
@@ -164,7 +164,7 @@ MAX_WIDTH_M = 2.7
 MIN_COURSE_MPS, MAX_SLIP_RAD, MIN_ACROSS = 1.5, np.deg2rad(45.0), 3
 
 
-def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
+def motion_doubts(category: str, w: Waypoints) -> tuple[Finding, ...]:
     """Doubt what moves faster than its category does, or reverses fast or far.
 
     Parameters
@@ -174,13 +174,13 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
     """
     margin = 0.0 if w.sigma_speed_mps is None else SIGNIFICANT_SIGMAS * w.sigma_speed_mps
     fast = np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category]
-    doubts = _doubts(w, fast, "speed", lambda k: f"moves at {_most(w.speed_mps[k]):.0f} m/s {_when(w.t_s, k)}")
+    doubts = _doubts(w, fast, "speed")
     if GROUP_OF[category] in ("vehicle", "two_wheeler"):
-        doubts += _doubts(w, _reverses(w, -w.speed_mps - margin), "reversing", lambda k: _words_of_reversing(w, k))
+        doubts += _doubts(w, _reverses(w, -w.speed_mps - margin), "reversing")
     return doubts
 
 
-def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, ...]:
+def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Finding, ...]:
     """Doubt a smoothed trajectory where several measurements in a row are far from it.
 
     Parameters
@@ -196,12 +196,12 @@ def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, .
     doubts = []
     for rows in spans_of(beside) if beside.mean() >= MIN_BESIDE_SHARE else []:
         if len(rows) >= MIN_BESIDE:
-            reason = f"measured up to {residual_m[rows].max():.1f} m off its path {_when(t_s, rows)}"
-            doubts.append(Doubt("jump", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])))
+            values = {"residual_m": float(residual_m[rows].max())}
+            doubts.append(Finding("jump", start_s=float(t_s[rows[0]]), end_s=float(t_s[rows[-1]]), values=values))
     return tuple(doubts)
 
 
-def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: Array) -> tuple[Doubt, ...]:
+def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: Array) -> tuple[Finding, ...]:
     """Doubt a vehicle whose length was measured to lie across its way most of the time.
 
     Parameters
@@ -221,8 +221,7 @@ def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: A
     rows = np.flatnonzero(across)
     if len(rows) < MIN_ACROSS or len(rows) <= certain.sum() / 2:
         return ()
-    reason = f"slides across its length {_when(t_s, rows)}"
-    return (Doubt("sideways", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])),)
+    return (Finding("sideways", start_s=float(t_s[rows[0]]), end_s=float(t_s[rows[-1]])),)
 
 
 def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:
@@ -235,24 +234,14 @@ def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:
     return wrong
 
 
-def _doubts(
-    w: Waypoints, holds: NDArray[np.bool_], flag: str, words: Callable[[NDArray[np.intp]], str]
-) -> tuple[Doubt, ...]:
-    """Make a doubt of each span in which something holds (T,)."""
-    return tuple(Doubt(flag, words(k), float(w.t_s[k[0]]), float(w.t_s[k[-1]])) for k in spans_of(holds))
-
-
-def _words_of_reversing(w: Waypoints, k: NDArray[np.intp]) -> str:
-    return f"reverses at up to {_most(w.speed_mps[k]):.1f} m/s {_when(w.t_s, k)}"
-
-
-def _most(speed_mps: Array) -> float:
-    return float(np.abs(speed_mps).max())
-
-
-def _when(t_s: Array, k: NDArray[np.intp]) -> str:
-    first, last = f"{t_s[k[0]]:.1f}", f"{t_s[k[-1]]:.1f}"
-    return f"at {first} s" if first == last else f"from {first} to {last} s"
+def _doubts(w: Waypoints, holds: NDArray[np.bool_], kind: str) -> tuple[Finding, ...]:
+    """Make a finding about the speed of each span in which something holds (T,)."""
+    return tuple(
+        Finding(
+            kind, start_s=float(w.t_s[k[0]]), end_s=float(w.t_s[k[-1]]), values={"most_mps": float(np.abs(w.speed_mps[k]).max())},
+        )
+        for k in spans_of(holds)
+    )  # fmt: skip
 
 
 # Spectral density of the jerk, m2/s5, of groups for which it is not estimated.
@@ -326,7 +315,7 @@ def moving_candidate(
     z = np.interp(at, t, _running_median(geometry.z_m))
     waypoints = _waypoints(path, _headings(path, group), z, observed)
     sigma_m = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
-    doubts = limit_doubts(path.broken) + jump_doubts(positions_s, path.residual_m, sigma_m)
+    doubts = path.broken + jump_doubts(positions_s, path.residual_m, sigma_m)
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])

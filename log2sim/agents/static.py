@@ -29,7 +29,7 @@ from log2sim.perception.boxes import (
     oriented_covariance,
     rotate,
 )
-from log2sim.perception.first_pass import OBSTACLE_REACH_M
+from log2sim.perception.lidar.cloud import OBSTACLE_REACH_M
 from log2sim.tracking.forward import CENTER_SIGMA_M
 
 MIN_POINTS = 8

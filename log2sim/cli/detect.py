@@ -55,7 +55,7 @@ def detect(
     log2sim detect kitti_object/ --detector lidar:MODEL.onnx -o boxes.json
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.reconstruct import pose_notes
+    from log2sim.cli.reconstruct import pose_lines
     from log2sim.config import Config
     from log2sim.evaluation.detection.detect_log import detect_log
     from log2sim.files.documents import check_targets
@@ -75,10 +75,8 @@ def detect(
     with progress(quiet=quiet) as report_progress:
         result = detect_log(opened, chosen, progress=partial(report_progress, "detect"))
     result.found.save(out)
-    for line in pose_notes(result.poses.to_dict()):
+    for line in (*pose_lines(result.poses.to_dict()), *(f"note: {finding}" for finding in result.findings)):
         say(line, quiet=quiet)
-    for name, unread in result.unreadable.items():
-        say(f"note: {name}: {unread['count']} records could not be read, first: {unread['first']}", quiet=quiet)
     if result.left_out:
         say(f"note: {counted(result.left_out, 'sweep')} left out, without points or a known pose", quiet=quiet)
     boxes = sum(len(found) for found in result.found.boxes)

@@ -14,11 +14,13 @@ from log2sim.cli import (
     cache,
     config,
     convert,
+    correct,
     detect,
     doctor,
     edit,
     evaluate,
     export,
+    help,
     import_,
     inspect,
     map,
@@ -26,11 +28,12 @@ from log2sim.cli import (
     predict,
     reconstruct,
     replay,
+    studio,
     synth,
     validate,
     view,
 )
-from log2sim.cli.options import fail, say
+from log2sim.cli.options import fail, printable, say
 from log2sim.cli.shared import (
     DEBUG,
     SIGNAL_CODE,
@@ -87,9 +90,10 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, correct.correct, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
+add_command(app, help.help_, "help")
 add_command(app, import_.import_, "import")
 add_command(app, map.map_, "map")
 
@@ -126,7 +130,7 @@ def _run(ended: Ended) -> NoReturn:
                 raise
             fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
         if not arguments:
-            sys.stderr.write(format_message() + "\n")
+            sys.stderr.write(printable(format_message()) + "\n")
             sys.exit(2)
         fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     _end(code, ended)

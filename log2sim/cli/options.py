@@ -107,16 +107,21 @@ NoCache = Annotated[
 ]
 
 
+def printable(text: str) -> str:
+    """Return a text whose control characters are escaped: names in a log must not steer the terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+
+
 def fail(message: str, code: int) -> NoReturn:
     """Print an error and exit with a code."""
-    sys.stderr.write(f"log2sim: {message}\n")
+    sys.stderr.write(f"log2sim: {printable(message)}\n")
     sys.exit(code)
 
 
 def say(text: str, *, quiet: bool = False) -> None:
     """Print a line for the user."""
     if not quiet:
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(printable(text) + "\n")
         sys.stdout.flush()
 
 

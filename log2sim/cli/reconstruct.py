@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -80,12 +80,6 @@ def known_ticks(report: dict[str, Any]) -> list[str]:
     return [f"{counted(found, 'tick')} known from earlier runs"] if found else []
 
 
-def cache_notes(report: dict[str, Any]) -> list[str]:
-    """Say why the first pass was not kept, where it should have been."""
-    cache = report["detection_cache"]
-    return [f"the first pass is not kept for later runs: {cache['problem']}"] if cache and cache["problem"] else []
-
-
 def described(scenario: Scenario) -> list[str]:
     """Count what was found beside the agents; nothing of what was not found or not looked for."""
     features = scenario.map_features
@@ -136,32 +130,10 @@ def look_line(log: Path, sequence: str | None, out: Path) -> str:
     return shlex.join(["log2sim", "view", str(out), "--log", str(log), *chosen, "-o", page])
 
 
-def pose_notes(poses: dict[str, Any]) -> list[str]:
-    """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
-    if poses["source"] == "none":
-        return []
-    chosen = (
-        [] if poses["source"] == poses["requested"] == "given" else [f"poses: {poses['source']} ({poses['reason']})"]
-    )
-    return [*chosen, *(f"note: {note}" for note in poses["notes"])]
-
-
-def fault_lines(faults: Sequence[dict[str, Any]]) -> list[str]:
-    """Say what is wrong with the sensors and poses of a log, a line for each fault."""
-    return [f"note: {fault['sensor']}: {fault['message']}" for fault in faults]
-
-
-def unused_records(report: dict[str, Any]) -> list[str]:
-    """List what a run could not use of a log, a line for each stream."""
-    unreadable = report["unreadable"].items()
-    without_pose = report["without_pose"].items()
-    return [
-        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unreadable),
-        *(
-            f"{name}: {count} frames skipped, since no ego pose is known at their stamps"
-            for name, count in without_pose
-        ),
-    ]
+def pose_lines(poses: dict[str, Any]) -> list[str]:
+    """Say which poses were used and why; nothing of the log's own where no others were asked for."""
+    own = poses["source"] == "none" or poses["source"] == poses["requested"] == "given"
+    return [] if own else [f"poses: {poses['source']} ({poses['reason']})"]
 
 
 def reconstruct(
@@ -219,6 +191,10 @@ def reconstruct(
             help="What of the vehicle's and the road's LiDARs is joined.",
         ),
     ] = None,
+    corrections: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Corrections by hand to apply to the result, see log2sim correct."),
+    ] = None,
     config: ConfigFile = None,
     settings: Settings = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.", show_default="0")] = None,
@@ -269,14 +245,17 @@ def reconstruct(
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
         from log2sim.config import Config
+        from log2sim.edit.corrections import correct, load_corrections
         from log2sim.errors import ConfigError, MissingExtra
         from log2sim.logs.opening import open_log
         from log2sim.perception.detect3d.detectors import describe_weakness
         from log2sim.perception.run_detectors import check_detectors
         from log2sim.pipeline import reconstruct as run
         from log2sim.plan import IMAGE_DETECTOR, choose_detector
+        from log2sim.report import unused_records
 
         chosen = Config.load(config, settings or (), **changes)
+        by_hand = None if corrections is None else load_corrections(corrections)
         check_detectors(chosen)
         opened = open_log(log, format=format, sequence=sequence)
     if topdown is not None and not opened.cameras:
@@ -290,16 +269,20 @@ def reconstruct(
         say(f"note: {weakness}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs)
-    for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):
-        say(line, quiet=quiet)
+    if by_hand is not None:
+        corrected = correct(result.scenario, by_hand)
+        result = replace(result, scenario=corrected.scenario)
+        for line in corrected.lost:
+            say(f"warning: {line}", quiet=quiet)
     with together():
         if topdown is not None:
             _write_topdown(result, topdown, overwrite=overwrite)
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
-    for note in (*unused_records(result.report), *cache_notes(result.report)):
-        say(f"note: {note}", quiet=quiet)
+    findings = (*result.findings, *unused_records(result.report))
+    for line in (*pose_lines(result.report["poses"]), *(f"note: {finding}" for finding in findings)):
+        say(line, quiet=quiet)
     say_written(report, topdown, quiet=quiet)
     for line in summarize(result, look_line(log, sequence, out), out, verbose=verbose):
         say(line, quiet=quiet)

@@ -210,9 +210,11 @@ def add_command(app: typer.Typer, command: Callable[..., None], name: str | None
     default: that of the function.
     """
     text, _, examples = (inspect.getdoc(command) or "").partition("\nExamples\n--------\n")
-    app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=format_examples(examples))(
-        with_shared_options(command)
-    )
+    # With defaults of its own, since those of the program for its option `--help` are not those of a command `help`.
+    settings: dict[str, Any] | None = {"default_map": {}} if name == "help" else None
+    help_text, epilog = text.strip(), format_examples(examples)
+    add = app.command(name=name, cls=CommandWithPlugins, help=help_text, epilog=epilog, context_settings=settings)
+    add(with_shared_options(command))
 
 
 def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:

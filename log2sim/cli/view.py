@@ -89,10 +89,10 @@ def view(
             from log2sim.visualization.recording import DEFAULT_MAX_BYTES
 
             max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
-            layers["recorded"] = _recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
+            layers["recorded"] = open_recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
         if background is not None:
             layers["background"] = load_background(background, loaded, sequence, report_progress)
-        elif log is not None and _shows_ground(opened := layers["recorded"].log):
+        elif log is not None and shows_ground(opened := layers["recorded"].log):
             layers["background"] = map_of(opened, loaded, report_progress)
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:
@@ -100,7 +100,7 @@ def view(
     say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {say_agents(a.id for a in loaded.agents)}", quiet=quiet)
 
 
-def _recorded(
+def open_recorded(
     path: Path,
     scenario: Scenario,
     sequence: str | None,
@@ -118,7 +118,7 @@ def _recorded(
     return Recorded(log, max_bytes, cameras, progress)
 
 
-def _shows_ground(log: Log) -> bool:
+def shows_ground(log: Log) -> bool:
     """Whether a log has a camera whose place is known, so that its ground can be mapped."""
     return any(camera.mount == "map" or log.ego is not None for camera in log.cameras.values())
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from log2sim.datatypes.agent import (
     COLOR_NAMES,
-    FLAGS,
     MARGIN_S,
     MIN_TRUSTED_CONFIDENCE,
     STANDSTILL_DRIFT_M,
     STANDSTILL_MPS,
     Agent,
-    Doubt,
     Trajectory,
     Waypoints,
     list_doubtful,
@@ -39,7 +37,7 @@ from log2sim.datatypes.detections import (
     Rays,
     Track,
 )
-from log2sim.datatypes.faults import FAULT_KINDS, Fault, Treatment
+from log2sim.datatypes.findings import KINDS, Finding, Treatment
 from log2sim.datatypes.log import (
     ENDS,
     ROAD,
@@ -82,10 +80,9 @@ __all__ = [
     "COLOR_NAMES",
     "EGO",
     "ENDS",
-    "FAULT_KINDS",
-    "FLAGS",
     "GROUPS",
     "GROUP_OF",
+    "KINDS",
     "LANE_LINE_KINDS",
     "LANE_ORIGINS",
     "MARGIN_S",
@@ -108,9 +105,8 @@ __all__ = [
     "Boxes3D",
     "Deferred",
     "Detections",
-    "Doubt",
     "EgoVehicle",
-    "Fault",
+    "Finding",
     "Frame",
     "IgnoreRegions",
     "ImageLabels",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.categories import CATEGORIES
+from log2sim.datatypes.findings import Finding
 from log2sim.datatypes.log import Span
 from log2sim.errors import ScenarioError
 from log2sim.files.documents import short_repr
@@ -260,65 +261,6 @@ def hermite_slope(value: Array, slope: Array, i: NDArray[np.intp], t: Array, spa
 MIN_TRUSTED_CONFIDENCE = 0.5
 """Agents below it are doubtful: by their confidence they are more likely wrong than right."""
 
-FLAGS = {
-    "acceleration": "accelerates or brakes harder than vehicles can",
-    "lateral_acceleration": "accelerates sideways harder than tires hold",
-    "curvature": "turns on a smaller circle than vehicles can",
-    "jerk": "changes its acceleration faster than brakes can",
-    "speed": "is faster than anything of its category",
-    "reversing": "drives backward fast or far",
-    "sideways": "slides across its length",
-    "jump": "its measurements are far from its trajectory",
-    "passes_through": "is in the place of another agent",
-    "in_ego": "touches the ego",
-    "empty": "LiDAR rays pass through its place",
-    "hardly_observed": "the LiDAR or the cameras look toward it and hardly ever show it",
-    "unlikely_size": "has a size that no road vehicle has",
-    "heading_ambiguous": "front and back may be swapped",
-}
-"""The flags that a reconstruction gives, and what each means."""
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """One reason to doubt an agent.
-
-    Attributes
-    ----------
-    flag : str
-        Short name of the reason; those of a reconstruction are in `FLAGS`.
-    reason : str
-        In words for people, such as "passes through car-22 at 1.2 s".
-    start_s, end_s : float or None, s
-        When it holds; None for the whole life of the agent.
-    """
-
-    flag: str
-    reason: str
-    start_s: float | None = None
-    end_s: float | None = None
-
-    def holds(self, t_s: Array) -> NDArray[np.bool_]:
-        """Return whether it holds at times (T,)."""
-        start = -np.inf if self.start_s is None else self.start_s
-        end = np.inf if self.end_s is None else self.end_s
-        return np.asarray((t_s >= start) & (t_s <= end))
-
-    def retimed(self, change: Callable[[float], float]) -> Doubt:
-        """Return the doubt of a trajectory whose times are put elsewhere by `change`, s to s."""
-        start_s, end_s = (None if t_s is None else change(t_s) for t_s in (self.start_s, self.end_s))
-        return replace(self, start_s=start_s, end_s=end_s)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {"flag": self.flag, "reason": self.reason, "start_s": self.start_s, "end_s": self.end_s}
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Doubt:
-        """Read an entry that keeps the schema."""
-        return cls(entry["flag"], entry["reason"], entry.get("start_s"), entry.get("end_s"))
-
-
 COLOR_NAMES = ("black", "white", "gray", "silver", "red", "blue", "green", "yellow", "brown", "orange")
 """Names that reconstructed colors of vehicles have."""
 
@@ -372,7 +314,7 @@ class Agent:
         Whether it is too likely wrong to be replayed or exported unless that is asked for, see `Scenario.active`.
     quality : mapping
         Figures of the reconstruction, such as the number of detections.
-    doubts : tuple of Doubt
+    doubts : tuple of Finding
         What speaks against it.
     observed_by : mapping of str to tuple of Span
         Times of the scenario, s, between which each of the `ENDS` measured it; empty for truth and the ego.
@@ -387,7 +329,7 @@ class Agent:
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0
     quality: Mapping[str, Any] = field(default_factory=dict)
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[Finding, ...] = ()
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
     quarantined: bool = False
 
@@ -396,7 +338,7 @@ class Agent:
         size, t = " x ".join(f"{edge_m:.1f}" for edge_m in self.size_m), self.waypoints.t_s
         times = f"{t[0]:.1f} to {t[-1]:.1f} s" if len(t) > 1 else "the whole time" if self.static else "once"
         notes = [f"confidence {self.confidence:.2f}", *(["static"] if self.static else [])]
-        notes += [doubt.flag for doubt in self.doubts]
+        notes += [doubt.kind for doubt in self.doubts]
         return f"<Agent {self.id!r:.80}: {self.category}, {size} m, {times}, {', '.join(notes)}>"
 
     @property
@@ -502,12 +444,16 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     )
 
 
-def _doubts_of(entry: Mapping[str, Any]) -> tuple[Doubt, ...]:
+def _doubts_of(entry: Mapping[str, Any]) -> tuple[Finding, ...]:
     """Read the doubts of an agent; before there were any, `quality` named the limits that its motion breaks."""
     if "doubts" in entry:
-        return tuple(Doubt.from_dict(doubt) for doubt in entry["doubts"])
+        return tuple(Finding.from_dict(doubt) for doubt in entry["doubts"])
     flags = entry["quality"].get("flags")
-    return tuple(Doubt(str(flag), f"breaks the limit of {flag}") for flag in flags) if isinstance(flags, list) else ()
+    return (
+        tuple(Finding(str(flag), text=f"breaks the limit of {flag}") for flag in flags)
+        if isinstance(flags, list)
+        else ()
+    )
 
 
 MAX_LISTED = 5
@@ -516,7 +462,7 @@ MAX_LISTED = 5
 def why_doubtful(agent: Agent) -> str:
     """Say why an agent is doubtful: the reasons of its doubts, else its low confidence; empty when it is not doubtful."""
     if agent.doubts:
-        return ", ".join(doubt.reason for doubt in agent.doubts)
+        return ", ".join(doubt.sentence for doubt in agent.doubts)
     return say_confidence(agent) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ""
 
 

@@ -214,7 +214,7 @@ def write_parquet(agents: Sequence[Agent], about: Mapping[str, Any], path: Path)
 def _columns_of(agent: Agent) -> dict[str, NDArray[Any]]:
     w, rows = agent.waypoints, len(agent.waypoints)
     length, width, height = agent.size_m
-    doubts = ",".join(dict.fromkeys(doubt.flag for doubt in agent.doubts))
+    doubts = ",".join(dict.fromkeys(doubt.kind for doubt in agent.doubts))
     same: dict[str, Any] = {
         "agent": agent.id, "category": agent.category, "length_m": length, "width_m": width, "height_m": height,
         "static": agent.static, "confidence": agent.confidence, "doubts": doubts, "sigma_yaw_rad": np.nan,

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Doubt, Span, Waypoints, retime_spans
+from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Finding, Span, Waypoints, retime_spans
 from log2sim.edit.motion import (
     STEP_S,
     along_path,
@@ -123,7 +123,7 @@ class _WaypointEdit(_AgentEdit):
         moved = replace(agent, waypoints=waypoints, doubts=self.doubts(agent), observed_by=self.observed_by(agent))
         return {**agents, self.agent: moved}
 
-    def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
+    def doubts(self, agent: Agent) -> tuple[Finding, ...]:
         """Return the doubts of the agent after the edit: the same ones, unless it moves in time."""
         return agent.doubts
 
@@ -181,7 +181,7 @@ class Speed(_WaypointEdit):
             return sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[0]
         return sped_up(agent.waypoints, self.factor)
 
-    def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
+    def doubts(self, agent: Agent) -> tuple[Finding, ...]:
         """Return the doubts at scaled times."""
         return retimed_doubts(agent.doubts, self._retime(agent))
 
@@ -366,7 +366,7 @@ class Shift(_WaypointEdit):
             )
         return w
 
-    def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
+    def doubts(self, agent: Agent) -> tuple[Finding, ...]:
         """Return the doubts at shifted times."""
         return doubts_shifted(agent, self.seconds)
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Doubt, Waypoints
+from log2sim.datatypes import Agent, Finding, Waypoints
 from log2sim.geometry import Array, wrap_angle
 
 MIN_PATH_MPS = 0.5  # slower waypoints do not define the curvature of a path
@@ -39,19 +39,19 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
     return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.items()})
 
 
-def doubts_shifted(agent: Agent, seconds: float) -> tuple[Doubt, ...]:
+def doubts_shifted(agent: Agent, seconds: float) -> tuple[Finding, ...]:
     """Return the doubts of an agent that comes `seconds` later; none that held only before the scenario's start t = 0."""
     moved = retimed_doubts(agent.doubts, lambda t_s: t_s + seconds)
     cut = (replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0)) for d in moved)
     return tuple(d for d in cut if d.end_s is None or d.end_s >= 0.0)
 
 
-def retimed_doubts(doubts: Sequence[Doubt], change: Callable[[float], float]) -> tuple[Doubt, ...]:
-    """Move the spans of doubts; a reason that names a time, which stays that of the source, says so."""
+def retimed_doubts(doubts: Sequence[Finding], change: Callable[[float], float]) -> tuple[Finding, ...]:
+    """Move the spans of doubts; a sentence of a file that names a time, which stays that of the source, says so."""
     moved = (doubt.retimed(change) for doubt in doubts)
     return tuple(
-        replace(d, reason=f"{d.reason}, {OLD_TIME}")
-        if _NAMES_A_TIME.search(d.reason) and OLD_TIME not in d.reason
+        replace(d, text=f"{d.text}, {OLD_TIME}")
+        if d.text is not None and _NAMES_A_TIME.search(d.text) and OLD_TIME not in d.text
         else d
         for d in moved
     )

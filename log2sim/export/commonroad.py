@@ -117,7 +117,7 @@ class CommonRoad:
 
 def _trust(agent: Agent) -> tuple[float, str]:
     """Return the confidence of an agent and the reasons to doubt it."""
-    return agent.confidence, ", ".join(doubt.reason for doubt in agent.doubts)
+    return agent.confidence, ", ".join(doubt.sentence for doubt in agent.doubts)
 
 
 def _camel_case(text: str) -> str:

@@ -66,7 +66,7 @@ def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:
 def _doubts(agent: Agent) -> list[str]:
     """List the flags of the doubts at each waypoint, separated by blanks."""
     holds = [doubt.holds(agent.waypoints.t_s) for doubt in agent.doubts]
-    flags = [doubt.flag for doubt in agent.doubts]
+    flags = [doubt.kind for doubt in agent.doubts]
     return [" ".join(flag for flag, held in zip(flags, holds) if held[k]) for k in range(len(agent.waypoints))]
 
 

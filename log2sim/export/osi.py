@@ -238,7 +238,7 @@ def _place(osi: Any, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any
 
 def _identity(osi: Any, number: int, agent: Agent) -> dict[str, Any]:
     reference = osi.ExternalReference(
-        type=SOURCE, identifier=[agent.id, agent.category, *(d.reason for d in agent.doubts)]
+        type=SOURCE, identifier=[agent.id, agent.category, *(d.sentence for d in agent.doubts)]
     )
     identity: dict[str, Any] = {"id": osi.Identifier(value=number), "source_reference": [reference]}
     if agent.color is not None:

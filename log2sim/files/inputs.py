@@ -15,6 +15,8 @@ from log2sim.errors import LogError
 
 # Of a file that grew since its size was asked for.
 CHUNK_BYTES = 1024 * 1024
+# Of one name in ext4, XFS, Btrfs, NTFS and APFS.
+MAX_NAME_BYTES = 255
 _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a named pipe"),
@@ -155,6 +157,10 @@ def inside(root: Path, relative: str, what: str) -> Path:
 
     Raises `LogError` for a path outside the log's folder, also through a symbolic link unless links are followed.
     """
+    if len(os.fsencode(Path(relative).name)) > MAX_NAME_BYTES:
+        raise LogError(
+            f"{what}: the file name '{relative[:20]}...' is longer than the {MAX_NAME_BYTES} bytes of file systems"
+        )
     try:
         resolved = (root / relative).resolve()
     except (OSError, RuntimeError, ValueError) as problem:  # a loop of symbolic links, a zero byte

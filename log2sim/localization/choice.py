@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log
+from log2sim.datatypes import Finding, Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import rounded
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index, period_of
 from log2sim.localization.camera_motion import CameraPath, follow_camera, motion_camera
-from log2sim.localization.given_poses import check_poses, list_faults
+from log2sim.localization.given_poses import Stretch, check_poses
 from log2sim.localization.odometry import (
     Odometry,
     densest_lidar,
@@ -53,10 +53,10 @@ class PoseChoice:
     scatter_m: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     # Figures of the odometry, JSON values; empty where none was run
     estimate: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()  # what is doubtful about estimated poses
+    findings: tuple[Finding, ...] = ()  # what is doubtful about estimated poses
     # (int, int): first and last stamp of what poses were estimated from; None for the whole log
     during_ns: tuple[int, int] | None = None
-    faults: tuple[Fault, ...] = ()  # faults of given poses
+    stretches: tuple[Stretch, ...] = ()  # in which given poses were repaired or are not known
     checked: bool = True  # whether given poses were checked, and repaired where that was needed
     # Poses by which the ground is drawn, where given ones drift by less than agents are misplaced anyway
     for_map: PoseTrack | None = None
@@ -75,7 +75,7 @@ class PoseChoice:
             "scatter_m": {name: dict(values) for name, values in self.scatter_m.items()},
             "excess_m": dict(self.excess_m),
             "estimate": dict(self.estimate),
-            "notes": list(self.notes),
+            "notes": [finding.sentence for finding in self.findings],
         }
 
     def to_provenance(self) -> dict[str, Any]:
@@ -190,7 +190,6 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     checked = bridge_by_lidar(
         request.log, check_poses(given), lambda done, total: request.progress("odometry", done, total)
     )
-    faults = list_faults(request.log, checked.stretches, request.during_ns)
     if checked.track is given:
         mended = request.log
     elif checked.moved:
@@ -199,10 +198,10 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     else:
         mended = request.log.changed(ego=checked.track)
     log, choice = _choose(replace(request, log=mended))
-    return log, replace(choice, faults=faults) if faults else choice
+    return log, replace(choice, stretches=checked.stretches) if checked.stretches else choice
 
 
-def refine_for_map(log: Log, choice: PoseChoice, faults: Sequence[Fault] = ()) -> PoseChoice:
+def refine_for_map(log: Log, choice: PoseChoice, faults: Sequence[Finding] = ()) -> PoseChoice:
     """Return a choice with the poses by which sweeps lie on each other, where those of the log can be refined.
 
     The ground is drawn by them. Agents keep the given poses: by refined ones their positions were nearer to the labels on a KITTI
@@ -244,11 +243,9 @@ def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
     )  # fmt: skip
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.start_T_ego, _max_gap_s(found.t_ns)))
     estimate = {**camera_figures(found), **_difference(track, log.ego), "frame": frame}
-    notes = ["camera motion is planar, and some percent of its path may be wrong"]
-    if found.predicted.any():
-        notes.append(f"camera motion: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
+    findings = (Finding("planar_motion", "ego"), *_predicted("camera motion", found.predicted))
     reason = "as requested" if request.requested == "camera" else "the log has no poses and no LiDAR on the ego"
-    return replace_poses(log, track), request.answer("camera", reason, estimate=estimate, notes=tuple(notes))
+    return replace_poses(log, track), request.answer("camera", reason, estimate=estimate, findings=findings)
 
 
 def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
@@ -290,7 +287,7 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
             "sweeps show too little that holds it, as in a tunnel or on an empty road; give poses"
         )
     reason = "as requested" if requested == "lidar" else "the log has no poses"
-    return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, notes=_doubts(log, found))
+    return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, findings=_doubts(log, found))
 
 
 def _better_of(
@@ -301,7 +298,7 @@ def _better_of(
     verdict = compare_with_given(log, found, track)
     choice = request.answer(
         "given" if verdict.keep else "lidar", verdict.reason, excess_m=verdict.excess_m, scatter_m=verdict.scatter_m,
-        estimate=estimate, notes=_doubts(log, found),
+        estimate=estimate, findings=_doubts(log, found),
     )  # fmt: skip
     return (log if verdict.keep else replace_poses(log, track)), choice
 
@@ -359,17 +356,20 @@ def _difference(track: PoseTrack, given: PoseTrack | None) -> dict[str, Any]:
     return {"given_difference_rms_m": rounded(float(np.sqrt(np.mean(np.sum(off[:, :3, 3] ** 2, axis=1)))), 4)}
 
 
-def _doubts(log: Log, found: Odometry) -> tuple[str, ...]:
+def _doubts(log: Log, found: Odometry) -> tuple[Finding, ...]:
     """List what is doubtful about the poses of an odometry that replace those of a log."""
-    notes = []
-    if log.ego is not None and "map" in _mounts(log):
-        notes.append("sensors fixed in the map stay there, labels move with the ego: they may not fit to each other")
+    findings = [Finding("moved_ego", "ego")] if log.ego is not None and "map" in _mounts(log) else []
     if found.degenerate.any():
-        count = f"{int(found.degenerate.sum())} of {len(found.t_ns)}"
-        notes.append(f"LiDAR odometry: {count} sweeps show too little that holds one direction of motion")
-    if found.predicted.any():
-        notes.append(f"LiDAR odometry: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
+        counts = {"count": float(found.degenerate.sum()), "total": float(len(found.t_ns))}
+        findings.append(Finding("degenerate_sweeps", "ego", values=counts))
+    findings += _predicted("LiDAR odometry", found.predicted)
     if found.problems:
         reasons = ", ".join(f"{reason} ({count})" for reason, count in found.problems.items())
-        notes.append(f"LiDAR odometry: sweeps that gave no pose: {reasons}")
-    return tuple(notes)
+        findings.append(Finding("sweeps_without_pose", "ego", other=reasons))
+    return tuple(findings)
+
+
+def _predicted(source: str, predicted: NDArray[np.bool_]) -> list[Finding]:
+    """Count the poses (N,) that were predicted where nothing was measured, if any."""
+    counts = {"count": float(predicted.sum()), "total": float(len(predicted))}
+    return [Finding("predicted_poses", "ego", values=counts, other=source)] if predicted.any() else []

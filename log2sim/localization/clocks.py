@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from log2sim.config import CalibrationConfig, Config
-from log2sim.datatypes import Fault, Log, Treatment
+from log2sim.datatypes import Finding, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
@@ -259,7 +259,6 @@ MIN_TRANSLATION_M = {X: 0.2, Y: 0.2, Z: 0.5}
 # An estimate that is no better than this does not help who asks for a correction.
 MAX_SIGMA_S, MAX_SIGMA_RAD = 0.05, np.deg2rad(1.0)
 ANGLES = {ROLL: "roll", PITCH: "pitch", YAW: "yaw"}
-TOO_FAR = {X: ("forward", "back"), Y: ("left", "right"), Z: ("up", "down")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,80 +290,43 @@ class Findings:
         value = float(self.found.values[row])
         return value if abs(value) >= max(MIN_SIGMAS * self.found.sigma[row], least) else 0.0
 
-    def faults(self) -> list[Fault]:
+    def faults(self) -> list[Finding]:
         """Describe what is wrong, and what cannot be corrected although it was asked for."""
-        faults = unseen_faults(self.lidar, self.found, self.asked)
+        faults, asked, pose_error_m = (
+            unseen_faults(self.lidar, self.found, self.asked),
+            self.asked,
+            self.found.pose_error_m,
+        )
         if self.offset_s:
-            faults.append(_offset_fault(self))
+            values = {"offset_s": -self.offset_s, "offset_sigma_s": float(self.found.sigma[OFFSET])}
+            values["pose_error_m"] = pose_error_m
+            faults.append(Finding("time_offset", self.lidar, "corrected" if asked.fix_time else "kept", values=values))
+        treatment: Treatment = "corrected" if asked.fix_mounts else "kept"
+        off, sigma = -self.found.values, self.found.sigma
         if any(self.turn_rad):
-            faults.append(_rotation_fault(self))
+            values = {f"{name}_deg": float(np.degrees(off[row])) for row, name in ANGLES.items()}
+            values |= {f"{name}_sigma_deg": float(np.degrees(sigma[row])) for row, name in ANGLES.items()}
+            course_rad, yaw_rad = course_in_ego(self.seen), self.turn_rad[2]
+            values |= {"course_deg": float(np.degrees(course_rad)), "pose_error_m": pose_error_m}
+            # Where the heading of the poses is turned rather than the mount, the ego drives askew by them.
+            askew = yaw_rad != 0 and abs(course_rad - yaw_rad) <= abs(course_rad)
+            case = "heading" if askew else "mount"
+            faults.append(Finding("lidar_rotation", self.lidar, treatment, values=values, case=case))
         if any(self.shift_m):
-            faults.append(_translation_fault(self))
+            values = {f"{name}_m": float(off[row]) for row, name in zip((X, Y, Z), "xyz")}
+            values |= {f"{name}_sigma_m": float(sigma[row]) for row, name in zip((X, Y, Z), "xyz")}
+            faults.append(Finding("lidar_translation", self.lidar, treatment, values=values))
         return faults
 
 
-def unseen_faults(lidar: str, found: Estimate | None, asked: CalibrationConfig) -> list[Fault]:
-    """Say what cannot be corrected although the settings ask for it; without an estimate, that is all of it."""
+def unseen_faults(lidar: str, found: Estimate | None, asked: CalibrationConfig) -> list[Finding]:
+    """List what cannot be corrected although the settings ask for it; without an estimate, that is all of it."""
     faults = []
     if asked.fix_time and (found is None or not found.shows_offset or found.sigma[OFFSET] > MAX_SIGMA_S):
-        message = (
-            "stamps are not corrected: the ego's motion does not show whether they are off, which takes that it speeds up, "
-            "brakes or turns"
-        )
-        faults.append(Fault("unknown_offset", lidar, message, "kept"))
+        faults.append(Finding("unknown_offset", lidar))
     if asked.fix_mounts and (found is None or found.sigma[YAW] > MAX_SIGMA_RAD):
-        message = "the mount is not corrected: the ego's motion does not show whether it is turned"
-        faults.append(Fault("unknown_rotation", lidar, message, "kept"))
+        faults.append(Finding("unknown_rotation", lidar, case="motion"))
     return faults
-
-
-def _offset_fault(of: Findings) -> Fault:
-    late_s, sigma_s = -of.offset_s, float(of.found.sigma[OFFSET])
-    words, treatment = _treated(of.asked.fix_time, "--fix-time")
-    message = (
-        f"stamps are {abs(late_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'} against the poses of the ego "
-        f"(sigma {sigma_s * 1e3:.0f} ms); {words}"
-    )
-    values = {"offset_s": late_s, "offset_sigma_s": sigma_s, "pose_error_m": of.found.pose_error_m}
-    return Fault("time_offset", of.lidar, message, treatment, values=values)
-
-
-def _rotation_fault(of: Findings) -> Fault:
-    off_deg, sigma_deg = -np.degrees(of.found.values), np.degrees(of.found.sigma)
-    figures = [
-        f"{name} {off_deg[row]:+.2f} degrees (sigma {sigma_deg[row]:.2f})"
-        for (row, name), turn in zip(ANGLES.items(), of.turn_rad)
-        if turn
-    ]
-    course_rad = course_in_ego(of.seen)
-    words, treatment = _treated(of.asked.fix_mounts, "--fix-calibration")
-    message = (
-        f"its mount in the calibration is turned by {', '.join(figures)} against the motion of the ego"
-        f"{_heading_words(of.turn_rad[2], course_rad)}; {words}"
-    )
-    values = {f"{name}_deg": float(off_deg[row]) for row, name in ANGLES.items()}
-    values |= {f"{name}_sigma_deg": float(sigma_deg[row]) for row, name in ANGLES.items()}
-    values |= {"course_deg": float(np.degrees(course_rad)), "pose_error_m": of.found.pose_error_m}
-    return Fault("lidar_rotation", of.lidar, message, treatment, values=values)
-
-
-def _translation_fault(of: Findings) -> Fault:
-    figures = [
-        f"{abs(shift):.2f} m too far {way[shift > 0]} (sigma {of.found.sigma[row]:.2f})"
-        for (row, way), shift in zip(TOO_FAR.items(), of.shift_m)
-        if shift
-    ]
-    words, treatment = _treated(of.asked.fix_mounts, "--fix-calibration")
-    message = (
-        f"its mount in the calibration, or the ego's origin, is {', '.join(figures)} by how the ego turns; {words}"
-    )
-    values = {f"{name}_m": -float(of.found.values[row]) for row, name in zip((X, Y, Z), "xyz")}
-    values |= {f"{name}_sigma_m": float(of.found.sigma[row]) for row, name in zip((X, Y, Z), "xyz")}
-    return Fault("lidar_translation", of.lidar, message, treatment, values=values)
-
-
-def _treated(corrected: bool, option: str) -> tuple[str, Treatment]:
-    return ("corrected", "corrected") if corrected else (f"not corrected, which {option} does", "kept")
 
 
 def course_in_ego(seen: SweepPairs) -> float:
@@ -378,20 +340,13 @@ def course_in_ego(seen: SweepPairs) -> float:
     return float(np.arctan(course))
 
 
-def _heading_words(yaw_rad: float, course_rad: float) -> str:
-    """Say so where it is the heading of the poses that is turned rather than the mount: the ego would drive askew by them."""
-    if yaw_rad == 0 or abs(course_rad - yaw_rad) > abs(course_rad):
-        return ""
-    return f", or the heading of the poses is, by which the ego drives {np.degrees(course_rad):+.2f} degrees off its own axis"
-
-
 Progress = Callable[[str, int, int], None]
 
 # Poses that err by more within seconds, or that belong to other sweeps, are no base for a calibration.
 MAX_POSE_ERROR_M = 0.5
 
 
-def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> tuple[Log, tuple[Fault, ...]]:
+def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> tuple[Log, tuple[Finding, ...]]:
     """Estimate time offset and mount of each LiDAR on the ego.
 
     Returns `log`: corrected where the settings ask for it; `faults`: what is certain and large enough to matter; and
@@ -402,7 +357,7 @@ def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progre
     Nothing is read where there is nothing to see: without a LiDAR on the ego, where it hardly moves, with poses that come from
     a sensor of the log itself.
     """
-    faults: list[Fault] = []
+    faults: list[Finding] = []
     if log.ego is None or config.poses.source not in ("given", "auto"):
         return log, ()
     for lidar in lidars_on_ego(sensors.restrict(log)):
@@ -411,7 +366,7 @@ def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progre
     return log, tuple(faults)
 
 
-def _check_lidar(log: Log, lidar: str, config: Config, progress: Progress) -> tuple[Log, list[Fault]]:
+def _check_lidar(log: Log, lidar: str, config: Config, progress: Progress) -> tuple[Log, list[Finding]]:
     """Return the log with one LiDAR corrected, and its faults."""
     asked, stage = config.calibration, f"check {lidar}"
     seen = pair_sweeps(log, lidar, during_ns(log, config), lambda done, total: progress(stage, done, total))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log, Treatment
+from log2sim.datatypes import Finding, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, Camera, inverse, rotation_from_rpy, transform, undistort
 from log2sim.localization.camera_motion import FollowSettings, follow_points
 from log2sim.localization.choice import during_ns
@@ -168,10 +168,8 @@ class MountCheck:
 class Mistake:
     """A mount that fits the images of a camera where its own does not."""
 
-    kind: str  # of the fault
-    words: str  # what is wrong, with a place for the LiDAR
+    fault: Finding  # whose `other` is the camera whose mount it is; "" for none
     mount_T_cam: Array  # (4, 4): what fits
-    other: str = ""  # the camera whose mount it is; "" for none
     certain: bool = True  # whether the run rather goes on without the camera
 
 
@@ -213,14 +211,12 @@ def _find_by_edges(check: MountCheck) -> dict[str, Mistake]:
 def _list_exchanged(check: MountCheck, mistakes: Mapping[str, Mistake]) -> dict[str, Mistake]:
     """List the cameras whose mount is another one's, though their own images do not show it: they get what that one had."""
     return {
-        mistake.other: Mistake(
-            "swapped_cameras",
-            f"its mount is that of {name}, whose images fit edges of {{}} with it and not with their own",
+        mistake.fault.other: Mistake(
+            Finding("swapped_cameras", mistake.fault.other, other=name, case="exchanged"),
             check.log.cameras[name].mount_T_cam,
-            name,
         )
         for name, mistake in mistakes.items()
-        if mistake.other and mistake.other not in mistakes
+        if mistake.fault.other and mistake.fault.other not in mistakes
     }
 
 
@@ -228,22 +224,15 @@ def _list_mistakes(check: MountCheck, name: str) -> list[Mistake]:
     """List the mounts that a camera may have instead of its own: those of others that do not fit them either, and likely slips."""
     cameras, own = check.log.cameras, check.log.cameras[name].mount_T_cam
     others = [other for other, yaw in check.yaws.items() if other != name and yaw is None]
-    fits = "edges of {} fit its images with"
     listed = [
-        Mistake(
-            "swapped_cameras",
-            f"sees {other}'s points: {fits} the mount of {other} and not with its own",
-            cameras[other].mount_T_cam,
-            other,
-        )
+        Mistake(Finding("swapped_cameras", name, other=other, case="edges"), cameras[other].mount_T_cam)
         for other in others
     ]
-    inverted = f"its mount in the calibration is inverted: {fits} the inverse and not as it is"
-    listed.append(Mistake("wrong_mount", inverted, inverse(own)))
+    listed.append(Mistake(Finding("wrong_mount", name, case="inverted"), inverse(own)))
     for degrees in (90, 180, 270):
         about_axis = transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(degrees)), np.zeros(3))
-        words = f"its images are turned by {degrees} degrees: {fits} its mount turned about the optical axis and not as it is"
-        listed.append(Mistake("wrong_mount", words, own @ about_axis))
+        turned = Finding("wrong_mount", name, values={"turn_deg": float(degrees)}, case="turned")
+        listed.append(Mistake(turned, own @ about_axis))
     return listed
 
 
@@ -261,11 +250,7 @@ def _find_by_flow(check: MountCheck, names: Sequence[str], during_ns: tuple[int,
         return {}
     return {
         name: Mistake(
-            "swapped_cameras",
-            f"sees {other}'s points: they move in its images as with the mount of {other} and against its own",
-            log.cameras[other].mount_T_cam,
-            other,
-            False,
+            Finding("swapped_cameras", name, other=other, case="flow"), log.cameras[other].mount_T_cam, certain=False
         )
         for name, other in find_exchanged(log.cameras, pairs).items()
     }
@@ -281,20 +266,12 @@ MIN_TOLD_RAD = 0.01
 MIN_SIGMAS = 4.0
 # Up to half of that, a camera is sound whatever more frames say.
 SOUND_RAD = MIN_TOLD_RAD / 2
-FIX = "--fix-calibration"
-DONE: Mapping[Treatment, str] = {
-    "corrected": "corrected",
-    "left_out": f"the camera is not used, unless {FIX} corrects it",
-    "kept": f"not corrected, which {FIX} does",
-}
-NOT_SEEN = "the mount is not corrected: the edges that {} sees do not show whether it is turned"
-
 Progress = Callable[[str, int, int], None]
 
 
 def check_cameras(
-    log: Log, config: Config, sensors: Sensors, *, of_lidars: tuple[Fault, ...] = (), progress: Progress
-) -> tuple[Log, tuple[Fault, ...]]:
+    log: Log, config: Config, sensors: Sensors, *, of_lidars: tuple[Finding, ...] = (), progress: Progress
+) -> tuple[Log, tuple[Finding, ...]]:
     """Return the log, corrected where the settings ask for it, and what is wrong with its cameras.
 
     `log`: with the poses and the LiDARs that the run uses. `config`: `calibration.fix_mounts`: whether mounts are
@@ -309,26 +286,31 @@ def check_cameras(
     if config.detect.in_images in ("", LABELS):
         return log, ()
     lidar = densest_lidar(sensors.restrict(log)) or ""
-    if any(fault.sensor == lidar and _is_wrong(fault) for fault in of_lidars):
+    if any(fault.subject == lidar and _is_wrong(fault) for fault in of_lidars):
         lidar = ""
     check = _look(log, lidar, config, sensors, progress)
     fix = config.calibration.fix_mounts
+    treatment: Treatment = "corrected" if fix else "kept"
     mistakes = find_mistakes(check, during_ns(log, config))
     mounts = {name: mistake.mount_T_cam for name, mistake in mistakes.items()}
     treatments = _treat_mistakes(mistakes, config, sensors)
-    faults = [_fault_of_mistake(name, lidar, mistake, treatments[name]) for name, mistake in mistakes.items()]
+    faults = [replace(mistake.fault, treatment=treatments[name]) for name, mistake in mistakes.items()]
     off = {name: yaw for name, yaw in check.yaws.items() if yaw is not None and is_off(yaw)}
     if turns_together(check.yaws):
-        faults.append(_fault_of_lidar(lidar, off, fix=fix))
+        faults.append(_fault_of_lidar(lidar, off, treatment))
     else:
-        faults += [_fault_of_yaw(name, check, yaw, fix=fix) for name, yaw in off.items()]
+        case = "either" if sum(yaw is not None for yaw in check.yaws.values()) == 1 else "camera"
+        faults += [
+            Finding("camera_rotation", name, treatment, values=_values(yaw), other=lidar, case=case)
+            for name, yaw in off.items()
+        ]
     mounts |= {name: turn_by(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
     unknown = [name for name, yaw in check.yaws.items() if fix and lidar and yaw is None and name not in mistakes]
-    faults += [Fault("unknown_rotation", name, NOT_SEEN.format(lidar), "kept") for name in unknown]
+    faults += [Finding("unknown_rotation", name, other=lidar, case="edges") for name in unknown]
     return (with_mounts(log, mounts) if fix and mounts else log), tuple(faults)
 
 
-def _is_wrong(fault: Fault) -> bool:
+def _is_wrong(fault: Finding) -> bool:
     """Return whether a LiDAR is used as it is though its clock or mount is off."""
     return fault.treatment == "kept" and fault.kind in ("time_offset", "lidar_rotation")
 
@@ -388,21 +370,7 @@ def _look_through(camera: Camera, seen: EdgeViews) -> tuple[list[EdgeView], YawE
     return views, estimate_mount_yaw(camera, views)
 
 
-def _fault_of_mistake(name: str, lidar: str, mistake: Mistake, treatment: Treatment) -> Fault:
-    return Fault(mistake.kind, name, f"{mistake.words.format(lidar)}; {DONE[treatment]}", treatment)
-
-
-def _fault_of_yaw(name: str, check: MountCheck, yaw: YawEstimate, *, fix: bool) -> Fault:
-    treatment: Treatment = "corrected" if fix else "kept"
-    alone = sum(other is not None for other in check.yaws.values()) == 1
-    message = (
-        f"its mount in the calibration is turned by {_words(yaw)} against edges that {check.lidar} sees too"
-        f"{f', or the mount of {check.lidar} is' if alone else ''}; {DONE[treatment]}"
-    )
-    return Fault("camera_rotation", name, message, treatment, values=_values(yaw))
-
-
-def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], *, fix: bool) -> Fault:
+def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], treatment: Treatment) -> Finding:
     """Describe the mount of a LiDAR, with which that of no camera agrees; corrected are those of the cameras."""
     weights = np.array([1 / yaw.sigma_rad**2 for yaw in yaws.values()])
     mean = YawEstimate(
@@ -411,17 +379,8 @@ def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], *, fix: bool) -
         min(yaw.gain for yaw in yaws.values()),
         sum(yaw.edges for yaw in yaws.values()),
     )
-    done = "the cameras are turned to fit it" if fix else f"not corrected; {FIX} turns the cameras to fit it"
-    message = (
-        f"its mount in the calibration is turned by {_words(mean)} against edges that {', '.join(yaws)} see too, all of them "
-        f"alike; {done}"
-    )
-    return Fault("lidar_rotation", lidar, message, "corrected" if fix else "kept", values=_values(mean))
-
-
-def _words(yaw: YawEstimate) -> str:
-    values = _values(yaw)
-    return f"yaw {values['yaw_deg']:+.2f} degrees (sigma {values['yaw_sigma_deg']:.2f})"
+    others = ", ".join(yaws)
+    return Finding("lidar_rotation", lidar, treatment, values=_values(mean), other=others, case="edges")
 
 
 def _values(yaw: YawEstimate) -> dict[str, float]:
@@ -432,7 +391,7 @@ def _values(yaw: YawEstimate) -> dict[str, float]:
 
 def check_calibration(
     log: Log, config: Config, sensors: Sensors, *, progress: Progress
-) -> tuple[Log, tuple[Fault, ...]]:
+) -> tuple[Log, tuple[Finding, ...]]:
     """Estimate offsets of clocks and rotations of mounts from a log.
 
     `log`: with the poses that the run uses. `config`: `calibration`: whether to check, and what to correct; `start_s`,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log
+from log2sim.datatypes import Finding, Log
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.odometry import lidars_on_ego
@@ -387,57 +387,28 @@ class Findings:
         """The pose of what is corrected, (4, 4)."""
         return exp_of(self.applied[POSE])
 
-    def faults(self) -> list[Fault]:
+    def faults(self) -> list[Finding]:
         """Describe what is wrong, and what cannot be said."""
         if self.contradicted:
-            return [Fault("wrong_road_pose", name, self._contradiction(), "left_out") for name in self.unit.sensors]
+            share = 0.0 if self.visibility[0] is None else self.visibility[0].contradicting
+            values = {"through_share": float(share)}
+            return [Finding("wrong_road_pose", name, "left_out", values=values) for name in self.unit.sensors]
         faults, lidar, values = [], self.unit.lidars[0], self._values()
         if self.moved:
-            faults.append(Fault("road_pose", lidar, self._displacement(), "corrected", values=values))
+            case = "all" if len(self._looked_rows) == DELAY else "height_and_tilt"
+            structure, objects = self.found.structure[1], self.found.objects[1]
+            values = values | {
+                "shift_m": float(np.linalg.norm(self.applied[:3])),
+                "turn_deg": float(np.degrees(np.linalg.norm(self.applied[3:DELAY]))),
+                "points": 0.0 if structure is None else float(structure.points),
+                "pairs": 0.0 if objects is None else float(objects.pairs),
+            }
+            faults.append(Finding("road_pose", lidar, "corrected", values=values, case=case))
         if self.late:
-            faults.append(Fault("road_clock", lidar, self._lateness(), "corrected", values=values))
+            faults.append(Finding("road_clock", lidar, "corrected", values=self._values()))
         if not self.verified:
-            faults.append(Fault("unknown_road_pose", lidar, self._uncertainty(), "kept", values=values))
+            faults.append(Finding("unknown_road_pose", lidar, values=self._values()))
         return faults
-
-    def _displacement(self) -> str:
-        shift, turn = np.linalg.norm(self.applied[:3]), np.degrees(np.linalg.norm(self.applied[3:DELAY]))
-        return (
-            f"its pose is {shift:.2f} m and {turn:.1f} degrees off the ego's map (sigma {max(self.sigma[:2]):.2f} m, "
-            f"{np.degrees(self.sigma[5]):.2f} degrees of yaw), by {self._sources()}; "
-            f"{'corrected' if len(self._looked_rows) == DELAY else 'its height and tilt are corrected'}{self._company()}"
-        )
-
-    def _lateness(self) -> str:
-        delay_s = float(self.applied[DELAY])
-        return (
-            f"its stamps are {abs(delay_s) * 1e3:.0f} ms {'late' if delay_s > 0 else 'early'} against the ego's clock "
-            f"(sigma {self.sigma[DELAY] * 1e3:.0f} ms), by road users that both ends see move; corrected{self._company()}"
-        )
-
-    def _uncertainty(self) -> str:
-        return (
-            "its place in the plane cannot be verified: the vehicle sees too little of what it sees "
-            f"(sigma {max(self.sigma[:2]):.2f} m, {np.degrees(self.sigma[5]):.1f} degrees of yaw); kept"
-        )
-
-    def _contradiction(self) -> str:
-        looked = self.visibility[0]
-        share = 0.0 if looked is None else looked.contradicting
-        return (
-            f"its pose cannot be trusted: the vehicle saw through {share:.0%} of the upright surfaces that it sees, and no "
-            "pose within 0.5 m and 2 degrees makes both fit; left out"
-        )
-
-    def _sources(self) -> str:
-        structure, objects = self.found.structure[1], self.found.objects[1]
-        parts = [] if structure is None else [f"{structure.points} points on surfaces"]
-        parts += [] if objects is None else [f"{objects.pairs} common road users"]
-        return " and ".join(parts)
-
-    def _company(self) -> str:
-        others = self.unit.sensors[1:]
-        return f", as {', '.join(others)} on the same pole" if others else ""
 
     def _values(self) -> dict[str, float]:
         values, sigma = self.found.values, self.sigma
@@ -483,7 +454,7 @@ class RoadRegistration:
     """What came of the registration of the road's sensors."""
 
     log: Log  # with the corrected mounts and stamps
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Finding, ...] = ()
     figures: list[dict[str, Any]] = field(default_factory=list)  # for the report, one entry for each roadside unit
 
 
@@ -502,7 +473,7 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
     if not config.cooperation.register_road or log.ego is None or not at_road or not lidars_on_ego(used):
         return RoadRegistration(log)
     ego, figures = log.ego, []
-    faults: list[Fault] = []
+    faults: list[Finding] = []
     for unit in units_of(used, at_road):
         stage = f"register {unit.lidars[0]}"
         sight = look_around(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]

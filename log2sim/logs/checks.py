@@ -50,8 +50,9 @@ def without_impossible_labels(log: Log) -> Log:
 
 # In image widths: a field of view of 136 degrees without distortion, and lenses for photographs of the moon.
 MIN_FOCAL_WIDTHS, MAX_FOCAL_WIDTHS = 0.2, 20.0
-# From the image to the principal point, in widths and heights: a crop of a larger image seldom leaves it farther outside.
-MAX_PRINCIPAL_POINT_SIZES = 0.5
+# Of the width and height, from an edge to the principal point: lenses are mounted over the middle of the sensor, and a crop that keeps
+# less beside the axis is rare. A unit of image widths instead of px puts it into a corner.
+MIN_PRINCIPAL_SHARE = 0.1
 # No lens without distortion sees farther off its axis; a pixel beyond shows nothing.
 MAX_RAY_DEGREES = 80.0
 # Longer than any road vehicle with its trailers.
@@ -104,11 +105,12 @@ def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     for field, axis, size_px in (("cx", 0, camera.width_px), ("cy", 1, camera.height_px)):
         value_px = float(camera.K[axis, 2])
         outside_px = max(-value_px, value_px - size_px, 0.0)
+        inside = "beside the edge" if outside_px == 0.0 else f"{outside_px:.6g} px outside"
         # Fails for a value that is not a number.
-        if not outside_px <= MAX_PRINCIPAL_POINT_SIZES * size_px:
+        if not MIN_PRINCIPAL_SHARE <= value_px / size_px <= 1.0 - MIN_PRINCIPAL_SHARE:
             yield CalibrationProblem(
-                f"{where}: its principal point {field} is {value_px:.6g} px, {outside_px:.6g} px outside of images of "
-                f"{camera.width_px}x{camera.height_px} px; check whether the images are cropped or scaled",
+                f"{where}: its principal point {field} is {value_px:.6g} px, {inside} of images of "
+                f"{camera.width_px}x{camera.height_px} px; check its unit, and whether the images are cropped or scaled",
                 bool(not outside_px <= limit * camera.K[axis, axis]),
             )
 

@@ -159,13 +159,24 @@ def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[n
             raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
     import cv2
 
-    # OpenCV returns the upper part of a truncated PNG as if it were whole.
-    if b"IEND" not in data[-64:]:
-        raise RecordError(f"{where}: PNG is truncated")
+    _check_png_chunks(data, where)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise RecordError(f"{where}: PNG cannot be decoded")
     return image.astype(np.uint8, copy=False)
+
+
+def _check_png_chunks(data: bytes, where: str) -> None:
+    """Check lengths and check sums: OpenCV returns the upper part of a truncated PNG as if it were whole, and libpng prints of its own."""
+    at, kind = 8, b""
+    while kind != b"IEND":
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        kind = data[at + 4 : at + 8]
+        if end + 4 > len(data):
+            raise RecordError(f"{where}: PNG is truncated")
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise RecordError(f"{where}: the check sum of the PNG at byte {end} is wrong")
+        at = end + 4
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:

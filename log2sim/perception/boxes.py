@@ -275,18 +275,30 @@ def _median(values: Array) -> float:
     return float(ordered[k]) if len(values) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
 
 
-def sample_surface(range_m: Array, max_count: int) -> NDArray[np.intp]:
-    """Return the indices of at most `max_count` points at distances (N,) from a sensor, evenly spread over their surface.
+def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Return the indices of at most so many points of each cluster, evenly spread over its surface.
+
+    Parameters
+    ----------
+    range_m : (N,) float, m
+        Distances from the sensor of the points of the first cluster, then those of the next.
+    count : (R,) int
+        Number of points of each cluster, at least 1.
 
     Notes
     -----
     A ray stands for a surface that grows with the square of the distance. Of every n-th point hardly one would be on
     the far end of a long vehicle beside the sensor.
     """
-    if len(range_m) <= max_count:
-        return np.arange(len(range_m))
-    area = np.cumsum(range_m.astype(np.float64) ** 2)
-    return np.unique(np.searchsorted(area, (np.arange(max_count) + 0.5) / max_count * area[-1]))
+    kept = np.repeat(count <= most, count)
+    many = np.flatnonzero(count > most)
+    if len(many):
+        area = np.concatenate([[0.0], np.cumsum(range_m.astype(np.float64) ** 2)])
+        first = (np.cumsum(count) - count)[many]
+        low, high = area[first], area[first + count[many]]
+        wanted = low[:, None] + (np.arange(most) + 0.5) / most * (high - low)[:, None]
+        kept[np.searchsorted(area[1:], wanted.ravel())] = True
+    return np.flatnonzero(kept)
 
 
 def extents(xy_m: Array, yaw_rad: float, trim: float = TRIM, max_trim_m: float = np.inf) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles, OtherView, Rays, Sweep
+from log2sim.datatypes import Boxes3D, Detections, Finding, Log, Measurements, Obstacles, OtherView, Rays, Sweep
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.packing import pack
@@ -26,7 +26,7 @@ from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.first_pass_cache import FirstPassCache
 from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, sample_rays
+from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, obstacles_of
 from log2sim.perception.observe_tick import Observed, TickObserver
 from log2sim.perception.records import Look, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.sync import Schedule
@@ -105,9 +105,6 @@ class ObstacleList(Sequence["Obstacles | None"]):
         return ArrayList([self._file.keep(column) for column in columns])
 
 
-OBSTACLE_REACH_M = 70.0
-OBSTACLE_VOXEL_M = 0.12
-RANK_BITS = 25  # more than the points of any sweep
 # Sweeps of each LiDAR that are kept for the next ticks, which may share some.
 SWEEPS_KEPT = 4
 # Ticks that are worked on together; where frames are skipped between some of them, a multiple of these.
@@ -255,29 +252,6 @@ class CloudMaker:
         return cloud
 
 
-def obstacles_of(cloud: Cloud) -> Obstacles:
-    """Take the points above the ground, one a voxel, and a sample of the rays, so that a long log fits in memory."""
-    index, xyz = cloud.obstacles, cloud.obstacle_columns.T
-    near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
-    index = index[near[_voxel_sample(xyz[near], OBSTACLE_VOXEL_M)]]
-    kept = cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
-    if not cloud.parts:
-        return Obstacles(*kept)
-    first = np.cumsum([len(part.xyz) for part in cloud.parts])
-    seen_from = np.searchsorted(first, index, side="right").astype(np.uint8)
-    return Obstacles(*kept, np.array([part.sensor for part in cloud.parts]), seen_from)
-
-
-def _voxel_sample(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
-    """Return the indices of the first point of every voxel among points (N, 3), in the order of the points."""
-    i, j, k = np.floor(xyz / voxel_m).astype(np.int64).T
-    # Voxel and rank in one number: numbers are sorted several times as fast as their places are.
-    ordered = np.sort((((i * 4096 + j) * 4096 + k) << RANK_BITS) + np.arange(len(xyz)))
-    voxel = ordered >> RANK_BITS
-    first = np.flatnonzero(np.diff(voxel, prepend=voxel[:1] - 1))
-    return np.sort(ordered[first] & ((1 << RANK_BITS) - 1))
-
-
 @dataclass(eq=False)
 class Observations:
     """Results of the first pass, by tick.
@@ -299,7 +273,7 @@ class Observations:
         By camera.
     unseen : mapping of str to list of int
         Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched.
-    faults : tuple of Fault
+    faults : tuple of Finding
         Of the records.
     lights : list of LightBox
         Traffic lights in frames, which are no agents.
@@ -316,7 +290,7 @@ class Observations:
     frames_detected: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
     unseen: dict[str, list[int]] = field(default_factory=dict)
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Finding, ...] = ()
     lights: list[LightBox] = field(default_factory=list)
 
     @property

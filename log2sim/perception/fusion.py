@@ -102,7 +102,7 @@ def _share_points(rows: Measurements, i: int, j: int) -> bool:
     """Decide whether two gated rows share points; without points their positions suffice."""
     if not len(rows.cluster[i]) or not len(rows.cluster[j]):
         return True
-    return max(_share_inside(rows, i, j), _share_inside(rows, j, i)) >= MIN_SHARED_POINTS
+    return _share_inside(rows, i, j) >= MIN_SHARED_POINTS or _share_inside(rows, j, i) >= MIN_SHARED_POINTS
 
 
 def _share_inside(rows: Measurements, i: int, j: int) -> float:
@@ -160,11 +160,10 @@ def _timed_from(rows: Measurements, members: Sequence[int], t_ns: int) -> NDArra
 
 def _is_driver(rows: Measurements) -> NDArray[np.bool_]:
     """Mark the rows (M,) of people whose points are inside a vehicle's extents."""
-    group = np.array([GROUP_OF[str(c)] for c in rows.category])
-    drop, with_points = np.zeros(len(rows), dtype=bool), _has_points(rows)
-    length_m = provisional_sizes(rows)[:, 0]
-    for i in np.flatnonzero((group == "pedestrian") & with_points):
-        for j in np.flatnonzero((group == "vehicle") & with_points):
-            near = np.hypot(*(rows.center_m[i] - rows.center_m[j])[:2]) < length_m[j]
-            drop[i] |= bool(near) and _share_inside(rows, int(i), int(j)) >= MIN_DRIVER_SHARE
+    group, with_points = np.array([GROUP_OF[c] for c in rows.category.tolist()], dtype=str), _has_points(rows)
+    drop, length_m = np.zeros(len(rows), dtype=bool), provisional_sizes(rows)[:, 0]
+    people, vehicles = (np.flatnonzero((group == name) & with_points) for name in ("pedestrian", "vehicle"))
+    apart = rows.center_m[people, None, :2] - rows.center_m[vehicles, :2]
+    for k, n in np.argwhere(np.hypot(apart[..., 0], apart[..., 1]) < length_m[vehicles]).tolist():
+        drop[people[k]] |= _share_inside(rows, int(people[k]), int(vehicles[n])) >= MIN_DRIVER_SHARE
     return drop

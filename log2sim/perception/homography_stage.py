@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
-from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
+from log2sim.geometry import Array, Camera, ground_homography, inverse
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
@@ -250,12 +250,13 @@ def count_rays(
     range_m = float(np.hypot(*foot[:2]))
     sigma_m = float(np.sqrt(xy @ covariance @ xy) / max(np.hypot(*xy), 1e-6))
     azimuth, reach, slope = obstacles.rays
-    turned = wrap_angle(azimuth - np.arctan2(foot[1], foot[0]))
-    z_there = slope * range_m - foot[2]
+    turned, reached = np.abs(azimuth - np.arctan2(foot[1], foot[0])), width / 2 / max(range_m, 1e-6)
+    near = np.flatnonzero((turned < reached) | (turned > 2 * np.pi - reached))
+    z_there = slope[near] * range_m - foot[2]
     low, high = RAY_HEIGHT_SHARES
-    toward = (np.abs(turned) * range_m < width / 2) & (z_there > low * height) & (z_there < high * height)
-    beyond = int((toward & (reach > range_m + width + 2 * sigma_m)).sum())
-    return beyond, int(toward.sum()) - beyond
+    toward = near[(z_there > low * height) & (z_there < high * height)]
+    beyond = int((reach[toward] > range_m + width + 2 * sigma_m).sum())
+    return beyond, len(toward) - beyond
 
 
 def _write(columns: dict[str, Any], k: int, placed: tuple[Array, Array], map_T_base: Array, ground_z_m: float) -> None:

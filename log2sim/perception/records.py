@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Fault, Log, Sweep
+from log2sim.datatypes import Finding, Log, Sweep, Treatment
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.sync import Schedule
 
@@ -88,35 +88,16 @@ def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[i
     return [(int(around[k]), int(around[k + 1])) for k in np.flatnonzero(np.diff(around) > shortest_ns)]
 
 
-Gap = tuple[int, int]
-
-
-def missing_records(log: Log, schedule: Schedule) -> Iterator[Fault]:
+def missing_records(log: Log, schedule: Schedule) -> Iterator[Finding]:
     """List the interruptions of the streams that a run uses, from its first to its last tick."""
     start_ns, end_ns = int(schedule.t_ns[0]), int(schedule.t_ns[-1])
     for name in dict.fromkeys([*schedule.frames, *schedule.sweeps]):
         gaps = gaps_of(log.streams[name].t_ns, start_ns, end_ns)
+        kind = "missing_images" if name in log.cameras else "missing_sweeps"
         for some in [gaps] if len(gaps) > MAX_SPANS else [[gap] for gap in gaps]:
-            yield _interruption(log, name, some, start_ns, end_ns)
-
-
-def _interruption(log: Log, name: str, gaps: list[Gap], start_ns: int, end_ns: int) -> Fault:
-    kind, what = ("missing_images", "pictures") if name in log.cameras else ("missing_sweeps", "sweeps")
-    first, last = gaps[0][0], gaps[-1][1]
-    longest_s = max(b - a for a, b in gaps) / NS_PER_S
-    a_s, b_s = (first - start_ns) / NS_PER_S, (last - start_ns) / NS_PER_S
-    if len(gaps) > 1:
-        message = f"no {what} in {len(gaps)} stretches of up to {longest_s:.2f} s, from {a_s:.2f} to {b_s:.2f} s"
-    elif first == start_ns and last == end_ns:
-        message = f"no {what} at all from the first to the last tick"
-    elif first == start_ns:
-        message = f"no {what} in the first {longest_s:.2f} s"
-    elif last == end_ns:
-        message = f"no {what} in the last {longest_s:.2f} s, after {a_s:.2f} s"
-    else:
-        message = f"no {what} for {longest_s:.2f} s, from {a_s:.2f} to {b_s:.2f} s"
-    values = {"gaps": float(len(gaps)), "longest_s": longest_s}
-    return Fault(kind, name, message, "kept", first, last, values)
+            start_s, end_s = ((t_ns - start_ns) / NS_PER_S for t_ns in (some[0][0], some[-1][1]))
+            values = {"gaps": float(len(some)), "longest_s": max(b - a for a, b in some) / NS_PER_S}
+            yield Finding(kind, name, "kept", start_s, end_s, values)
 
 
 # Cells along the longer side. A cell of a camera for vehicles covers about a hundred pixels, whose noise averages out.
@@ -621,60 +602,48 @@ class RecordWatch:
             return camera.assume_unchanged(look.t_ns)
         return camera.judge(look.t_ns, look.shown, found=look.found)
 
-    def faults(self, schedule: Schedule) -> tuple[Fault, ...]:
-        """List what was found, a fault for each span of each sensor."""
+    def faults(self, schedule: Schedule) -> tuple[Finding, ...]:
+        """List what was found, one for each span of each sensor."""
         t0_ns = int(schedule.t_ns[0])
         found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, t0_ns)]
         found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, t0_ns)]
         return (*found, *missing_records(self._log, schedule))
 
 
-def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Fault]:
+def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Finding]:
     stamps = np.array(sorted(watch.states), dtype=np.int64)
     states = np.array([watch.states[t] for t in stamps.tolist()])
-    for span in spans_of(stamps, states == "frozen"):
-        message = f"pictures repeat an earlier one: {_when(span, t0_ns)}; they are not used"
-        yield Fault("frozen_images", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
-    for span in spans_of(stamps, states == "black"):
-        message = f"pictures show nothing (black, covered, of one color): {_when(span, t0_ns)}; they are not used"
-        yield Fault("black_images", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
+    for kind, state in (("frozen_images", "frozen"), ("black_images", "black")):
+        for span in spans_of(stamps, states == state):
+            yield _finding(kind, watch.name, "left_out", span, t0_ns)
 
 
-def _lidar_faults(watch: LidarWatch, t0_ns: int) -> Iterator[Fault]:
+def _lidar_faults(watch: LidarWatch, t0_ns: int) -> Iterator[Finding]:
     stamps = np.array(sorted(watch.points), dtype=np.int64)
     if len(stamps) == 0:
         return
     repeated = np.array([watch.repeated[t] for t in stamps.tolist()])
     for span in spans_of(stamps, repeated):
-        message = f"sweeps repeat an earlier one: {_when(span, t0_ns)}; they are not used"
-        yield Fault("repeated_sweeps", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
+        yield _finding("repeated_sweeps", watch.name, "left_out", span, t0_ns)
     yield from _sparse_sweeps(watch.name, stamps, np.array([watch.points[t] for t in stamps.tolist()]), t0_ns)
 
 
-def _sparse_sweeps(name: str, t_ns: NDArray[np.int64], points: NDArray[np.int64], t0_ns: int) -> Iterator[Fault]:
+def _sparse_sweeps(name: str, t_ns: NDArray[np.int64], points: NDArray[np.int64], t0_ns: int) -> Iterator[Finding]:
     """Mark the sweeps (F,) with next to no points, judged by what this LiDAR usually gives."""
     usual = float(np.quantile(points, USUAL_QUANTILE))
     if usual < MIN_USUAL_POINTS:
-        message = f"sweeps have next to no points, at most {points.max()}"
-        values = {"count": float(len(points)), "most_points": float(points.max())}
-        yield Fault("sparse_sweeps", name, message, "kept", int(t_ns[0]), int(t_ns[-1]), values)
+        whole = Span(int(t_ns[0]), int(t_ns[-1]), len(points), len(points))
+        yield replace(
+            _finding("sparse_sweeps", name, "kept", whole, t0_ns, most_points=float(points.max())), case="all"
+        )
         return
     for span in spans_of(t_ns, points < MAX_SPARSE_SHARE * usual):
         inside = (t_ns >= span.start_ns) & (t_ns <= span.end_ns) & (points < MAX_SPARSE_SHARE * usual)
-        most = int(points[inside].max())
-        message = f"sweeps have at most {most} points where {usual:.0f} are usual: {_when(span, t0_ns)}"
-        values = _counts(span) | {"most_points": float(most), "usual_points": usual}
-        yield Fault("sparse_sweeps", name, message, "kept", span.start_ns, span.end_ns, values)
+        values = {"most_points": float(points[inside].max()), "usual_points": usual}
+        yield replace(_finding("sparse_sweeps", name, "kept", span, t0_ns, **values), case="some")
 
 
-def _when(span: Span, t0_ns: int) -> str:
-    """Say how many records a span holds, and when: "12 from 2.00 to 3.10 s"."""
-    start_s, end_s = ((t - t0_ns) / NS_PER_S for t in (span.start_ns, span.end_ns))
-    if span.total == 1:
-        return f"1 at {start_s:.2f} s"
-    counted = f"{span.count}" if span.count == span.total else f"{span.count} of {span.total}"
-    return f"{counted} from {start_s:.2f} to {end_s:.2f} s"
-
-
-def _counts(span: Span) -> dict[str, float]:
-    return {"count": float(span.count)}
+def _finding(kind: str, name: str, treatment: Treatment, span: Span, t0_ns: int, **values: float) -> Finding:
+    start_s, end_s = ((t_ns - t0_ns) / NS_PER_S for t_ns in (span.start_ns, span.end_ns))
+    counts = {"count": float(span.count), "total": float(span.total)}
+    return Finding(kind, name, treatment, start_s, end_s, counts | values)

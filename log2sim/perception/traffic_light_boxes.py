@@ -83,7 +83,7 @@ def with_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[Li
     if not lights:
         return []
     high = np.flatnonzero(cloud.height > MIN_HEIGHT_M)
-    visible = project_points(view, cloud.origin, np.ascontiguousarray(cloud.xyz[high].T))
+    visible = project_points(view, cloud.origin, cloud.columns.take(high, axis=1))
     return [_with_range(light, view, cloud, high, visible) for light in lights]
 
 

@@ -65,7 +65,7 @@ def measure(world: World, noise: tuple[float, float], delay_s: float) -> list[Ou
     outcomes = []
     for pole, figures in zip(world.poles, found.figures):
         objects = figures["objects"]["after"]
-        kinds = tuple(fault.kind for fault in found.faults if fault.sensor == pole)
+        kinds = tuple(fault.kind for fault in found.faults if fault.subject == pole)
         outcomes.append(
             Outcome(
                 f"{world.spec.kind} {world.spec.road_lidar}", noise, delay_s, errors_of(found.log, world.log, pole),

@@ -24,7 +24,7 @@ def row(log: Log, error: RoadError) -> dict[str, Any]:
     return {
         "before": before,
         "after": after,
-        "faults": [[fault.kind, fault.treatment] for fault in run.faults if fault.sensor == ROAD_LIDAR],
+        "faults": [[fault.kind, fault.treatment] for fault in run.faults if fault.subject == ROAD_LIDAR],
     }
 
 

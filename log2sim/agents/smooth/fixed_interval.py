@@ -48,6 +48,10 @@ PLACE_SIGMA_M = 5.0
 # Errors of a center repeat while the view stays the same, for some half a second of passing traffic; the rest of the variance
 # changes from tick to tick.
 VIEW_S, REPEATED_SHARE = 0.5, 0.9
+# Stated standard deviations are wrong by a factor of two, for a whole track and along each axis apart: boxes of partly hidden
+# objects by more, image boxes of a camera that stands by less.
+NOISE_SCALES = 2.0 ** np.arange(-2, 3)
+NOISE_SCALE_LOG = -0.5 * np.log2(NOISE_SCALES) ** 2 - np.logaddexp.reduce(-0.5 * np.log2(NOISE_SCALES) ** 2)
 # One position in twenty shows something else, anywhere within a gate of 3 m.
 OUTLIER_LOG = float(np.log(0.05 / (np.pi * 3.0**2)))
 # Outliers are removed in so many rounds at most, each those that are worse than as many on either side: since errors repeat, an
@@ -121,7 +125,9 @@ def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> Marg
 
     Notes
     -----
-    The velocity is a Wiener process about the middle of the track. O(n^3).
+    The velocity is a Wiener process about the middle of the track. The scale of the noise is unknown along each axis, and is
+    integrated out over `NOISE_SCALES`: with stated noise alone, a walk is an error that drifts where the statement is too large,
+    and errors are a motion where it is too small. O(n^3).
     """
     inlier = np.ones(len(positions), dtype=bool)
     best = MarginalLikelihood(-np.inf, inlier)
@@ -153,11 +159,15 @@ def _likelihoods(p: Positions, motion: MotionPriorSigmas) -> tuple[float, Array]
         k += motion.acceleration_mps2**2 * near**2 * (far / 2 - near / 6)
     log, each = 0.0, np.zeros(len(p))
     for axis in range(2):
-        covariance = k + noise_of(p, axis)
+        covariance = k + NOISE_SCALES[:, None, None] ** 2 * noise_of(p, axis)
         inverse = np.linalg.inv(covariance)
-        weighted, variance = inverse @ z[:, axis], 1.0 / np.diag(inverse)
-        log -= 0.5 * float(z[:, axis] @ weighted + np.linalg.slogdet(covariance)[1] + len(p) * np.log(2 * np.pi))
-        each -= 0.5 * (np.log(2 * np.pi * variance) + variance * weighted**2)
+        weighted = inverse @ z[:, axis]
+        squared = weighted @ z[:, axis] + np.linalg.slogdet(covariance)[1]
+        logs = NOISE_SCALE_LOG - 0.5 * (squared + len(p) * np.log(2 * np.pi))
+        log += float(np.logaddexp.reduce(logs))
+        best = int(np.argmax(logs))
+        variance = 1.0 / np.diag(inverse[best])
+        each -= 0.5 * (np.log(2 * np.pi * variance) + variance * weighted[best] ** 2)
     return log, each
 
 

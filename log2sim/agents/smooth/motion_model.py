@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Doubt
+from log2sim.datatypes import Finding
 from log2sim.geometry import Array, wrap_angle
 
 # Beyond these a vehicle's motion is infeasible for Waymax (Gulino et al., 2023).
@@ -21,35 +21,8 @@ MAX_JERK_MPS3 = 50.0
 # A limit counts as broken where the motion is beyond it by as many of its own standard deviations.
 SIGNIFICANT_SIGMAS = 2.0
 
-PHRASES = {
-    "acceleration": "accelerates at {:.0f} m/s2",
-    "lateral_acceleration": "accelerates sideways at {:.0f} m/s2",
-    "curvature": "turns on a circle of {:.1f} m",
-    "jerk": "jerks at {:.0f} m/s3",
-}
 
-
-@dataclass(frozen=True)
-class BrokenLimit:
-    """A limit that a motion breaks.
-
-    Attributes
-    ----------
-    name : str
-        A key of `PHRASES`.
-    worst : float
-        Farthest beyond the limit, in its unit.
-    worst_s : float, s
-        When.
-    start_s, end_s : float, s
-        First and last time at which it is broken.
-    """
-
-    name: str
-    worst: float
-    worst_s: float
-    start_s: float
-    end_s: float
+MOST = {"acceleration": "most_mps2", "lateral_acceleration": "most_mps2", "curvature": "radius_m", "jerk": "most_mps3"}
 
 
 def broken_limits(
@@ -58,7 +31,7 @@ def broken_limits(
     yaw_rad: Array,
     curvature_1pm: Array,
     sigma: Mapping[str, Array] | None = None,
-) -> tuple[BrokenLimit, ...]:
+) -> tuple[Finding, ...]:
     """Find the limits that a motion breaks anywhere.
 
     Parameters
@@ -86,19 +59,10 @@ def broken_limits(
             worst = int(broken[np.argmax(values[broken])])
             # A difference of two waypoints holds for both of them.
             last = int(broken[-1]) + len(t_s) - len(values)
-            times = (float(t_s[k]) for k in (worst, int(broken[0]), last))
-            found.append(BrokenLimit(name, float(values[worst]), *times))
+            at_s, start_s, end_s = (float(t_s[k]) for k in (worst, int(broken[0]), last))
+            most = 1.0 / float(values[worst]) if name == "curvature" else float(values[worst])
+            found.append(Finding(name, start_s=start_s, end_s=end_s, values={MOST[name]: most, "at_s": at_s}))
     return tuple(found)
-
-
-def limit_doubts(broken: Iterable[BrokenLimit]) -> tuple[Doubt, ...]:
-    """Make doubts of the limits that a motion breaks."""
-    doubts = []
-    for limit in broken:
-        value = 1.0 / limit.worst if limit.name == "curvature" else limit.worst
-        reason = f"{PHRASES[limit.name].format(value)} at {limit.worst_s:.1f} s"
-        doubts.append(Doubt(limit.name, reason, limit.start_s, limit.end_s))
-    return tuple(doubts)
 
 
 # Below these speeds of vehicles and pedestrians the direction of a smoothed velocity is noise.

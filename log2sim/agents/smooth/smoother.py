@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.agents.smooth.fixed_interval import smooth_interval
-from log2sim.agents.smooth.motion_model import BrokenLimit, MotionModel, Smoothed, broken_limits, speed_sigma
+from log2sim.agents.smooth.motion_model import MotionModel, Smoothed, broken_limits, speed_sigma
 from log2sim.agents.smooth.quadratic import NoisyPositions
+from log2sim.datatypes import Finding
 from log2sim.geometry import Array, wrap_angle
 
 __all__ = ["MotionModel", "SmoothedTrack", "smooth_track"]
@@ -45,7 +46,7 @@ class SmoothedTrack:
     inlier : (n,) bool
     sigma_yaw_rad, sigma_speed_mps : (T,) float64
         One standard deviation of heading and speed.
-    broken : tuple of BrokenLimit
+    broken : tuple of Finding
         Limits that the motion breaks.
     """
 
@@ -60,7 +61,7 @@ class SmoothedTrack:
     inlier: NDArray[np.bool_]
     sigma_yaw_rad: Array
     sigma_speed_mps: Array
-    broken: tuple[BrokenLimit, ...]
+    broken: tuple[Finding, ...]
 
 
 def smooth_track(
@@ -146,7 +147,7 @@ def _curvature(velocity: Array, acceleration: Array) -> Array:
     return curvature
 
 
-def _broken_limits(t_s: Array, path: Smoothed, curvature: Array) -> tuple[BrokenLimit, ...]:
+def _broken_limits(t_s: Array, path: Smoothed, curvature: Array) -> tuple[Finding, ...]:
     speed = np.hypot(*path.state[:, 1].T)
     sigma = np.sqrt(np.trace(path.covariance[:, 4:, 4:], axis1=1, axis2=2) / 2)
     of_curvature = np.divide(sigma, speed**2, out=np.zeros_like(speed), where=speed > MIN_CURVATURE_SPEED_MPS)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.moving import turn_to_courses
 from log2sim.config import Config
-from log2sim.datatypes import ROAD, Boxes3D, Log, end_of
+from log2sim.datatypes import ROAD, Boxes3D, Finding, Log, end_of
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.localization.choice import PoseChoice
@@ -23,6 +22,7 @@ from log2sim.perception.lidar.measure import outside_ego
 from log2sim.perception.sync import sweep_middle_ns
 from log2sim.pipeline import Run, start
 from log2sim.plan import FusionLevel
+from log2sim.report import unreadable_records
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class LogDetections:
 
     found: DetectedBoxes
     left_out: int  # sweeps that cannot be read or have no pose
-    unreadable: dict[str, Any]  # count and first message by stream
+    findings: tuple[Finding, ...]  # of poses, sensors and records
     poses: PoseChoice  # where the poses come from that place the boxes in the map
 
 
@@ -124,7 +124,8 @@ def detect_log(
     t_ns = np.array(stamps, dtype=np.int64)
     turned = turn_to_courses(boxes, t_ns, config.track)
     found = DetectedBoxes(log.name, run.detectors.name, t_ns, tuple(turned), run.poses.to_provenance())
-    return LogDetections(found, len(run.schedule) - len(stamps), records.summary(), run.poses)
+    findings = (*run.poses.findings, *run.faults, *unreadable_records(records.summary()))
+    return LogDetections(found, len(run.schedule) - len(stamps), findings, run.poses)
 
 
 def without_ego(log: Log, boxes: Boxes3D) -> Boxes3D:

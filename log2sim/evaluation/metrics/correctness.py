@@ -125,7 +125,7 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
 def doubts(agent: Agent) -> tuple[str, ...]:
     """Name the reasons for which a scenario doubts an agent: its doubts, and a confidence below one half."""
     low = ("confidence",) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ()
-    return (*low, *dict.fromkeys(doubt.flag for doubt in agent.doubts))
+    return (*low, *dict.fromkeys(doubt.kind for doubt in agent.doubts))
 
 
 def doubted_at(agent: Agent, t_s: Array) -> Mask:

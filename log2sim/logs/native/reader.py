@@ -99,8 +99,13 @@ def read_csv_table(
     try:
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         rows = [(reader.line_num, row) for row in reader if row]
-    except (UnicodeDecodeError, csv.Error) as problem:
-        raise LogError(f"{path}: not a CSV table in UTF-8: {problem}") from None
+    except UnicodeDecodeError as problem:
+        number = data.count(b"\n", 0, problem.start) + 1
+        raise LogError(
+            f"{path}, line {number}: not text in UTF-8: byte 0x{data[problem.start]:02x}; save the table as UTF-8"
+        ) from None
+    except csv.Error as problem:
+        raise LogError(f"{path}: not a CSV table: {problem}") from None
     if not rows:
         raise LogError(f"{path}: is empty; expected the header {','.join(columns)}")
     header = [name.strip() for name in rows[0][1]]

@@ -94,7 +94,7 @@ def points_of_boxes(
     low, high = center_m[:, :2] - reach, center_m[:, :2] + reach
     box, place, order = candidates(xyz, usable, CoarseGrid.around(low, high), low, high)
     # Column by column, in the points' own precision and the order of their cells: this is where the time goes.
-    columns = np.ascontiguousarray(xyz.take(order, axis=0).T)
+    columns = [xyz[:, axis].take(order) for axis in range(3)]
     center, (length, width, height) = center_m.T.astype(xyz.dtype), half.T.astype(xyz.dtype)
     c, s = (v.astype(xyz.dtype).take(box) for v in (c, s))
     x, y, z = (columns[axis].take(place) - center[axis].take(box) for axis in range(3))

@@ -198,7 +198,7 @@ def viewpoints_xy(cloud: Cloud) -> Array:
 
 def _cropped(cloud: Cloud, centers: Array, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Take the points within range of any of the centers (V, 2)."""
-    x, y, height = cloud.xyz[:, 0], cloud.xyz[:, 1], cloud.height
+    (x, y, _), height = cloud.columns, cloud.height
     near = np.zeros(len(x), dtype=bool)
     for center in centers:
         low, high = (center - range_m).astype(np.float32), (center + range_m).astype(np.float32)
@@ -207,9 +207,8 @@ def _cropped(cloud: Cloud, centers: Array, range_m: float) -> tuple[NDArray[np.f
     index = np.flatnonzero(near & (height > MIN_HEIGHT_M) & (height < MAX_HEIGHT_M))
     if len(index) > MAX_POINTS:
         index = index[:: -(-len(index) // MAX_POINTS)]
-    xyz = np.empty((len(index), 3), np.float32)
-    xyz[:, 0], xyz[:, 1], xyz[:, 2] = x[index], y[index], height[index]
-    return xyz, index
+    # Values of one coordinate side by side, as all that follows goes through them.
+    return np.stack([x[index], y[index], height[index]]).T, index
 
 
 def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[np.intp]) -> Array:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import Array, Camera, undistort
+from log2sim.perception.boxes import quantile_of_sorted
 from log2sim.perception.homography.fit import HomographyFit, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import CHI2_2DOF_99, NormalizedCorrespondences, bounded_losses, linearize
 from log2sim.perception.homography.ransac import RobustFit
@@ -225,7 +226,7 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
         sensor, cluster = measured.sensor_m[k, :2], measured.cluster[k][:, :2]
         direction = measured.center_m[k, :2] - sensor
         direction /= np.hypot(*direction)
-        nearest = np.quantile((cluster - sensor) @ direction, NEAREST_SIDE_QUANTILE)
+        nearest = quantile_of_sorted(np.sort((cluster - sensor) @ direction), NEAREST_SIDE_QUANTILE)
         foot = np.append(sensor + direction * nearest, measured.bottom_m[k])
         box = measured.box_px[k]
         xy.append((ego_T_map[:3, :3] @ foot + ego_T_map[:3, 3])[:2])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ENDS, VEHICLE, Log, Rays, Sweep, end_of
+from log2sim.datatypes import ENDS, VEHICLE, Log, Obstacles, Rays, Sweep, end_of
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.boxes import upper_median
 
@@ -160,7 +160,7 @@ MIN_RAYS_BEYOND = 2
 # Share of a cluster's points skipped at each end, so that a stray one is not taken for the end.
 TRIM, MAX_TRIMMED_POINTS = 0.01, 2
 # Points this near to an end form the face that ends there; a corner has more than this share of their variance across.
-FACE_M, MAX_FLATNESS = 1.5, 0.05
+FACE_M, MAX_FLATNESS, MAX_FACE_POINTS = 1.5, 0.05, 256
 SLOPE_MARGIN = 0.01
 # Azimuths are integer steps that fit into 16 bits; one turn has this many.
 STEPS_PER_TURN = 60_000
@@ -182,28 +182,32 @@ class AzimuthIndex:
         Height over horizontal distance, relative to the sensor.
     obstacle : (N,) bool
         False for points on the ground.
-    rank : (N,) int
+    rank : (N,) int32
         Position of every point of the cloud in the columns above.
+    unsorted : tuple of (N,) uint16, (N,) float32, (N,) float32
+        Azimuth, distance and slope in the order of the cloud.
     """
 
     azimuth: NDArray[np.uint16]
     range_m: NDArray[np.float32]
     slope: NDArray[np.float32]
     obstacle: NDArray[np.bool_]
-    rank: NDArray[np.intp]
+    rank: NDArray[np.int32]
+    unsorted: tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]
 
     @classmethod
     def of(cls, xyz: NDArray[np.float32], sensor: NDArray[np.float32], ground: NDArray[np.bool_]) -> AzimuthIndex:
         """Sort points (N, 3) by their azimuth around a sensor (3,); `ground` (N,) marks those on the ground."""
-        x, y, z = (xyz - sensor).T
+        x, y, z = (xyz[:, axis] - sensor[axis] for axis in range(3))
         # NumPy sorts 16-bit integers by radix, ten times as fast as angles.
         azimuth = ((np.arctan2(y, x) + np.pi) / STEP_RAD).astype(np.uint16)
         order = np.argsort(azimuth, kind="stable")
         range_m = np.hypot(x, y)
-        rank = np.empty(len(order), dtype=np.intp)
-        rank[order] = np.arange(len(order))
+        rank = np.empty(len(order), dtype=np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
         slope = z / np.maximum(range_m, 1e-3)
-        return cls(azimuth[order], range_m[order], slope[order], ~ground[order], rank)
+        obstacle, unsorted = ~ground.take(order), (azimuth, range_m, slope)
+        return cls(azimuth.take(order), range_m.take(order), slope.take(order), obstacle, rank, unsorted)
 
     def ends_visible(self, members: Sequence[NDArray[np.intp]]) -> NDArray[np.bool_]:
         """Decide which of the right and the left end (R, 2) of clusters are ends of their objects.
@@ -262,6 +266,8 @@ class _Clusters:
         The point in the index.
     azimuth : (K,) int64
         In steps, negative for the points of a cluster that lie before the azimuth at which a turn begins.
+    ordered : (K,) int64
+        Cluster and row of each point in one number, in rising order.
     """
 
     index: AzimuthIndex
@@ -270,20 +276,25 @@ class _Clusters:
     group: NDArray[np.intp]
     row: NDArray[np.intp]
     azimuth: NDArray[np.int64]
+    ordered: NDArray[np.int64]
 
     @classmethod
     def of(cls, index: AzimuthIndex, members: Sequence[NDArray[np.intp]]) -> _Clusters:
         """Sort the points of clusters, given as rows of the cloud."""
         count = np.array([len(rows) for rows in members])
         start, group = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
-        row = np.sort(group * len(index.rank) + index.rank[np.concatenate(members)]) - group * len(index.rank)
+        size = len(index.rank)
+        # NumPy sorts numbers of 32 bits in half the time.
+        kind = np.uint32 if len(count) * size < 2**32 else np.int64
+        ordered = np.sort((group * size + index.rank.take(np.concatenate(members))).astype(kind)).astype(np.int64)
+        row = ordered - group * size
         azimuth = index.azimuth[row].astype(np.int64)
         across = azimuth[start + count - 1] - azimuth[start] > STEPS_PER_TURN // 2
         if across.any():
             azimuth = np.where(across[group] & (azimuth >= STEPS_PER_TURN // 2), azimuth - STEPS_PER_TURN, azimuth)
             order = np.lexsort((azimuth, group))
             row, azimuth = row[order], azimuth[order]
-        return cls(index, count, start, group, row, azimuth)
+        return cls(index, count, start, group, row, azimuth, ordered)
 
     def ends(self) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the place (R, 2) of the points at the ends, stray ones left out, and their azimuths (R, 2)."""
@@ -309,10 +320,9 @@ class _Clusters:
 
     def contain(self, group: NDArray[np.intp], row: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Mark points (n,) of the index that belong to a cluster (n,)."""
-        size = len(self.index.rank)
-        own, wanted = np.sort(self.group * size + self.row), group * size + row
-        place = np.minimum(np.searchsorted(own, wanted), len(own) - 1)
-        return np.asarray(own[place] == wanted)
+        wanted = group * len(self.index.rank) + row
+        place = np.minimum(np.searchsorted(self.ordered, wanted), len(self.ordered) - 1)
+        return np.asarray(self.ordered[place] == wanted)
 
     def extended_face_ranges(
         self, end: NDArray[np.intp], window: NDArray[np.intp], azimuth: NDArray[np.uint16]
@@ -327,12 +337,19 @@ class _Clusters:
             Twice the cluster, plus one at its left end.
         azimuth : (n,) uint16
         """
-        xy = self.index.range_m[self.row, None] * _direction(self.index.azimuth[self.row])
+        # Some points of each cluster show its faces as well as all do.
+        place = np.arange(len(self.row)) - self.start[self.group]
+        some = np.flatnonzero(place % -(-self.count // MAX_FACE_POINTS)[self.group] == 0)
+        group = self.group[some]
+        corner, xy = (
+            self.index.range_m[row][..., None] * _direction(self.index.azimuth[row])
+            for row in (self.row[end], self.row[some])
+        )
         near, points = [], []
         for side in range(2):
-            x, y = (xy - xy[end[self.group, side]]).T
-            point = np.flatnonzero(np.hypot(x, y) < FACE_M)
-            near.append(2 * self.group[point] + side)
+            x, y = (xy - corner[group, side]).T
+            point = np.flatnonzero(x * x + y * y < FACE_M**2)
+            near.append(2 * group[point] + side)
             points.append(xy[point])
         of, (x, y) = np.concatenate(near), np.concatenate(points).T
         count = np.maximum(np.bincount(of, minlength=end.size), 1)
@@ -462,12 +479,12 @@ class Cloud:
     @cached_property
     def obstacle_columns(self) -> NDArray[np.float32]:
         """The points at `obstacles` as rows x, y, z (3, n), shared by all cameras."""
-        return np.ascontiguousarray(self.xyz[self.obstacles].T)
+        return self.columns.take(self.obstacles, axis=1)
 
     @cached_property
     def azimuth_index(self) -> AzimuthIndex:
         """The points sorted by azimuth around the sensor."""
-        return AzimuthIndex.of(self.xyz, self.sensor, self.ground)
+        return AzimuthIndex.of(self.columns.T, self.sensor, self.ground)
 
     @cached_property
     def ground_sample(self) -> NDArray[np.intp]:
@@ -572,11 +589,11 @@ def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array
     xyz = [np.ascontiguousarray(sweep.xyz_m[:, axis]) for axis in range(3)]
     rotation = map_T_lidar[:, :3, :3].astype(np.result_type(sweep.xyz_m, np.float32))
     position, moved = map_T_lidar[:-1, :3, 3], np.diff(map_T_lidar[:, :3, 3], axis=0)
-    out = np.empty((len(t_ns), 3))
+    out = np.empty((3, len(t_ns)))
     for row in range(3):
         rotated = sum(rotation[:, row, axis].take(k) * xyz[axis] for axis in range(3))
-        out[:, row] = rotated + position[:, row].take(k) + moved[:, row].take(k) * place
-    return out
+        out[row] = rotated + position[:, row].take(k) + moved[:, row].take(k) * place
+    return out.T
 
 
 def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
@@ -715,21 +732,22 @@ def assemble_cloud(
         # Halfway through the sweep: a sensor at 30 m/s is 3 m away from there at its begin or end.
         middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
-        local = (mapped[0] - origin).astype(np.float32)
-        near = np.flatnonzero(np.logical_and.reduce([np.abs(local[:, axis]) <= max_range_m for axis in range(3)]))
+        # Values of one coordinate side by side, as what follows goes through them.
+        local = [(mapped[0][:, axis] - origin[axis]).astype(np.float32) for axis in range(3)]
+        near = np.flatnonzero(np.logical_and.reduce([np.abs(column) <= max_range_m for column in local]))
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
-        parts.append((local.take(near, axis=0), t_s.take(near), position))
+        parts.append((np.stack([column.take(near) for column in local]), t_s.take(near), position))
         place = _follow_sensor(log, name, stamp, t_s, origin)
         sensors.append(CloudSensor(len(near), *place, end_of(log.lidars[name])))
     if not parts:
         return None
-    xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-    surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
-    height = xyz[:, 2] - surface.at(xyz[:, :2])
+    columns, t_s = np.concatenate([p[0] for p in parts], axis=1), np.concatenate([p[1] for p in parts])
+    surface = estimate_ground(columns.T, np.zeros(2), ground_z - float(origin[2]))
+    height = columns[2] - surface.at(columns[:2].T)
     # A distant LiDAR without points in range must not shift the viewpoint.
-    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
-    ground = np.abs(height) <= ON_GROUND_M
+    sensor = np.mean([p[2] for p in parts if p[0].size] or [p[2] for p in parts], axis=0).astype(np.float32)
+    ground, xyz = np.abs(height) <= ON_GROUND_M, np.ascontiguousarray(columns.T)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
 
 
@@ -746,6 +764,52 @@ def _follow_sensor(log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32],
     first, last = map_T_lidar[:, :3, 3] - origin
     velocity = (last - first) / (last_s - first_s) if last_s > first_s else np.zeros(3)
     return first - first_s * velocity, velocity
+
+
+OBSTACLE_REACH_M = 70.0
+OBSTACLE_VOXEL_M = 0.12
+# Places in which voxels are looked up, as a power of two: some times as many as a sweep has voxels.
+TABLE_BITS = 20
+
+
+def obstacles_of(cloud: Cloud) -> Obstacles:
+    """Take the points above the ground, one a voxel, and a sample of the rays, so that a long log fits in memory."""
+    x, y, _ = cloud.obstacle_columns
+    near = np.flatnonzero(np.hypot(x, y) < OBSTACLE_REACH_M)
+    index = cloud.obstacles[near[_first_of_voxels(cloud.obstacle_columns.take(near, axis=1), OBSTACLE_VOXEL_M)]]
+    kept = cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
+    if not cloud.parts:
+        return Obstacles(*kept)
+    first = np.cumsum([len(part.xyz) for part in cloud.parts])
+    seen_from = np.searchsorted(first, index, side="right").astype(np.uint8)
+    return Obstacles(*kept, np.array([part.sensor for part in cloud.parts]), seen_from)
+
+
+def _first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
+    """Return the indices of the first point of every voxel among points (3, N), in the order of the points.
+
+    Notes
+    -----
+    Points are written into a table from the last to the first, each in the place of its voxel, which so holds its first. Voxels
+    that share a place with another's are looked up again in other places.
+    """
+    i, j, k = np.floor(columns / np.float32(voxel_m)).astype(np.int64)
+    voxel = ((i * 4096 + j) * 4096 + k).astype(np.uint64)
+    left, kept, table = (
+        np.arange(len(voxel)),
+        np.zeros(len(voxel), dtype=bool),
+        np.empty(1 << TABLE_BITS, dtype=np.int32),
+    )
+    factor = np.array(
+        [0x9E3779B97F4A7C15], dtype=np.uint64
+    )  # multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)
+    while len(left):
+        place = ((voxel[left] * factor) >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
+        table[place[::-1]] = left[::-1]
+        first = table[place]
+        kept[left[first == left]] = True
+        left, factor = left[voxel[first] != voxel[left]], factor * np.uint64(3)
+    return np.flatnonzero(kept)
 
 
 # One ray is kept of each cell of directions. At 50 m cells are 0.4 m wide: the side of a car has twenty.
@@ -767,12 +831,11 @@ def sample_rays(cloud: Cloud) -> Rays:
     """
     if cloud.parts:
         return _join([sample_rays(part) for part in cloud.parts], cloud)
-    index = cloud.azimuth_index
-    point = np.flatnonzero((index.range_m[index.rank] < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
-    row = index.rank[point]
+    azimuth, range_m, slope = cloud.azimuth_index.unsorted
+    point = np.flatnonzero((range_m < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
     # The slope of a ray differs from its angle where it is steep: near the sensor, where rays are many.
-    slope = np.clip(index.slope[row] / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
-    column = _sensor_of(cloud, point) * COLUMNS + index.azimuth[row] // CELL_STEPS
+    slope = np.clip(slope.take(point) / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
+    column = _sensor_of(cloud, point) * COLUMNS + azimuth.take(point) // CELL_STEPS
     cell = column * CELLS_PER_COLUMN + np.floor(slope).astype(np.int64) + CELLS_PER_COLUMN // 2
     # Written from the last to the first point, a cell holds its first one; cells without points are not read.
     first = np.empty(max(len(cloud.sensors), 1) * COLUMNS * CELLS_PER_COLUMN, dtype=np.int32)

@@ -40,7 +40,7 @@ from log2sim.perception.boxes import (
     place_boxes,
     quantile_of_clusters,
     rotate,
-    sample_surface,
+    sample_surfaces,
     sort_clusters,
     upper_median,
 )
@@ -379,8 +379,8 @@ def _measure_as_paper(view: View, cloud: Cloud, columns: dict[str, Any], rows: I
         columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
 
 
-# Points of a cluster that are kept as evidence.
-MAX_KEPT_POINTS = 400
+# Points of a cluster that are kept as evidence, of which extents and heights are measured.
+MAX_KEPT_POINTS = 256
 
 
 def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequence[Index], cloud: Cloud) -> None:
@@ -411,11 +411,9 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
 
 def _write_view(columns: dict[str, Any], rows: Index, members: Sequence[Index], cloud: Cloud) -> None:
     """Write what the points of one viewpoint, R arrays (n,), show into rows (R,)."""
-    count = np.array([len(index) for index in members])
+    index, count, of_sensor = _sampled(cloud, members)
     edges = np.concatenate([[0], np.cumsum(count)])
-    index = np.concatenate(members)
-    xyz = cloud.xyz[index].astype(np.float64)
-    xy, start = xyz[:, :2] - cloud.sensor[:2], edges[:-1]
+    xy, start, xyz = of_sensor[:, :2], edges[:-1], of_sensor + cloud.sensor.astype(np.float64)
     typical = np.array([TYPICAL_SIZE_M[str(category)] for category in columns["category"][rows]])
     yaw, low, high = fit_extents_of_clusters(xy, count, typical, columns["box_yaw_rad"][rows])
     columns["yaw_rad"][rows], columns["low_m"][rows], columns["high_m"][rows] = yaw, low, high
@@ -428,28 +426,33 @@ def _write_view(columns: dict[str, Any], rows: Index, members: Sequence[Index], 
     columns["t_ns"][rows] = cloud.stamp_ns + mean_ns
     columns["sensor_m"][rows] = cloud.sensor + cloud.origin
     timed = np.column_stack([xyz + cloud.origin, t_s - np.repeat(mean_ns, count) / NS_PER_S])
-    range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
     columns["ends_visible"][rows] = cloud.azimuth_index.ends_visible(members)
-    for row, a, b in zip(rows.tolist(), edges[:-1].tolist(), edges[1:].tolist()):
-        # A copy, which does not keep the points of all others in memory.
-        columns["cluster"][row] = timed[a:b][sample_surface(range_m[a:b], MAX_KEPT_POINTS)]
+    for row, points in zip(rows.tolist(), np.split(timed, edges[1:-1])):
+        columns["cluster"][row] = points
+
+
+def _sampled(cloud: Cloud, members: Sequence[Index]) -> tuple[Index, NDArray[np.intp], Array]:
+    """Sample the surfaces of R clusters: points (n,) of the cloud, how many of each (R,), and their places (n, 3) from the sensor."""
+    index, count = np.concatenate(members), np.array([len(points) for points in members])
+    of_sensor = cloud.xyz.take(index, axis=0) - cloud.sensor
+    kept = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count, MAX_KEPT_POINTS)
+    count = np.diff(np.searchsorted(kept, np.concatenate([[0], np.cumsum(count)])))
+    return index[kept], count, of_sensor[kept].astype(np.float64)
 
 
 def _other_view(cloud: Cloud, members: Index, t_ns: int) -> OtherView:
     """Describe what the points at `members` (n,) of a second viewpoint show of an object that is measured at a time."""
-    xyz = cloud.xyz[members].astype(np.float64)
-    late_s = cloud.t_s[members].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
-    kept = sample_surface(np.linalg.norm(xyz - cloud.sensor, axis=1), MAX_KEPT_POINTS)
+    index, _, of_sensor = _sampled(cloud, [members])
+    late_s = cloud.t_s[index].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
+    place = cloud.sensor + cloud.origin
     return OtherView(
-        cloud.sensor + cloud.origin,
-        cloud.azimuth_index.ends_visible([members])[0],
-        np.column_stack([xyz + cloud.origin, late_s])[kept],
+        place, cloud.azimuth_index.ends_visible([members])[0], np.column_stack([of_sensor + place, late_s])
     )
 
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
     """Project the cloud's points at `index`: which of them the camera sees (n,), pixels (n, 2) and depths (n,)."""
-    visible = project_points(view, cloud.origin, np.ascontiguousarray(cloud.xyz[index].T))
+    visible = project_points(view, cloud.origin, cloud.columns.take(index, axis=1))
     uv = np.stack([visible.u, visible.v], axis=1).astype(np.float64)
     return visible.index, uv, visible.depth.astype(np.float64)
 
@@ -521,7 +524,7 @@ def follow_box(boxes: Boxes3D, view: Cloud) -> Boxes3D:
 
 def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
     """Find the points of the cloud above the ground in each box, somewhat widened; each point belongs to one box."""
-    center, xyz = boxes.center_m - cloud.origin, cloud.xyz[cloud.obstacles]
+    center, xyz = boxes.center_m - cloud.origin, cloud.obstacle_columns.T
     found = points_of_boxes(xyz, center, boxes.size_m + 2 * BOX_MARGIN_M, boxes.yaw_rad)
     own = np.ones(len(found.point), dtype=bool)
     # Of several boxes that hold a point, it is deepest in its own.

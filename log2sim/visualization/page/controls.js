@@ -2,10 +2,11 @@
 
 const CLICK_PX = 5;
 
-// Drag, pinch, wheel and click on the map. act: drag(dx, dy), zoom(factor, sx, sy), click(sx, sy, margin), hover(sx, sy)
+// Drag, pinch, wheel and click on the map. act: drag(dx, dy), zoom(factor, sx, sy), click(sx, sy, margin), hover(sx, sy),
+// grab(sx, sy): whether what is pressed there is pulled instead of the map, by pull(dx, dy, sx, sy)
 const listenToPointers = (canvas, act) => {
   const down = new Map();
-  let travelled = 0;
+  let travelled = 0, grabbed = false;
   const spread = () => {
     const [a, b] = [...down.values()];
     return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, distance: Math.max(Math.hypot(a.x - b.x, a.y - b.y), 1) };
@@ -13,7 +14,7 @@ const listenToPointers = (canvas, act) => {
   canvas.addEventListener("pointerdown", (event) => {
     if (event.button > 0) return;
     canvas.setPointerCapture(event.pointerId);
-    if (down.size === 0) travelled = 0;
+    if (down.size === 0) [travelled, grabbed] = [0, act.grab(event.offsetX, event.offsetY)];
     down.set(event.pointerId, { x: event.offsetX, y: event.offsetY });
   });
   canvas.addEventListener("pointermove", (event) => {
@@ -28,7 +29,8 @@ const listenToPointers = (canvas, act) => {
       act.drag(after.x - before.x, after.y - before.y);
       act.zoom(after.distance / before.distance, after.x, after.y);
       travelled = Infinity;
-    } else if (travelled > CLICK_PX) act.drag(dx, dy);
+    } else if (grabbed) act.pull(dx, dy, pointer.x, pointer.y);
+    else if (travelled > CLICK_PX) act.drag(dx, dy);
   });
   const release = (event) => {
     if (down.delete(event.pointerId) && event.type === "pointerup" && down.size === 0 && travelled <= CLICK_PX) {

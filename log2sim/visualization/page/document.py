@@ -15,7 +15,7 @@ from log2sim.datatypes import (
     MIN_TRUSTED_CONFIDENCE,
     STANDSTILL_MPS,
     Agent,
-    Doubt,
+    Finding,
     MapFeatures,
     Scenario,
     Trajectory,
@@ -310,10 +310,10 @@ def _trust(agent: Agent) -> dict[str, Any]:
     w, points, source = agent.waypoints, agent.quality.get("points_median"), _source(agent)
     columns = {key: getattr(w, key) for key in SIGMAS}
     known = {key: c for key, c in columns.items() if c is not None and np.any(c > 0)}
-    low = () if agent.doubts or not agent.is_doubtful else (Doubt("confidence", why_doubtful(agent)),)
+    low = () if agent.doubts or not agent.is_doubtful else (Finding("confidence", text=why_doubtful(agent)),)
     return {
         "confidence": round(agent.confidence, 4),
-        "doubts": [[doubt.reason, doubt.start_s, doubt.end_s, doubt.flag] for doubt in (*agent.doubts, *low)],
+        "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in (*agent.doubts, *low)],
         "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
         **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
         **({"source": source} if source else {}),
@@ -346,7 +346,7 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
         "id": agent.id,
         "category": agent.category,
         "group": GROUP_OF[agent.category],
-        "size_m": [round(float(v), 3) for v in agent.size_m[:2]],
+        "size_m": [round(float(v), 3) for v in agent.size_m],
         "stationary": stationary,
         "permanent": static and len(columns.t_s) == 1,  # one pose during the whole scenario
         **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k in WAYPOINT_COLUMNS},

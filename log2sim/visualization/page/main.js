@@ -18,6 +18,7 @@ const choose = (track) => {
   state.chosen = track;
   list.choose(track);
   details.choose(track);
+  editor?.show();
   drawPresence();
   updateAddress();
   requestDraw();
@@ -160,7 +161,9 @@ const listen = () => {
   listenToPointers(byId("map"), {
     drag: (dx, dy) => { follow(false); view.drag(dx, dy); requestDraw(); },
     zoom,
-    click: (sx, sy, margin) => choose(agentAt(sx, sy, margin)),
+    click: (sx, sy, margin) => editor?.click(sx, sy, margin) || choose(agentAt(sx, sy, margin)),
+    grab: (sx, sy) => editor?.grab(sx, sy) ?? false,
+    pull: (dx, dy, sx, sy) => editor.drag(dx, dy, sx, sy),
     hover: (sx, sy) => hover(sx === null ? null : agentAt(sx, sy, 3)),
   });
   window.addEventListener("hashchange", readAddress);

@@ -6,6 +6,7 @@ window.log2sim = {
   get chosen() { return state.chosen?.id ?? null; },
   choose: (id) => choose(tracks.find((track) => track.id === id) ?? null),
   play, pause,
+  corrections: () => editor?.made ?? [],
   // Position of an agent's center on the canvas, CSS pixels; null when it is absent.
   placeOf: (id) => {
     const track = tracks.find((other) => other.id === id);

@@ -2,9 +2,15 @@
 
 const data = load(byId("data").textContent);
 const tracks = data.layers.scenario, ego = tracks.find((track) => track.ego) ?? null;
-for (const track of tracks) track.label = track.id.length > 24 ? `${track.id.slice(0, 23)}…` : track.id;
-const doubtful = tracks.filter((track) => track.doubts.length > 0);
-for (const track of doubtful) track.label += "?";
+const doubtful = [];
+// Names and doubts of tracks that are new.
+const prepareTracks = () => {
+  for (const track of tracks) track.label = track.id.length > 24 ? `${track.id.slice(0, 23)}…` : track.id;
+  doubtful.splice(0, doubtful.length, ...tracks.filter((track) => track.doubts.length > 0));
+  for (const track of doubtful) track.label += "?";
+};
+prepareTracks();
+let editor = null;  // of corrections, on a page of the studio
 const state = {
   t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
   shown: { scenario: true, truth: true, replay: true, trails: true, names: true, predictions: true, ends: true, lanes: true, ground: true, pictures: true, points: true },
@@ -42,6 +48,7 @@ const draw = (now) => {
     if (leader.present) [view.x, view.y] = [leader.px, leader.py];
   }
   painter.paint(data, state.t, state.shown, state.chosen, state.hovered);
+  editor?.paint(painter);
   if (state.shown.pictures) pictures?.paint(state.t, state.chosen, state.hovered);
   const text = state.t.toFixed(2);
   if (text !== labelled) {

@@ -27,7 +27,7 @@ class Track {
     Object.assign(this, {
       id: entry.id, category: entry.category, group: entry.group, stationary: entry.stationary, permanent: entry.permanent,
       ego: entry.ego === true, leading: entry.leading === true || entry.ego === true, base: entry.color ?? null,
-      length: entry.size_m[0], width: entry.size_m[1],
+      length: entry.size_m[0], width: entry.size_m[1], height: entry.size_m[2],
       t: sums(entry.t_s, scales.t_s), x: sums(entry.x_m, scales.x_m), y: sums(entry.y_m, scales.y_m),
       yaw: sums(entry.yaw_rad, scales.yaw_rad), v: sums(entry.speed_mps, scales.speed_mps),
     });
@@ -156,7 +156,7 @@ const load = (text) => {
   const { name, origin, north, metrics, recording, begin_s: begin, end_s: end } = document_;
   return {
     name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title, features: loadFeatures(document_),
-    background: loadBackground(document_.background), north, metrics, recording,
+    background: loadBackground(document_.background), north, metrics, recording, studio: document_.studio ?? null,
     points: recording?.points ? new Points(recording.points, () => requestDraw()) : null,
   };
 };

@@ -100,7 +100,19 @@ def write_page(
     refuse_existing(out_path, overwrite=overwrite)
     if isinstance(recorded, Log):
         recorded = Recorded(localize_like(recorded, scenario.provenance))
-    document = {**page_document(scenario, truth, replay, predict_s, background, metrics), "scales": SCALES}
+    document = page_document(scenario, truth, replay, predict_s, background, metrics)
+    page = make_page(document, scenario, recorded)
+    with replaced(out_path) as temporary:
+        temporary.write_bytes(page)
+    return tuple(document["recording"]["notes"]) if recorded is not None else ()
+
+
+def make_page(document: dict[str, Any], scenario: Scenario, recorded: Recorded | None) -> bytes:
+    """Return the page of a document, to which `recorded` adds what fits of pictures and points of a log.
+
+    Raises `ConfigError` when nothing fits.
+    """
+    document["scales"] = SCALES
     if recorded is not None:
         rest = len(html_of(document).encode()) + MARGIN_BYTES
         if rest >= recorded.max_bytes:
@@ -109,19 +121,22 @@ def write_page(
     page = html_of(document).encode()
     if recorded is not None and len(page) > recorded.max_bytes:
         raise ConfigError(f"--max-mb: the page has {len(page) / 1e6:.2f} MB at least; give as much")
-    with replaced(out_path) as temporary:
-        temporary.write_bytes(page)
-    return tuple(document["recording"]["notes"]) if recorded is not None else ()
+    return page
 
 
 def html_of(document: dict[str, Any]) -> str:
-    """Assemble the page; its content security policy allows this script and style by their hashes and nothing else."""
-    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in SCRIPT_FILES) + "})();\n"
+    """Assemble the page; its content security policy allows this script and style by their hashes and nothing else.
+
+    Only a page of the studio (`document["studio"]`) talks to anybody: the program that serves it.
+    """
+    edits = "studio" in document
+    files = (*SCRIPT_FILES[:-1], *(("studio.js",) if edits else ()), SCRIPT_FILES[-1])
+    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in files) + "})();\n"
     style = _file("style.css")
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
         "base-uri 'none'; form-action 'none'"
-    )
+    ) + ("; connect-src 'self'" if edits else "")
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     parts = {
         "policy": policy,
@@ -129,6 +144,7 @@ def html_of(document: dict[str, Any]) -> str:
         "style": style,
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": script,
+        "panel": _file("studio.html") if edits else "",
     }
     # One pass: inserted text is not searched again, so no name in a scenario can be taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))

@@ -1,0 +1,494 @@
+"""Corrections by hand: a file of them, applied to a scenario as evidence.
+
+A correction names its agent by where it is at a time, so that it holds when the log is reconstructed again with other settings
+or by a later version. One that no longer finds its agent is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from log2sim.datatypes import (
+    CATEGORIES,
+    EGO,
+    TYPICAL_SIZE_M,
+    Agent,
+    MapFeatures,
+    Marking,
+    RoadBorder,
+    Scenario,
+    Waypoints,
+)
+from log2sim.datatypes.agent import STANDSTILL_MPS
+from log2sim.datatypes.map_features import BORDER_KINDS
+from log2sim.edit.motion import STEP_S, resampled, with_steps
+from log2sim.errors import ConfigError, ScenarioError
+from log2sim.files.documents import check, read_json
+from log2sim.geometry import NS_PER_S, Array, wrap_angle
+
+# A later run places an agent elsewhere by its errors, and a hand points beside it: together less than half the gap between parked cars.
+MAX_AWAY_M = 1.0
+# A later run may begin or end a track by some ticks.
+MAX_OUTSIDE_S = 1.0
+# What a trajectory has wrong it has wrong for about as long as the view of an object stays the same.
+CORRELATION_S = 2.0
+POSE_SIGMA_M, POSE_SIGMA_RAD = 0.05, 0.02
+# Where a scenario does not state how sure a heading is; of a box in a LiDAR sweep.
+YAW_SIGMA_RAD = 0.05
+# White acceleration of a road user between two parts of its track, m/s2 over 1 s, as of everyday braking.
+BRIDGE_ACCELERATION = 1.5
+PAINT_WIDTH_M = 0.15
+# What each kind of correction settles.
+SETTLED = {
+    "flip": {"heading_ambiguous", "reversing"},
+    "size": {"unlikely_size"},
+    "category": {"unlikely_size", "speed"},
+    "split": {"jump"},
+    "merge": {"jump", "passes_through"},
+    "move": {"jump", "empty", "in_ego", "passes_through", "sideways"},
+}
+SINGLE = ("category", "size", "color", "flip")
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """The corrected scenario, and a line for each correction that did not find what it is about."""
+
+    scenario: Scenario
+    lost: tuple[str, ...]
+
+
+def load_corrections(path: Path | str) -> dict[str, Any]:
+    """Read a file of corrections.
+
+    Raises
+    ------
+    ScenarioError
+        When it is no JSON, of another version, or a correction lacks what its kind needs.
+    """
+    document = read_json(path, ScenarioError)
+    try:
+        check(document, "corrections-1", ScenarioError)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+    return dict(document)
+
+
+def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
+    """Apply corrections in the order of the file.
+
+    Parameters
+    ----------
+    corrections : mapping
+        A document of `schemas/corrections-1.json`, as `load_corrections` returns it.
+
+    Returns
+    -------
+    Corrected
+        The scenario, with the corrections that were applied and the digest of its source appended to `provenance["corrections"]`.
+
+    Raises
+    ------
+    ConfigError
+        When two corrections contradict each other, or one cannot be: a split outside of the life of an agent.
+    """
+    work = _Work(scenario, corrections.get("map_offset_m"))
+    lost, applied = [], []
+    for number, entry in enumerate(corrections["corrections"], 1):
+        missing = work.apply(number, entry)
+        if missing:
+            lost.append(f"correction {number} ({entry['kind']}): {missing}")
+        else:
+            applied.append(dict(entry))
+    history = [*scenario.provenance.get("corrections", []), {"source_digest": scenario.digest, "corrections": applied}]
+    return Corrected(work.result(history), tuple(lost))
+
+
+class _Work:
+    """A scenario on the way: agents by id, features of the map, and what was said of whom."""
+
+    def __init__(self, scenario: Scenario, offset_m: Sequence[float] | None) -> None:
+        self.scenario = scenario
+        self.agents = {a.id: a for a in scenario.agents}
+        self.deleted: dict[str, Agent] = {}
+        self.features = scenario.map_features or MapFeatures()
+        self.said: dict[tuple[str, str], tuple[int, Any]] = {}
+        self.shift = np.zeros(3) if offset_m is None else np.array(offset_m) - np.array(scenario.map.offset_m)
+
+    def result(self, history: list[Any]) -> Scenario:
+        provenance = {**self.scenario.provenance, "corrections": history}
+        features = self.features if self.features or self.scenario.map_features is not None else None
+        agents = tuple(self.agents.values())
+        end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
+        duration_s = max(self.scenario.duration_s, end_s)
+        return replace(
+            self.scenario, agents=agents, map_features=features, provenance=provenance, duration_s=duration_s
+        )
+
+    def apply(self, number: int, entry: Mapping[str, Any]) -> str:
+        """Apply one correction; return what it did not find, "" where it is done."""
+        kind = entry["kind"]
+        if kind == "draw":
+            self._draw(entry)
+            return ""
+        if kind == "erase":
+            return self._erase(np.array(entry["at"]) + self.shift)
+        if kind == "add":
+            agent = added(entry["category"], entry.get("size_m"), self._poses(entry), self._new_id(entry["category"]))
+            self.agents[agent.id] = agent
+            return ""
+        agent_id = self._find(number, entry["agent"])
+        if agent_id is None:
+            return f"no agent within {MAX_AWAY_M:g} m of {self._place(entry['agent'])}"
+        agent = self.agents[agent_id]
+        if kind in SINGLE:
+            value = {k: entry.get(k) for k in ("category", "size_m", "rgb", "name")}
+            earlier = self.said.setdefault((agent_id, kind), (number, value))
+            if earlier[1] != value:
+                raise ConfigError(
+                    f"corrections {earlier[0]} and {number} contradict each other: two values of '{kind}' for {agent_id}"
+                )
+        if kind == "delete":
+            self.deleted[agent_id] = self.agents.pop(agent_id)
+        elif kind == "merge":
+            other_id = self._find(number, entry["other"])
+            if other_id is None or other_id == agent_id:
+                what = "that is the same agent" if other_id else "no agent"
+                return f"{what} within {MAX_AWAY_M:g} m of {self._place(entry['other'])}"
+            self.agents[agent_id] = settled(merged(agent, self.agents.pop(other_id)), kind)
+        elif kind == "split":
+            t_s = self._time_s(entry["t_ns"])
+            first, second = split(agent, t_s)
+            self.agents[agent_id] = settled(first, kind)
+            new_id = self._new_id(agent.category)
+            self.agents[new_id] = settled(replace(second, id=new_id), kind)
+        elif kind == "confirm":
+            self.agents[agent_id] = replace(agent, confidence=1.0, doubts=(), quarantined=False)
+        elif kind == "move":
+            poses = self._poses(entry)
+            self.agents[agent_id] = settled(moved(agent, poses, float(entry.get("over_s", CORRELATION_S))), kind)
+        else:
+            self.agents[agent_id] = settled(_changed(agent, kind, entry), kind)
+        return ""
+
+    def _find(self, number: int, at: Mapping[str, Any]) -> str | None:
+        """Return the id of the agent whose box is nearest to a place at a time; None where none is near enough."""
+        t_s, x, y = self._time_s(at["t_ns"]), at["x_m"] + self.shift[0], at["y_m"] + self.shift[1]
+        found = nearest_agent([a for a in self.agents.values() if a.id != EGO], t_s, x, y)
+        if found is None:
+            gone = nearest_agent(list(self.deleted.values()), t_s, x, y)
+            if gone is not None:
+                raise ConfigError(
+                    f"correction {number} changes {gone}, which an earlier correction deletes; drop one of the two"
+                )
+        return found
+
+    def _place(self, at: Mapping[str, Any]) -> str:
+        return f"({at['x_m']:.1f}, {at['y_m']:.1f}) m at {self._time_s(at['t_ns']):.2f} s"
+
+    def _time_s(self, t_ns: int) -> float:
+        return (t_ns - self.scenario.t0_ns) / NS_PER_S
+
+    def _new_id(self, category: str) -> str:
+        taken = {*self.agents, *self.deleted}
+        return next(name for k in range(1, len(taken) + 2) if (name := f"{category}-{k}") not in taken)
+
+    def _poses(self, entry: Mapping[str, Any]) -> list[dict[str, float]]:
+        """Return key poses in time and map of the scenario, in the order of time."""
+        shift = dict(zip(("x_m", "y_m", "z_m"), self.shift))
+        poses = [
+            {"t_s": self._time_s(p["t_ns"]), **{k: p[k] + shift.get(k, 0.0) for k in p if k != "t_ns"}}
+            for p in entry["poses"]
+        ]
+        return list({p["t_s"]: p for p in sorted(poses, key=lambda p: p["t_s"])}.values())
+
+    def _draw(self, entry: Mapping[str, Any]) -> None:
+        points = np.array(entry["points_m"], dtype=np.float64) + self.shift
+        items: list[Marking | RoadBorder] = [*self.features.markings, *self.features.borders]
+        taken = {item.id for item in items}
+        name = next(n for k in range(1, len(taken) + 2) if (n := f"drawn-{k}") not in taken)
+        if entry["feature"] in BORDER_KINDS:
+            border = RoadBorder(name, entry["feature"], points)
+            self.features = replace(self.features, borders=(*self.features.borders, border))
+        else:
+            marking = Marking(name, entry["feature"], points, float(entry.get("width_m", PAINT_WIDTH_M)))
+            self.features = replace(self.features, markings=(*self.features.markings, marking))
+
+    def _erase(self, at: Array) -> str:
+        items: list[Marking | RoadBorder] = [*self.features.markings, *self.features.borders]
+        far = [_distance_to_line(item.points_m[:, :2], at[:2]) for item in items]
+        if not far or min(far) > MAX_AWAY_M:
+            return f"no marking or border within {MAX_AWAY_M:g} m of ({at[0]:.1f}, {at[1]:.1f}) m"
+        gone = items[int(np.argmin(far))].id
+        markings = tuple(m for m in self.features.markings if m.id != gone)
+        borders = tuple(b for b in self.features.borders if b.id != gone)
+        lanes = tuple(
+            replace(
+                lane, left=None if lane.left == gone else lane.left, right=None if lane.right == gone else lane.right
+            )
+            for lane in self.features.lanes
+        )
+        self.features = replace(self.features, markings=markings, borders=borders, lanes=lanes)
+        return ""
+
+
+def nearest_agent(agents: Sequence[Agent], t_s: float, x_m: float, y_m: float) -> str | None:
+    """Return the id of the agent whose box at a time is nearest to a place, of several the one whose center is; None beyond `MAX_AWAY_M`."""
+    best: tuple[float, float, str] | None = None
+    for agent in agents:
+        w = agent.waypoints
+        if not agent.is_permanent and not w.t_s[0] - MAX_OUTSIDE_S <= t_s <= w.t_s[-1] + MAX_OUTSIDE_S:
+            continue
+        s = agent.trajectory.at(np.array([t_s]))
+        dx, dy, yaw = x_m - s.x_m[0], y_m - s.y_m[0], s.yaw_rad[0]
+        along, across = abs(dx * np.cos(yaw) + dy * np.sin(yaw)), abs(dy * np.cos(yaw) - dx * np.sin(yaw))
+        outside = np.hypot(max(along - agent.size_m[0] / 2, 0.0), max(across - agent.size_m[1] / 2, 0.0))
+        if outside <= MAX_AWAY_M and (best is None or (outside, np.hypot(dx, dy)) < best[:2]):
+            best = float(outside), float(np.hypot(dx, dy)), agent.id
+    return None if best is None else best[2]
+
+
+def settled(agent: Agent, kind: str) -> Agent:
+    """Return the agent without the doubts that a kind of correction settles."""
+    return replace(agent, doubts=tuple(d for d in agent.doubts if d.kind not in SETTLED.get(kind, ())))
+
+
+def _changed(agent: Agent, kind: str, entry: Mapping[str, Any]) -> Agent:
+    """Return the agent with another category, size, front or color."""
+    w = agent.waypoints
+    if kind == "category":
+        return replace(agent, category=entry["category"])
+    if kind == "size":
+        length, width, height = map(float, entry["size_m"])
+        # The wheels stay on the ground.
+        raised = replace(w, z_m=w.z_m + (height - agent.size_m[2]) / 2)
+        return replace(agent, size_m=(length, width, height), waypoints=raised)
+    if kind == "flip":
+        return replace(agent, waypoints=replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=-w.speed_mps))
+    return replace(agent, color={"rgb": list(entry["rgb"]), "name": entry["name"], "confidence": 1.0})
+
+
+def split(agent: Agent, t_s: float) -> tuple[Agent, Agent]:
+    """Return the agent before a time, and the other object that it is from then on."""
+    w = agent.waypoints
+    first, second = w.t_s < t_s, w.t_s >= t_s
+    if not first.any() or not second.any():
+        raise ConfigError(f"split: {agent.id} has no waypoints on both sides of {t_s:.2f} s")
+    return tuple(replace(agent, waypoints=w.take(part)) for part in (first, second))  # type: ignore[return-value]
+
+
+def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CORRELATION_S) -> Agent:
+    """Return the agent with key poses as further measurements of its trajectory.
+
+    The error of the trajectory is a Gaussian process with the stated sigmas and a Matern covariance (smoothness 3/2) of
+    correlation time `over_s`; of a static agent it is the same at all times. A single pose of sigma s moves the place at its
+    time by the Kalman gain sigma^2 / (sigma^2 + s^2) of its distance (Rasmussen and Williams, "Gaussian Processes for Machine
+    Learning", 2006, section 2.2), and less before and after. Where the poses contradict the stated sigmas, these are too small
+    and grow until the distance is as expected.
+    """
+    key_s = np.array([p["t_s"] for p in poses])
+    w = agent.waypoints
+    if not agent.static:
+        inside = key_s[(key_s > w.t_s[0]) & (key_s < w.t_s[-1])]
+        steps = np.unique(np.concatenate([with_steps(w, float(w.t_s[0]), float(w.t_s[-1])), inside]))
+        w = resampled(agent, steps[np.concatenate([[True], np.diff(steps) > 1e-6])])
+
+    def correlation(a: Array, b: Array) -> Array:
+        apart = np.zeros((len(a), len(b))) if agent.static else np.sqrt(3) * np.abs(a[:, None] - b) / over_s
+        return np.asarray((1 + apart) * np.exp(-apart))
+
+    def posterior(sigma: Array, offset: Array, noise: Array, at: Array) -> tuple[Array, Array]:
+        """Return the mean offsets (T, axes) and the standard deviations (T,) after offsets (K, axes) at times `at` (K,)."""
+        at_key = np.interp(at, w.t_s, sigma)
+        prior, cross = at_key[:, None] * at_key * correlation(at, at), sigma[:, None] * at_key * correlation(w.t_s, at)
+        scale = 1.0
+        for _ in range(50):
+            squared = float(np.sum(offset * np.linalg.solve(scale * prior + np.diag(noise**2), offset))) / offset.size
+            if squared <= 1.01:
+                break
+            scale *= squared
+        inverse = np.linalg.inv(scale * prior + np.diag(noise**2))
+        left = scale * sigma**2 - scale**2 * np.einsum("tk,kl,tl->t", cross, inverse, cross)
+        return scale * cross @ inverse @ offset, np.sqrt(np.maximum(left, 1e-6**2))
+
+    here = agent.trajectory.at(key_s)
+    offset = np.array([[p["x_m"], p["y_m"]] for p in poses]) - np.stack([here.x_m, here.y_m], axis=1)
+    noise = np.array([p.get("sigma_m", POSE_SIGMA_M) for p in poses])
+    shift, sigma_xy = posterior(np.maximum(w.sigma_xy_m, 1e-3), offset, noise, key_s)
+    turn, sigma_yaw = np.zeros(len(w)), np.full(len(w), YAW_SIGMA_RAD) if w.sigma_yaw_rad is None else w.sigma_yaw_rad
+    turned = [k for k, p in enumerate(poses) if "yaw_rad" in p]
+    if turned:
+        angle = wrap_angle(np.array([poses[k]["yaw_rad"] for k in turned]) - here.yaw_rad[turned])[:, None]
+        noise = np.array([poses[k].get("sigma_rad", POSE_SIGMA_RAD) for k in turned])
+        mean, sigma_yaw = posterior(np.maximum(sigma_yaw, 1e-4), angle, noise, key_s[turned])
+        turn = mean[:, 0]
+    yaw, speed = w.yaw_rad, w.speed_mps
+    if not agent.static and len(w) > 1:
+        velocity = np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], axis=1)
+        after = velocity + np.gradient(shift, w.t_s, axis=0)
+        moves = (np.abs(speed) > STANDSTILL_MPS) & (np.hypot(*after.T) > STANDSTILL_MPS)
+        swing = wrap_angle(np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(velocity[:, 1], velocity[:, 0]))
+        if not turned:  # the heading follows the way
+            turn = np.where(moves, swing, 0.0)
+        speed = np.where(moves, np.sign(speed) * np.hypot(*after.T), speed)
+    waypoints = replace(
+        w, x_m=w.x_m + shift[:, 0], y_m=w.y_m + shift[:, 1], yaw_rad=wrap_angle(yaw + turn), speed_mps=speed, sigma_xy_m=sigma_xy,
+        sigma_yaw_rad=sigma_yaw, visible=None, lidar_points=None,
+    )  # fmt: skip
+    return replace(agent, waypoints=waypoints)
+
+
+def merged(agent: Agent, other: Agent) -> Agent:
+    """Return one agent of two tracks of the same object, under the id of the first.
+
+    Where both have states the mean by their variances stands. A gap is bridged by the cubic through the places and velocities
+    at its ends, the mean of a motion of white acceleration, whose variance is a^2 s^3 (T - s)^3 / (3 T^3) at time s of T.
+    """
+    longer = max(
+        (agent, other), key=lambda a: (int(a.waypoints.observed.sum()), a.waypoints.t_s[-1] - a.waypoints.t_s[0])
+    )
+    static = agent.static and other.static
+    if static:
+        waypoints = _mean_of_static(agent.waypoints, other.waypoints)
+    else:
+        first, last = sorted((_unfolded(agent), _unfolded(other)), key=lambda a: float(a.waypoints.t_s[0]))
+        waypoints = _joined(first, last)
+    doubts = tuple(dict.fromkeys(d for a in (agent, other) for d in a.doubts))
+    seen = {
+        side: (*agent.observed_by.get(side, ()), *other.observed_by.get(side, ()))
+        for side in {**agent.observed_by, **other.observed_by}
+    }
+    return replace(
+        longer, id=agent.id, waypoints=waypoints, static=static, doubts=doubts, confidence=max(agent.confidence, other.confidence),
+        quarantined=agent.quarantined and other.quarantined, color=longer.color or agent.color or other.color,
+        observed_by={side: tuple(sorted(spans)) for side, spans in seen.items()},
+    )  # fmt: skip
+
+
+def _unfolded(agent: Agent) -> Agent:
+    """Return the agent with steps of a tenth of a second, so that two can be averaged."""
+    w = agent.waypoints
+    return replace(
+        agent, waypoints=resampled(agent, with_steps(w, float(w.t_s[0]), float(w.t_s[-1]))) if len(w) > 1 else w
+    )
+
+
+def _mean_of_static(a: Waypoints, b: Waypoints) -> Waypoints:
+    """Return one place that never changes, over the times of both."""
+    weight = np.array([1 / max(float(w.sigma_xy_m.min()), 1e-3) ** 2 for w in (a, b)])
+    weight = weight / weight.sum()
+    turn = float(wrap_angle(b.yaw_rad[:1] - a.yaw_rad[0])[0])
+    long = a if len(a) > 1 or len(b) == 1 else b
+    t_s = np.unique(np.concatenate([a.t_s, b.t_s])) if len(a) > 1 and len(b) > 1 else long.t_s
+    place = {k: np.full(len(t_s), weight @ [getattr(w, k)[0] for w in (a, b)]) for k in ("x_m", "y_m", "z_m")}
+    known = [np.interp(t_s, w.t_s, w.observed.astype(np.float64), left=0.0, right=0.0) > 0.5 for w in (a, b)]
+    sigma = (
+        1 / np.sqrt(1 / max(float(a.sigma_xy_m.min()), 1e-3) ** 2 + 1 / max(float(b.sigma_xy_m.min()), 1e-3) ** 2)
+    ) * np.ones(len(t_s))
+    yaw = np.full(len(t_s), float(wrap_angle(a.yaw_rad[:1] + weight[1] * turn)[0]))
+    return Waypoints(
+        t_s=t_s, **place, yaw_rad=yaw, speed_mps=np.zeros(len(t_s)), observed=known[0] | known[1], sigma_xy_m=sigma
+    )
+
+
+def _joined(first: Agent, last: Agent) -> Waypoints:
+    """Return the states of two tracks in the order of time: averaged where both are, bridged where none is."""
+    a, b = first.waypoints, last.waypoints
+    if a.t_s[-1] >= b.t_s[0]:
+        t_s = np.unique(np.concatenate([a.t_s, b.t_s]))
+        t_s = t_s[np.concatenate([[True], np.diff(t_s) > 1e-6])]
+        weights, states = [], []
+        for agent, w in ((first, a), (last, b)):
+            there = (t_s >= w.t_s[0] - 1e-9) & (t_s <= w.t_s[-1] + 1e-9)
+            weights.append(np.where(there, 1 / np.maximum(np.interp(t_s, w.t_s, w.sigma_xy_m), 1e-3) ** 2, 0.0))
+            states.append(agent.trajectory.at(t_s))
+        total = weights[0] + weights[1]
+        share = weights[1] / total
+        mean = {
+            k: (1 - share) * getattr(states[0], k) + share * getattr(states[1], k)
+            for k in ("x_m", "y_m", "z_m", "speed_mps")
+        }
+        yaw = wrap_angle(states[0].yaw_rad + share * wrap_angle(states[1].yaw_rad - states[0].yaw_rad))
+        known = [np.interp(t_s, w.t_s, w.observed.astype(np.float64), left=0.0, right=0.0) > 0.5 for w in (a, b)]
+        return Waypoints(t_s=t_s, **mean, yaw_rad=yaw, observed=known[0] | known[1], sigma_xy_m=1 / np.sqrt(total))
+    span = float(b.t_s[0] - a.t_s[-1])
+    s = np.linspace(0.0, span, max(int(np.ceil(span / STEP_S)), 1) + 1)[1:-1]
+    f = s / span
+
+    def ends(column: str) -> tuple[float, float]:
+        return float(getattr(a, column)[-1]), float(getattr(b, column)[0])
+
+    yaw0, yaw1 = ends("yaw_rad")
+    v0, v1 = ends("speed_mps")
+    place, rate = {}, {}
+    for k, trig in (("x_m", np.cos), ("y_m", np.sin)):
+        p0, p1 = ends(k)
+        begin, end, rise = span * v0 * trig(yaw0), span * v1 * trig(yaw1), p1 - p0
+        c2, c3 = 3 * rise - 2 * begin - end, begin + end - 2 * rise
+        place[k], rate[k] = p0 + f * (begin + f * (c2 + f * c3)), (begin + f * (2 * c2 + 3 * f * c3)) / span
+    pace = np.hypot(rate["x_m"], rate["y_m"])
+    turned = yaw0 + f * wrap_angle(np.array([yaw1 - yaw0]))[0]
+    sign = 1.0 if v0 + v1 >= 0 else -1.0
+    course = np.arctan2(sign * rate["y_m"], sign * rate["x_m"])
+    moves = pace > STANDSTILL_MPS
+    z0, z1 = ends("z_m")
+    sigma0, sigma1 = ends("sigma_xy_m")
+    bridge = BRIDGE_ACCELERATION**2 * s**3 * (span - s) ** 3 / (3 * span**3)
+    middle = Waypoints(
+        t_s=a.t_s[-1] + s, **place, z_m=z0 + f * (z1 - z0), yaw_rad=wrap_angle(np.where(moves, course, turned)),
+        speed_mps=sign * pace, observed=np.zeros(len(s), dtype=bool), sigma_xy_m=np.sqrt((sigma0 + f * (sigma1 - sigma0)) ** 2 + bridge),
+    )  # fmt: skip
+    common = set(a.columns()) & set(middle.columns()) & set(b.columns())
+    return Waypoints(**{k: np.concatenate([w.columns()[k] for w in (a, middle, b)]) for k in common})
+
+
+def added(category: str, size_m: Sequence[float] | None, poses: Sequence[Mapping[str, float]], name: str) -> Agent:
+    """Return an agent that passes key poses on the path of least acceleration, static where there is one pose or all are one place."""
+    from scipy.interpolate import CubicSpline
+
+    if category not in CATEGORIES:
+        raise ConfigError(f"add: no category '{category}'")
+    length, width, height = map(float, TYPICAL_SIZE_M[category] if size_m is None else size_m)
+    key_s = np.array([p["t_s"] for p in poses])
+    at = np.array([[p["x_m"], p["y_m"], p.get("z_m", height / 2)] for p in poses])
+    sigma = np.array([p.get("sigma_m", POSE_SIGMA_M) for p in poses])
+    given = np.array([p.get("yaw_rad", np.nan) for p in poses])
+    static = bool(np.ptp(at[:, :2], axis=0).max() <= POSE_SIGMA_M)
+    if static:
+        one = np.ones(1)
+        yaw = given[np.isfinite(given)][:1] if np.isfinite(given).any() else 0 * one
+        waypoints = Waypoints(key_s[:1], at[:1, 0], at[:1, 1], at[:1, 2], wrap_angle(yaw), 0 * one, one < 0, sigma[:1])
+        return Agent(name, category, (length, width, height), waypoints, static=True)
+    t_s = np.unique(np.concatenate([np.arange(key_s[0], key_s[-1], STEP_S), key_s]))
+    t_s = t_s[np.concatenate([[True], np.diff(t_s) > 1e-6])]
+    spline = CubicSpline(key_s, at, bc_type="natural")
+    xyz, rate = spline(t_s), spline(t_s, 1)
+    pace = np.hypot(rate[:, 0], rate[:, 1])
+    course = np.unwrap(np.arctan2(rate[:, 1], rate[:, 0]))
+    # Where it stands it keeps the heading with which it came.
+    course = np.interp(t_s, t_s[pace > STANDSTILL_MPS], course[pace > STANDSTILL_MPS])
+    waypoints = Waypoints(
+        t_s,
+        xyz[:, 0],
+        xyz[:, 1],
+        xyz[:, 2],
+        wrap_angle(course),
+        pace,
+        np.zeros(len(t_s), dtype=bool),
+        np.interp(t_s, key_s, sigma),
+    )
+    return Agent(name, category, (length, width, height), waypoints)
+
+
+def _distance_to_line(points: Array, at: Array) -> float:
+    """Distance in m from a point (2,) to a polyline (N, 2)."""
+    begin, along = points[:-1], np.diff(points, axis=0)
+    share = np.clip(
+        np.einsum("ni,ni->n", at - begin, along) / np.maximum(np.einsum("ni,ni->n", along, along), 1e-12), 0, 1
+    )
+    return float(np.hypot(*(begin + share[:, None] * along - at).T).min())

@@ -1,0 +1,174 @@
+"""The studio: a page on which a scenario is corrected, served to this computer alone."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from log2sim.datatypes import CATEGORIES, Scenario
+from log2sim.edit.corrections import Corrected, correct, load_corrections
+from log2sim.errors import Log2SimError, ScenarioError
+from log2sim.files.documents import check, write_json
+from log2sim.visualization.page.document import SCALES, page_document
+from log2sim.visualization.page.writer import make_page
+from log2sim.visualization.plot.drawing import Background
+from log2sim.visualization.recording import Recorded
+
+# A hundred thousand corrections have some 20 MB.
+MAX_BODY_BYTES = 32_000_000
+HOST = "127.0.0.1"
+
+
+class Studio:
+    """A scenario with the corrections of a file, which every change of the page is written to.
+
+    Attributes
+    ----------
+    address : str
+        Of the page, with a token that each run makes anew.
+    result : Corrected
+        The scenario with all corrections so far.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        path: Path,
+        *,
+        recorded: Recorded | None = None,
+        background: Background | None = None,
+        port: int = 0,
+    ) -> None:
+        """Open a scenario; `path` holds its corrections, earlier ones are gone on with.
+
+        Raises
+        ------
+        ScenarioError, ConfigError
+            When the file is none of corrections, or they contradict each other.
+        OSError
+            When the port is taken.
+        """
+        self.scenario, self.path, self.recorded, self.background = scenario, path, recorded, background
+        empty = {"format": "log2sim-corrections", "version": 1, "log": scenario.name, "corrections": []}
+        self.document: dict[str, Any] = load_corrections(path) if path.exists() else empty
+        self.result: Corrected = correct(scenario, self.document)
+        self._token = secrets.token_urlsafe(24)
+        self._lock = threading.Lock()
+        studio = self
+
+        class Handler(_Handler):
+            served = studio
+
+        self._server = ThreadingHTTPServer((HOST, port), Handler)
+        self._server.daemon_threads = True
+        self.origin = f"http://{HOST}:{self._server.server_address[1]}"
+        self.address = f"{self.origin}/{self._token}/"
+
+    def serve(self) -> None:
+        """Answer until `close` is called or the program is interrupted."""
+        try:
+            self._server.serve_forever(poll_interval=0.1)
+        finally:
+            self._server.server_close()
+
+    def close(self) -> None:
+        """Have `serve` return."""
+        self._server.shutdown()
+
+    def page(self) -> bytes:
+        """Return the page with the scenario as it is corrected now."""
+        with self._lock:
+            document = page_document(self.result.scenario, background=self.background)
+            ego = self.scenario.ego
+            document["studio"] = {
+                "address": f"/{self._token}/corrections",
+                "t0_ns": self.scenario.t0_ns,
+                "map_offset_m": list(self.scenario.map.offset_m),
+                "log": self.scenario.name,
+                "categories": list(CATEGORIES),
+                "corrections": self.document["corrections"],
+                # The height of the ground where an agent is added, by where the ego stands.
+                "ground_m": None if ego is None else float(ego.waypoints.z_m[0]) - ego.size_m[2] / 2,
+            }
+            return make_page(document, self.result.scenario, self.recorded)
+
+    def keep(self, body: bytes) -> dict[str, Any]:
+        """Apply a document of corrections, write it to the file, and return what the page shows of the scenario then.
+
+        Raises `Log2SimError` for what is no such document, and for corrections that cannot be.
+        """
+        try:
+            document = json.loads(body, parse_constant=_refuse)
+        except (ValueError, RecursionError) as problem:
+            raise ScenarioError(f"no JSON: {type(problem).__name__}") from None
+        check(document, "corrections-1", ScenarioError)
+        with self._lock:
+            result = correct(self.scenario, document)
+            write_json(self.path, document)
+            self.document, self.result = document, result
+            agents = page_document(result.scenario)["layers"]["scenario"]
+        return {"agents": agents, "scales": SCALES, "lost": list(result.lost)}
+
+    def allows(self, path: str, host: str | None, origin: str | None) -> bool:
+        """Whether a request is for this run, asked of this computer by its own page."""
+        named = path.startswith(f"/{self._token}/") and host == self.origin.removeprefix("http://")
+        return named and origin in (None, self.origin)
+
+
+def _refuse(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Two answers: the page, and what corrections make of the scenario."""
+
+    served: Studio
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "log2sim", ""
+    timeout = 30
+
+    def do_GET(self) -> None:
+        """Answer with the page."""
+        if not self.served.allows(self.path, self.headers["Host"], self.headers["Origin"]) or not self.path.endswith(
+            "/"
+        ):
+            return self._answer(404, "text/plain", b"not found")
+        try:
+            self._answer(200, "text/html; charset=utf-8", self.served.page())
+        except Log2SimError as error:
+            self._answer(500, "text/plain; charset=utf-8", str(error).encode())
+
+    def do_PUT(self) -> None:
+        """Keep corrections."""
+        if not self.served.allows(self.path, self.headers["Host"], self.headers["Origin"]) or not self.path.endswith(
+            "/corrections"
+        ):
+            return self._answer(404, "text/plain", b"not found")
+        length = self.headers["Content-Length"] or ""
+        if not length.isascii() or not length.isdecimal() or int(length[:12]) > MAX_BODY_BYTES:
+            self.close_connection = True
+            return self._answer(413, "application/json", b'{"error": "too large"}')
+        try:
+            reply, code = self.served.keep(self.rfile.read(int(length))), 200
+        except Log2SimError as error:
+            reply, code = {"error": str(error)}, 422
+        except OSError as error:
+            reply, code = {"error": f"{self.served.path}: {error.strerror}"}, 500
+        self._answer(code, "application/json", json.dumps(reply).encode())
+
+    def _answer(self, code: int, kind: str, body: bytes) -> None:
+        self.send_response(code)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Print nothing."""

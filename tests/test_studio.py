@@ -1,0 +1,244 @@
+"""The studio: what it serves and to whom, what it keeps, and what can be done on its page."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import CHROMIUM, DRIVER, Browser, browsing
+from command_line import run
+from test_edit import parked, scenario, straight
+
+from log2sim.datatypes import Finding, Scenario
+from log2sim.edit.corrections import load_corrections
+from log2sim.errors import ScenarioError
+from log2sim.visualization.studio import Studio
+
+
+def world() -> Scenario:
+    """A car whose track is broken in two beside a parked one that points backwards."""
+    whole = straight("car-1", y_m=6.0)
+    w = whole.waypoints
+    first, last = (
+        type(whole)(**{**vars_of(whole), "id": name, "waypoints": w.take(part)})
+        for name, part in (("car-1", w.t_s < 1.5), ("car-2", w.t_s > 2.0))
+    )
+    doubtful = type(whole)(**{**vars_of(parked("car-3")), "doubts": (Finding("heading_ambiguous"),)})
+    return scenario(straight("ego", speed_mps=5.0), first, last, doubtful)
+
+
+def vars_of(agent: Any) -> dict[str, Any]:
+    return {name: getattr(agent, name) for name in type(agent).__dataclass_fields__}
+
+
+@contextlib.contextmanager
+def serving(path: Path) -> Iterator[Studio]:
+    studio = Studio(world(), path)
+    thread = threading.Thread(target=studio.serve, daemon=True)
+    thread.start()
+    try:
+        yield studio
+    finally:
+        studio.close()
+        thread.join(10)
+
+
+def ask(studio: Studio, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection(studio.origin.removeprefix("http://"), timeout=20)
+    connection.request(method, path, body, headers)
+    reply = connection.getresponse()
+    got = reply.status, reply.read()
+    connection.close()
+    return got
+
+
+FLIP = {"kind": "flip", "agent": {"t_ns": 10**9, "x_m": 30.0, "y_m": -3.0}}
+
+
+def put(studio: Studio, *entries: Any, **headers: str) -> tuple[int, dict[str, Any]]:
+    document = {"format": "log2sim-corrections", "version": 1, "corrections": list(entries)}
+    path = studio.address.removeprefix(studio.origin) + "corrections"
+    code, body = ask(studio, "PUT", path, json.dumps(document).encode(), **headers)
+    return code, json.loads(body) if code != 404 else {}
+
+
+def test_what_is_corrected_is_kept_and_gone_on_with(tmp_path: Path) -> None:
+    file = tmp_path / "c.json"
+    with serving(file) as studio:
+        code, reply = put(studio, FLIP)
+        assert code == 200
+        assert reply["lost"] == []
+        assert [a["doubts"] for a in reply["agents"] if a["id"] == "car-3"] == [[]]
+    assert load_corrections(file)["corrections"] == [FLIP]
+    with serving(file) as studio:
+        assert not studio.result.scenario["car-3"].doubts
+        assert b"heading_ambiguous" not in studio.page()
+
+
+def test_only_its_own_page_on_this_computer_is_answered(tmp_path: Path) -> None:
+    with serving(tmp_path / "c.json") as studio:
+        page = studio.address.removeprefix(studio.origin)
+        assert ask(studio, "GET", page)[0] == 200
+        assert ask(studio, "GET", "/")[0] == 404
+        assert ask(studio, "GET", "/guess/")[0] == 404
+        assert ask(studio, "GET", page, Host="evil.example")[0] == 404
+        assert put(studio, FLIP, Origin="http://evil.example")[0] == 404
+        assert put(studio, FLIP, Host="localhost.evil.example")[0] == 404
+        assert studio.origin.startswith("http://127.0.0.1:")
+    assert not (tmp_path / "c.json").exists()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"{",
+        b"[" * 100_000,
+        b'{"format": 1}',
+        b'{"format": "log2sim-corrections", "version": 1, "corrections": [NaN]}',
+    ],
+)
+def test_a_body_that_is_no_document_changes_nothing(tmp_path: Path, body: bytes) -> None:
+    with serving(tmp_path / "c.json") as studio:
+        put(studio, FLIP)
+        path = studio.address.removeprefix(studio.origin) + "corrections"
+        code, reply = ask(studio, "PUT", path, body)
+        assert code == 422
+        assert "error" in json.loads(reply)
+        assert ask(studio, "PUT", path, None, **{"Content-Length": "99999999999"})[0] == 413
+        assert put(studio, FLIP)[0] == 200
+    assert load_corrections(tmp_path / "c.json")["corrections"] == [FLIP]
+
+
+def test_contradicting_corrections_are_one_line_and_not_kept(tmp_path: Path) -> None:
+    with serving(tmp_path / "c.json") as studio:
+        entries = [{**FLIP, "kind": "category", "category": name} for name in ("bus", "truck")]
+        code, reply = put(studio, *entries)
+        assert code == 422
+        assert "contradict" in reply["error"]
+    assert not (tmp_path / "c.json").exists()
+    (tmp_path / "c.json").write_text("{}")
+    with pytest.raises(ScenarioError):
+        Studio(world(), tmp_path / "c.json")
+
+
+def test_a_second_studio_on_a_file_is_refused(tmp_path: Path) -> None:
+    world().save(tmp_path / "s.json")
+    arguments = ["studio", tmp_path / "s.json", "--corrections", tmp_path / "c.json", "--no-browser"]
+    command = [sys.executable, "-m", "log2sim", *map(str, arguments)]
+    first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        assert first.stdout is not None
+        assert first.stdout.readline().startswith("http://127.0.0.1:")
+        ran = run(*arguments)
+        assert ran.code == 2
+        assert "c.json" in ran.err
+        first.send_signal(signal.SIGINT)
+        assert "0 corrections" in first.communicate(timeout=20)[0]
+        assert first.returncode == 0
+    finally:
+        first.kill()
+
+
+# The page
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if CHROMIUM is None or DRIVER is None:
+        pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
+    with browsing(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def studio(tmp_path: Path) -> Iterator[Studio]:
+    with serving(tmp_path / "c.json") as served:
+        yield served
+
+
+def shown(browser: Browser, studio: Studio, count: int) -> list[str]:
+    """Wait until so many corrections are kept; return the agents of the page."""
+    browser.wait(f"log2sim.corrections().length === {count}")
+    assert len(studio.document["corrections"]) == count
+    return list(browser.run("return log2sim.agents"))
+
+
+def click(browser: Browser, name: str) -> None:
+    browser.run("document.getElementById(arguments[0]).click()", f"studio-{name}")
+
+
+def place(browser: Browser, agent: str) -> tuple[float, float]:
+    x, y = browser.run(
+        "const r = document.getElementById('map').getBoundingClientRect(), p = log2sim.placeOf(arguments[0]); return [p[0] + r.left, p[1] + r.top]",
+        agent,
+    )
+    return float(x), float(y)
+
+
+def test_a_scenario_is_corrected_on_the_page(chromium: Browser, studio: Studio) -> None:
+    browser = chromium
+    browser.open(studio.address)
+    browser.press("J")  # the doubtful one
+    assert browser.run("return log2sim.chosen") == "car-3"
+    browser.press("B")
+    shown(browser, studio, 1)
+    assert studio.result.scenario["car-3"].waypoints.yaw_rad[0] < 0
+    assert browser.run("return document.getElementById('doubts-toggle').hidden")
+
+    # Two tracks of one car, merged by the keyboard and a click.
+    browser.run("log2sim.choose('car-1'); log2sim.time = 2.2")
+    browser.press("M")
+    browser.mouse(place(browser, "car-2"))
+    assert shown(browser, studio, 2) == ["ego", "car-1", "car-3"]
+    assert studio.result.scenario["car-1"].waypoints.t_s[-1] == 4.0
+
+    # Dragged 2 m to the left of its way, and put back by undo.
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    click(browser, "move")
+    x, y = place(browser, "car-1")
+    browser.mouse((x, y), (x, y - scale), (x, y - 2 * scale))
+    click(browser, "move")
+    shown(browser, studio, 3)
+    assert studio.result.scenario["car-1"].at(2.2).y_m[0] == pytest.approx(8.0, abs=2 / scale)
+    browser.press("Z")
+    shown(browser, studio, 2)
+    assert studio.result.scenario["car-1"].at(2.2).y_m[0] == pytest.approx(6.0, abs=0.01)
+    browser.press("Y")
+    shown(browser, studio, 3)
+
+    browser.run(
+        "const e = document.getElementById('studio-category'); e.value = 'truck'; e.dispatchEvent(new Event('change'))"
+    )
+    shown(browser, studio, 4)
+    assert studio.result.scenario["car-1"].category == "truck"
+    browser.press("\ue017")  # Delete
+    assert "car-1" not in shown(browser, studio, 5)
+    assert [entry for entry in browser.log("browser") if entry["level"] == "SEVERE"] == []
+    assert {address.split("/")[2] for address in browser.requests()} <= {studio.origin.removeprefix("http://")}
+
+
+def test_on_a_phone_and_by_touch(chromium: Browser, studio: Studio) -> None:
+    browser = chromium
+    browser.open(studio.address, size=(420, 800), dark=True)
+    browser.touch([place(browser, "car-3")])
+    browser.wait("log2sim.chosen === 'car-3'")
+    for name in ("confirm", "merge", "move", "next", "undo"):
+        left, top, right, bottom = browser.run(
+            "const r = document.getElementById(arguments[0]).getBoundingClientRect(); return [r.left, r.top, r.right, r.bottom]",
+            f"studio-{name}",
+        )
+        assert bottom - top >= 44
+        assert 0 <= left < right <= 420
+    click(browser, "confirm")
+    shown(browser, studio, 1)
+    assert not studio.result.scenario["car-3"].is_doubtful
