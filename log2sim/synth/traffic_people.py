@@ -63,13 +63,11 @@ def shifted(part: Polytope, x: float, y: float) -> Polytope:
     return Polytope(part.normals, offsets.astype(np.float32), part.low + move, part.high + move, part.material)
 
 
-def _person(height: float, parts: list[Polytope], things: list[Polytope] | None = None) -> Shape:
-    """Box people in without what they push or hold."""
+def _person(parts: list[Polytope], things: list[Polytope] | None = None) -> Shape:
+    """Box people in without what they push or hold, which is in their middle's frame too."""
     low, high = np.min([p.low for p in parts], axis=0), np.max([p.high for p in parts], axis=0)
-    # The box's middle is the person's.
-    x, y = (low[:2] + high[:2]) / 2
-    length, width = float(np.clip(high[0] - low[0], 0.35, 1.3)), float(np.clip(high[1] - low[1], 0.3, 1.0))
-    return (length, width, height), tuple(shifted(p, -x, -y) for p in parts + (things or []))
+    (x, y), (length, width, _) = (low[:2] + high[:2]) / 2, np.maximum(high - low, [0.35, 0.3, 0.0])
+    return (float(length), float(width), float(high[2])), tuple(shifted(p, -x, -y) for p in parts + (things or []))
 
 
 def _height(rng: Rng) -> float:
@@ -86,13 +84,13 @@ def _upright(rng: Rng, height: float, *, reach: float | None = None, lean: float
 def walking(rng: Rng) -> Shape:
     """Draw somebody who stands or walks, some with hands in front."""
     height = _height(rng)
-    return _person(height, _upright(rng, height, reach=rng.uniform(0.15, 0.4) if rng.random() < 0.25 else None))
+    return _person(_upright(rng, height, reach=rng.uniform(0.15, 0.4) if rng.random() < 0.25 else None))
 
 
 def child(rng: Rng) -> Shape:
     """Draw a child of one year to twelve."""
     height = float(rng.uniform(0.75, 1.45))
-    return _person(height, _upright(rng, height))
+    return _person(_upright(rng, height))
 
 
 def coat(rng: Rng) -> Shape:
@@ -100,7 +98,7 @@ def coat(rng: Rng) -> Shape:
     height = _height(rng)
     hips, hem, flare = 0.5 * height, rng.uniform(0.05, 0.5), rng.uniform(0.12, 0.28)
     skirt = prism([(-flare, hem), (flare, hem), (0.14, hips + 0.05), (-0.14, hips + 0.05)], 2 * flare, CLOTH, taper=0.1)
-    return _person(height, [*_torso(rng, height, base=hips, lean=0.03), skirt, column(0.1, (0.0, hem + 0.05), CLOTH)])
+    return _person([*_torso(rng, height, base=hips, lean=0.03), skirt, column(0.1, (0.0, hem + 0.05), CLOTH)])
 
 
 def bent(rng: Rng) -> Shape:
@@ -113,7 +111,7 @@ def bent(rng: Rng) -> Shape:
         parts.append(box((-0.2, -0.2, 0.0), (rng.uniform(0.2, 0.45), 0.2, hips + 0.05), CLOTH))
     else:
         parts += _legs(rng, hips, 0.0, 0.1)
-    return _person(float(max(p.high[2] for p in parts)), parts)
+    return _person(parts)
 
 
 def seated(rng: Rng) -> Shape:
@@ -141,7 +139,7 @@ def seated(rng: Rng) -> Shape:
         things += [box((x, y - 0.02, 0), (x + 0.04, y + 0.02, seat), METAL) for x in (-0.34, 0.08) for y in (-0.2, 0.2)]
         if rng.random() < 0.7:
             things.append(box((-0.38, -0.23, seat), (-0.33, 0.23, seat + rng.uniform(0.35, 0.5)), Material.WOOD))
-    return _person(float(max(p.high[2] for p in parts)), parts, things)
+    return _person(parts, things)
 
 
 def laden(rng: Rng) -> Shape:
@@ -161,7 +159,7 @@ def laden(rng: Rng) -> Shape:
         parts.append(
             box((0.12, -0.25, hips + 0.05), (rng.uniform(0.4, 0.6), 0.25, hips + rng.uniform(0.25, 0.5)), Material.WOOD)
         )
-    return _person(height, parts)
+    return _person(parts)
 
 
 def suitcase(rng: Rng) -> Shape:
@@ -169,7 +167,7 @@ def suitcase(rng: Rng) -> Shape:
     height, back, y = _height(rng), rng.uniform(0.5, 0.8), rng.choice([-0.25, 0.25])
     case = [box((-back - 0.2, y - 0.2, 0.05), (-back + 0.1, y + 0.2, rng.uniform(0.5, 0.8)), CLOTH)]
     case.append(box((-back, y - 0.02, 0.5), (-back + 0.05, y + 0.02, 1.0), METAL))
-    return _person(height, _upright(rng, height), case)
+    return _person(_upright(rng, height), case)
 
 
 def _wheels(at: list[tuple[float, float]], radius: float) -> list[Polytope]:
@@ -184,7 +182,7 @@ def cart(rng: Rng) -> Shape:
     mesh = Material.MESH if rng.random() < 0.4 else Material.WOOD
     things = [box((start, -w, low), (end, w, top), mesh), box((start - 0.1, -w, 0.9), (start, w, 0.96), METAL)]
     things += _wheels([(x, y) for x in (start + 0.15, end - 0.15) for y in (-w, w)], rng.uniform(0.07, low * 0.8))
-    return _person(height, _upright(rng, height, reach=start, lean=rng.uniform(0.05, 0.3)), things)
+    return _person(_upright(rng, height, reach=start, lean=rng.uniform(0.05, 0.3)), things)
 
 
 def pram(rng: Rng) -> Shape:
@@ -199,7 +197,7 @@ def pram(rng: Rng) -> Shape:
         bar,
         *_wheels([(x, y) for x in (start + 0.1, start + 0.65) for y in (-0.26, 0.26)], rng.uniform(0.1, 0.2)),
     ]
-    return _person(height, _upright(rng, height, reach=start), things)
+    return _person(_upright(rng, height, reach=start), things)
 
 
 def dog(rng: Rng) -> Shape:
@@ -223,7 +221,7 @@ def dog(rng: Rng) -> Shape:
     things.append(
         box((x + length, y - tall * 0.12, tall * 0.8), (x + length + tall * 0.35, y + tall * 0.12, tall * 1.15), CLOTH)
     )
-    return _person(height, _upright(rng, height), things)
+    return _person(_upright(rng, height), things)
 
 
 def wheelchair(rng: Rng) -> Shape:
@@ -237,7 +235,7 @@ def umbrella(rng: Rng) -> Shape:
     """Draw somebody under an umbrella."""
     height, radius = _height(rng), rng.uniform(0.45, 0.65)
     shade = ellipsoid((radius, radius, 0.15), (0.1, 0.1, height + 0.2), CLOTH)
-    return _person(height, _upright(rng, height), [shade, column(0.015, (1.1, height + 0.2), METAL, at=(0.15, 0.1))])
+    return _person(_upright(rng, height), [shade, column(0.015, (1.1, height + 0.2), METAL, at=(0.15, 0.1))])
 
 
 def _bicycle(rng: Rng, length: float, radius: float) -> list[Polytope]:
@@ -267,7 +265,7 @@ def pushed_bicycle(rng: Rng) -> Shape:
     things = [
         shifted(p, rng.uniform(0.0, 0.3), y) for p in _bicycle(rng, rng.uniform(1.6, 1.85), rng.uniform(0.31, 0.36))
     ]
-    return _person(height, _upright(rng, height, reach=rng.uniform(0.2, 0.4)), things)
+    return _person(_upright(rng, height, reach=rng.uniform(0.2, 0.4)), things)
 
 
 def _rider(rng: Rng, height: float, seat: float, lean: float, foot: float) -> list[Polytope]:
@@ -410,7 +408,7 @@ def parked_motorcycle(rng: Rng) -> Shape:
 def bicycle(rng: Rng) -> Shape:
     """Draw a bicycle without a rider."""
     length = rng.uniform(1.4, 1.85)
-    return (length, 0.6, 1.05), tuple(_bicycle(rng, length, rng.uniform(0.19, 0.2) * length))
+    return _ridden(length, 0.6, _bicycle(rng, length, rng.uniform(0.19, 0.2) * length))
 
 
 def kick_scooter(rng: Rng) -> Shape:
