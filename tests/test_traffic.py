@@ -313,6 +313,10 @@ def test_boxes_in_space_project_into_boxes_in_the_picture(kitti: Path) -> None:
             left, top, right, bottom = values[3:7]
             assert -1 <= left < right <= w
             assert -1 <= top < bottom <= h
+            # People may push or pull something that is in their silhouette and not in their box.
+            if kind in ("Pedestrian", "Cyclist"):
+                assert np.all(uv.min(0) < [right, bottom]) and np.all(uv.max(0) > [left, top])  # noqa: PT018
+                continue
             # The silhouette lies within the projected box and fills most of it.
             assert np.all(uv.min(0) < [left + 2, top + 2])
             assert np.all(uv.max(0) > [right - 2, bottom - 2])
