@@ -317,12 +317,15 @@ def main(arguments: list[str] | None = None) -> None:
             generate(options.mount, data, this.scenes, this.seed)
     # Drawing scenes takes as long as training on them, so both are done side by side.
     generator = None if options.only else Popen([sys.executable, __file__, *arguments, "--only", "generate"])
-    if options.only in (None, "fit"):
-        for number in range(1, len(rounds) + 1):
+    try:
+        for number in range(1, len(rounds) + 1) if options.only in (None, "fit") else ():
             fit(
                 options.mount, data, options.out, rounds[:number], own,
                 start=options.start, bfloat16=options.bfloat16, generator=generator,
             )  # fmt: skip
+    finally:
+        if generator is not None:
+            generator.terminate()
     if options.only in (None, "finish"):
         finish(options.mount, options.out, rounds, options.examples, held_out)
 
