@@ -311,7 +311,8 @@ def main(arguments: list[str] | None = None) -> None:
     data = options.out / "data"
     if options.scenes == 0 and not options.data:
         parser.error("--scenes 0 needs --data")
-    own, held_out = read_own(options.data, data, options.every) if options.data else ([], [])
+    reads = bool(options.data) and options.only != "generate"
+    own, held_out = read_own(options.data, data, options.every) if reads else ([], [])
     if options.only == "generate":
         for this in rounds:
             generate(options.mount, data, this.scenes, this.seed)
