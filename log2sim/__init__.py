@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from log2sim.pipeline import reconstruct
     from log2sim.prediction.prediction import predict_scenario
     from log2sim.road.builder import map_ground
+    from log2sim.scenarios.failure import search as search_failures
+    from log2sim.scenarios.logical import fit as fit_logical
+    from log2sim.scenarios.query import ask as find_situations
+    from log2sim.scenarios.tagging import tag as tag_scenario
     from log2sim.simulation.runner import replay
     from log2sim.synth.synthesis import write_synthetic
     from log2sim.visualization.page.writer import write_page as view
@@ -45,6 +49,8 @@ _PLACES = {
     "examine_installation": "log2sim.cli.doctor:examine",
     "export_scenario": "log2sim.export.exporters:export",
     "import_scenario": "log2sim.export.openscenario.read:load",
+    "find_situations": "log2sim.scenarios.query:ask",
+    "fit_logical": "log2sim.scenarios.logical:fit",
     "map_ground": "log2sim.road.builder:map_ground",
     "open_log": "log2sim.logs.opening:open_log",
     "plot": "log2sim.visualization.plot.scene:plot",
@@ -52,8 +58,10 @@ _PLACES = {
     "reconstruct": "log2sim.pipeline:reconstruct",
     "reconstruct_all": "log2sim.batch.run:reconstruct_all",
     "replay": "log2sim.simulation.runner:replay",
+    "search_failures": "log2sim.scenarios.failure:search",
     "show_progress": "log2sim.visualization.progress:show_progress",
     "summarize_log": "log2sim.logs.excerpt:summarize",
+    "tag_scenario": "log2sim.scenarios.tagging:tag",
     "validate_log": "log2sim.logs.validation:validate_log",
     "view": "log2sim.visualization.page.writer:write_page",
     "write_log": "log2sim.logs.native.writer:write_log",
@@ -63,8 +71,8 @@ _PLACES = {
 
 __all__ = [
     "Config", "Log2SimError", "Scenario", "__version__", "bench", "correct_scenario", "detect_log", "edit_scenario", "evaluate", "examine_installation",
-    "export_scenario", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
-    "replay", "show_progress", "summarize_log", "validate_log", "view", "write_log", "write_synthetic",
+    "export_scenario", "find_situations", "fit_logical", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
+    "replay", "search_failures", "show_progress", "summarize_log", "tag_scenario", "validate_log", "view", "write_log", "write_synthetic",
 ]  # fmt: skip
 
 

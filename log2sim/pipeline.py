@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,82 +10,27 @@ import numpy as np
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.confidence import rate_agents
 from log2sim.agents.conflicts import extend_static
-from log2sim.agents.estimate import (
-    camera_entries,
-    ego_agent,
-    ego_path,
-    estimate_agents,
-    provenance_of,
-    roadside_sensors,
-    simplify,
-    with_observers,
-    with_pose_errors,
-)
+from log2sim.agents.estimate import ego_agent, ego_path, estimate_agents, simplify, with_observers, with_pose_errors
 from log2sim.agents.evidence import Recording
 from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import judge
 from log2sim.config import Config
-from log2sim.datatypes import Finding, Log, Measurements, Scenario
-from log2sim.errors import NothingToReconstruct
+from log2sim.datatypes import Log
 from log2sim.files.processes import default_jobs
 from log2sim.files.stages import StageClock
-from log2sim.geometry import NS_PER_S
-from log2sim.localization.choice import GIVEN, PoseChoice, localize, refine_for_map
+from log2sim.localization.choice import localize, refine_for_map
 from log2sim.localization.given_poses import list_faults
 from log2sim.localization.mounts import check_calibration
 from log2sim.localization.roadside import register_road
-from log2sim.logs.checks import say_without_pose
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse_by_end
 from log2sim.perception.homography_stage import fit_homographies, place_by_homography
-from log2sim.perception.run_detectors import Detectors, GivenDetector, create_detectors, sort_detectors
-from log2sim.perception.sync import Schedule, schedule_of
-from log2sim.plan import Plan, choose_detector, make_plan, select_sensors
-from log2sim.report import report_of, stage_outcomes
+from log2sim.perception.run_detectors import GivenDetector, create_detectors, sort_detectors
+from log2sim.perception.sync import schedule_of
+from log2sim.plan import choose_detector, make_plan, select_sensors
+from log2sim.report import Progress, Result, Run, conclude, draft_scenario
 from log2sim.road.describe import describe
 from log2sim.tracking.tracker import mark_unrecorded, track_ends
-
-Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What came of a run: the scenario, a report as of `schemas/report-1.json`, the log as it was used, and what is wrong with it."""
-
-    scenario: Scenario
-    report: dict[str, Any]
-    log: Log
-    findings: tuple[Finding, ...]  # of poses, sensors and records; those of agents are their doubts
-
-    def __repr__(self) -> str:
-        """Return its scenario and its log in one line."""
-        return f"<Result: {self.scenario!r} of {self.log!r}>"
-
-    def _repr_html_(self) -> str | None:
-        """Return what a notebook shows of its scenario."""
-        return self.scenario._repr_html_()
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What the stages of one run share: the sensors in one map and on one clock, the ticks, and the plan.
-
-    `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
-    `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
-    of processes that share the ticks.
-    """
-
-    log: Log
-    config: Config
-    plan: Plan
-    schedule: Schedule
-    detectors: Detectors
-    clock: StageClock
-    progress: Progress
-    jobs: int = 1
-    poses: PoseChoice = GIVEN
-    faults: tuple[Finding, ...] = ()
-    registration: Sequence[dict[str, Any]] = ()
 
 
 def reconstruct(
@@ -107,26 +51,20 @@ def reconstruct(
     config : Config, optional
         Settings; the defaults without.
     detector : callable, Detector, LidarDetector, str or a list of two of them, optional
-        Takes the place of `detect.name` in the settings. A function gets a picture, (H, W, 3) uint8 BGR, and returns rows of x0,
-        y0, x1, y1 in px, score in [0, 1], category of `log2sim.datatypes.CATEGORIES`; or `Detections`. An object has the members of
-        `log2sim.perception.detect.detectors.Detector` or, for LiDAR sweeps, of `log2sim.perception.detect3d.detectors.LidarDetector`.
-        A name is one that `--detector` takes. A list joins one for pictures and one for sweeps, such as `[find_cars, "lidar:vehicle"]`.
+        In place of `detect.name` of the settings. A function gets a picture, (H, W, 3) uint8 BGR, and returns rows of x0, y0, x1,
+        y1 in px, score in [0, 1], category of `log2sim.datatypes.CATEGORIES`; or `Detections`. An object is a `Detector` of
+        `perception.detect.detectors` or, for sweeps, a `LidarDetector` of `perception.detect3d.detectors`; a name one that
+        `--detector` takes. A list joins one for pictures and one for sweeps, such as `[find_cars, "lidar:vehicle"]`.
     progress : callable, optional
         Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
     cache : bool
         Whether what is detected and measured is taken from the user's cache, and kept there.
     jobs : int, optional
-        Processes that share the ticks; the result is the same for any number. None for as many as there are usable cores, and one
-        with a detector of another package or program, which need not work in a forked process.
+        Processes that share the ticks; the result is the same for any number. None for all usable cores, or one with a detector
+        from elsewhere, which need not work in a forked process.
 
-    Raises
-    ------
-    LogError, ConfigError, MissingExtra
-        For logs and settings that cannot work.
-    PluginError
-        When the detector fails, or returns something else.
-    NothingToReconstruct
-        When neither an ego nor any agent was found.
+    Raises `LogError`, `ConfigError` and `MissingExtra` for logs and settings that cannot work, `PluginError` when the detector fails
+    or returns something else, `NothingToReconstruct` when neither an ego nor any agent was found.
     """
     run = start(log, config or Config(), detector=detector, progress=progress, cache=cache, jobs=jobs)
     return infer_scenario(run, observe_log(run))
@@ -162,8 +100,7 @@ def start(
     with clock.stage("sync"):
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
-    wrong_poses = list_faults(log, poses.stretches, int(schedule.t_ns[0]), int(schedule.t_ns[-1]))
-    faults = (*wrong_poses, *faults, *road.faults)
+    faults = (*list_faults(log, poses.stretches, *schedule.t_ns[[0, -1]].tolist()), *faults, *road.faults)
     jobs = jobs or (default_jobs() if detectors.own else 1)
     return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
 
@@ -173,19 +110,10 @@ def observe_log(run: Run) -> Observations:
     config, stage = run.config, "detect and measure"
     run.progress(stage, 0, len(run.schedule))
     return observe(
-        run.log,
-        run.schedule,
-        run.detectors.images,
-        run.plan,
-        mode=config.measure.mode,
-        max_range_m=config.measure.max_range_m,
-        clock=run.clock,
-        progress=lambda done, total: run.progress(stage, done, total),
-        lidar_detector=run.detectors.sweeps,
-        sweeps=config.lidar.sweeps,
-        cache=run.detectors.cache,
-        jobs=run.jobs,
-    )
+        run.log, run.schedule, run.detectors.images, run.plan, mode=config.measure.mode, max_range_m=config.measure.max_range_m,
+        clock=run.clock, progress=lambda done, total: run.progress(stage, done, total), lidar_detector=run.detectors.sweeps,
+        sweeps=config.lidar.sweeps, cache=run.detectors.cache, jobs=run.jobs,
+    )  # fmt: skip
 
 
 def infer_scenario(run: Run, observations: Observations) -> Result:
@@ -198,7 +126,6 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         placed = place_by_homography(log, observations, homographies)
     with clock.stage("fuse"):
         by_end = fuse_by_end(placed, plan)
-        measurements = by_end[0] if len(by_end) == 1 else [Measurements.join(rows) for rows in zip(*by_end)]
     with clock.stage("track", run.progress):
         tracks = track_ends(by_end, schedule.t_ns, config.track)
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
@@ -216,35 +143,8 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         agents = [replace(a, quarantined=a.confidence < config.track.quarantine_confidence) for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
-    if ego is None and not agents:
-        reason = say_without_pose(log, schedule.t_ns)
-        raise NothingToReconstruct(f"{log.name}: {reason}, and no object was detected in {len(schedule)} ticks")
 
-    faults = [fault.to_dict() for fault in (*run.faults, *observations.faults)]
-    scenario = Scenario(
-        name=log.name,
-        t0_ns=timeline.t0_ns,
-        duration_s=float((schedule.t_ns[-1] - schedule.t_ns[0]) / NS_PER_S),
-        agents=(*([] if ego is None else [ego]), *agents),
-        map=log.map,
-        cameras=tuple(camera_entries(log, plan.cameras, homographies)),
-        sensors=roadside_sensors(log, config.measure.max_range_m),
-        provenance={
-            **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
-            **({"faults": faults} if faults else {}),
-        },
-    )
-    description = describe(scenario, log, config, plan, run.poses, observations.lights, clock, run.progress)
-    outcomes = (*stage_outcomes(plan, observations, homographies, agents, clock), *description.outcomes)
-    scenario = replace(description.scenario, stages=tuple(outcome.to_dict() for outcome in outcomes))
-    cache = run.detectors.cache
-    report = {
-        **report_of(log, config, schedule, observations, measurements, homographies, outcomes, scenario, clock),
-        "unreadable": {**description.unreadable, **observations.unreadable},
-        **description.figures,
-        "poses": run.poses.to_dict(),
-        "faults": faults,
-        "registration": list(run.registration),
-        "detection_cache": None if cache is None else cache.figures(),
-    }
-    return Result(scenario, report, log, (*run.poses.findings, *run.faults, *observations.faults))
+    everyone = agents if ego is None else [ego, *agents]
+    scenario = draft_scenario(run, observations, homographies, everyone)
+    described = describe(scenario, log, config, plan, run.poses, observations.lights, clock, run.progress)
+    return conclude(run, observations, by_end, homographies, described)

@@ -191,29 +191,22 @@ class FusionLevel(StrEnum):
     TRACKS = "tracks"
 
 
-@dataclass(frozen=True)
-class FusionChoice:
-    """At what level the ends of a log are joined."""
+def fusion_level(log: Log, config: Config) -> tuple[FusionLevel | None, str]:
+    """Decide at what level the ends of a log, with the sensors that are used, are joined, and why.
 
-    level: FusionLevel | None  # none where not both ends have LiDARs that are searched or measured
-    reason: str  # "" for a log with one end
-
-
-def fusion_level(log: Log, config: Config) -> FusionChoice:
-    """Decide at what level the ends of a log, with the sensors that are used, are joined."""
+    No level where not both ends have LiDARs that are searched or measured; no reason for a log with one end.
+    """
     ends = {end_of(lidar) for lidar in log.lidars.values()} | {end_of(camera) for camera in log.cameras.values()}
     if ends < set(ENDS):
-        return FusionChoice(None, "")
+        return None, ""
     with_lidar, asked = {end_of(lidar) for lidar in log.lidars.values()}, FusionLevel(config.cooperation.fusion)
     if with_lidar < set(ENDS):
         missing = [end for end in ENDS if end not in with_lidar]
-        return FusionChoice(
-            None, f"no LiDAR of {' and '.join(missing)}: what their cameras measure is joined as of any"
-        )
+        return None, f"no LiDAR of {' and '.join(missing)}: what their cameras measure is joined as of any"
     if not config.detect.in_sweeps and asked is not FusionLevel.POINTS:
         reason = f"points: images alone are searched, so that there are no {asked} of LiDARs to join"
-        return FusionChoice(FusionLevel.POINTS, reason)
-    return FusionChoice(asked, f"{asked}: cooperation.fusion")
+        return FusionLevel.POINTS, reason
+    return asked, f"{asked}: cooperation.fusion"
 
 
 LABELS = "labels"
@@ -259,15 +252,21 @@ class HomographyScope(Enum):
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether a stage runs, and why."""
+    """Whether a stage runs, and why: as planned, or as the data turned out, since a planned stage may have nothing to do."""
 
     stage: Stage
     kept: bool
     reason: str  # for people; nothing is decided by it
+    saved_s: float | None = None  # seconds that leaving out (a part of) the stage saved, None where unknown
+    saved_how: str | None = None  # how `saved_s` was estimated
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the decision as scenario.json and report.json hold it."""
+        """Return what is the same for the same log and settings, as scenario.json holds it."""
         return {"stage": str(self.stage), "kept": self.kept, "reason": self.reason}
+
+    def to_report(self) -> dict[str, Any]:
+        """Return the decision with its seconds, as report.json holds it."""
+        return {**self.to_dict(), "saved_s": self.saved_s, "saved_how": self.saved_how}
 
 
 @dataclass(frozen=True)
@@ -312,7 +311,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     # frames that many ticks apart in which the detector found nothing, the others need not be decoded.
     stride = max(min_hits(t_ns, config.track.min_life_s), 1) if decodes and every == 1 else 1
     moved_m, turned_rad = (0.0, 0.0) if log.ego is None else _ego_motion(log.ego, t_ns)
-    ends = fusion_level(sensors.only(log), config)
+    level, why_level = fusion_level(sensors.only(log), config)
     ground = [what for what, used in (("pictures", cameras), ("sweeps", lidars)) if used]
     decisions = [
         _decide(
@@ -365,8 +364,8 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     if sweeps:
         reason = "boxes of images and of sweeps are evidence for the same objects"
         decisions.append(_decide(Stage.FUSION_WITH_LIDAR, reason, no_camera))
-    if ends.reason:
-        decisions.append(Decision(Stage.FUSION_OF_ENDS, ends.level is not None, ends.reason))
+    if why_level:
+        decisions.append(Decision(Stage.FUSION_OF_ENDS, level is not None, why_level))
     decisions += [
         Decision(Stage.TRACKING, True, "identities over time are the result"),
         _decide(Stage.SMOOTHING, "measured positions are noisy", (not config.smooth.enabled, "smooth.enabled=false")),
@@ -393,7 +392,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         ),
     ]
     scope = HomographyScope.CAMERAS_IN_NEED if homography.kept else HomographyScope.NONE
-    return Plan(cameras, tuple(decisions), scope, stride, ends.level, every)
+    return Plan(cameras, tuple(decisions), scope, stride, level, every)
 
 
 def _decide(stage: Stage, reason: str, *against: tuple[bool, str]) -> Decision:
@@ -410,21 +409,3 @@ def _ego_motion(ego: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[float, float]:
     positions, rotations = map_T_ego[:, :3, 3], map_T_ego[:, :3, :3]
     cosine = (np.einsum("ij,nij->n", rotations[0], rotations) - 1) / 2
     return float(np.ptp(positions, axis=0).max()), float(np.arccos(np.clip(cosine, -1, 1)).max())
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a stage did."""
-
-    # As planned, or as the data turned out: a stage that was planned and had nothing to do was not kept.
-    decision: Decision
-    saved_s: float | None = None  # seconds that leaving out (a part of) the stage saved, None where unknown
-    saved_how: str | None = None  # how `saved_s` was estimated
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what is the same for the same log and settings, as scenario.json holds it."""
-        return self.decision.to_dict()
-
-    def to_report(self) -> dict[str, Any]:
-        """Return the outcome with its seconds, as report.json holds it."""
-        return {**self.to_dict(), "saved_s": self.saved_s, "saved_how": self.saved_how}

@@ -3,125 +3,196 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from log2sim.agents.estimate import TOLERANCE_M
+from log2sim.agents.estimate import TOLERANCE_M, camera_entries, provenance_of, roadside_sensors
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Finding, Log, Measurements, Scenario
+from log2sim.errors import NothingToReconstruct
 from log2sim.files.documents import rounded
 from log2sim.files.stages import StageClock
 from log2sim.geometry import NS_PER_S
+from log2sim.localization.choice import GIVEN, PoseChoice
+from log2sim.logs.checks import explain_missing_poses
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
-from log2sim.plan import DESCRIBING, Decision, HomographyScope, Outcome, Plan, Stage
+from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage
 from log2sim.version import __version__
 
+Progress = Callable[[str, int, int], None]
 
-def stage_outcomes(
-    plan: Plan,
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What the stages of one run share: the sensors in one map and on one clock, the ticks, and the plan.
+
+    `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
+    `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
+    of processes that share the ticks.
+    """
+
+    log: Log
+    config: Config
+    plan: Plan
+    schedule: Schedule
+    detectors: Detectors
+    clock: StageClock
+    progress: Progress
+    jobs: int = 1
+    poses: PoseChoice = GIVEN
+    faults: tuple[Finding, ...] = ()
+    registration: Sequence[dict[str, Any]] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What came of a run: the scenario, a report as of `schemas/report-1.json`, the log as it was used, and what is wrong with it."""
+
+    scenario: Scenario
+    report: dict[str, Any]
+    log: Log
+    findings: tuple[Finding, ...]  # of poses, sensors and records; those of agents are their doubts
+
+    def __repr__(self) -> str:
+        """Return its scenario and its log in one line."""
+        return f"<Result: {self.scenario!r} of {self.log!r}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return what a notebook shows of its scenario."""
+        return self.scenario._repr_html_()
+
+
+def draft_scenario(
+    run: Run, observations: Observations, homographies: Mapping[str, CameraHomography], agents: Sequence[Agent]
+) -> Scenario:
+    """Put agents, the ego among them, and sensors into a scenario with its provenance; raises `NothingToReconstruct` without agents."""
+    log, config, t_ns = run.log, run.config, run.schedule.t_ns
+    if not agents:
+        reason = explain_missing_poses(log, t_ns)
+        raise NothingToReconstruct(f"{log.name}: {reason}, and no object was detected in {len(t_ns)} ticks")
+    faults = [fault.to_dict() for fault in (*run.faults, *observations.faults)]
+    return Scenario(
+        name=log.name,
+        t0_ns=int(t_ns[0]),
+        duration_s=float((t_ns[-1] - t_ns[0]) / NS_PER_S),
+        agents=tuple(agents),
+        map=log.map,
+        cameras=tuple(camera_entries(log, run.plan.cameras, homographies)),
+        sensors=roadside_sensors(log, config.measure.max_range_m),
+        provenance={
+            **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
+            **({"faults": faults} if faults else {}),
+        },
+    )
+
+
+def conclude(
+    run: Run,
     observations: Observations,
+    measurements: Sequence[Sequence[Measurements]],
     homographies: Mapping[str, CameraHomography],
-    agents: Sequence[Agent],
-    clock: StageClock,
-) -> tuple[Outcome, ...]:
-    """Join the decisions of a plan with what the stages did, in the plan's order, but for those that describe the scenario."""
-    found: Mapping[Stage, Callable[[Decision], Outcome]] = {
+    described: tuple[Scenario, Sequence[Decision], Mapping[str, Any]],
+) -> Result:
+    """Join the plan and what became of it to the report of a finished run, and write what each stage did into its scenario.
+
+    `measurements`: by end and tick. `described`: what `describe` returns.
+    """
+    log, config, schedule, clock, cache = run.log, run.config, run.schedule, run.clock, run.detectors.cache
+    scenario, decisions, figures = described
+    found: Mapping[Stage, Callable[[Decision], Decision]] = {
         Stage.MOTION_COMPENSATION: lambda d: _compensation(d, observations),
-        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, plan.picture_stride, observations, clock),
-        Stage.HOMOGRAPHY: lambda d: _homography(d, plan.homography, homographies),
-        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(agents),
-        Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(agents),
+        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, run.plan.picture_stride, observations, clock),
+        Stage.HOMOGRAPHY: lambda d: _homography(d, run.plan.homography, homographies),
+        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(scenario.others),
+        Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(scenario.others),
     }
-    return tuple(found.get(d.stage, Outcome)(d) for d in plan.decisions if d.stage not in DESCRIBING)
+    planned = (d for d in run.plan.decisions if d.stage not in DESCRIBING)
+    stages = (*(found[d.stage](d) if d.stage in found else d for d in planned), *decisions)
+    scenario = replace(scenario, stages=tuple(stage.to_dict() for stage in stages))
+    from_lidar = [rows.source == "lidar" for end in measurements for rows in end]
+    report = {
+        "report_version": 1,
+        "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
+        "log2sim_version": __version__,
+        "ticks": len(schedule),
+        "duration_s": (int(schedule.t_ns[-1]) - int(schedule.t_ns[0])) / NS_PER_S,
+        **_times(clock, len(schedule)),
+        "plan": [stage.to_report() for stage in stages],
+        "sync": {"reference": schedule.reference, "streams": schedule.summary()},
+        "without_pose": _frames_without_pose(log, schedule),
+        "detections": observations.detections,
+        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
+        "measurements": {"total": sum(map(len, from_lidar)), "with_lidar": int(sum(map(np.sum, from_lidar)))},
+        "agents": _agent_counts(scenario),
+        **figures,
+        "unreadable": {**figures["unreadable"], **observations.unreadable},
+        "poses": run.poses.to_dict(),
+        "faults": [fault.to_dict() for fault in (*run.faults, *observations.faults)],
+        "registration": list(run.registration),
+        "detection_cache": None if cache is None else cache.figures(),
+    }
+    return Result(scenario, report, log, (*run.poses.findings, *run.faults, *observations.faults))
 
 
-def _compensation(planned: Decision, observations: Observations) -> Outcome:
+def _compensation(planned: Decision, observations: Observations) -> Decision:
     counts, total = observations.sweeps, sum(observations.sweeps.values())
     if not planned.kept or not total:
-        return Outcome(planned)
+        return planned
     if counts["in the log"] == total:
-        return Outcome(Decision(planned.stage, False, "the sweeps of the log are compensated already"))
+        return Decision(planned.stage, False, "the sweeps of the log are compensated already")
     if counts["in the log"] + counts["no times"] == total:
-        return Outcome(Decision(planned.stage, False, "the points have no times of their own"))
+        return Decision(planned.stage, False, "the points have no times of their own")
     if counts["at rest"]:
         reason = f"{planned.reason}; it stands still during {counts['at rest']} of {total} sweeps"
-        return Outcome(Decision(planned.stage, counts["moving"] > 0, reason))
-    return Outcome(planned)
+        return Decision(planned.stage, counts["moving"] > 0, reason)
+    return planned
 
 
-def _detection(planned: Decision, picture_stride: int, observations: Observations, clock: StageClock) -> Outcome:
+def _detection(planned: Decision, picture_stride: int, observations: Observations, clock: StageClock) -> Decision:
     seconds = clock.seconds
     skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
     if planned.kept or not detected:
-        return Outcome(planned)
+        return planned
     if not skipped:
-        return Outcome(Decision(planned.stage, True, "no camera was empty long enough to skip a frame"))
+        return Decision(planned.stage, True, "no camera was empty long enough to skip a frame")
     names = ", ".join(f"{name} {n}" for name, n in sorted(observations.frames_skipped.items()))
     reason = f"{skipped} of {skipped + detected} frames are between two in which nothing was found: {names}"
     if picture_stride > 1:
         reason = f"{planned.reason}; {skipped} of {skipped + detected} frames were not"
     each_s = (seconds.get("decode", 0.0) + seconds.get("detect", 0.0)) / max(detected, 1)
     how = f"estimated: {1e3 * each_s:.3g} ms a frame (measured on {detected}), times {skipped}"
-    return Outcome(Decision(planned.stage, False, reason), round(skipped * each_s, 4), how)
+    return Decision(planned.stage, False, reason, round(skipped * each_s, 4), how)
 
 
-def _homography(planned: Decision, scope: HomographyScope, homographies: Mapping[str, CameraHomography]) -> Outcome:
+def _homography(planned: Decision, scope: HomographyScope, homographies: Mapping[str, CameraHomography]) -> Decision:
     if scope is HomographyScope.NONE:
-        return Outcome(planned)
+        return planned
     if not homographies:
-        return Outcome(Decision(planned.stage, False, "every detection has LiDAR points or no foot in the image"))
-    return Outcome(Decision(planned.stage, True, f"{planned.reason}: {', '.join(homographies)}"))
+        return Decision(planned.stage, False, "every detection has LiDAR points or no foot in the image")
+    return Decision(planned.stage, True, f"{planned.reason}: {', '.join(homographies)}")
 
 
-def _static(agents: Sequence[Agent]) -> Outcome:
+def _static(agents: Sequence[Agent]) -> Decision:
     static = sum(a.static for a in agents)
     reason = f"{static} of {len(agents)} agents are static: one pose for each" if static else "no agent is static"
-    return Outcome(Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, not static, reason))
+    return Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, not static, reason)
 
 
-def _waypoints(agents: Sequence[Agent]) -> Outcome:
+def _waypoints(agents: Sequence[Agent]) -> Decision:
     stage, left_out = Stage.WAYPOINT_AT_EVERY_TICK, sum(a.quality.get("waypoints_left_out", 0) for a in agents)
     if not left_out:
-        return Outcome(Decision(stage, True, "no agent moves straight at constant speed"))
+        return Decision(stage, True, "no agent moves straight at constant speed")
     total = left_out + sum(len(a.waypoints) for a in agents)
     reason = f"{left_out} of {total} lie within {TOLERANCE_M * 100:.0f} cm of the line between their neighbors"
-    return Outcome(Decision(stage, False, reason))
+    return Decision(stage, False, reason)
 
 
 DETECTOR_STAGES = ("detect",)
-
-
-def report_of(
-    log: Log,
-    config: Config,
-    schedule: Schedule,
-    observations: Observations,
-    measurements: Sequence[Measurements],
-    homographies: Mapping[str, CameraHomography],
-    outcomes: Sequence[Outcome],
-    scenario: Scenario,
-    clock: StageClock,
-) -> dict[str, Any]:
-    """Assemble what a report says of the stages of a finished run."""
-    ticks = len(schedule)
-    return {
-        "report_version": 1,
-        "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
-        "log2sim_version": __version__,
-        "ticks": ticks,
-        "duration_s": (int(schedule.t_ns[-1]) - int(schedule.t_ns[0])) / NS_PER_S,
-        **_times(clock, ticks),
-        "plan": [outcome.to_report() for outcome in outcomes],
-        "sync": {"reference": schedule.reference, "streams": schedule.summary()},
-        "without_pose": _without_pose(log, schedule),
-        "detections": observations.detections,
-        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
-        "measurements": _measurement_counts(measurements),
-        "agents": _agent_counts(scenario),
-    }
 
 
 def _times(clock: StageClock, ticks: int) -> dict[str, Any]:
@@ -135,7 +206,7 @@ def _times(clock: StageClock, ticks: int) -> dict[str, Any]:
     }
 
 
-def _without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
+def _frames_without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
     """Frames by camera that were left out because the ego's pose is not known at their stamp."""
     counts = {}
     for name, index in schedule.frames.items():
@@ -178,11 +249,6 @@ def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
         "condition": rounded(fit.condition, 3),
         "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
     }
-
-
-def _measurement_counts(measurements: Sequence[Measurements]) -> dict[str, Any]:
-    by_tick = [rows.source == "lidar" for rows in measurements]
-    return {"total": sum(map(len, by_tick)), "with_lidar": int(sum(np.sum(mask) for mask in by_tick))}
 
 
 def _agent_counts(scenario: Scenario) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from worlds import tiny_log
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Detections, Frame, Log, Scenario, Waypoints
 from log2sim.errors import LogError
-from log2sim.evaluation.bench.benchmark import Benchmark, bench, document, format_table
+from log2sim.evaluation.bench.benchmark import Benchmark, bench, bench_document, format_benchmark
 from log2sim.evaluation.bench.runs import BenchContext, detect_once, make_context
 from log2sim.evaluation.bench.runs import timed_first_pass as run_first_pass
 from log2sim.evaluation.bench.scores import (
@@ -283,7 +283,7 @@ def test_every_stage_has_a_panel_and_the_figures_fit_each_other(result: Benchmar
 
 
 def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> None:
-    out = json.loads(json.dumps(document(result), allow_nan=False))
+    out = json.loads(json.dumps(bench_document(result), allow_nan=False))
     check(out, "bench-1", LogError)
     assert out["truth"] == "tiny"
     assert out["ticks"] == 10
@@ -307,7 +307,7 @@ def test_the_dataframe_has_a_row_for_each_setting_with_its_figures(result: Bench
 
 
 def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) -> None:
-    lines = format_table(result).split("\n")
+    lines = format_benchmark(result).split("\n")
     for panel in result.panels:
         rows = lines[lines.index(f"{panel.stage}: {panel.label}") + 2 :][: len(panel.points)]
         for p in panel.points:

@@ -13,7 +13,7 @@ from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Measurements, Track
-from log2sim.evaluation.detection.detect_log import without_ego
+from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
 from log2sim.perception.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative import (
@@ -169,17 +169,17 @@ def test_every_level_finds_every_object_once(both_ends, level) -> None:
 
 def test_levels_fall_back_where_an_end_has_no_lidar(both_ends) -> None:
     config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
-    assert fusion_level(both_ends, config).level is FusionLevel.BOXES
+    assert fusion_level(both_ends, config)[0] is FusionLevel.BOXES
     images = config.changed(detect={"name": "labels"})
-    choice = fusion_level(both_ends, images)
-    assert choice.level is FusionLevel.POINTS
-    assert "images alone" in choice.reason
+    level, reason = fusion_level(both_ends, images)
+    assert level is FusionLevel.POINTS
+    assert "images alone" in reason
     alone = both_ends.changed(lidars={"post": both_ends.lidars["post"]})
-    choice = fusion_level(alone, config)
-    assert choice.level is None
-    assert "no LiDAR of vehicle" in choice.reason
+    level, reason = fusion_level(alone, config)
+    assert level is None
+    assert "no LiDAR of vehicle" in reason
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
-    assert fusion_level(vehicle, config).reason == ""
+    assert fusion_level(vehicle, config)[1] == ""
 
 
 def track_of(ticks, xy, *, late_s=0.0, end=0, category="car"):
@@ -365,6 +365,6 @@ def test_the_ego_that_the_road_sees_is_no_detection(both_ends) -> None:
     t_ns = int(both_ends.streams["post"].t_ns[2])
     center = both_ends.ego_centers(both_ends.ego.at(t_ns)[0])[0]
     found = boxes_at((*center, 4.5, 1.8, 1.5, 0.0), (*(center + np.array([9, 3, 0])), 4.5, 1.8, 1.5, 0.0), t_ns=t_ns)
-    assert without_ego(both_ends, found).center_m.tolist() == found.center_m[1:].tolist()
+    assert drop_ego(both_ends, found).center_m.tolist() == found.center_m[1:].tolist()
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
-    assert without_ego(vehicle, found) is found
+    assert drop_ego(vehicle, found) is found

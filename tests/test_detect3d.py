@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.config import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.protocols import Criterion, match
+from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import box_corners_bev, overlap_area, wrap_angle
 from log2sim.perception.detect3d.boxes import (
     MIN_HEAT,
@@ -231,7 +231,7 @@ def test_most_vehicles_with_many_points_are_found_and_few_are_invented(scenes) -
     sure = SceneBoxes.join([vehicles(f).take(vehicles(f).score >= 0.5) for f in found])
     truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
     near = truth.ignoring((truth.points < 50) | (truth.range_m > 25))
-    matches = match(sure, near, Criterion("iou_bev", 0.5))
+    matches = match_detections(sure, near, Criterion("iou_bev", 0.5))
     assert matches.truths > 40
     assert matches.right.sum() / matches.truths > 0.8
     assert matches.right.sum() / (matches.right | matches.false).sum() > 0.8
@@ -241,7 +241,7 @@ def test_most_headings_point_forward(scenes) -> None:
     _, examples, found = scenes
     sure = SceneBoxes.join([vehicles(f).take(vehicles(f).score >= 0.5) for f in found])
     truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
-    matches = match(sure, truth, Criterion("iou_bev", 0.5))
+    matches = match_detections(sure, truth, Criterion("iou_bev", 0.5))
     off = wrap_angle(sure.box[matches.right, 6] - truth.box[matches.truth[matches.right], 6])
     assert np.mean(np.abs(off) < np.pi / 2) > 0.75
 

@@ -20,7 +20,7 @@ from log2sim.datatypes import Boxes3D, ImageRegions, Labels, Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
-from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
+from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes
 from log2sim.evaluation.detection.truth import labeled_sweeps, truth_of_sweeps
 from log2sim.files.documents import check
 from log2sim.geometry import points_in_box
@@ -185,7 +185,7 @@ def test_labels_as_detector_are_found_again_by_every_protocol(tiny: Log) -> None
     assert done[-1] == (len(found.t_ns),) * 2
     assert found.t_ns.tolist() == tiny.streams["top"].t_ns[:8].tolist()
     for protocol in ("kitti", "dair", "center"):
-        result = evaluate_boxes(found, tiny, Options(protocol))
+        result = evaluate_boxes(found, tiny, DetectionOptions(protocol))
         check(result, "detection-metrics-1", LogError)
         name = "car" if protocol == "kitti" else "vehicle"
         for class_name in (name, "pedestrian"):
@@ -203,15 +203,15 @@ def moved(found: DetectedBoxes, by_m: float) -> DetectedBoxes:
 
 def test_what_is_out_of_range_counts_for_nothing(tiny: Log) -> None:
     found = detect_log(tiny, LABELS).found
-    far = evaluate_boxes(found, tiny, Options("center", max_range_m=13.5))
+    far = evaluate_boxes(found, tiny, DetectionOptions("center", max_range_m=13.5))
     row = far["classes"]["vehicle"]["figures"][0]
-    whole = evaluate_boxes(found, tiny, Options("center"))["classes"]["vehicle"]["figures"][0]
+    whole = evaluate_boxes(found, tiny, DetectionOptions("center"))["classes"]["vehicle"]["figures"][0]
     assert 0 < row["truths"] < whole["truths"]
     assert row["true_positives"] == row["truths"]
     assert row["false_positives"] == 0
     astray = moved(found, 40.0)
     false = [
-        evaluate_boxes(astray, tiny, Options("center", max_range_m=m))["classes"]["vehicle"]["figures"][0][
+        evaluate_boxes(astray, tiny, DetectionOptions("center", max_range_m=m))["classes"]["vehicle"]["figures"][0][
             "false_positives"
         ]
         for m in (30.0, 100.0)
@@ -225,7 +225,7 @@ def test_where_nothing_was_labeled_nothing_is_false(tiny: Log) -> None:
     nowhere = ImageRegions(stamps, np.tile([0.0, 0, 480, 300], (len(stamps), 1)))
 
     def false(log: Log, protocol: str) -> int:
-        row = evaluate_boxes(found, log, Options(protocol))["classes"]["pedestrian"]["figures"][0]
+        row = evaluate_boxes(found, log, DetectionOptions(protocol))["classes"]["pedestrian"]["figures"][0]
         return int(row["false_positives"])
 
     for protocol in ("kitti", "dair"):
@@ -234,7 +234,10 @@ def test_where_nothing_was_labeled_nothing_is_false(tiny: Log) -> None:
     # Labels of one camera only: a box behind it can be neither right nor false.
     behind = moved(found, -60.0)
     only = replace(tiny, labels=replace(tiny.labels, cameras=("front",)))
-    rows = [evaluate_boxes(behind, log, Options("dair"))["classes"]["vehicle"]["figures"][0] for log in (tiny, only)]
+    rows = [
+        evaluate_boxes(behind, log, DetectionOptions("dair"))["classes"]["vehicle"]["figures"][0]
+        for log in (tiny, only)
+    ]
     assert rows[0]["false_positives"] > 5
     assert rows[1]["false_positives"] == 0
 
@@ -266,22 +269,25 @@ def test_a_log_of_another_time_and_one_without_labels_are_refused(tiny: Log) -> 
     found = detect_log(tiny, LABELS).found
     later = replace(found, t_ns=found.t_ns + 3600 * NS)
     with pytest.raises(LogError, match="are both of one log"):
-        evaluate_boxes(later, tiny, Options("center"))
+        evaluate_boxes(later, tiny, DetectionOptions("center"))
     with pytest.raises(LogError, match="no labeled 3D boxes"):
-        evaluate_boxes(found, replace(tiny, labels=None), Options("center"))
+        evaluate_boxes(found, replace(tiny, labels=None), DetectionOptions("center"))
     with pytest.raises(LogError, match="of no sweep"):
-        evaluate_boxes(replace(found, t_ns=found.t_ns[:0], boxes=()), tiny, Options("center"))
+        evaluate_boxes(replace(found, t_ns=found.t_ns[:0], boxes=()), tiny, DetectionOptions("center"))
     with pytest.raises(ConfigError, match="need a camera"):
-        evaluate_boxes(found, replace(tiny, cameras={}), Options("kitti"))
+        evaluate_boxes(found, replace(tiny, cameras={}), DetectionOptions("kitti"))
 
 
 def test_options_name_what_is_wrong() -> None:
     with pytest.raises(ConfigError, match=r"'kiti' \(did you mean 'kitti'"):
-        Options("kiti")
+        DetectionOptions("kiti")
     with pytest.raises(ConfigError, match="--score"):
-        Options("kitti", min_score=1.5)
+        DetectionOptions("kitti", min_score=1.5)
     with pytest.raises(ConfigError, match="--range: 0 m"):
-        Options("kitti", max_range_m=0.0)
+        DetectionOptions("kitti", max_range_m=0.0)
     with pytest.raises(ConfigError, match="has no 'truck'"):
-        Options("kitti", classes=["truck"]).chosen()
-    assert [c.name for c in Options("center", classes=["two_wheeler", "bus"]).chosen()] == ["two_wheeler", "bus"]
+        DetectionOptions("kitti", classes=["truck"]).chosen()
+    assert [c.name for c in DetectionOptions("center", classes=["two_wheeler", "bus"]).chosen()] == [
+        "two_wheeler",
+        "bus",
+    ]

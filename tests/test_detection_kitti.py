@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from log2sim.datatypes import ImageRegions, Log
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import ClassBoxes, class_figures, precision_recall
-from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS, Criterion, candidate_pairs, match
+from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS, Criterion, candidate_pairs, match_detections
 from log2sim.evaluation.detection.truth import ImageViews, image_views
 from log2sim.geometry import Camera, transform
 from log2sim.logs.kitti.labels import CATEGORY_OF, parse_labels
@@ -160,7 +160,7 @@ def test_the_sampled_average_is_that_of_the_published_rules(limit, recall_points
     found, truth = detector_world(seed)
     found = found.take(~found.ignored)
     expected = devkit(found, truth, found.ignored, truth.ignored, limit, recall_points)
-    curve = precision_recall(found, match(found, truth, Criterion("iou_3d", limit)))
+    curve = precision_recall(found, match_detections(found, truth, Criterion("iou_3d", limit)))
     assert curve.sampled_average(recall_points) == pytest.approx(expected)
 
 

@@ -12,7 +12,7 @@ from log2sim.evaluation.detection import (
     Criterion,
     SceneBoxes,
     average_precision,
-    match,
+    match_detections,
     precision_recall,
 )
 from log2sim.geometry import box_corners_bev, rectangle_overlap, upright_box_iou
@@ -72,7 +72,7 @@ def test_the_iou_of_upright_boxes_counts_their_heights():
 
 def test_the_best_score_takes_a_true_box_and_the_second_on_it_is_false():
     found = SceneBoxes.of(cars(0.3, 0.0, 20.0), score=[0.9, 0.8, 0.7])
-    matches = match(found, SceneBoxes.of(cars(0.0, 20.2)), IOU)
+    matches = match_detections(found, SceneBoxes.of(cars(0.0, 20.2)), IOU)
     assert matches.truth.tolist() == [0, -1, 1]
     assert matches.right.tolist() == [True, False, True]
     assert matches.false.tolist() == [False, True, False]
@@ -81,7 +81,7 @@ def test_the_best_score_takes_a_true_box_and_the_second_on_it_is_false():
 def test_ignored_true_boxes_excuse_one_found_box_and_count_for_nothing():
     truth = SceneBoxes.of(cars(0.0, 20.0), ignored=[False, True])
     found = SceneBoxes.of(cars(0.0, 20.0, 20.1), score=[0.5, 0.9, 0.8])
-    matches = match(found, truth, IOU)
+    matches = match_detections(found, truth, IOU)
     assert matches.truths == 1
     assert matches.right.tolist() == [True, False, False]
     assert matches.false.tolist() == [False, False, True]
@@ -99,11 +99,11 @@ def test_average_precision_of_a_case_by_hand():
 
 def test_nuscenes_leaves_out_low_recall_and_low_precision():
     found = SceneBoxes.of(cars(0.0, 10.0), score=[0.9, 0.8])
-    curve = precision_recall(found, match(found, SceneBoxes.of(cars(0.0, 10.0)), Criterion("center_m", 0.5)))
+    curve = precision_recall(found, match_detections(found, SceneBoxes.of(cars(0.0, 10.0)), Criterion("center_m", 0.5)))
     assert curve.nuscenes_average() == pytest.approx(1.0)
     # One of two found among four: precision .25 up to recall .5, which is 40 of the 90 points.
     found = SceneBoxes.of(cars(0.0, 70.0, 80.0, 90.0), score=0.5)
-    curve = precision_recall(found, match(found, SceneBoxes.of(cars(0.0, 10.0)), Criterion("center_m", 0.5)))
+    curve = precision_recall(found, match_detections(found, SceneBoxes.of(cars(0.0, 10.0)), Criterion("center_m", 0.5)))
     assert curve.nuscenes_average() == pytest.approx(40 / 90 * (0.25 - 0.1) / 0.9)
 
 
@@ -137,7 +137,7 @@ def test_turning_and_moving_everything_changes_nothing(criterion, seed, turn, sh
         box[:, 6] += turn
         return SceneBoxes(boxes.scene, box, boxes.category, boxes.score, None, boxes.range_m, boxes.ignored)
 
-    before, after = match(found, truth, criterion), match(moved(found), moved(truth), criterion)
+    before, after = match_detections(found, truth, criterion), match_detections(moved(found), moved(truth), criterion)
     assert before.truth.tolist() == after.truth.tolist()
     np.testing.assert_allclose(before.value, after.value, atol=1e-6)
 
@@ -148,12 +148,12 @@ def test_better_scores_for_right_boxes_never_lower_the_average(seed):
     rng = np.random.default_rng(seed)
     found, truth = world(rng)
     criterion = Criterion("iou_bev", 0.5)
-    matches = match(found, truth, criterion)
+    matches = match_detections(found, truth, criterion)
     curve = precision_recall(found, matches)
     assert np.all(np.diff(curve.recall) >= 0)
     assert np.all((curve.precision >= 0) & (curve.precision <= 1))
     raised = SceneBoxes(
         found.scene, found.box, found.category, found.score + 2.0 * matches.right, None, found.range_m, found.ignored
     )
-    before, after = curve.average(), precision_recall(raised, match(raised, truth, criterion)).average()
+    before, after = curve.average(), precision_recall(raised, match_detections(raised, truth, criterion)).average()
     assert (before is None and after is None) or after >= before - 1e-12

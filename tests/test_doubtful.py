@@ -29,7 +29,7 @@ from log2sim.edit.apply import edit
 from log2sim.edit.edits import DropDoubtful, Lateral, Only, Shift, Speed
 from log2sim.errors import ConfigError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.export.exporters import Options, export, formats, with_doubtful
+from log2sim.export.exporters import Options, export, filter_doubtful, formats
 from log2sim.export.openscenario.read import load
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
@@ -60,8 +60,8 @@ def ids(scenario: Scenario) -> list[str]:
 def test_doubtful_agents_are_left_out_but_for_the_ego() -> None:
     scenario = doubted()
     assert [a.id for a in scenario.doubtful] == ["ego", "phantom", "unsure"]
-    assert ids(scenario.without_doubtful()) == ["ego", "sure"]
-    assert ids(world(unsure(0.5)).without_doubtful()) == ["unsure"]
+    assert ids(scenario.drop_doubtful()) == ["ego", "sure"]
+    assert ids(world(unsure(0.5)).drop_doubtful()) == ["unsure"]
 
 
 def test_dropping_is_an_edit_that_the_history_keeps() -> None:
@@ -146,8 +146,8 @@ def test_quarantined_agents_stay_in_the_file_and_out_of_replays_and_exports(tmp_
         export(scenario, "csv", tmp_path / name, **choices)
         rows = next((tmp_path / name).glob("*.csv")).read_text()
         assert ("unsure" in rows) is bool(choices)
-    assert ids(with_doubtful(scenario, "keep")) == ["ego", "sure"]
-    assert ids(with_doubtful(scenario, "all")) == ids(scenario)
+    assert ids(filter_doubtful(scenario, "keep")) == ["ego", "sure"]
+    assert ids(filter_doubtful(scenario, "all")) == ids(scenario)
     assert evaluate(scenario, scenario.active)["precision"] == 1.0
     assert evaluate(scenario, scenario.active)["quarantined"] == ["unsure"]
 

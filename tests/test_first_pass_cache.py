@@ -23,7 +23,8 @@ from log2sim.files.documents import check
 from log2sim.perception import first_pass, first_pass_cache
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.first_pass_cache import open_cache
-from log2sim.pipeline import Run, observe_log, start
+from log2sim.pipeline import observe_log, start
+from log2sim.report import Run
 
 ROOT = Path(__file__).resolve().parents[1]
 TICKS = 6

@@ -21,7 +21,7 @@ from log2sim.agents.smooth.fixed_interval import (
     Positions,
     marginal_likelihood,
 )
-from log2sim.agents.static import robust_line
+from log2sim.agents.static import MAX_SPEED_SIGMA_MPS, standing_speed_sigma
 from log2sim.datatypes import Detections, Measurements, Track
 
 RATES_HZ = [2.0, 5.0, 20.0]
@@ -219,16 +219,15 @@ def test_a_walk_across_the_rays_of_a_camera_that_stands_is_told_from_standing(sp
 TRUCK = (18.0, 2.55, 3.8)
 
 
-def test_a_robust_line_is_least_squares_without_outliers_and_hardly_moves_with_them():
-    rng = np.random.default_rng(2)
-    t = np.sort(rng.uniform(0, 4, 60))
-    xy = np.outer(t, [1.5, -0.5]) + rng.normal(0, 0.1, (60, 2))
-    _, velocity, sigma = robust_line(t, xy, np.full(60, 0.01))
-    np.testing.assert_allclose(velocity, np.polyfit(t, xy, 1)[0], atol=0.02)
-    assert np.abs(velocity - [1.5, -0.5]).max() < 4 * sigma
-    xy[rng.choice(60, 10, replace=False)] += 8.0
-    np.testing.assert_allclose(robust_line(t, xy, np.full(60, 0.01))[1], [1.5, -0.5], atol=0.1)
-    assert robust_line(np.ones(5), xy[:5], np.ones(5))[2] == np.inf
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
+def test_the_speed_of_what_stands_is_as_uncertain_as_a_line_through_its_centers(factor):
+    t, rng = np.arange(0, 20, 0.1), np.random.default_rng(2)
+    xy = rng.normal(0, 0.1 * factor, (200, 2))
+    expected = 0.1 * max(factor, 1.0) / np.sqrt(200 * np.var(t))
+    assert standing_speed_sigma(track_of(t, xy, sigma_m=0.1).measurements, 0.0) == pytest.approx(expected, rel=0.15)
+    xy[rng.choice(200, 20, replace=False)] += 2.0
+    assert standing_speed_sigma(track_of(t, xy, sigma_m=0.1).measurements, 0.0) < 1.6 * expected
+    assert standing_speed_sigma(track_of(t[:1], xy[:1]).measurements, 0.0) == MAX_SPEED_SIGMA_MPS
 
 
 def passing(speed_mps: float):

@@ -26,8 +26,9 @@ from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.fusion import fuse_tick
 from log2sim.perception.lidar.cloud import assemble_cloud
-from log2sim.pipeline import Result, infer_scenario, observe_log, start
+from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.report import Result
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}

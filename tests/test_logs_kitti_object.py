@@ -11,7 +11,7 @@ import pytest
 from log2sim import open_log
 from log2sim.config import Config
 from log2sim.evaluation.detection.detect_log import detect_log
-from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
+from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, transform
 
 K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
@@ -110,7 +110,7 @@ def test_its_labels_as_detector_are_perfect_by_kittis_rules(root: Path) -> None:
     log = open_log(root)
     found = detect_log(log, Config().changed(detect={"name": "lidar:labels"})).found
     assert len(found.t_ns) == 4
-    result = evaluate_boxes(found, log, Options("kitti"))
+    result = evaluate_boxes(found, log, DetectionOptions("kitti"))
     assert (result["sweeps"], result["sweeps_without_labels"]) == (4, 0)
     rows = {
         r["objects"]: r

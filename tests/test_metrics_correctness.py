@@ -13,10 +13,10 @@ from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
 from log2sim.datatypes import CATEGORIES, Agent, Finding, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.evaluation.metrics.comparison import Selection, compare, reconstructed_states, truth_states
+from log2sim.evaluation.metrics.comparison import Selection, compare_agents, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import format_table, format_verdict
-from log2sim.evaluation.metrics.verdicts import REPORTED, judge
+from log2sim.evaluation.metrics.verdicts import REPORTED, judge_against_truth
 from log2sim.files.documents import check
 
 TICKS = len(T_S)
@@ -284,7 +284,7 @@ def test_what_is_not_selected_is_not_judged_at_all():
     ego_xy = np.zeros((TICKS, 2))
     ours = reconstructed_states((driving("x", 9.0, yaw=np.pi), agent("y", 0.0, 9.0, category="truck")), T_S, ego_xy)
     truth = truth_states((driving("a", 5.0), agent("b", 0.0, 9.0)), T_S, np.zeros(3), ego_xy)
-    found = judge(compare(truth, ours, 0.1, Selection(8.0, frozenset(["car"]))), None)
+    found = judge_against_truth(compare_agents(truth, ours, 0.1, Selection(8.0, frozenset(["car"]))), None)
     near = np.array([5 * T_S <= 8.0, np.zeros(TICKS, dtype=bool)])
     assert np.array_equal(found.judged, near)
     assert np.array_equal(found.wrong, near)

@@ -23,7 +23,7 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.perception.sync import synchronize
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.visualization.notebook import labels_of
+from log2sim.visualization.notebook import notebook_labels
 from log2sim.visualization.overlay import labels_at, read_moment
 
 EVIL = "<script>window.hacked = 1</script>\"'<img src=x onerror=hacked>"
@@ -163,7 +163,7 @@ def test_agents_are_drawn_where_their_labels_are(log: Log, scenario: Scenario) -
     tick = log.ticks()[5]
     moment = read_moment(log, t_ns=tick.t_ns)
     known = labels_at(log.labels, tick.t_ns)
-    drawn = labels_at(labels_of(scenario, log, tick.t_ns), tick.t_ns)
+    drawn = labels_at(notebook_labels(scenario, log, tick.t_ns), tick.t_ns)
     assert moment.t_ns == tick.t_ns
     assert sorted(drawn.category) == sorted(known.category)
     for at, size in zip(drawn.center_m, drawn.size_m):

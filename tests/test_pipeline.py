@@ -17,7 +17,7 @@ from log2sim.datatypes import Labels, Log, Stream
 from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check, write_json
-from log2sim.pipeline import Result
+from log2sim.report import Result
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 

@@ -17,7 +17,9 @@ from log2sim.geometry import inverse, project_boxes, wrap_angle
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.pipeline import Detectors, Result, infer_scenario, observe_log, reconstruct, start
+from log2sim.perception.run_detectors import Detectors
+from log2sim.pipeline import infer_scenario, observe_log, reconstruct, start
+from log2sim.report import Result
 
 ALL_AROUND = [{**tiny_table()["lidar"][0], "azimuth_deg": [-180.0, 180.0], "azimuth_step_deg": 1.0, "channels": 20}]
 BEHIND = PARKED | {"id": "behind", "pose": [-9.0, 4.0, 200.0]}

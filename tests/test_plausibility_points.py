@@ -17,7 +17,7 @@ from log2sim.agents.evidence import (
     count_rays,
     weigh,
 )
-from log2sim.agents.judge import contradict, is_refuted, missing_nats
+from log2sim.agents.judge import decide, missing_nats
 from log2sim.datatypes import Log, Obstacles, Rays, Track
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.sync import Schedule
@@ -91,10 +91,10 @@ def test_rays_that_end_at_the_back_of_a_car_support_it() -> None:
 
 def test_an_agent_through_whose_place_nearly_all_rays_pass_is_refuted() -> None:
     support = Support(inside=10, through=90, seen_ticks=9)
-    assert is_refuted(replace(candidate(agent(5.0)), support=support), 0.9)
+    assert decide(replace(candidate(agent(5.0)), support=support), 0.9) is None
     # The rays of two ticks, or few ones, may be chance; a box that is too large has something in it.
     for other in ({"seen_ticks": 2}, {"inside": 1, "through": 9}, {"inside": 40}):
-        assert not is_refuted(replace(candidate(agent(5.0)), support=replace(support, **other)), 0.9)
+        assert decide(replace(candidate(agent(5.0)), support=replace(support, **other)), 0.9) is not None
 
 
 def with_support(**figures):
@@ -112,8 +112,8 @@ def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
 
 
 def test_what_no_ray_reaches_is_refuted_and_what_has_no_point_doubted():
-    assert is_refuted(with_support(unreached=True), 0.9)
-    (doubt,) = contradict(with_support(pointless=True), 0.9)
+    assert decide(with_support(unreached=True), 0.9) is None
+    (doubt,) = decide(with_support(pointless=True), 0.9)
     assert doubt.kind == "hardly_observed"
 
 
@@ -146,7 +146,7 @@ def test_where_the_lidar_looks_an_object_has_points(thing, points, pointless, un
     )
     (weighed,) = weigh([seen], recording)
     assert (weighed.support.pointless, weighed.support.unreached) == (pointless, unreached)
-    assert is_refuted(weighed, 0.9) is unreached
+    assert (decide(weighed, 0.9) is None) is unreached
 
 
 """Axes of a camera that looks along x."""

@@ -29,7 +29,7 @@ from log2sim.visualization.plot.selection import (
 )
 from log2sim.visualization.plot.style import INK
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import assign_roles
+from log2sim.visualization.plot.viewport import assign_view_roles
 
 
 def scene() -> Scenario:
@@ -189,7 +189,7 @@ def test_a_picture_shows_the_agents_and_the_part_of_the_map_that_it_is_asked_for
     options = PlotOptions(extent_m=(12.0, 9.0, -3.0, -4.0), agents=("car-1",))
     shown, result = select_shown(scenario, replay(scenario, dt_s=0.05), options)
     assert [a.id for a in shown.agents] == [a.id for a in result.agents] == ["car-1"]
-    layout = still(shown, assign_roles(shown), Overlays(options=options))
+    layout = still(shown, assign_view_roles(shown), Overlays(options=options))
     x0, x1, y0, y1 = *layout.ax.get_xlim(), *layout.ax.get_ylim()
     assert (x0 + x1, y0 + y1) == pytest.approx((9.0, 5.0))
     assert min(x1 - x0 - 15.0, y1 - y0 - 13.0) == pytest.approx(0.0, abs=1e-9)

@@ -24,7 +24,7 @@ from log2sim.visualization.plot.layers import Overlays
 from log2sim.visualization.plot.layout import FigureLayout
 from log2sim.visualization.plot.style import ALARM, TRACK_ALPHA
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import assign_roles
+from log2sim.visualization.plot.viewport import assign_view_roles
 
 
 def make_agent(
@@ -78,7 +78,7 @@ def test_an_unknown_suffix_lists_the_known_ones(tmp_path: Path) -> None:
 
 
 def draw(scenario: Scenario, **overlays: object) -> FigureLayout:
-    return still(scenario, assign_roles(scenario), Overlays(**overlays))  # type: ignore[arg-type]
+    return still(scenario, assign_view_roles(scenario), Overlays(**overlays))  # type: ignore[arg-type]
 
 
 def test_the_view_holds_every_mover_and_equal_meters_on_both_axes() -> None:
@@ -133,9 +133,9 @@ def test_boxes_have_the_real_size_and_heading() -> None:
 
 
 def test_colors_of_movers_are_distinct_and_keep_to_rank() -> None:
-    roles = assign_roles(many(20))
+    roles = assign_view_roles(many(20))
     assert len({role.color for role in roles.movers}) == 21
-    nearest = assign_roles(
+    nearest = assign_view_roles(
         make_scenario(
             make_agent("ego", (0, 0), (10, 0)), make_agent("a", (0, 50), (5, 0)), make_agent("b", (0, 5), (5, 0))
         )
@@ -162,7 +162,7 @@ def reckless() -> tuple[Scenario, Replay]:
 
 
 def layout_of(scenario: Scenario, result: Replay | None) -> FigureLayout:
-    return still(scenario, assign_roles(scenario), Overlays(replay=result))
+    return still(scenario, assign_view_roles(scenario), Overlays(replay=result))
 
 
 def chart_axes(layout: FigureLayout) -> list:
@@ -203,7 +203,7 @@ def test_a_gif_keeps_every_frame_and_the_colors_that_mean_something(tmp_path: Pa
         for frame in (0, 30, 60):
             moving.seek(frame)
             pixels = np.asarray(moving.convert("RGB")).reshape(-1, 3).astype(int)
-            for color in [role.color for role in assign_roles(scenario).movers] + [ALARM]:
+            for color in [role.color for role in assign_view_roles(scenario).movers] + [ALARM]:
                 full = 255 * np.array(to_rgb(color))
                 for alpha in (1.0, TRACK_ALPHA) if color != ALARM else (1.0,):
                     near = np.abs(pixels - (alpha * full + (1 - alpha) * 255)).max(axis=1) <= 6
@@ -226,7 +226,7 @@ def scene_doubts() -> Scenario:
 
 
 def drawn(scenario: Scenario) -> FigureLayout:
-    return still(scenario, assign_roles(scenario))
+    return still(scenario, assign_view_roles(scenario))
 
 
 def striped(layout: FigureLayout) -> list[Array]:

@@ -15,7 +15,7 @@ from worlds import tiny_log
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.pipeline import Result
+from log2sim.report import Result
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"
 

@@ -24,9 +24,9 @@ from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.runner import replay
 from log2sim.visualization.page.document import SCALES, page_document, second_differences
-from log2sim.visualization.page.writer import html_of, write_page
+from log2sim.visualization.page.writer import page_html, write_page
 from log2sim.visualization.plot import style
-from log2sim.visualization.plot.viewport import assign_roles
+from log2sim.visualization.plot.viewport import assign_view_roles
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = ROOT / "samples" / "crossing" / "truth.json"
@@ -89,7 +89,7 @@ def test_the_document_holds_every_layer() -> None:
 def test_agents_have_the_colors_of_the_pictures() -> None:
     scenario = Scenario.load(TRUTH)
     entries = {e["id"]: e for e in page_document(scenario)["layers"]["scenario"]}
-    roles = assign_roles(scenario)
+    roles = assign_view_roles(scenario)
     assert list(entries) == [r.agent.id for r in roles.movers] + [a.id for a in roles.stationary]
     for role in roles.movers[1:]:
         assert entries[role.agent.id]["color"] == role.color
@@ -98,7 +98,7 @@ def test_agents_have_the_colors_of_the_pictures() -> None:
 
 
 def test_the_page_asks_for_nothing_from_outside() -> None:
-    page = html_of({**page_document(Scenario.load(TRUTH)), "scales": SCALES})
+    page = page_html({**page_document(Scenario.load(TRUTH)), "scales": SCALES})
     parts = Parts(page)
     assert set(re.findall(r"https?://[^\s\"'<>]+", page)) == {"http://www.w3.org/2000/svg"}  # a name, not a place
     assert not [a for _, a in parts.tags if {"src", "action"} & set(a)]
@@ -115,7 +115,7 @@ def test_the_page_asks_for_nothing_from_outside() -> None:
 
 def test_names_in_a_scenario_cannot_become_part_of_the_page() -> None:
     document = {**page_document(made(agent(EVIL, np.arange(5.0), 0.0), name=EVIL)), "scales": SCALES}
-    parts, usual = (Parts(html_of(d)) for d in (document, {**document, "name": "x", "layers": {"scenario": []}}))
+    parts, usual = (Parts(page_html(d)) for d in (document, {**document, "name": "x", "layers": {"scenario": []}}))
     assert [tag for tag, _ in parts.tags] == [tag for tag, _ in usual.tags]
     data = next(text for tag, text in parts.texts if tag == "script")
     assert json.loads(data) == document

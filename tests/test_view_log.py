@@ -27,7 +27,7 @@ from log2sim.visualization.recording import (
     UNIT_M,
     PointsAbove,
     Recorded,
-    pack,
+    pack_recording,
     records_within,
     take_at_rate,
     take_evenly,
@@ -123,7 +123,7 @@ def test_points_come_back_one_of_each_cell_the_highest(seed: int, cell_m: float)
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 300))
     xy, height = rng.uniform(-100, 100, (n, 2)) * rng.choice([0.02, 1.0]), rng.uniform(MIN_HEIGHT_M, 5.0, n)
-    rows = unpacked(pack(PointsAbove(0, (0, 0), xy, height, np.full(n, np.nan)), cell_m, 0.0))
+    rows = unpacked(pack_recording(PointsAbove(0, (0, 0), xy, height, np.full(n, np.nan)), cell_m, 0.0))
     highest: dict[tuple[int, ...], int] = {}
     for k, cell in enumerate(map(tuple, np.floor(xy / cell_m).astype(int).tolist())):
         if cell not in highest or height[k] > height[highest[cell]]:

@@ -275,8 +275,8 @@ def figures_of(case: Case, config: Config, stage: str) -> tuple[Figures, str]:
         setattr(pipeline, name, lambda *_, results=results, **__: next(results))
     with_road = stage in ("localization", "perception", "road")
     if not with_road:
-        description = case.recorded["describe"][0]
-        pipeline.describe = lambda scenario, *_, **__: replace(description, scenario=scenario)  # type: ignore[assignment]
+        _, decisions, figures = case.recorded["describe"][0]
+        pipeline.describe = lambda scenario, *_, **__: (scenario, decisions, figures)
     scenario = pipeline.reconstruct(case.log, config, cache=False).scenario
     document = scenario.to_dict()
     agents = [{k: v for k, v in agent.items() if k != "color"} for agent in document["agents"]]

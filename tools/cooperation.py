@@ -126,7 +126,7 @@ def run_overlap(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
         row = {"scenario": overlap_measures.of_scenario(world, found).tolist()}
         # Tracks join after detection: their boxes are those of each end.
         return (
-            row if way == "tracks" else {**row, "boxes": overlap_measures.of_boxes(world, *detect(log, way)).tolist()}
+            row if way == "tracks" else {**row, "boxes": overlap_measures.from_boxes(world, *detect(log, way)).tolist()}
         )
 
     rows = [r for _, r in measured("overlap", choices, seeds, measure)]

@@ -24,7 +24,7 @@ from kitti.boxes import Boxes, read_tracks
 from kitti.map import Index, Matcher, Scene, make_scene
 
 from log2sim.errors import Log2SimError
-from log2sim.evaluation.metrics.comparison import Pairs
+from log2sim.evaluation.metrics.comparison import AgentPairs
 from log2sim.evaluation.metrics.evaluator import hota
 from log2sim.geometry import Array
 
@@ -191,7 +191,7 @@ def _hota(scene: Scene, match: Index, threshold: float) -> tuple[float, float, f
     counted = ~scene.ignorable
     truth_there[scene.truth.track_id[counted], scene.truth.frame[counted]] = True
     other_there[scene.found.track_id[there], scene.found.frame[there]] = True
-    pairs = Pairs(
+    pairs = AgentPairs(
         scene.truth.frame[scene.row], scene.truth.track_id[scene.row], scene.found.track_id[scene.col],
         1 - scene.iou, scene.iou, np.ones(len(scene.iou), dtype=bool),
     )  # fmt: skip

@@ -36,7 +36,8 @@ from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, RecordError
 from log2sim.logs.opening import open_log
 from log2sim.perception.sync import Schedule
-from log2sim.pipeline import Run, infer_scenario, observe_log, start
+from log2sim.pipeline import infer_scenario, observe_log, start
+from log2sim.report import Run
 
 PACKAGE = str(Path(log2sim.__file__).parent) + os.sep
 TASKS = Path("/proc/self/task")

@@ -110,14 +110,6 @@ def is_confirmed(track: Track, *, typical: bool, followed: float = 0.0) -> bool:
     return max(sweep_confidence(track), moving_confidence(track), followed) >= MIN_SWEEP_CONFIDENCE
 
 
-def agent_confidence(track: Track, followed: float = 0.0) -> float:
-    """Return the confidence of an agent in [0, 1] from the scores of its track and its `followed_confidence`."""
-    best = float(_strongest(track.measurements.score).mean())
-    if np.isnan(track.measurements.box_yaw_rad).all():
-        return best
-    return max(sweep_confidence(track), followed, best if image_confidence(track) >= MIN_TRACK_CONFIDENCE else 0.0)
-
-
 def image_confidence(track: Track) -> float:
     """Return the share of its searched ticks at which a track is detected in images, times the mean of the best scores there."""
     m = track.measurements
@@ -281,17 +273,11 @@ def candidate_of(
         waypoints=waypoints,
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
-        confidence=float(np.clip(agent_confidence(track, followed), 0.0, 1.0)),
         quality=_quality_of(track) | quality,
     )
     return AgentCandidate(
         agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely, followed=followed), track, geometry
     )
-
-
-def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:
-    """Keep the confirmed candidates."""
-    return [c for c in candidates if c.confirmed]
 
 
 def _quality_of(track: Track) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from log2sim.agents.candidate import AgentCandidate, Support, confirm, name_agents
+from log2sim.agents.candidate import AgentCandidate, Support, name_agents
 from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
-from log2sim.agents.evidence import Recording, doubt_size, weigh
+from log2sim.agents.evidence import MIN_LOOKING_RAYS, Recording, doubt_size, weigh
 from log2sim.agents.size import independent
 from log2sim.datatypes import GROUP_OF, Agent, AgentTable, Finding
 from log2sim.geometry import overlap_of_smaller
@@ -57,14 +57,16 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
     return bool(np.median(overlap_of_smaller(*(boxes.rectangles(k, slice(None)) for k in range(2)))) > least)
 
 
-# Share of the rays that pass through the solid part of labeled boxes in real logs and of exact ones in synthetic ones: below
-# 0.2 for vehicles; people and bicycles have gaps, below 0.6.
-MAX_THROUGH_SHARE = {"vehicle": 0.35}
-MAX_THROUGH_SHARE_WITH_GAPS = 0.8
-# From here on nothing is there; below, something may be that is smaller than the box or beside it.
-EMPTY_SHARE = 0.8
-# Fewer rays, or those of fewer ticks, may all have gone through a window or past a corner.
-MIN_RAYS, MIN_EMPTY_TICKS = 20, 3
+# Nats against a candidate, of which each reason has some: odds of 20 to 1 drop it. What is certain outweighs any detections.
+REFUTED_NATS, CERTAIN_NATS = 3.0, 10.0
+# One labeled vehicle in ten stands so close to something that most of its points are on a surface that goes on beyond it.
+BESIDE_STRUCTURE_NATS = 2.3
+# Through labeled vehicles in real logs, and exact ones in synthetic ones, pass less than 0.2 of the rays toward their solid part;
+# people and bicycles have gaps. Above the lower share something may be there that is smaller than the box or beside it, above the
+# higher one nothing is.
+DOUBTED_SHARE, EMPTY_SHARE = 0.35, 0.8
+# Rays of fewer ticks may all have gone through a window or past a corner.
+MIN_EMPTY_TICKS = 3
 # A surface counts that is there at more than this share of the searched ticks.
 MOSTLY = 0.5
 # Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken
@@ -73,13 +75,9 @@ FALSE_RATE = 0.05
 MAX_USUAL_RATE = 0.9
 # Fewer ticks tell no rate.
 MIN_SHOWN_TICKS = 8
-# Nats against a vehicle by a surface that goes on beyond it: one in ten labeled ones stands that close to something.
-BESIDE_STRUCTURE_NATS = 2.3
 # The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5 is three standard deviations low. Then the
 # points are not those of what the image shows, but of something nearer that hides it.
 MIN_IMAGE_HEIGHT_SHARE = 0.5
-# Odds of 20 to 1 against a candidate.
-REFUTED_NATS = 3.0
 
 
 def usual_detection_rate(candidates: Sequence[AgentCandidate]) -> float:
@@ -89,8 +87,8 @@ def usual_detection_rate(candidates: Sequence[AgentCandidate]) -> float:
     return sum(s.detected_ticks for s in supports) / shown if shown else 0.0
 
 
-def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
-    """Return whether the sensors show that a candidate is not there, or show something else in its place.
+def decide(candidate: AgentCandidate, usual_rate: float) -> list[Finding] | None:
+    """Return what is doubtful about a weighed candidate, None if it is dropped: nothing is there, or something else.
 
     Parameters
     ----------
@@ -99,32 +97,33 @@ def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
     """
     s = candidate.support
     if s is None:
-        return False
-    if s.image_height_share is not None and s.image_height_share < MIN_IMAGE_HEIGHT_SHARE:
-        return True
-    if s.unreached or s.in_structure > MOSTLY or _through_more_than(EMPTY_SHARE, s):
-        return True
-    beside = BESIDE_STRUCTURE_NATS if s.beside_structure > MOSTLY else 0.0
-    return missing_nats(s, usual_rate) + beside > REFUTED_NATS
-
-
-def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Finding]:
-    """Doubt a candidate through which rays pass, that has no points, or that is seldom detected where it is well seen."""
-    s, doubts = candidate.support, []
-    if s is None:
-        return []
-    if _through_more_than(MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS), s):
-        doubts.append(Finding("empty", values={"through_share": s.through_share or 0.0}))
+        return doubt_size(candidate.agent)
+    known = s.inside + s.through >= MIN_LOOKING_RAYS and s.seen_ticks >= MIN_EMPTY_TICKS
+    through = (s.through_share or 0.0) if known else 0.0
+    undetected = missing_nats(s, usual_rate)
+    height_share = 1.0 if s.image_height_share is None else s.image_height_share
+    against = {
+        "points of something nearer": CERTAIN_NATS * (height_share < MIN_IMAGE_HEIGHT_SHARE),
+        "rays do not end in it": CERTAIN_NATS * s.unreached,
+        "rays pass through": CERTAIN_NATS * (through > EMPTY_SHARE),
+        "part of something longer": CERTAIN_NATS * (s.in_structure > MOSTLY),
+        "beside something longer": BESIDE_STRUCTURE_NATS * (s.beside_structure > MOSTLY),
+        "not detected": undetected,
+    }
+    if sum(against.values()) > REFUTED_NATS:
+        return None
+    doubts = []
+    if through > DOUBTED_SHARE and GROUP_OF[candidate.agent.category] == "vehicle":
+        doubts.append(Finding("empty", values={"through_share": through}))
     if s.pointless:
         doubts.append(Finding("hardly_observed", case="no_points"))
-    if missing_nats(s, usual_rate) > 0:
-        counts = {"detected_ticks": float(s.detected_ticks), "shown_ticks": float(s.shown_ticks)}
-        doubts.append(Finding("hardly_observed", case="any", values=counts))
-    elif missing_nats(replace(s, detected_ticks=s.image_ticks), usual_rate) > REFUTED_NATS:
-        # Sweeps alone show it, and images next to them hardly ever do.
-        counts = {"detected_ticks": float(s.image_ticks), "shown_ticks": float(s.shown_ticks)}
-        doubts.append(Finding("hardly_observed", case="images", values=counts))
-    return doubts
+    # Where sweeps alone show it, images next to them should, too.
+    only_sweeps = missing_nats(replace(s, detected_ticks=s.image_ticks), usual_rate) > REFUTED_NATS
+    if undetected > 0 or only_sweeps:
+        case, ticks = ("any", s.detected_ticks) if undetected > 0 else ("images", s.image_ticks)
+        counts = {"detected_ticks": float(ticks), "shown_ticks": float(s.shown_ticks)}
+        doubts.append(Finding("hardly_observed", case=case, values=counts))
+    return [*doubts, *doubt_size(candidate.agent)]
 
 
 def missing_nats(s: Support, usual_rate: float) -> float:
@@ -143,12 +142,6 @@ def missing_nats(s: Support, usual_rate: float) -> float:
     return float(mean) * independent(s.shown_ticks)
 
 
-def _through_more_than(limit: float, s: Support) -> bool:
-    """Return whether rays of several ticks, in sum enough to tell, pass through the place of an agent by more than a share."""
-    share, enough = s.through_share, s.inside + s.through >= MIN_RAYS and s.seen_ticks >= MIN_EMPTY_TICKS
-    return enough and share is not None and share > limit
-
-
 def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording) -> list[AgentCandidate]:
     """Keep the candidates that are confirmed and can be true together, each named and with what speaks against it.
 
@@ -160,11 +153,11 @@ def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Re
         At its place there is no other agent.
     """
     t_s = recording.t_s
-    weighed = weigh(confirm(candidates), recording)
+    weighed = weigh([c for c in candidates if c.confirmed], recording)
     usual_rate = usual_detection_rate(weighed)
-    apart = suppress_duplicates([c for c in weighed if not is_refuted(c, usual_rate)], ego)
+    decided = [(c, decide(c, usual_rate)) for c in weighed]
+    apart = suppress_duplicates([c.doubted(doubts) for c, doubts in decided if doubts is not None], ego)
     apart = resolve_conflicts(apart, ego, t_s)
     # A doubt may name another agent.
     named = name_agents(apart)
-    conflicts = conflict_doubts(named, ego, t_s)
-    return [c.doubted([*contradict(c, usual_rate), *doubt_size(c.agent), *found]) for c, found in zip(named, conflicts)]
+    return [c.doubted(found) for c, found in zip(named, conflict_doubts(named, ego, t_s))]

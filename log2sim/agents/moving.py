@@ -141,7 +141,7 @@ def _placed(boxes: Boxes3D) -> Measurements:
     """Return a row for each box, placed at its center as exactly as centers of boxes are."""
     sigma = np.array([CENTER_SIGMA_M[GROUP_OF[str(c)]] for c in boxes.category])
     return replace(
-        Measurements.of_boxes(boxes, np.zeros(3)),
+        Measurements.from_boxes(boxes, np.zeros(3)),
         center_m=boxes.center_m,
         covariance=sigma[:, None, None] ** 2 * np.eye(2),
         source=np.full(len(boxes), "lidar", dtype="<U16"),

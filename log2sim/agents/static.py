@@ -21,7 +21,6 @@ from log2sim.perception.boxes import (
     SENSOR_SIGMA_M,
     SIDE_END,
     UNIFORM_SIGMA,
-    align_to,
     complete_box,
     corrected_yaw,
     extents_of_rotated,
@@ -53,11 +52,9 @@ LEVELS = 0.25, 0.75
 # What ends on both sides and is shorter than this share of the box is something else.
 MIN_SIZE_SHARE = 0.5
 # Gains of the constant-velocity filter.
-POSITION_GAIN, VELOCITY_GAIN, YAW_GAIN = 0.6, 0.15, 0.3
+POSITION_GAIN, VELOCITY_GAIN = 0.6, 0.15
 # What is longer than so many widths moves along its length.
 LONG_WIDTHS = 1.5
-# Slower objects keep their yaw.
-MIN_COURSE_SPEED_MPS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,11 +179,10 @@ def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
     dt_s = (match.t_ns - state.t_ns) / NS_PER_S
     expected = state.xy_m + state.velocity_mps * dt_s
     innovation = match.xy_m - expected
-    velocity, yaw_rad = state.velocity_mps, state.yaw_rad
+    velocity, yaw_rad = state.velocity_mps, match.yaw_rad
     if abs(dt_s) > 1e-3:
         velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-        yaw_rad = _turned(match.yaw_rad, velocity)
-        if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
+        if yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
             axis = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
             velocity = (velocity @ axis) * axis
     position = expected + POSITION_GAIN * innovation
@@ -321,15 +317,6 @@ def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
     return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
 
 
-def _turned(yaw_rad: float, velocity: Array) -> float:
-    """Turn a yaw toward the course of a velocity (2,), up to half turns, if it is fast enough."""
-    speed = float(np.hypot(*velocity))
-    if speed < MIN_COURSE_SPEED_MPS:
-        return yaw_rad
-    course = align_to(float(np.arctan2(velocity[1], velocity[0])), yaw_rad, np.pi)
-    return yaw_rad + YAW_GAIN * float(np.arctan2(np.sin(course - yaw_rad), np.cos(course - yaw_rad)))
-
-
 # Standard deviations of a yaw known up to half a turn: of the box of one tick, and the least of any.
 BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = 0.1, 0.005
 # What seems to stand is not faster than this, standard deviation, however short it was seen.
@@ -411,57 +398,21 @@ def _is_too_large(geometry: TrackGeometry, category: str) -> bool:
     return bool(np.any(geometry.size_m[:2] >= MAX_SIZE_M[category][:2]))
 
 
-# Tuning constant of Cauchy's weights with 95 % efficiency for normal errors (Holland & Welsch, 1977).
-CAUCHY_SIGMAS = 2.385
-REWEIGHTINGS = 5
-
-
-def robust_line(t: Array, xy: Array, variance: Array) -> tuple[Array, Array, float]:
-    """Fit uniform motion to positions by weighted least squares that outliers move little.
-
-    Parameters
-    ----------
-    t : (n,) float64, s
-    xy : (n, d) float64, m
-    variance : (n,) float64, m2
-        Of a position in each direction.
-
-    Returns
-    -------
-    center : (d,)
-        The weighted mean of the positions.
-    velocity : (d,)
-        In m/s; zero where all times are the same.
-    sigma_mps : float
-        Standard deviation of the velocity in each direction, larger where positions scatter more than their variances say
-        (Birge, 1932), infinite where all times are the same.
-
-    Notes
-    -----
-    Iteratively reweighted by Cauchy's function of the residuals (Holland & Welsch, "Robust regression using iteratively
-    reweighted least-squares", 1977).
-    """
-    weight, robust = 1.0 / variance, np.ones(len(t))
-    for _ in range(REWEIGHTINGS):
-        w = weight * robust
-        mean_t, center = w @ t / w.sum(), w @ xy / w.sum()
-        known = float(w @ (t - mean_t) ** 2)
-        velocity = (w * (t - mean_t)) @ (xy - center) / known if known > 0 else np.zeros(xy.shape[1])
-        residual = xy - center - (t - mean_t)[:, None] * velocity
-        squared = weight * (residual**2).sum(axis=1)
-        robust = 1.0 / (1.0 + squared / CAUCHY_SIGMAS**2)
-    scatter = float(squared.mean()) / xy.shape[1]
-    return center, velocity, (max(scatter, 1.0) / known) ** 0.5 if known > 0 else np.inf
-
-
 def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:
     """Return the standard deviation in m/s of the speed of a track that stands: that of a line through its centers.
 
+    It is larger where they scatter more than their variances say (Birge, 1932), by the median, which outliers move little.
     `sigma_m` is what changing views add to the noise of a center.
     """
-    variance: Array = np.linalg.eigvalsh(m.covariance)[:, -1].astype(np.float64) + sigma_m**2
-    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
-    return min(robust_line(t, m.center_m[:, :2], variance)[2], MAX_SPEED_SIGMA_MPS)
+    weight: Array = 1.0 / (np.linalg.eigvalsh(m.covariance)[:, -1].astype(np.float64) + sigma_m**2)
+    t, xy = (m.t_ns - m.t_ns[0]) / NS_PER_S, m.center_m[:, :2]
+    late, off = t - np.average(t, weights=weight), xy - np.median(xy, axis=0)
+    known = float(weight @ late**2)
+    if known == 0:
+        return MAX_SPEED_SIGMA_MPS
+    squared = weight * ((off - np.outer(late, weight * late @ off / known)) ** 2).sum(axis=1)
+    scatter = float(np.median(squared)) / np.log(4.0)  # median of chi-square with two degrees of freedom
+    return min(float(np.sqrt(max(scatter, 1.0) / known)), MAX_SPEED_SIGMA_MPS)
 
 
 def yaw_sigma(m: BoxEvidence, geometry: TrackGeometry) -> float:

@@ -17,8 +17,8 @@ from log2sim.cli.options import (
     Stop,
     complete_detectors,
     option,
+    report_written,
     say,
-    say_written,
     write_to,
 )
 
@@ -60,8 +60,8 @@ def bench(
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.evaluation.bench.benchmark import bench as run
-    from log2sim.evaluation.bench.benchmark import document, format_table, write_picture
-    from log2sim.evaluation.bench.scores import Scope
+    from log2sim.evaluation.bench.benchmark import bench_document, format_benchmark, write_picture
+    from log2sim.evaluation.bench.scores import ScoreScope
     from log2sim.evaluation.metrics.truth import truth_at
     from log2sim.files.documents import check_targets, write_json
     from log2sim.files.outputs import together
@@ -79,13 +79,13 @@ def bench(
     made = {"poses": choice.to_provenance()}
     used = chosen.cameras or tuple(opened.cameras)
     known = truth_at(truth or log, used, sequence, provenance=made) if truth is not None or labeled else None
-    scope = Scope(range, tuple(c.strip() for c in categories.split(",")) if categories else None)
+    scope = ScoreScope(range, tuple(c.strip() for c in categories.split(",")) if categories else None)
     with progress(quiet=quiet) as report_progress:
         result = run(
             opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=report_progress
         )
     with together():
-        write_json(out / "bench.json", document(result))
+        write_json(out / "bench.json", bench_document(result))
         write_picture(result, out / "bench.png")
-    say(format_table(result), quiet=quiet)
-    say_written(out / "bench.json", out / "bench.png", quiet=quiet)
+    say(format_benchmark(result), quiet=quiet)
+    report_written(out / "bench.json", out / "bench.png", quiet=quiet)

@@ -45,14 +45,14 @@ def cache(
         store.set_limit(max_mb)
     removed = store.clear() if clear else None
     if as_json:
-        say(json.dumps(summarize(store), indent=2))
+        say(json.dumps(summarize_cache(store), indent=2))
     elif removed is not None:
         say(f"{store.folder}: {counted(removed, 'part')} removed")
     else:
-        say("\n".join(describe(summarize(store))))
+        say("\n".join(describe_cache(summarize_cache(store))))
 
 
-def summarize(store: DiskCache) -> dict[str, Any]:
+def summarize_cache(store: DiskCache) -> dict[str, Any]:
     """Return the folder and the size of a cache, the parts of logs by detector, and what the last run took from it."""
     usage, last = store.usage(), store.last_run
     detectors = [
@@ -70,7 +70,7 @@ def summarize(store: DiskCache) -> dict[str, Any]:
     }
 
 
-def describe(found: dict[str, Any]) -> list[str]:
+def describe_cache(found: dict[str, Any]) -> list[str]:
     """Describe a cache in lines for people."""
     from log2sim.cli.shared import format_rows
 

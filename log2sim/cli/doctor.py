@@ -177,7 +177,7 @@ def examine_extras(requirements: list[Requirement]) -> Iterator[Extra]:
     names = dict.fromkeys(extra for r in requirements if (extra := extra_of(r)))
     for extra in sorted(names, key=lambda name: (name not in PURPOSES, name)):
         needed = [r for r in requirements if r.marker and extra_of(r) == extra and r.marker.evaluate({"extra": extra})]
-        missing = tuple(r.name for r in needed if not is_installed(r))
+        missing = tuple(r.name for r in needed if not is_module_installed(r))
         yield Extra(extra, missing, PURPOSES.get(extra, ""), install_command(extra))
 
 
@@ -188,7 +188,7 @@ def extra_of(requirement: Requirement) -> str | None:
     return after.split('"')[0] if found else None
 
 
-def is_installed(requirement: Requirement) -> bool:
+def is_module_installed(requirement: Requirement) -> bool:
     """Return whether a package is there in a version that is good enough."""
     version = version_of(requirement.name)
     return version is not None and requirement.specifier.contains(version, prereleases=True)
@@ -264,12 +264,12 @@ def doctor(as_json: AsJson = False) -> None:
     import json
 
     found = examine()
-    say(json.dumps(found.to_dict(), indent=2) if as_json else "\n".join(describe(found)))
+    say(json.dumps(found.to_dict(), indent=2) if as_json else "\n".join(describe_installation(found)))
     if found.broken:
         fail("; ".join(found.broken), BROKEN_CODE)
 
 
-def describe(found: Installation) -> list[str]:
+def describe_installation(found: Installation) -> list[str]:
     """Describe an installation in lines for people."""
     from log2sim.cli.shared import format_rows
 

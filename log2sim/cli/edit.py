@@ -58,7 +58,7 @@ def edit(
     log2sim edit s.json --add car --at ego+20 --replace car-2=truck -o more.json
     log2sim edit s.json --remove bus-1 --speed car-2=1.2 -o edited.json
     """
-    from log2sim.datatypes import Scenario, list_doubtful, say_agents
+    from log2sim.datatypes import Scenario, count_agents, list_doubtful
     from log2sim.edit.apply import edit as run
     from log2sim.edit.edits import DropDoubtful as Drop
     from log2sim.files.documents import check_targets
@@ -84,7 +84,7 @@ def edit(
     for warning in result.warnings:
         say(f"warning: {warning}", quiet=quiet)
     say(
-        f"{out}: {counted(len(edits), 'edit')}, {say_agents(a.id for a in edited.agents)} over {edited.duration_s:.1f} s, "
+        f"{out}: {counted(len(edits), 'edit')}, {count_agents(a.id for a in edited.agents)} over {edited.duration_s:.1f} s, "
         f"{counted(len(result.warnings), 'warning')}",
         quiet=quiet,
     )

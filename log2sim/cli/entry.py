@@ -20,6 +20,7 @@ from log2sim.cli import (
     edit,
     evaluate,
     export,
+    find,
     help,
     import_,
     inspect,
@@ -30,7 +31,10 @@ from log2sim.cli import (
     replay,
     studio,
     synth,
+    tag,
+    test_,
     validate,
+    vary,
     view,
 )
 from log2sim.cli.options import fail, printable, say
@@ -90,11 +94,12 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, correct.correct, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, correct.correct, tag.tag, find.find, vary.vary, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, help.help_, "help")
 add_command(app, import_.import_, "import")
+add_command(app, test_.run_test, "test")
 add_command(app, map.map_, "map")
 
 

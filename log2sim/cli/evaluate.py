@@ -18,8 +18,8 @@ from log2sim.cli.options import (
     Verbose,
     complete,
     option,
+    report_written,
     say,
-    say_written,
     write_to,
 )
 
@@ -104,7 +104,7 @@ def evaluate(
         if out is not None:
             write_json(out, result)
         say(table, quiet=quiet)
-        say_written(out, quiet=quiet)
+        report_written(out, quiet=quiet)
         return
     document = read_json(path, ScenarioError)
     if is_boxes_document(document):
@@ -142,7 +142,7 @@ def evaluate(
         if plot is not None:
             _plot_reliability(result, plot)
     say(table, quiet=quiet)
-    say_written(out, plot, quiet=quiet)
+    report_written(out, plot, quiet=quiet)
 
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
@@ -249,9 +249,9 @@ def _boxes_figures(
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
     from log2sim.evaluation.detection.boxes import DetectedBoxes
-    from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes, format_table, format_verdict
+    from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes, format_table, format_verdict
 
-    chosen = Options(**options)
+    chosen = DetectionOptions(**options)
     chosen.chosen()
     try:
         detected = DetectedBoxes.from_dict(document)

@@ -56,7 +56,7 @@ def export(
     """
     from log2sim.datatypes import Scenario
     from log2sim.export.checks import doubtful_note, export_notes
-    from log2sim.export.exporters import EXTERNAL, Options, with_doubtful, with_ego
+    from log2sim.export.exporters import EXTERNAL, Options, filter_doubtful, make_ego
     from log2sim.export.exporters import export as run
     from log2sim.files.documents import check_folder
     from log2sim.logs.opening import open_log
@@ -65,8 +65,8 @@ def export(
     loaded = Scenario.load(scenario)
     driver = EXTERNAL if ego == EXTERNAL and all(a.id != EXTERNAL for a in loaded.agents) else None
     if ego is not None and driver is None:
-        loaded = with_ego(loaded, ego)
-    chosen = with_doubtful(loaded, doubtful)
+        loaded = make_ego(loaded, ego)
+    chosen = filter_doubtful(loaded, doubtful)
     opened = open_log(log) if log is not None else None
     options = Options(revision, map, mode, opened, driver)
     files = run(chosen, to, out, options, quarantined=doubtful == "all", overwrite=overwrite)

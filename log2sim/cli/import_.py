@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, report_written, write_to
 
 
 def import_(
@@ -27,4 +27,4 @@ def import_(
 
     check_targets(out, overwrite=overwrite)
     load(file).save(out)
-    say_written(out, quiet=quiet)
+    report_written(out, quiet=quiet)

@@ -19,8 +19,8 @@ from log2sim.cli.options import (
     camera_names,
     counted,
     option,
+    report_written,
     say,
-    say_written,
 )
 from log2sim.cli.shared import format_rows, wrap
 from log2sim.errors import ConfigError
@@ -197,4 +197,4 @@ def inspect(
     from log2sim.visualization.overlay import read_moment, write_overlay
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-    say_written(overlay, quiet=quiet)
+    report_written(overlay, quiet=quiet)

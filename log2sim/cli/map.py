@@ -13,8 +13,8 @@ from log2sim.cli.options import (
     SequenceName,
     choose,
     option,
+    report_written,
     say,
-    say_written,
     write_to,
 )
 
@@ -103,7 +103,7 @@ def map_(
         say(f"note: {line}", quiet=quiet)
     rows, columns = ground.alpha.shape
     d = ground.resolution_m
-    say_written(world, quiet=quiet)
+    report_written(world, quiet=quiet)
     say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
 
 

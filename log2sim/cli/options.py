@@ -125,7 +125,7 @@ def say(text: str, *, quiet: bool = False) -> None:
         sys.stdout.flush()
 
 
-def say_written(*paths: Path | None, quiet: bool) -> None:
+def report_written(*paths: Path | None, quiet: bool) -> None:
     """Name the files that a command wrote; None stands for one that was not asked for."""
     written = [str(path) for path in paths if path is not None]
     if written:

@@ -5,7 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, SequenceName, Truth, option, say, say_written, write_to
+from log2sim.cli.options import (
+    Overwrite,
+    Quiet,
+    ScenarioPath,
+    SequenceName,
+    Truth,
+    option,
+    report_written,
+    say,
+    write_to,
+)
 
 
 def plot(
@@ -75,4 +85,4 @@ def plot(
             loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
             overwrite=overwrite, progress=report_progress,
         )  # fmt: skip
-    say_written(picture.path, quiet=quiet)
+    report_written(picture.path, quiet=quiet)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, say, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, report_written, say, write_to
 
 
 def predict(
@@ -44,4 +44,4 @@ def predict(
     say(format_figures(document), quiet=quiet)
     if loaded.is_reconstruction:
         say("note: the states were smoothed over the whole log and depend a little on what came next", quiet=quiet)
-    say_written(out, quiet=quiet)
+    report_written(out, quiet=quiet)

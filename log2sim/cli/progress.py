@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from log2sim.visualization.progress import OPENING, VALIDATING, say_stage
+from log2sim.visualization.progress import OPENING, VALIDATING, describe_stage
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -50,7 +50,7 @@ class Bars:
             if stage in self._tasks:
                 self._display.reset(self._tasks[stage])
         if stage not in self._tasks:
-            self._tasks[stage] = self._display.add_task(say_stage(stage), total=total or None)
+            self._tasks[stage] = self._display.add_task(describe_stage(stage), total=total or None)
         self._display.update(self._tasks[stage], completed=done, total=total or None)
 
     def _end_current(self) -> None:
@@ -114,6 +114,6 @@ def _lines() -> Report:
         if wanted:
             last[0] = now
             count = f": {done} of {total}" if total else ""
-            sys.stderr.write(f"{say_stage(stage)}{count}\n")
+            sys.stderr.write(f"{describe_stage(stage)}{count}\n")
 
     return report_progress

@@ -27,14 +27,14 @@ from log2sim.cli.options import (
     choose,
     complete_detectors,
     counted,
+    report_written,
     say,
-    say_written,
     write_to,
 )
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
-    from log2sim.pipeline import Result
+    from log2sim.report import Result
 
 
 # Stages without which something is missing in a scenario; the others save time.
@@ -47,16 +47,16 @@ LOOKED_FOR = (
 )
 
 
-def summarize(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
+def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
     """Summarize a run for people; with `verbose` everything is listed, also which stages were left out."""
     from log2sim.cli.shared import format_rows
-    from log2sim.datatypes import say_agents, say_categories
+    from log2sim.datatypes import count_agents, count_categories
 
     scenario, seconds = result.scenario, result.report["seconds"]
-    ids = say_agents(agent.id for agent in scenario.agents)
+    ids = count_agents(agent.id for agent in scenario.agents)
     speed = f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     rows = [
-        ("agents", say_categories(scenario.others) or "none"),
+        ("agents", count_categories(scenario.others) or "none"),
         *(("doubtful", line) for line in doubt_lines(scenario, verbose=verbose) or ["none"]),
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
@@ -90,11 +90,11 @@ def described(scenario: Scenario) -> list[str]:
 
 def doubt_lines(scenario: Scenario, *, verbose: bool = False) -> list[str]:
     """Say how many agents are doubtful and why the first ones are, or all; no line without any."""
-    from log2sim.datatypes import list_doubtful, why_doubtful
+    from log2sim.datatypes import explain_doubt, list_doubtful
     from log2sim.datatypes.agent import MAX_LISTED
 
     ego, others = scenario.ego, [agent for agent in scenario.others if agent.is_doubtful]
-    lines = [f"the ego: {why_doubtful(ego)}"] if ego is not None and ego.is_doubtful else []
+    lines = [f"the ego: {explain_doubt(ego)}"] if ego is not None and ego.is_doubtful else []
     if not others:
         return lines
     named = list_doubtful(others, None if verbose else MAX_LISTED)
@@ -123,7 +123,7 @@ def stage_lines(scenario: Scenario) -> list[str]:
     return [f"{'with' if stage['kept'] else 'no'} {stage['stage']}: {stage['reason']}" for stage in scenario.stages]
 
 
-def look_line(log: Path, sequence: str | None, out: Path) -> str:
+def view_command(log: Path, sequence: str | None, out: Path) -> str:
     """Return the command that shows the scenario with the pictures and the ground of its log."""
     chosen = [] if sequence is None else ["--sequence", sequence]
     page = str(out.with_suffix(".html"))
@@ -283,8 +283,8 @@ def reconstruct(
     findings = (*result.findings, *unused_records(result.report))
     for line in (*pose_lines(result.report["poses"]), *(f"note: {finding}" for finding in findings)):
         say(line, quiet=quiet)
-    say_written(report, topdown, quiet=quiet)
-    for line in summarize(result, look_line(log, sequence, out), out, verbose=verbose):
+    report_written(report, topdown, quiet=quiet)
+    for line in summarize_run(result, view_command(log, sequence, out), out, verbose=verbose):
         say(line, quiet=quiet)
 
 

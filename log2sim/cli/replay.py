@@ -14,8 +14,8 @@ from log2sim.cli.options import (
     Verbose,
     choose,
     option,
+    report_written,
     say,
-    say_written,
     write_to,
 )
 
@@ -163,7 +163,7 @@ def replay(
     note = doubtful_note(kept, kept)
     for line in [*([note] if note else []), *export_notes(kept)]:
         say(f"note: {line}", quiet=quiet)
-    say_written(out, quiet=quiet)
+    report_written(out, quiet=quiet)
     if strict:
         require_strict(result, limits)
     for broken in check_limits(result, limits):
@@ -172,12 +172,12 @@ def replay(
 
 def _trusted(scenario: Scenario, confidence: float | None, *, drop_doubtful: bool) -> tuple[Scenario, dict[str, str]]:
     """Return the scenario without the agents that are not wanted, and these with why."""
-    from log2sim.datatypes import say_confidence, why_doubtful
+    from log2sim.datatypes import explain_doubt, format_confidence
 
     kept = scenario.active if confidence is None else scenario.trusted(confidence)
     there = {a.id for a in kept.agents}
-    left_out = {a.id: say_confidence(a) for a in scenario.agents if a.id not in there}
+    left_out = {a.id: format_confidence(a) for a in scenario.agents if a.id not in there}
     if drop_doubtful:
-        left_out |= {a.id: why_doubtful(a) for a in kept.doubtful if a is not kept.ego}
-        kept = kept.without_doubtful()
+        left_out |= {a.id: explain_doubt(a) for a in kept.doubtful if a is not kept.ego}
+        kept = kept.drop_doubtful()
     return kept, left_out

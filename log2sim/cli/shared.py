@@ -214,10 +214,10 @@ def add_command(app: typer.Typer, command: Callable[..., None], name: str | None
     settings: dict[str, Any] | None = {"default_map": {}} if name == "help" else None
     help_text, epilog = text.strip(), format_examples(examples)
     add = app.command(name=name, cls=CommandWithPlugins, help=help_text, epilog=epilog, context_settings=settings)
-    add(with_shared_options(command))
+    add(add_shared_options(command))
 
 
-def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:
+def add_shared_options(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with options that `log2sim.cli.entry` reads before it runs any command."""
 
     @functools.wraps(command)

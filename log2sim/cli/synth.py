@@ -9,18 +9,18 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, option, say_written, write_to
+from log2sim.cli.options import Overwrite, Quiet, option, report_written, write_to
 from log2sim.errors import ConfigError
 
 
-class Traffic(StrEnum):
+class SceneTraffic(StrEnum):
     """Where the LiDAR of random traffic is."""
 
     vehicle = "vehicle"
     roadside = "roadside"
 
 
-class Layout(StrEnum):
+class SceneLayout(StrEnum):
     """Layout of data of random traffic."""
 
     kitti = "kitti"
@@ -48,7 +48,7 @@ def synth(
     out: Annotated[Path, write_to("DIR", "Folder to write.")],
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
     traffic: Annotated[
-        Traffic | None,
+        SceneTraffic | None,
         option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
     ] = None,
     scenes: Annotated[int, option("Number of random scenes.", min=1, max=1_000_000)] = 10,
@@ -57,7 +57,7 @@ def synth(
         option("LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"),
     ] = None,
     layout: Annotated[
-        Layout | None,
+        SceneLayout | None,
         option(
             "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
             "pictures]"
@@ -105,11 +105,11 @@ def synth(
         elif traffic is not None:
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic
 
-            chosen = layout or (Layout.log2sim if no_pictures else Layout.kitti)
+            chosen = layout or (SceneLayout.log2sim if no_pictures else SceneLayout.kitti)
             settings = TrafficSettings(
                 traffic.value, scenes, seed, sensor, chosen.value, duration,
                 None if light is None else light.value, None if weather is None else weather.value,
                 pictures=not no_pictures,
             )  # fmt: skip
             write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
-    say_written(out, quiet=quiet)
+    report_written(out, quiet=quiet)

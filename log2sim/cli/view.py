@@ -66,7 +66,7 @@ def view(
     """
     from log2sim.cli.layers import load_background, load_placed_truth, load_replay, map_of
     from log2sim.cli.progress import progress
-    from log2sim.datatypes import Scenario, say_agents
+    from log2sim.datatypes import Scenario, count_agents
     from log2sim.errors import ConfigError
     from log2sim.files.documents import check_targets
     from log2sim.visualization.page.writer import write_page
@@ -97,7 +97,7 @@ def view(
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:
         say(note, quiet=quiet)
-    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {say_agents(a.id for a in loaded.agents)}", quiet=quiet)
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}", quiet=quiet)
 
 
 def open_recorded(

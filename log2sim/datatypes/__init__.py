@@ -11,9 +11,9 @@ from log2sim.datatypes.agent import (
     Agent,
     Trajectory,
     Waypoints,
+    explain_doubt,
+    format_confidence,
     list_doubtful,
-    say_confidence,
-    why_doubtful,
 )
 from log2sim.datatypes.agent_table import AgentTable
 from log2sim.datatypes.categories import (
@@ -71,7 +71,8 @@ from log2sim.datatypes.map_features import (
     Marking,
     RoadBorder,
 )
-from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Signal, say_agents, say_categories
+from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Signal, count_agents, count_categories
+from log2sim.datatypes.tag import TAGS, Tag
 
 __all__ = [
     "BORDER_KINDS",
@@ -95,6 +96,7 @@ __all__ = [
     "SIGNAL_STATES",
     "STANDSTILL_DRIFT_M",
     "STANDSTILL_MPS",
+    "TAGS",
     "TUPLES",
     "TYPICAL_SIZE_M",
     "VEHICLE",
@@ -129,17 +131,18 @@ __all__ = [
     "Span",
     "Stream",
     "Sweep",
+    "Tag",
     "Tick",
     "Track",
     "Trajectory",
     "Treatment",
     "Waypoints",
+    "count_agents",
+    "count_categories",
     "end_of",
+    "explain_doubt",
+    "format_confidence",
     "list_doubtful",
     "retime_spans",
-    "say_agents",
-    "say_categories",
-    "say_confidence",
     "seen_from",
-    "why_doubtful",
 ]

@@ -459,14 +459,14 @@ def _doubts_of(entry: Mapping[str, Any]) -> tuple[Finding, ...]:
 MAX_LISTED = 5
 
 
-def why_doubtful(agent: Agent) -> str:
+def explain_doubt(agent: Agent) -> str:
     """Say why an agent is doubtful: the reasons of its doubts, else its low confidence; empty when it is not doubtful."""
     if agent.doubts:
         return ", ".join(doubt.sentence for doubt in agent.doubts)
-    return say_confidence(agent) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ""
+    return format_confidence(agent) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ""
 
 
-def say_confidence(agent: Agent) -> str:
+def format_confidence(agent: Agent) -> str:
     """Say the confidence of an agent, rounded down, so that 0.499 is not shown as the limit that it misses."""
     return f"confidence {math.floor(agent.confidence * 100 + 1e-9) / 100:.2f}"
 
@@ -477,6 +477,6 @@ def list_doubtful(agents: Sequence[Agent], limit: int | None = MAX_LISTED) -> st
     Those with a doubt come first, since low confidence alone says less.
     """
     first = sorted(agents, key=lambda agent: not agent.doubts)[:limit]
-    named = [f"{agent.id} ({why_doubtful(agent) or say_confidence(agent)})" for agent in first]
+    named = [f"{agent.id} ({explain_doubt(agent) or format_confidence(agent)})" for agent in first]
     rest = len(agents) - len(first)
     return ", ".join(named) + (f" and {rest} more" if rest > 0 else "")

@@ -278,7 +278,7 @@ class Measurements(BoxEvidence):
         return cls.unplaced(Detections.empty(), t_ns=0, camera="", sensor_m=np.zeros(3))
 
     @classmethod
-    def of_boxes(cls, boxes: Boxes3D, sensor_m: Array) -> Measurements:
+    def from_boxes(cls, boxes: Boxes3D, sensor_m: Array) -> Measurements:
         """Return a row for each box (M,) of a 3D detector, seen from a sensor (3,), without LiDAR points and position."""
         found = Detections(np.full((len(boxes), 4), np.nan), boxes.score, boxes.category)
         return replace(

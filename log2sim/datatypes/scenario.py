@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.log import IgnoreRegions, MapFrame
 from log2sim.datatypes.map_features import MapFeatures
+from log2sim.datatypes.tag import Tag
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.files import plugins
 from log2sim.files.documents import check, read_json, replaced, short_repr, write_json
@@ -184,7 +185,7 @@ def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
     return xarray.Dataset(along, coords=coordinates, attrs=dict(about))
 
 
-def write_parquet(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
+def write_states(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
     """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata.
 
     Raises
@@ -258,6 +259,8 @@ class Scenario:
         Only in truth: where objects were left without labels; None when the labels are complete.
     map_features : MapFeatures or None
         Markings, borders and lanes; None where they were not looked for.
+    tags : tuple of Tag or None
+        What its road users do; None where that was not looked for.
     """
 
     name: str
@@ -272,6 +275,7 @@ class Scenario:
     map_features: MapFeatures | None = None
     signals: tuple[Signal, ...] = ()
     sensors: tuple[Mapping[str, Any], ...] = ()
+    tags: tuple[Tag, ...] | None = None
 
     def __repr__(self) -> str:
         """Return name, agents and duration in one line."""
@@ -324,7 +328,7 @@ class Scenario:
             return self
         return replace(self, agents=tuple(a for a in self.agents if not a.quarantined))
 
-    def without_doubtful(self) -> Scenario:
+    def drop_doubtful(self) -> Scenario:
         """Return a copy without the doubtful agents; the ego stays."""
         return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or not a.is_doubtful))
 
@@ -400,7 +404,10 @@ class Scenario:
         sensors = tuple(
             {**s, **{k: s[k] + d for k, d in zip(("x_m", "y_m", "z_m"), (dx, dy, dz))}} for s in self.sensors
         )
-        placed = replace(self, map_features=features, signals=signals, sensors=sensors)
+        tags = self.tags and tuple(
+            replace(g, **{k: getattr(g, k) + later_s for k in ("start_s", "t_s", "end_s")}) for g in self.tags
+        )
+        placed = replace(self, map_features=features, signals=signals, sensors=sensors, tags=tags)
         return replace(placed, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
@@ -452,7 +459,7 @@ class Scenario:
         ConfigError
             When the file cannot be written.
         """
-        write_parquet(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
+        write_states(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/scenario-1.json`."""
@@ -484,6 +491,8 @@ class Scenario:
             document["signals"] = [signal.to_dict() for signal in self.signals]
         if self.sensors:
             document["sensors"] = [dict(sensor) for sensor in self.sensors]
+        if self.tags is not None:
+            document["tags"] = [tag.to_dict() for tag in self.tags]
         return document
 
     @classmethod
@@ -518,6 +527,7 @@ class Scenario:
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
             signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
             sensors=tuple(document.get("sensors", ())),
+            tags=tuple(Tag.from_dict(entry) for entry in document["tags"]) if "tags" in document else None,
         )
         for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
             seen: set[str] = set()
@@ -531,7 +541,7 @@ class Scenario:
 PLURALS = {"bus": "buses", "other": "others"}
 
 
-def say_agents(ids: Iterable[str]) -> str:
+def count_agents(ids: Iterable[str]) -> str:
     """Count agents by their ids, as all commands do: "12 agents and the ego", "1 agent", "no agent but the ego"."""
     listed = list(ids)
     others = sum(id != EGO for id in listed)
@@ -540,7 +550,7 @@ def say_agents(ids: Iterable[str]) -> str:
     return f"{others} agent{'s' * (others != 1)} and the ego" if others else "no agent but the ego"
 
 
-def say_categories(agents: Sequence[Agent]) -> str:
+def count_categories(agents: Sequence[Agent]) -> str:
     """Count agents by category, most frequent first, with how many of each are static: "8 cars (3 static), 1 bus"."""
     counts: dict[str, list[int]] = {}
     for agent in agents:
@@ -548,9 +558,9 @@ def say_categories(agents: Sequence[Agent]) -> str:
         count[0] += 1
         count[1] += agent.static
     ordered = sorted(counts.items(), key=lambda entry: (-entry[1][0], entry[0]))
-    return ", ".join(_say_category(category, total, static) for category, (total, static) in ordered)
+    return ", ".join(_count_category(category, total, static) for category, (total, static) in ordered)
 
 
-def _say_category(category: str, total: int, static: int) -> str:
+def _count_category(category: str, total: int, static: int) -> str:
     noun = category if total == 1 else PLURALS.get(category, f"{category}s")
     return f"{total} {noun}" + (f" ({static} static)" if static else "")

@@ -165,13 +165,23 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
         agents=tuple(agents.values()),
         duration_s=max(scenario.duration_s, end_s),
         provenance={**scenario.provenance, "edits": _history(scenario, edits)},
+        tags=None,
     )
-    # What is wrong with the edited scenario and not with its source, a line each, with agent, time and value.
     source = {a.id: a for a in scenario.agents}
     changed = [a for a in edited.agents if a is not source.get(a.id)]
-    infeasible = [line for a in changed for line in _infeasible(source.get(a.id), a)]
-    undrivable = () if infeasible else _undrivable(scenario, edited, changed)
-    return Edited(edited, (*_collisions(scenario, edited, {a.id for a in changed}), *infeasible, *undrivable))
+    return Edited(edited, find_problems(scenario, edited, changed))
+
+
+def find_problems(source: Scenario, changed: Scenario, agents: Sequence[Agent]) -> tuple[str, ...]:
+    """Say what is wrong with a changed scenario and not with its source, a line each, with agent, time and value.
+
+    `agents`: those of the changed scenario that were changed. New collisions, accelerations and curvatures that no vehicle reaches, and
+    agents whose vehicle model cannot keep on their paths.
+    """
+    known = {a.id: a for a in source.agents}
+    infeasible = [line for a in agents for line in _infeasible(known.get(a.id), a)]
+    undrivable = () if infeasible else _undrivable(source, changed, agents)
+    return (*_collisions(source, changed, {a.id for a in agents}), *infeasible, *undrivable)
 
 
 def _check_names(scenario: Scenario, edits: Sequence[Edit]) -> None:

@@ -26,7 +26,7 @@ from log2sim.datatypes import (
 )
 from log2sim.datatypes.agent import STANDSTILL_MPS
 from log2sim.datatypes.map_features import BORDER_KINDS
-from log2sim.edit.motion import STEP_S, resampled, with_steps
+from log2sim.edit.motion import STEP_S, insert_steps, resampled
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check, read_json
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
@@ -127,7 +127,7 @@ class _Work:
         end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
         duration_s = max(self.scenario.duration_s, end_s)
         return replace(
-            self.scenario, agents=agents, map_features=features, provenance=provenance, duration_s=duration_s
+            self.scenario, agents=agents, map_features=features, provenance=provenance, duration_s=duration_s, tags=None
         )
 
     def apply(self, number: int, entry: Mapping[str, Any]) -> str:
@@ -160,7 +160,7 @@ class _Work:
             if other_id is None or other_id == agent_id:
                 what = "that is the same agent" if other_id else "no agent"
                 return f"{what} within {MAX_AWAY_M:g} m of {self._place(entry['other'])}"
-            self.agents[agent_id] = settled(merged(agent, self.agents.pop(other_id)), kind)
+            self.agents[agent_id] = settled(merge_agents(agent, self.agents.pop(other_id)), kind)
         elif kind == "split":
             t_s = self._time_s(entry["t_ns"])
             first, second = split(agent, t_s)
@@ -295,7 +295,7 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
     w = agent.waypoints
     if not agent.static:
         inside = key_s[(key_s > w.t_s[0]) & (key_s < w.t_s[-1])]
-        steps = np.unique(np.concatenate([with_steps(w, float(w.t_s[0]), float(w.t_s[-1])), inside]))
+        steps = np.unique(np.concatenate([insert_steps(w, float(w.t_s[0]), float(w.t_s[-1])), inside]))
         w = resampled(agent, steps[np.concatenate([[True], np.diff(steps) > 1e-6])])
 
     def correlation(a: Array, b: Array) -> Array:
@@ -343,7 +343,7 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
     return replace(agent, waypoints=waypoints)
 
 
-def merged(agent: Agent, other: Agent) -> Agent:
+def merge_agents(agent: Agent, other: Agent) -> Agent:
     """Return one agent of two tracks of the same object, under the id of the first.
 
     Where both have states the mean by their variances stands. A gap is bridged by the cubic through the places and velocities
@@ -374,7 +374,7 @@ def _unfolded(agent: Agent) -> Agent:
     """Return the agent with steps of a tenth of a second, so that two can be averaged."""
     w = agent.waypoints
     return replace(
-        agent, waypoints=resampled(agent, with_steps(w, float(w.t_s[0]), float(w.t_s[-1]))) if len(w) > 1 else w
+        agent, waypoints=resampled(agent, insert_steps(w, float(w.t_s[0]), float(w.t_s[-1]))) if len(w) > 1 else w
     )
 
 

@@ -103,7 +103,7 @@ def resampled(agent: Agent, t_s: Array) -> Waypoints:
     return Waypoints(t_s=np.asarray(t_s, dtype=np.float64), observed=observed, **columns)
 
 
-def with_steps(w: Waypoints, begin_s: float, end_s: float) -> Array:
+def insert_steps(w: Waypoints, begin_s: float, end_s: float) -> Array:
     """Return the times of waypoints with more of them, at most `STEP_S` apart, between two times."""
     begin_s, end_s = np.clip([begin_s, end_s], w.t_s[0], w.t_s[-1])
     steps = np.linspace(begin_s, end_s, max(int(np.ceil((end_s - begin_s) / STEP_S)), 1) + 1)
@@ -127,7 +127,7 @@ def lane_changed(agent: Agent, meters: float, begin_s: float, over_s: float) -> 
 
     The heading follows the direction of motion, the speed its length, so that a vehicle can drive it.
     """
-    w = resampled(agent, with_steps(agent.waypoints, begin_s, begin_s + over_s))
+    w = resampled(agent, insert_steps(agent.waypoints, begin_s, begin_s + over_s))
     offset, slope = smooth_step((w.t_s - begin_s) / over_s)
     offset, drift = meters * offset, meters * slope / over_s
     yaw = np.unwrap(w.yaw_rad)
@@ -163,14 +163,14 @@ def sped_up_between(
         return np.asarray(np.interp(t_s, old, new))
 
     during = old[(new >= begin_s) & (new <= begin_s + over_s)]
-    w = resampled(agent, with_steps(agent.waypoints, float(during[0]), float(during[-1])))
+    w = resampled(agent, insert_steps(agent.waypoints, float(during[0]), float(during[-1])))
     t_s = moved(w.t_s)
     return replace(w, t_s=t_s, speed_mps=w.speed_mps * np.interp(t_s, new, pace)), moved
 
 
 def along_path(agent: Agent, meters: float) -> Waypoints:
     """Return waypoints `meters` ahead on the path of an agent at its pace, straight on beyond its ends; behind where negative."""
-    w = resampled(agent, with_steps(agent.waypoints, *agent.waypoints.t_s[[0, -1]]))
+    w = resampled(agent, insert_steps(agent.waypoints, *agent.waypoints.t_s[[0, -1]]))
     station = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(w.x_m), np.diff(w.y_m)))])
     moves = np.concatenate([[True], np.diff(station) > 1e-6])
     path, target = station[moves], station + meters

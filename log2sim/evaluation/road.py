@@ -126,7 +126,7 @@ Line = Marking | RoadBorder
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class RoadSamples:
     """Points of lines, S in all."""
 
     xy_m: Array  # (S, 2)
@@ -134,7 +134,7 @@ class Samples:
     line: NDArray[np.int64]  # (S,) index of its line
 
     @classmethod
-    def of(cls, lines: Sequence[Line]) -> Samples:
+    def of(cls, lines: Sequence[Line]) -> RoadSamples:
         """Sample lines."""
         parts = [sampled(line.points_m) for line in lines]
         counts = [len(xy) for xy, _, _ in parts]
@@ -144,12 +144,12 @@ class Samples:
             np.repeat(np.arange(len(lines)), counts),
         )
 
-    def where(self, chosen: NDArray[np.bool_]) -> Samples:
+    def where(self, chosen: NDArray[np.bool_]) -> RoadSamples:
         """Select samples (S,)."""
-        return Samples(self.xy_m[chosen], self.length_m[chosen], self.line[chosen])
+        return RoadSamples(self.xy_m[chosen], self.length_m[chosen], self.line[chosen])
 
 
-def nearest(samples: Samples, lines: Sequence[Line]) -> tuple[NDArray[np.int64], Array]:
+def nearest_road(samples: RoadSamples, lines: Sequence[Line]) -> tuple[NDArray[np.int64], Array]:
     """Find the nearest line (S,) of each sample and its distance (S,) in m; -1 and infinite without lines."""
     index, distance = np.full(len(samples.line), -1), np.full(len(samples.line), np.inf)
     geometries = [shapely.LineString(line.points_m[:, :2]) for line in lines]
@@ -170,12 +170,12 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
     lateral errors are distances of found points to the nearest true line within `LATERAL_REACH_M`. None where there is
     nothing to compute a figure from.
     """
-    ours = Samples.of(found)
+    ours = RoadSamples.of(found)
     ours = ours.where(area.counts(ours.xy_m))
-    theirs = Samples.of(true)
+    theirs = RoadSamples.of(true)
     theirs = theirs.where(area.expects(theirs.xy_m))
-    nearest_true, away = nearest(ours, true)
-    _, missed_by = nearest(theirs, found)
+    nearest_true, away = nearest_road(ours, true)
+    _, missed_by = nearest_road(theirs, found)
     right = away <= MATCH_M
     found_m, true_m = float(ours.length_m.sum()), float(theirs.length_m.sum())
     false_m = float(ours.length_m[~right].sum())
@@ -195,7 +195,7 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
 
 
 def _agreement(
-    found: Sequence[Line], true: Sequence[Line], ours: Samples, matched: NDArray[np.int64]
+    found: Sequence[Line], true: Sequence[Line], ours: RoadSamples, matched: NDArray[np.int64]
 ) -> dict[str, float | None]:
     """Shares of the matched length whose kind, and whose color where both sides state one, is right."""
     kinds = _same([line.kind for line in found], [line.kind for line in true], ours.line, matched)

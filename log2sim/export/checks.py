@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario, list_doubtful, why_doubtful
+from log2sim.datatypes import Agent, Scenario, explain_doubt, list_doubtful
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, bev_iou, box_corners_bev, rectangles_overlap, wrap_angle
 
@@ -74,7 +74,7 @@ def doubtful_note(source: Scenario, exported: Scenario) -> str:
     parts = [
         f"{len(gone)} of {total} agents left out as doubtful: {list_doubtful(gone)}" if gone else "",
         f"{len(there)} of {total} agents are doubtful: {list_doubtful(there)}" if there else "",
-        f"the ego is doubtful: {why_doubtful(ego)}" if ego is not None and ego.is_doubtful else "",
+        f"the ego is doubtful: {explain_doubt(ego)}" if ego is not None and ego.is_doubtful else "",
     ]
     return "; ".join(part for part in parts if part)
 

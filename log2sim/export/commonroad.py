@@ -17,7 +17,7 @@ import numpy as np
 from log2sim.datatypes import Agent, MapLane, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
-from log2sim.export.csv_table import write_table
+from log2sim.export.csv_table import write_csv_table
 from log2sim.export.exporters import Options, SampledMotion, sample_motion, sample_steps, step_times
 from log2sim.export.roads.network import MarkFinder
 from log2sim.export.roads.opendrive import edges_of, lanes, signal_lanes
@@ -112,7 +112,7 @@ class CommonRoad:
         root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
         root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
         xml_text.write(root, folder / f"{name}.xml")
-        write_table(folder / "agents.csv", table)
+        write_csv_table(folder / "agents.csv", table)
 
 
 def _trust(agent: Agent) -> tuple[float, str]:

@@ -30,7 +30,7 @@ HEADER = ("id", "category", *COLUMNS, *ABOUT)
 FORMULA = re.compile(r"\s*[=+\-@](?!\d+(\.\d+)?$)")
 
 
-def write_table(file: Path, rows: Iterable[Sequence[Any]]) -> None:
+def write_csv_table(file: Path, rows: Iterable[Sequence[Any]]) -> None:
     """Write rows as CSV; an apostrophe is put before texts that a spreadsheet would execute as a formula."""
     with file.open("w", newline="", encoding="utf-8") as opened:
         table = csv.writer(opened, lineterminator="\n")
@@ -49,7 +49,7 @@ class Csv:
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write the table."""
-        write_table(folder / "agents.csv", _rows(scenario))
+        write_csv_table(folder / "agents.csv", _rows(scenario))
 
 
 def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:

@@ -322,7 +322,7 @@ def export(
         return _move_into(temporary, folder, overwrite=overwrite)
 
 
-def with_ego(scenario: Scenario, agent: str) -> Scenario:
+def make_ego(scenario: Scenario, agent: str) -> Scenario:
     """Call one of the agents "ego", as scenarios of roadside sensors need it for formats with an ego.
 
     Raises `ConfigError` when the scenario has another ego or no such agent.
@@ -337,12 +337,12 @@ def with_ego(scenario: Scenario, agent: str) -> Scenario:
     return replace(scenario, agents=agents)
 
 
-def with_doubtful(scenario: Scenario, choice: str) -> Scenario:
+def filter_doubtful(scenario: Scenario, choice: str) -> Scenario:
     """Return a scenario with its doubtful agents but the quarantined ("keep"), without ("drop"), or with all of them ("all").
 
     Raises `ConfigError` for another choice.
     """
-    choices = {"keep": scenario.active, "drop": scenario.without_doubtful(), "all": scenario}
+    choices = {"keep": scenario.active, "drop": scenario.drop_doubtful(), "all": scenario}
     if choice not in choices:
         raise ConfigError(f"--doubtful: '{choice}', expected {', '.join(choices)}")
     return choices[choice]

@@ -30,7 +30,7 @@ from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from log2sim.datatypes import Agent, why_doubtful
+from log2sim.datatypes import Agent, explain_doubt
 from log2sim.export.viewers import AgentSteps, CameraFrame, ThinnedSweep, UnreadableRecord, ViewerRecord, rgb_of
 from log2sim.geometry import NS_PER_S, Array, quaternion_from_rotation, rotation_from_rpy, transform
 
@@ -102,7 +102,7 @@ def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntit
     above = position + np.array([0.0, 0.0, height / 2 + LABEL_ABOVE_M])
     about = {"category": agent.category, "static": str(agent.static).lower(), "confidence": f"{agent.confidence:g}"}
     if agent.is_doubtful:
-        about["doubtful"] = why_doubtful(agent)
+        about["doubtful"] = explain_doubt(agent)
     name = TextPrimitive(
         pose=_pose(above, 0.0),
         billboard=True,

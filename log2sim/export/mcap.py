@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from log2sim.datatypes import Scenario, why_doubtful
+from log2sim.datatypes import Scenario, explain_doubt
 from log2sim.errors import MissingExtra, ScenarioError
 from log2sim.export.exporters import Options, file_name, near_origin
 from log2sim.export.viewers import agent_steps, viewer_records
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from log2sim.export.foxglove import Message
 
 
-class Mcap:
+class ScenarioMcap:
     """`<name>.mcap`: `/agents`, `/paths`, `/tf`, and with a log `/camera/<name>/...` and `/lidar/<name>`.
 
     Times are those of the log, to the nanosecond. The metadata record "log2sim" holds the offset of the positions and
@@ -61,8 +61,8 @@ def _about(scenario: Scenario, origin_m: tuple[float, float, float]) -> Iterator
     """Describe the map frame of the file, as text."""
     yield "scenario", scenario.name
     yield "position_offset_m", json.dumps(origin_m)
-    yield "doubtful", json.dumps({a.id: why_doubtful(a) for a in scenario.doubtful})
+    yield "doubtful", json.dumps({a.id: explain_doubt(a) for a in scenario.doubtful})
     yield from ((f"map.{key}", json.dumps(value)) for key, value in asdict(scenario.map).items())
 
 
-EXPORTER = Mcap()
+EXPORTER = ScenarioMcap()

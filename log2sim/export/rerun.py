@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Log, Scenario, why_doubtful
+from log2sim.datatypes import Agent, Log, Scenario, explain_doubt
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options, SampledMotion, file_name, near_origin
 from log2sim.export.viewers import (
@@ -83,7 +83,7 @@ def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
     placement = near_origin(scenario)
     origin = np.array(placement.origin_m)
     about = {"scenario": scenario.name, "position_offset_m": placement.origin_m, "map": asdict(scenario.map)}
-    doubtful = {a.id: why_doubtful(a) for a in scenario.doubtful}
+    doubtful = {a.id: explain_doubt(a) for a in scenario.doubtful}
     yield (), None, rerun.ViewCoordinates.columns(xyz=[rerun.ViewCoordinates.RIGHT_HAND_Z_UP])
     yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps({**about, "doubtful": doubtful}, indent=1)])
     steps = agent_steps(scenario)

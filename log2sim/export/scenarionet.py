@@ -120,14 +120,14 @@ class ScenarioNet:
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write the description and the two tables."""
-        description = describe(scenario)
+        description = scenario_description(scenario)
         name = f"sd_{DATASET}_{VERSION}_{file_name(scenario.name)}.pkl"
         _dump(description, folder / name)
         _dump({name: _without_arrays(description["metadata"])}, folder / "dataset_summary.pkl")
         _dump({name: ""}, folder / "dataset_mapping.pkl")
 
 
-def describe(scenario: Scenario) -> Value:
+def scenario_description(scenario: Scenario) -> Value:
     """Return the scenario description as a dictionary of plain values and arrays with T steps of 0.1 s from the ego's first.
 
     Raises `ScenarioError` when the scenario has no ego.

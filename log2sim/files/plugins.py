@@ -251,7 +251,7 @@ def _label(kind: str) -> str:
 
 LATE_FUNCTIONS = {
     "find_logs": "log2sim.batch.discovery:find_logs",
-    "html_of": "log2sim.visualization.notebook:html_of",
+    "html_of": "log2sim.visualization.notebook:notebook_html",
     "show_log": "log2sim.visualization.notebook:show_log",
     "truth_of": "log2sim.evaluation.metrics.truth:truth_from_log",
     "ticks_of": "log2sim.perception.sync:ticks_of",

@@ -202,8 +202,8 @@ def list_time_problems(log: Log) -> list[str]:
     return [*_other_clocks(log), *_reference_problem(log), *_image_label_problems(log), *_label_problems(log)]
 
 
-def say_without_pose(log: Log, t_ns: NDArray[np.int64]) -> str:
-    """Say why no pose of the ego is known at any of some ticks (T,)."""
+def explain_missing_poses(log: Log, t_ns: NDArray[np.int64]) -> str:
+    """Explain why no pose of the ego is known at any of some ticks (T,)."""
     if log.ego is None:
         return "no ego poses"
     poses, ticks = Span.of("ego poses", log.ego.t_ns), Span.of("ticks", t_ns)

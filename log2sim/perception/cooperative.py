@@ -601,7 +601,7 @@ def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None
     ConfigError, MissingExtra
         See `create_lidar_detector`.
     """
-    name, level = config.detect.in_sweeps, fusion_level(log, config).level
+    name, level = config.detect.in_sweeps, fusion_level(log, config)[0]
     vehicle = given or create_lidar_detector(name, log, config.lidar)
     if level in (None, FusionLevel.POINTS):
         return vehicle

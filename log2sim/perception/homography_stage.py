@@ -14,6 +14,7 @@ from log2sim.geometry import Array, Camera, ground_homography, inverse
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
+    MAX_CONDITION,
     STREAM_METHODS,
     EstimationOptions,
     fit_camera,
@@ -30,8 +31,6 @@ from log2sim.plan import HomographyScope, Plan
 FOOT_BORDER_PX = 3
 # A camera lower than this sees the ground under too flat an angle, m.
 MIN_CAMERA_HEIGHT_M = 0.2
-# Condition number beyond which a calibrated homography is singular.
-MAX_CONDITION = 1e12
 # Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
 # is empty.
 MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25

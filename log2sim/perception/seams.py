@@ -278,32 +278,20 @@ class Seam:
         return float(np.hypot(*self.offset_m))
 
 
-@dataclass(frozen=True, eq=False)
-class SeamView:
-    """A place at a tick, and what of it is hidden from either camera.
-
-    Attributes
-    ----------
-    hidden : mapping of str to (R, C) bool
-        Cells that do not show the ground, by camera.
-    """
-
-    place: SeamPlace
-    tick: int
-    hidden: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
-
-
 def measure_seam(
-    view: SeamView, images: Mapping[str, NDArray[np.uint8]], cameras: Mapping[str, Camera],
+    place: SeamPlace,
+    tick: int,
+    hidden: Mapping[str, NDArray[np.bool_]],
+    images: Mapping[str, NDArray[np.uint8]],
+    cameras: Mapping[str, Camera],
     homographies: Mapping[str, Array],
-) -> Seam | None:  # fmt: skip
-    """Register what two cameras show of a place; None where that is not possible."""
-    place, tick = view.place, view.tick
+) -> Seam | None:
+    """Register what two cameras show of a place but where it is hidden (R, C) from either; None where that is not possible."""
     xy, patches = place.cells(), []
     for name in (place.first, place.second):
         patch = draw_patch(images[name], cameras[name], homographies[name], xy)
-        patches.append(np.where(view.hidden[name], np.nan, patch).astype(np.float32) if view.hidden else patch)
-    found: Offset | None = register_patches(patches[0], patches[1], CELL_M)
+        patches.append(np.where(hidden[name], np.nan, patch).astype(np.float32))
+    found = register_patches(patches[0], patches[1], CELL_M)
     if found is None:
         return None
     axes = place.axes
@@ -322,14 +310,6 @@ def misalignment_m(seam: Seam, homographies: Mapping[str, Array]) -> float:
         return float("inf")
     xy = q[:, :2] / q[:, 2:]
     return float(np.hypot(*(xy[1] - xy[0])))
-
-
-def summarize_seams(seams: Sequence[Seam]) -> dict[str, float]:
-    """Compute the median misalignment, m, of each pair of cameras, named first|second."""
-    pairs: dict[str, list[float]] = {}
-    for seam in seams:
-        pairs.setdefault(f"{seam.place.first}|{seam.place.second}", []).append(seam.distance_m)
-    return {pair: float(np.median(lengths)) for pair, lengths in pairs.items()}
 
 
 # The road is not a plane: cameras half a meter apart and 1.6 m high show 0.05 m of height 0.015 m apart. Together with what the
@@ -598,7 +578,7 @@ class SeamPictures:
                 if hidden is None:
                     covered += 1
                     continue
-                seam = measure_seam(SeamView(place, tick, hidden), images, cameras, roads)
+                seam = measure_seam(place, tick, hidden, images, cameras, roads)
                 if seam is not None:
                     seams.append(seam)
         return SeamSurvey(tuple(seams), places, covered)
@@ -631,17 +611,6 @@ def roads_at(log: Log, schedule: Schedule, homographies: Mapping[str, CameraHomo
             level = np.array([[*moved[0, :2], moved[0, 3]], [*moved[1, :2], moved[1, 3]], [0.0, 0.0, 1.0]])
             out[name] = level @ h
     return out
-
-
-def turn_mounts(log: Log, homographies: Mapping[str, CameraHomography]) -> Log:
-    """Return the log with the mounts of its cameras turned as their homographies ask for."""
-    cameras = dict(log.cameras)
-    for name, ground in homographies.items():
-        if ground.rig is not None and ground.rig.state is not None:
-            turn = np.eye(4)
-            turn[:3, :3] = rotation_of(ground.rig.state.mount[name]).T
-            cameras[name] = replace(cameras[name], mount_T_cam=cameras[name].mount_T_cam @ turn)
-    return log.changed(cameras=cameras)
 
 
 def ticks_of(schedule: Schedule, count: int = TICKS, *, held_out: bool = False) -> list[int]:

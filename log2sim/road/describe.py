@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from log2sim.config import Config
@@ -20,22 +20,12 @@ from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
 from log2sim.perception.traffic_light_boxes import LightBox
-from log2sim.plan import Decision, Outcome, Plan, Stage
+from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
 from log2sim.road.lane_graph import infer_lanes
 from log2sim.road.markings import find_markings
 from log2sim.road.signals import find_signals
-
-
-@dataclass(frozen=True, eq=False)
-class Description:
-    """A described scenario."""
-
-    scenario: Scenario
-    outcomes: tuple[Outcome, ...]  # of the stages of the description
-    figures: dict[str, Any]  # for the report: "map_features", "colors", "signals"
-    unreadable: dict[str, Any]  # records that could not be read, by stream, for the report
 
 
 def describe(
@@ -47,8 +37,8 @@ def describe(
     lights: Sequence[LightBox],
     clock: StageClock,
     progress: Callable[[str, int, int], None],
-) -> Description:
-    """Add what the plan keeps of lanes, colors and traffic lights to a scenario.
+) -> tuple[Scenario, list[Decision], dict[str, Any]]:
+    """Add what the plan keeps of lanes, colors and traffic lights to a scenario; with what the stages did, and figures of the report.
 
     `poses`: with those by which the ground is drawn. `lights`: traffic lights in frames, from the first pass.
     """
@@ -87,14 +77,15 @@ def describe(
         Stage.COLORS: "; ".join([f"colors of {colored} vehicles", *uncolored]),
         Stage.SIGNALS: seen_lights,
     }
-    decisions = [plan.decision(stage) for stage in said]
-    outcomes = (Outcome(Decision(d.stage, d.kept, said[d.stage] if d.kept else d.reason)) for d in decisions)
+    planned = [plan.decision(stage) for stage in said]
+    decisions = [replace(d, reason=said[d.stage]) if d.kept else d for d in planned]
     figures = {
         "map_features": None if features is None else count_features(features),
         "colors": dict(Counter(str(agent.color["name"]) for agent in agents if agent.color is not None)),
         "signals": len(signals),
+        "unreadable": reader.summary(),
     }
-    return Description(described, tuple(outcomes), figures, reader.summary())
+    return described, decisions, figures
 
 
 def count_features(features: MapFeatures) -> dict[str, Any]:

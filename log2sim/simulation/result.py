@@ -312,7 +312,7 @@ def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
         )  # fmt: skip
         agents.append(replace(agent, waypoints=waypoints))
     provenance = {**scenario.provenance, "replay": {"mode": replay.mode, "model": replay.model, "dt_s": replay.dt_s}}
-    return replace(scenario, agents=tuple(agents), provenance=provenance)
+    return replace(scenario, agents=tuple(agents), provenance=provenance, tags=None)
 
 
 def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:

@@ -30,38 +30,26 @@ MIN_RIDDEN_M = 3.0
 MIN_RIDER_SHARE = 0.25
 # Measurements at either end of a track whose median position counts, so that single wrong ones do not.
 CATEGORY_END_MEASUREMENTS = 5
-# Errors of the positions at both ends of a shorter track may make up that speed.
-MIN_FAST_S = 1.0
 
 
-def decide_category(m: Measurements) -> str:
+def decide_category(m: Measurements, *, whole_boxes: bool = False) -> str:
     """Decide the category of a track from its measurements, which are sorted by time.
 
-    It is the one with most of the score; a pedestrian faster than people run is a cyclist whose bicycle the detector
-    missed, and a bicycle that moves and sometimes shows a rider has one.
+    It is the one with most of the score. Without `whole_boxes`, a pedestrian faster than people run is a cyclist whose bicycle the
+    detector missed, and a bicycle that moves and sometimes shows a rider has one.
     """
     category = voted_category(m)
+    if whole_boxes:
+        return category
     if category == "pedestrian" and _speed_mps(m) > MAX_PEDESTRIAN_SPEED_MPS:
         return "cyclist"
     if (
         category == "bicycle"
-        and _displacement_m(m) > MIN_RIDDEN_M
         and (m.category != category).mean() >= MIN_RIDER_SHARE
+        and _displacement_m(m) > MIN_RIDDEN_M
     ):
         return "cyclist"
     return category
-
-
-def gets_on_fast(m: Measurements) -> bool:
-    """Return whether a track gets on faster than people run, from one end to the other, which takes `MIN_FAST_S` or more.
-
-    Errors of single positions make a pedestrian fast for a moment, but do not carry it away.
-    """
-    if (m.t_ns[-1] - m.t_ns[0]) / NS_PER_S < MIN_FAST_S:
-        return False
-    count = min(CATEGORY_END_MEASUREMENTS, len(m) // 2)
-    between_s = float(np.median(m.t_ns[-count:]) - np.median(m.t_ns[:count])) / NS_PER_S
-    return _displacement_m(m) > MAX_PEDESTRIAN_SPEED_MPS * between_s
 
 
 def voted_category(m: Measurements) -> str:
@@ -162,7 +150,7 @@ def stitch(
             chain = [head]
             while chain[-1] in following:
                 chain.append(following[chain[-1]])
-            joined.append(_concatenate([current[k] for k in chain]))
+            joined.append(_concatenate([current[k] for k in chain], whole_boxes=whole_boxes))
         current = joined
     return current
 
@@ -293,8 +281,8 @@ def _filtered(
     return mean, covariance
 
 
-def _concatenate(parts: Sequence[Track]) -> Track:
+def _concatenate(parts: Sequence[Track], *, whole_boxes: bool) -> Track:
     if len(parts) == 1:
         return parts[0]
     m = Measurements.join([p.measurements for p in parts])
-    return Track(voted_category(m), np.concatenate([p.tick for p in parts]), m)
+    return Track(decide_category(m, whole_boxes=whole_boxes), np.concatenate([p.tick for p in parts]), m)

@@ -18,7 +18,7 @@ from log2sim.config import TrackConfig
 from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
 from log2sim.tracking.forward import CHI2_2DOF_99, measurement_noise, track_forward
-from log2sim.tracking.stitch import decide_category, gets_on_fast, stitch, voted_category
+from log2sim.tracking.stitch import decide_category, stitch
 
 SWEEPS = ""
 """Represents the LiDARs among the cameras, as in the column `camera` of measurements."""
@@ -84,15 +84,10 @@ def track(
     tracks = []
     for t in tracklets:
         rows = everything.take(first_row[t.ticks] + t.rows)
-        category = voted_category(rows)
-        # A rider who was taken for a pedestrian before an occlusion may be seen to ride after it.
-        rides = category == "pedestrian" and not whole_boxes and gets_on_fast(rows)
-        tracks.append(Track("cyclist" if rides else category, t.ticks, rows))
+        tracks.append(Track(decide_category(rows, whole_boxes=whole_boxes), t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
     required = min_hits(t_ns, min_life_s)
     kept = [t for t in joined if len(t) >= required]
-    if not whole_boxes:
-        kept = [replace(t, category=decide_category(t.measurements)) for t in kept]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
@@ -132,7 +127,6 @@ def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], 
         tracks = merge_tracks(tracks, found) if tracks else found
     required = min_hits(t_ns, min_life_s)
     kept = [t for t in stitch(tracks, t_ns, max_gap_s=max_gap_s) if len(t) >= required]
-    kept = [replace(t, category=decide_category(t.measurements)) for t in kept]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
@@ -243,7 +237,7 @@ def _merge(tracks: Sequence[Track], velocity: Sequence[Array]) -> Track:
     for k, view in zip(pair.tolist(), merged.others):
         others[k] = view
     out = replace(out, **columns, others=tuple(others))
-    return Track(tracks[0].category, tick[first], out)
+    return Track(decide_category(out), tick[first], out)
 
 
 def merge_rows(a: Measurements, b: Measurements, velocity_b: Array) -> Measurements:

@@ -122,7 +122,7 @@ MAX_SENSORS = 12
 Row = tuple[str, str]
 
 
-def html_of(value: Log | Scenario | Replay) -> str:
+def notebook_html(value: Log | Scenario | Replay) -> str:
     """Return the HTML of a value; its text is escaped, and without a picture where that cannot be drawn."""
     rows: list[Row]
     draw: Callable[[], list[Thumbnail]]
@@ -256,13 +256,13 @@ def show_log(
     """Draw one moment of a log, as `Log.show` does; see there."""
     cameras = (camera,) if isinstance(camera, str) else tuple(camera)
     at_s, t_ns = (None, when.t_ns) if isinstance(when, Tick) else (when, None)
-    boxes = None if scenario is None else (lambda stamp_ns: labels_of(scenario, log, stamp_ns))
+    boxes = None if scenario is None else (lambda stamp_ns: notebook_labels(scenario, log, stamp_ns))
     moment = read_moment(log, cameras, at_s, t_ns=t_ns, labels=boxes)
     figure = draw_moment(moment, box_name="3D label" if scenario is None else "agent")
     return Picture(figure, f"{log.name!r:.80} at {moment.at_s:.3f} s")
 
 
-def labels_of(scenario: Scenario, log: Log, t_ns: int) -> Labels:
+def notebook_labels(scenario: Scenario, log: Log, t_ns: int) -> Labels:
     """Return the agents but for the ego around a stamp as labels in the map frame of a log."""
     shift = np.array(scenario.map.offset_m) - np.array(log.map.offset_m)
     t_s = (t_ns - scenario.t0_ns) / NS_PER_S + AROUND_S

@@ -36,7 +36,7 @@ from log2sim.perception.detect.detectors import MAX_AGE_S, LabelBoxes, interpola
 from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_to_map
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, printable
+from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, printable_label
 
 # Stamps of labels and frames of one moment differ by rounding in some logs.
 STAMP_TOLERANCE_NS = 1_000_000
@@ -69,7 +69,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class OverlayMoment:
     """All sensors at one tick."""
 
     log: Log  # with standing poses where it has none
@@ -88,7 +88,7 @@ def read_moment(
     *,
     t_ns: int | None = None,
     labels: Callable[[int], Labels] | None = None,
-) -> Moment:
+) -> OverlayMoment:
     """Read the records of one tick.
 
     `cameras`: all of the log where it is empty. `at_s`: time of the tick since the first one, s; by default in the
@@ -117,7 +117,7 @@ def read_moment(
     sweeps = reader.at(schedule, schedule.reference_row, tick)
     boxes = labels_at(log.labels, t_ns)
     at = float(t_ns - schedule.t_ns[0]) / NS_PER_S
-    return Moment(log, t_ns, at, shots, sweeps, boxes, (*notes, *reader.problems))
+    return OverlayMoment(log, t_ns, at, shots, sweeps, boxes, (*notes, *reader.problems))
 
 
 def labels_at(labels: Labels | None, t_ns: int) -> LabelBoxes:
@@ -265,7 +265,7 @@ MOTION = {
 DPI = 150
 
 
-def write_overlay(moment: Moment, path: Path | str, *, overwrite: bool = False) -> None:
+def write_overlay(moment: OverlayMoment, path: Path | str, *, overwrite: bool = False) -> None:
     """Write a moment as a .png.
 
     Raises `ConfigError` when the name has another suffix, the file exists and `overwrite` is False, or it cannot be
@@ -280,7 +280,7 @@ def write_overlay(moment: Moment, path: Path | str, *, overwrite: bool = False) 
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
-def draw_moment(moment: Moment, *, box_name: str = "3D label") -> Figure:
+def draw_moment(moment: OverlayMoment, *, box_name: str = "3D label") -> Figure:
     """Draw all cameras of a moment and, where it has sweeps or boxes, the view from above; the legend names the boxes."""
     count = len(moment.shots) + bool(moment.sweeps or len(moment.boxes.t_ns))
     columns = int(np.ceil(np.sqrt(count)))
@@ -302,13 +302,13 @@ def draw_moment(moment: Moment, *, box_name: str = "3D label") -> Figure:
             ((column * tile_in + 0.06) / width, bottom_in / height, wide_in / width, picture_in / height)
         )
         caption = _draw_above(ax, moment, wide_in / picture_in) if above else _draw_shot(ax, moment.shots[k], moment)
-        text = "\n".join(printable(line, 110) for line in caption)
+        text = "\n".join(printable_label(line, 110) for line in caption)
         ax.set_title(text, fontsize=6.5, color=INK, family=FONT, parse_math=False, pad=3, loc="left")
     _draw_frame(figure, moment, box_name)
     return figure
 
 
-def _draw_shot(ax: Axes, shot: Shot, moment: Moment) -> tuple[str, str]:
+def _draw_shot(ax: Axes, shot: Shot, moment: OverlayMoment) -> tuple[str, str]:
     """Draw one camera and return its caption."""
     camera = shot.camera
     ax.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0), aspect="equal", facecolor=MUTED)
@@ -339,7 +339,7 @@ def _draw_shot(ax: Axes, shot: Shot, moment: Moment) -> tuple[str, str]:
     return " · ".join(first), " · ".join([*([shot.problem] if shot.problem else []), *second])
 
 
-def _draw_above(ax: Axes, moment: Moment, aspect: float) -> tuple[str, str]:
+def _draw_above(ax: Axes, moment: OverlayMoment, aspect: float) -> tuple[str, str]:
     """Draw points and boxes from above, x to the right and y up as in the map, and return the caption."""
     origin, ground_z = cloud_origin(moment.log, moment.t_ns)
     far = [np.abs(s.xyz[:, :2] - origin[:2]).max(axis=1) for s in moment.sweeps]
@@ -375,15 +375,15 @@ def _outline(corners: Array) -> Array:
     return np.array([front, *corners, corners[0], front, corners.mean(axis=0)])
 
 
-def _draw_frame(figure: Figure, moment: Moment, box_name: str) -> None:
+def _draw_frame(figure: Figure, moment: OverlayMoment, box_name: str) -> None:
     """Write the title, the scale of depths and the legend of boxes."""
     width, height = figure.get_size_inches()
     log = moment.log
     title = f"{log.name} ({log.format}), {moment.at_s:.3f} s after the first tick, stamp {moment.t_ns} ns"
     text: dict[str, Any] = {"family": FONT, "parse_math": False, "va": "top"}
-    figure.text(0.06 / width, 1 - 0.08 / height, printable(title, 160), fontsize=9, color=INK, **text)
+    figure.text(0.06 / width, 1 - 0.08 / height, printable_label(title, 160), fontsize=9, color=INK, **text)
     notes = "; ".join(moment.notes)
-    figure.text(0.06 / width, 1 - 0.27 / height, printable(notes, 220), fontsize=6.5, color="#C8102E", **text)
+    figure.text(0.06 / width, 1 - 0.27 / height, printable_label(notes, 220), fontsize=6.5, color="#C8102E", **text)
     groups = list(dict.fromkeys(CATEGORY[c].group for c in CATEGORIES))
     handles = [Line2D([], [], color=COLORS[g], lw=1.6, label=f"{box_name}: {g.replace('_', '-')}") for g in groups]
     handles.append(Line2D([], [], color=IMAGE_BOX_COLOR, lw=1.6, ls=(0, (3, 2)), label="2D label"))

@@ -43,7 +43,7 @@ WIDTH = 72  # letters of the line, which cover those of the one before
 _drawn_s = [-REDRAWN_EVERY_S]
 
 
-def say_stage(stage: str) -> str:
+def describe_stage(stage: str) -> str:
     """Return the words for a stage."""
     for start, words in WORDS_BEFORE_SENSORS.items():
         if stage not in WORDS and stage.startswith(start):
@@ -66,7 +66,7 @@ def show_progress(*state: str | int) -> None:
     >>> reconstruct(log, progress=show_progress)
     """
     *stage, done, total = state
-    words = say_stage(str(stage[0])) if stage else "done"
+    words = describe_stage(str(stage[0])) if stage else "done"
     now_s = time.monotonic()
     if total == 0:
         sys.stdout.write(f"\r{words:<{WIDTH}}\n")

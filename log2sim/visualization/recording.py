@@ -150,13 +150,13 @@ class OutlineProjector:
             row = int(rows[i])
             corners = box_corners(center[row], self._size_m[row], yaw[row])[0]
             middle_px = found.box_px[i].reshape(2, 2).mean(axis=0)[None]
-            kind, coordinates = outline_of(view.camera, apply(_cam_T_map(view, middle_px), corners))
+            kind, coordinates = ground_outline(view.camera, apply(_cam_T_map(view, middle_px), corners))
             if len(coordinates):
                 out.append([row, kind, *np.rint(coordinates).astype(np.int64).ravel().tolist()])
         return out
 
 
-def outline_of(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
+def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
     """Return the kind and the coordinates, px, of the outline of a box with corners (8, 3), m, cam frame.
 
     Corners where straight lines between them are right: all in front of the camera, and the lens bends no edge visibly.
@@ -410,7 +410,7 @@ def point_document(
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
         if (points := sweeps.at(main, i)) is not None:
-            moments.append((points, pack(points, spacing.cell_m, bright)))
+            moments.append((points, pack_recording(points, spacing.cell_m, bright)))
         progress(done + 1, len(chosen))
     while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
         moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
@@ -427,7 +427,7 @@ def point_document(
     }
 
 
-def pack(points: PointsAbove, cell_m: float, bright: float) -> str:
+def pack_recording(points: PointsAbove, cell_m: float, bright: float) -> str:
     """Keep the highest point of each cell and pack the rest as base64 of a zlib stream.
 
     For N points in rows of cells from south to north, each from west to east: low bytes of the steps in x (N), their high
@@ -459,7 +459,7 @@ def _fit_points(
     sizes: Mapping[float, float] = {}
     for spacing in SPACINGS:
         if spacing.cell_m not in sizes:
-            mean = np.mean([len(pack(p, spacing.cell_m, bright)) for p in probes])
+            mean = np.mean([len(pack_recording(p, spacing.cell_m, bright)) for p in probes])
             sizes = {**sizes, spacing.cell_m: POINT_SAFETY * float(mean) + BYTES_OF_ENTRY}
         chosen = take_at_rate(t_ns, within, spacing.rate_hz, start_ns)
         if len(chosen) * sizes[spacing.cell_m] <= budget_bytes:

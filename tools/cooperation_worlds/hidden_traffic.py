@@ -14,7 +14,7 @@ from cooperation_worlds.world import ROAD_LIDAR, ROAD_LINES, VEHICLE_LIDAR, Arra
 from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision
-from log2sim.evaluation.detection.protocols import Criterion, match
+from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel, Weather
@@ -270,7 +270,7 @@ def figures(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
             ap[kind][way] = average_precision(found, truth, criterion)
             if kind == "vehicle":
                 hidden = np.concatenate([np.array(s["hidden"], bool) for s in sweeps])
-                right = match(found.take(found.score >= REPORTED_SCORE), truth, criterion).truth
+                right = match_detections(found.take(found.score >= REPORTED_SCORE), truth, criterion).truth
                 got = np.isin(np.arange(len(truth)), right[right >= 0])
                 recall["seen"][way] = float(got[~truth.ignored & ~hidden].mean())
                 recall["hidden"][way] = float(got[~truth.ignored & hidden].mean())

@@ -42,7 +42,7 @@ def of_scenario(world: World, found: Found) -> Array:
     return best
 
 
-def of_boxes(world: World, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D], min_score: float = 0.3) -> Array:
+def from_boxes(world: World, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D], min_score: float = 0.3) -> Array:
     """Overlap and IoU (F, 2) of the best-scored box at the target's place in each sweep, each at the box's own time."""
     category = next(a for a in world.moving.actors if a.spec.id == world.target).spec.category
     out = []

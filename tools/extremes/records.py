@@ -23,7 +23,7 @@ from extremes.table import (
 )
 from log2sim import open_log, reconstruct
 from log2sim.errors import LogError
-from log2sim.pipeline import Result
+from log2sim.report import Result
 
 
 @case("map: UTM coordinates of 5e6 m", "as at the origin to 1e-6 m")

@@ -20,8 +20,9 @@ from log2sim import Config, Scenario, open_log, reconstruct
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, LogError
 from log2sim.logs.native.writer import write_log
-from log2sim.pipeline import Result, infer_scenario, observe_log, start
+from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import Decision, Stage
+from log2sim.report import Result
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 

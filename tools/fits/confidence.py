@@ -40,7 +40,7 @@ from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.comparison import Selection
 from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
-from log2sim.evaluation.metrics.verdicts import judge
+from log2sim.evaluation.metrics.verdicts import judge_against_truth
 from log2sim.geometry import Array
 
 Table = dict[str, float]
@@ -90,7 +90,7 @@ def agents_of(case: Case) -> list[Rated]:
     t_ns, lidar = case.run.schedule.t_ns, bool(case.run.log.lidars)
     timeline = Timeline(t_ns, int(t_ns[0]))
     compared, _, ego = compare_scenarios(scenario, case.truth, Selection(None, frozenset(CATEGORIES)))
-    v, out = judge(compared, ego), []
+    v, out = judge_against_truth(compared, ego), []
     for k, agent in enumerate(scenario.others):
         ticks = v.judged[k]
         if not ticks.any():

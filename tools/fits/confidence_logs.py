@@ -29,7 +29,8 @@ from log2sim.perception.detect.detectors import MIN_SIDE_PX
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
 from log2sim.perception.run_detectors import Detectors
-from log2sim.pipeline import Run, infer_scenario, observe_log, start
+from log2sim.pipeline import infer_scenario, observe_log, start
+from log2sim.report import Run
 from log2sim.synth.traffic import TrafficScene
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, log_of
 

@@ -17,7 +17,7 @@ from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import calibration, operating_point, precision_recall
-from log2sim.evaluation.detection.protocols import Criterion, Matches, match
+from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, open_network
 from log2sim.perception.detect3d.network import (
     METADATA_KEY,
@@ -152,7 +152,7 @@ def calibrate(path: Path, examples: list[Example]) -> dict[str, list[float]]:
         for group in GROUPS:
             own = found.category == group
             truth = group_of(example.truth, group)
-            matches = match(found.take(own), truth, RIGHT[group])
+            matches = match_detections(found.take(own), truth, RIGHT[group])
             counted = matches.right | matches.false
             features[group].append(columns[own][counted])
             right[group].append(matches.right[counted])
@@ -242,7 +242,7 @@ def report(detector: LidarDetector, examples: list[Example], *, range_m: float) 
         f = SceneBoxes.join([group_of(boxes, group) for boxes in found])
         t = SceneBoxes.join([group_of(e.truth, group) for e in examples])
         f, t = f.take(f.range_m < range_m), t.ignoring(t.range_m >= range_m)
-        matches = match(f, t, RIGHT[group])
+        matches = match_detections(f, t, RIGHT[group])
         point = operating_point(f, matches, SCORE)
         totals += [point["true_positives"], point["false_positives"], point["false_negatives"]]
         right = np.flatnonzero(matches.right & (f.score >= SCORE))

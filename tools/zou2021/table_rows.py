@@ -14,7 +14,7 @@ from lidar_training.real_logs import LogSweep
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision, operating_point
-from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion, match
+from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion, match_detections
 from log2sim.perception.detect3d.detectors import LidarDetector
 
 # Two-wheelers and people are hit by a handful of points beyond.
@@ -72,7 +72,7 @@ def figures(result: Judged, criteria: dict[str, Criterion], min_score: float) ->
     counts, average = np.zeros(3), {}
     for group in GROUPS:
         f, t = result.found[group], result.truth[group]
-        point = operating_point(f, match(f, t, criteria[group]), min_score)
+        point = operating_point(f, match_detections(f, t, criteria[group]), min_score)
         counts += [point["true_positives"], point["false_positives"], point["false_negatives"]]
         average[group] = average_precision(f, t, criteria[group])
     right, false, missed = counts

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from log2sim.evaluation.bench.benchmark import Benchmark, Panel, bench
-from log2sim.evaluation.bench.scores import Scope
+from log2sim.evaluation.bench.scores import ScoreScope
 
-__all__ = ["Benchmark", "Panel", "Scope", "bench"]
+__all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]

@@ -32,7 +32,7 @@ from log2sim.evaluation.bench.runs import (
     run_all,
     whole_points,
 )
-from log2sim.evaluation.bench.scores import EVERYTHING, Scope, Score
+from log2sim.evaluation.bench.scores import EVERYTHING, Score, ScoreScope
 from log2sim.evaluation.bench.settings import (
     COVERAGE,
     Point,
@@ -48,9 +48,20 @@ from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.files.documents import check, replaced
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.version import __version__
-from log2sim.visualization.plot.style import CROWD_COLOR, FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, halo, printable
+from log2sim.visualization.plot.style import (
+    CROWD_COLOR,
+    FONT,
+    FRAME,
+    GRID,
+    INK,
+    MUTED,
+    PALETTE,
+    PAPER,
+    halo,
+    printable_label,
+)
 
-__all__ = ["Benchmark", "Panel", "Scope", "bench"]
+__all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
 
 
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
@@ -231,7 +242,7 @@ def bench(
     config: Config | None = None,
     *,
     truth: Scenario | None = None,
-    scope: Scope = EVERYTHING,
+    scope: ScoreScope = EVERYTHING,
     detectors: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Benchmark:
@@ -306,7 +317,7 @@ CANDIDATES = tuple(
 Box = tuple[float, float, float, float]  # left, bottom, right, top in display pixels
 
 
-def place_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
+def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
     """Label points (K, 2) with their settings, clear of a line with corners `line` (n, 2)."""
     pt = float(ax.figure.dpi) / 72
     at = ax.transData.transform(xy)
@@ -317,7 +328,7 @@ def place_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> N
     inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
     for members in sorted(_together(at, MAX_SHARED_LABEL_PT * pt), key=lambda m: -float(at[m[0], 1])):
         members = sorted(members, key=lambda k: not points[k].present)
-        names = [printable(_label(points[k], present), 42) for k in members]
+        names = [printable_label(_label(points[k], present), 42) for k in members]
         box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
         taken.append(box)
         _lead(ax, at[members].mean(axis=0), box, pt)
@@ -442,9 +453,9 @@ def _title(figure: Figure, result: Benchmark) -> None:
     text = " · ".join([*parts, against, "one stage's setting changed at a time"])
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
     x = MARGIN_IN["left"] / figure.get_figwidth()
-    title = printable(f"{context.log.name}: error against run time", 90)
+    title = printable_label(f"{context.log.name}: error against run time", 90)
     figure.text(x, 1 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
-    figure.text(x, 1 - 0.6 / height, printable(text, 150), fontsize=8, color=MUTED, **style)
+    figure.text(x, 1 - 0.6 / height, printable_label(text, 150), fontsize=8, color=MUTED, **style)
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
@@ -459,10 +470,12 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
     ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
     label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
-    ax.text(0, 1.035, printable(label, 90), fontsize=6.8, color=MUTED, **style)
+    ax.text(0, 1.035, printable_label(label, 90), fontsize=6.8, color=MUTED, **style)
     hidden = [p.setting for p in panel.points if p.error is None]
     if hidden:
-        ax.text(0.02, 0.025, printable(f"no error known: {', '.join(hidden)}"), fontsize=6.8, color=MUTED, **style)
+        ax.text(
+            0.02, 0.025, printable_label(f"no error known: {', '.join(hidden)}"), fontsize=6.8, color=MUTED, **style
+        )
     if not shown:
         ax.set(xticks=[], yticks=[])
         return
@@ -479,7 +492,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     for point, on_front in shown:
         _mark(ax, point, on_front=on_front, chosen=point.setting == panel.recommendation.supported)
     corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
-    place_labels(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
+    place_point_labels(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
 
 
 def _mark(ax: Axes, point: Point, *, on_front: bool, chosen: bool) -> None:
@@ -527,14 +540,14 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
     )  # fmt: skip
     y = 0.86
     for panel in result.panels:
-        for k, line in enumerate(wrap(printable(panel.recommendation.reason, 240), 50)):
+        for k, line in enumerate(wrap(printable_label(panel.recommendation.reason, 240), 50)):
             head = panel.stage if k == 0 else ""
             ax.text(0, y, head, fontsize=7.2, family=FONT, color=INK, weight="bold", va="top", parse_math=False)
             ax.text(0.23, y, line, fontsize=7.2, family=FONT, color=INK, va="top", parse_math=False)
             y -= 0.058
         y -= 0.03
     for note in result.notes:
-        for line in wrap(printable(f"Note: {note}", 240), 70):
+        for line in wrap(printable_label(f"Note: {note}", 240), 70):
             ax.text(0, y, line, fontsize=6.6, family=FONT, color=MUTED, va="top", parse_math=False)
             y -= 0.05
 
@@ -556,7 +569,7 @@ TABLE_COLUMNS = (
 )
 
 
-def document(result: Benchmark) -> dict[str, Any]:
+def bench_document(result: Benchmark) -> dict[str, Any]:
     """Return the document of `schemas/bench-1.json`."""
     context, config = result.context, result.context.grid.present.config
     t = context.schedule.t_ns
@@ -610,7 +623,7 @@ def _interval(point: Point) -> list[float] | None:
     return None if found is None else [round(value, 6) for value in found]
 
 
-def format_table(result: Benchmark) -> str:
+def format_benchmark(result: Benchmark) -> str:
     """Format one block for each stage, then the recommendations."""
     lines = [
         "* present setting   + on the Pareto front: no setting is as accurate in less time",

@@ -17,8 +17,8 @@ from log2sim.errors import LogError, NothingToReconstruct, RecordError
 from log2sim.evaluation.bench.scores import (
     EVERYTHING,
     Holdout,
-    Scope,
     Score,
+    ScoreScope,
     check_scope,
     lidar_positions,
     score_homographies,
@@ -39,8 +39,9 @@ from log2sim.perception.homography_stage import CameraHomography, fit_homographi
 from log2sim.perception.run_detectors import Detectors, create_image_detector
 from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
 from log2sim.perception.sync import Schedule, schedule_of
-from log2sim.pipeline import Run, infer_scenario, observe_log, start
+from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.report import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +175,7 @@ class BenchContext:
     plan: Plan
     schedule: Schedule
     truth: Scenario | None
-    scope: Scope
+    scope: ScoreScope
     grid: Grid
     found: dict[str, RecordedDetections]  # detections by setting of the detector
     shared_s: dict[str, float]  # time of stages that all runs share
@@ -205,7 +206,7 @@ class BenchRun:
 
 
 def make_context(
-    log: Log, grid: Grid, truth: Scenario | None, report: Progress, scope: Scope = EVERYTHING
+    log: Log, grid: Grid, truth: Scenario | None, report: Progress, scope: ScoreScope = EVERYTHING
 ) -> BenchContext:
     """Synchronize the log and detect once with every setting of the detector."""
     check_scope(truth, scope)
@@ -346,7 +347,7 @@ def homography_points(context: BenchContext, observations: Observations, report:
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
             begin = time.perf_counter()
-            fits[setting.name] = fit(context, setting, holdout)
+            fits[setting.name] = fit_setting(context, setting, holdout)
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
@@ -363,7 +364,7 @@ def homography_points(context: BenchContext, observations: Observations, report:
     return out
 
 
-def fit(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, CameraHomography]:
+def fit_setting(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, CameraHomography]:
     """Fit the homographies of all cameras by one method."""
     plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
     rng = np.random.default_rng(setting.config.seed)
@@ -386,7 +387,7 @@ STAGE = "ends"
 DETECTOR = "lidar:vehicle"  # searches sweeps where the settings name no detector for them
 
 
-def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: Scope) -> BenchContext:
+def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: ScoreScope) -> BenchContext:
     """Synchronize a log without cameras, of which the ends alone are compared.
 
     Raises `LogError` for a log without LiDARs at both ends.
@@ -428,7 +429,7 @@ def whole_points(
     log: Log,
     settings: Sequence[Setting],
     truth: Scenario | None,
-    scope: Scope,
+    scope: ScoreScope,
     report: Callable[[str, int, int], None],
 ) -> list[Point]:
     """Run every setting once, as `reconstruct` does, and score its scenario.

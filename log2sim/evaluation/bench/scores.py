@@ -38,17 +38,17 @@ EVALUATE_KEYS = (
 
 
 @dataclass(frozen=True)
-class Scope:
+class ScoreScope:
     """Which objects are compared with the truth: within `max_range_m` of the ego, of these `categories`; None for all."""
 
     max_range_m: float | None = None
     categories: tuple[str, ...] | None = None
 
 
-EVERYTHING = Scope()
+EVERYTHING = ScoreScope()
 
 
-def check_scope(truth: Scenario | None, scope: Scope) -> None:
+def check_scope(truth: Scenario | None, scope: ScoreScope) -> None:
     """Raise `ConfigError` for an invalid scope before any work is done."""
     if truth is not None:
         evaluate(truth, truth, max_range_m=scope.max_range_m, categories=scope.categories)
@@ -65,7 +65,7 @@ class Score:
     by_object: Mapping[str, ErrorSums] = field(default_factory=dict)
 
 
-def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: Scope = EVERYTHING) -> Score:
+def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: ScoreScope = EVERYTHING) -> Score:
     """Score a scenario; without truth only by figures that need none.
 
     - `error_m`: root mean square position error; a missed and a false object together count as one at `CUTOFF_M`.

@@ -112,20 +112,20 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     cannot be loaded.
     """
     if config.detect.name == AUTO:
-        config = with_changes(config, "detect", name=IMAGE_DETECTOR)
+        config = change_section(config, "detect", name=IMAGE_DETECTOR)
     if config.topdown.method == NO_METHOD:
-        config = with_changes(config, "topdown", method=choices(config.topdown, "method")[0])
+        config = change_section(config, "topdown", method=choices(config.topdown, "method")[0])
     # List smoothing on and off, and all values of its other settings.
     keys = type(config.smooth).model_fields
     switches = [key for key in keys if isinstance(getattr(config.smooth, key), bool)]
     named = [key for key in keys if config.smooth.choices(key)]
     out = [Setting("smooth", _smooth_name(config, switches, named), config, True)]
     for key in switches:
-        other = with_changes(config, "smooth", **{key: not getattr(config.smooth, key)})
+        other = change_section(config, "smooth", **{key: not getattr(config.smooth, key)})
         out.append(Setting("smooth", _smooth_name(other, [key], []), other, False))
     for key in named:
         for value in choices(config.smooth, key)[1:]:
-            other = with_changes(config, "smooth", **{key: value})
+            other = change_section(config, "smooth", **{key: value})
             out.append(Setting("smooth", value, other, False))
     return Grid(
         detect=tuple(_detector_settings(log, config, detectors)),
@@ -147,7 +147,7 @@ def default_settings(log: Log, config: Config) -> tuple[Setting, ...]:
 def _methods_apart(config: Config) -> list[Setting]:
     """List the methods, the present one as it is and the others for each camera alone."""
     present, *others = _choices("homography", config, "topdown", "method")
-    return [present, *(replace(s, config=with_changes(s.config, "topdown", rig="apart")) for s in others)]
+    return [present, *(replace(s, config=change_section(s.config, "topdown", rig="apart")) for s in others)]
 
 
 def _rig_settings(log: Log, config: Config) -> list[Setting]:
@@ -155,19 +155,19 @@ def _rig_settings(log: Log, config: Config) -> list[Setting]:
     if len(config.cameras or log.cameras) < 2:
         return []
     other = choices(config.topdown, "rig")[1]
-    return [Setting("homography", f"cameras {other}", with_changes(config, "topdown", rig=other), False)]
+    return [Setting("homography", f"cameras {other}", change_section(config, "topdown", rig=other), False)]
 
 
 def _hypotheses(config: Config) -> list[Setting]:
     """List other numbers of hypotheses for the present method, for which only homographies are scored, no whole runs."""
     return [
-        Setting("homography", f"{n} hypotheses", with_changes(config, "topdown", hypotheses=n), False)
+        Setting("homography", f"{n} hypotheses", change_section(config, "topdown", hypotheses=n), False)
         for n in HYPOTHESES
         if n != config.topdown.hypotheses
     ]
 
 
-def with_changes(config: Config, section: str, **changes: Any) -> Config:
+def change_section(config: Config, section: str, **changes: Any) -> Config:
     """Return a copy of the settings with changes in one section."""
     return config.changed(**{section: changes})
 
@@ -181,7 +181,7 @@ def choices(section: Section, key: str) -> list[str]:
 def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Setting, ...]:
     names = choices(getattr(config, section), key)
     return tuple(
-        Setting(stage, name, with_changes(config, section, **{key: name}), k == 0) for k, name in enumerate(names)
+        Setting(stage, name, change_section(config, section, **{key: name}), k == 0) for k, name in enumerate(names)
     )
 
 
@@ -196,20 +196,22 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     """List every detector with all distinct numbers of tiles, and with other input sizes where the model accepts them."""
     names = list(dict.fromkeys([config.detect.name, *detectors]))
     for name in names:
-        if with_changes(config, "detect", name=name).detect.in_sweeps:
+        if change_section(config, "detect", name=name).detect.in_sweeps:
             raise ConfigError(
                 f"bench: compares detectors in images, and '{name}' searches LiDAR sweeps; see log2sim detect"
             )
     out: list[Setting] = []
     for name in names:
-        own = config if name == config.detect.name else with_changes(config, "detect", name=name, layout="", input_px=0)
+        own = (
+            config if name == config.detect.name else change_section(config, "detect", name=name, layout="", input_px=0)
+        )
         label = f"{_short(name, names)} " if len(names) > 1 else ""
         detector = create_image_detector(log, own)
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
             continue
         for key, value in _inputs(log, own, detector):
-            other = with_changes(own, "detect", **{key: value})
+            other = change_section(own, "detect", **{key: value})
             out.append(Setting("detect", f"{label}{_input_name(key, value)}", other, not out))
     return out
 

@@ -9,7 +9,7 @@ from log2sim.evaluation.detection.evaluation import (
     operating_point,
     precision_recall,
 )
-from log2sim.evaluation.detection.protocols import Criterion, Matches, match
+from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 
 __all__ = [
     "Criterion",
@@ -17,7 +17,7 @@ __all__ = [
     "PrecisionRecall",
     "SceneBoxes",
     "average_precision",
-    "match",
+    "match_detections",
     "operating_point",
     "precision_recall",
 ]

@@ -20,9 +20,9 @@ from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import outside_ego
 from log2sim.perception.sync import sweep_middle_ns
-from log2sim.pipeline import Run, start
+from log2sim.pipeline import start
 from log2sim.plan import FusionLevel
-from log2sim.report import unreadable_records
+from log2sim.report import Run, unreadable_records
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def detect_log(
     for searched in clouds(run, records, detector):
         if searched.cloud is not None:
             stamps.append(of_sweeps[searched.tick])
-            boxes.append(without_ego(run.log, searched.boxes))
+            boxes.append(drop_ego(run.log, searched.boxes))
         if progress is not None:
             progress(searched.tick + 1, len(run.schedule))
     records.require_some()
@@ -128,6 +128,6 @@ def detect_log(
     return LogDetections(found, len(run.schedule) - len(stamps), findings, run.poses)
 
 
-def without_ego(log: Log, boxes: Boxes3D) -> Boxes3D:
+def drop_ego(log: Log, boxes: Boxes3D) -> Boxes3D:
     """Leave out the boxes on the ego where the road's LiDARs see it: it is no other road user, and no label is on it."""
     return outside_ego(log, boxes) if any(end_of(lidar) == ROAD for lidar in log.lidars.values()) else boxes

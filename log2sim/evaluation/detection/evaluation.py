@@ -16,14 +16,14 @@ from log2sim.evaluation.detection.protocols import (
     DIFFICULTIES,
     MIN_POINTS,
     PROTOCOLS,
+    BoxPairs,
     Criterion,
     Matches,
     ObjectClass,
-    Pairs,
     Protocol,
-    assign,
+    assign_boxes,
     candidate_pairs,
-    match,
+    match_detections,
 )
 from log2sim.evaluation.detection.truth import ImageViews, SweepTruth, image_views, truth_of_sweeps
 from log2sim.evaluation.metrics.comparison import MIN_REGION_SHARE
@@ -117,7 +117,7 @@ def average_precision(
 
     `recall_points`: as in `PrecisionRecall.average`.
     """
-    return precision_recall(found, match(found, truth, criterion)).average(recall_points)
+    return precision_recall(found, match_detections(found, truth, criterion)).average(recall_points)
 
 
 def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> dict[str, Any]:
@@ -129,10 +129,10 @@ def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> di
     """
     reported = found.score >= min_score
     right, false = (int(np.count_nonzero(rows & reported)) for rows in (matches.right, matches.false))
-    return rates(right, false, matches.truths - right)
+    return detection_rates(right, false, matches.truths - right)
 
 
-def rates(right: int, false: int, missed: int) -> dict[str, Any]:
+def detection_rates(right: int, false: int, missed: int) -> dict[str, Any]:
     """Compute the figures of `operating_point` from its counts."""
     precision = right / (right + false) if right + false else None
     recall = right / (right + missed) if right + missed else None
@@ -206,9 +206,9 @@ class Objects:
     # (M,) found boxes that are not false where they match nothing, since they are out of range or of other objects.
     elsewhere: Mask
 
-    def matches(self, pairs: Pairs, criterion: Criterion) -> Matches:
+    def matches(self, pairs: BoxPairs, criterion: Criterion) -> Matches:
         """Match them; boxes where nothing was labeled are not false."""
-        found = assign(self.found, self.truth, pairs, criterion)
+        found = assign_boxes(self.found, self.truth, pairs, criterion)
         return found.excusing(self.elsewhere).excusing(self.boxes.unlabeled)
 
 
@@ -284,7 +284,7 @@ def by_points(boxes: ClassBoxes) -> Iterator[Objects]:
         )
 
 
-def figures(objects: Objects, pairs: Pairs, criterion: Criterion, min_score: float) -> dict[str, Any]:
+def figures(objects: Objects, pairs: BoxPairs, criterion: Criterion, min_score: float) -> dict[str, Any]:
     """Compute average precision, the figures at a score, and how many headings are off by more than 90 degrees."""
     matches = objects.matches(pairs, criterion)
     curve = precision_recall(objects.found, matches)
@@ -298,21 +298,21 @@ def figures(objects: Objects, pairs: Pairs, criterion: Criterion, min_score: flo
         "ap_nuscenes": curve.nuscenes_average() if criterion.measure == "center_m" else None,
         **(published(objects, pairs, criterion) if in_images else {}),
         **operating_point(objects.found, matches, min_score),
-        "heading_over_90_deg": headings(objects, matches, min_score),
+        "heading_over_90_deg": heading_figures(objects, matches, min_score),
     }
 
 
-def published(objects: Objects, pairs: Pairs, criterion: Criterion) -> dict[str, Any]:
+def published(objects: Objects, pairs: BoxPairs, criterion: Criterion) -> dict[str, Any]:
     """Compute average precision as KITTI's published program does: sampled, and false in regions without labels too.
 
     The program compares the 3D boxes of these regions, which do not exist, so that its figures for 3D boxes lack the rule.
     """
-    found = assign(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
+    found = assign_boxes(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
     curve = precision_recall(objects.found, found)
     return {"ap_r40_published": curve.sampled_average(40), "ap_r11_published": curve.sampled_average(11)}
 
 
-def headings(objects: Objects, matches: Matches, min_score: float) -> float | None:
+def heading_figures(objects: Objects, matches: Matches, min_score: float) -> float | None:
     """Compute the share of right boxes at a score whose heading is off by more than 90 degrees; None without any."""
     rows = np.flatnonzero(matches.right & (objects.found.score >= min_score))
     off = wrap_angle(objects.found.box[rows, 6] - objects.truth.box[matches.truth[rows], 6])
@@ -340,7 +340,7 @@ def overall(classes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
             sums = counts.setdefault(row["objects"], [0, 0, 0])
             for k, key in enumerate(("true_positives", "false_positives", "false_negatives")):
                 sums[k] += row[key]
-    return [{"objects": name, "truths": c[0] + c[2], **rates(*c)} for name, c in counts.items()]
+    return [{"objects": name, "truths": c[0] + c[2], **detection_rates(*c)} for name, c in counts.items()]
 
 
 AVERAGES = {
@@ -448,7 +448,7 @@ DEFAULT_SCORE = 0.5
 
 
 @dataclass(frozen=True)
-class Options:
+class DetectionOptions:
     """What to evaluate."""
 
     protocol: str  # "kitti", "dair" or "center"
@@ -487,7 +487,7 @@ class Options:
 
 
 def evaluate_boxes(
-    detected: DetectedBoxes, log: Log, options: Options, *, progress: Callable[[int, int], None] | None = None
+    detected: DetectedBoxes, log: Log, options: DetectionOptions, *, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
     """Compute the figures of a detector on a log.
 
@@ -586,7 +586,7 @@ def _unlabeled(log: Log, t_ns: NDArray[np.int64], found: SceneBoxes) -> Array:
     return np.where(np.isfinite(share), share, 0.0 if only is None else 1.0)
 
 
-def _class_boxes(sides: _Sides, of_class: ObjectClass, options: Options, protocol: Protocol) -> ClassBoxes:
+def _class_boxes(sides: _Sides, of_class: ObjectClass, options: DetectionOptions, protocol: Protocol) -> ClassBoxes:
     """Select the boxes of a class and decide what is ignored."""
     mine, true = (np.isin(b.category, of_class.categories) for b in (sides.found, sides.truth))
     far_m = np.inf if options.max_range_m is None else options.max_range_m

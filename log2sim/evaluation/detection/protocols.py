@@ -44,7 +44,7 @@ class Criterion:
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class BoxPairs:
     """Pairs of found and true boxes that may match."""
 
     # found, truth: (P,) rows of both tables.
@@ -68,15 +68,15 @@ class Matches:
         return replace(self, false=self.false & ~rows)
 
 
-def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches:
+def match_detections(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches:
     """Match found and true boxes of all scenes one to one, best score first.
 
     `found`, `truth`: of one class: categories are not compared.
     """
-    return assign(found, truth, candidate_pairs(found, truth, criterion), criterion)
+    return assign_boxes(found, truth, candidate_pairs(found, truth, criterion), criterion)
 
 
-def assign(found: SceneBoxes, truth: SceneBoxes, pairs: Pairs, criterion: Criterion) -> Matches:
+def assign_boxes(found: SceneBoxes, truth: SceneBoxes, pairs: BoxPairs, criterion: Criterion) -> Matches:
     """Choose among candidate pairs, which do not depend on what is ignored; see `match`.
 
     A found box takes the best true box that is free, a counted one before an ignored one. Ignored found boxes come last. So
@@ -99,7 +99,7 @@ def assign(found: SceneBoxes, truth: SceneBoxes, pairs: Pairs, criterion: Criter
     return Matches(partner, of_pair, to_counted & ~found.ignored, ~matched & ~found.ignored, counted)
 
 
-def candidate_pairs(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Pairs:
+def candidate_pairs(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> BoxPairs:
     """List the pairs of boxes of one scene that meet a criterion."""
     rows_i, rows_j, values = [], [], []
     for i, j in _pairs_in_scenes(found.scene, truth.scene):
@@ -117,8 +117,8 @@ def candidate_pairs(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) 
         rows_j.append(j[near])
         values.append(value[near])
     if not values:
-        return Pairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
-    return Pairs(np.concatenate(rows_i), np.concatenate(rows_j), np.concatenate(values))
+        return BoxPairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+    return BoxPairs(np.concatenate(rows_i), np.concatenate(rows_j), np.concatenate(values))
 
 
 def _pairs_in_scenes(

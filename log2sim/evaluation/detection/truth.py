@@ -18,7 +18,8 @@ from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of,
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import cloud_origin
-from log2sim.pipeline import Run, start
+from log2sim.pipeline import start
+from log2sim.report import Run
 
 MAX_LAG_NS = 60_000_000  # a label holds for this time around its stamp: half a period at 10 Hz, and jitter
 # Between labels of a track that are farther apart than this many periods the object was not labeled.

@@ -29,7 +29,7 @@ def gate_m(length_m: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class AgentPairs:
     """Pairs within the gate, sorted by tick."""
 
     tick: Index  # (P,)
@@ -40,16 +40,16 @@ class Pairs:
     similarity: Array  # (P,) 1 - distance / gate; 0 across groups of categories
     same_group: Mask  # (P,)
 
-    def take(self, index: Mask | Index) -> Pairs:
+    def take(self, index: Mask | Index) -> AgentPairs:
         """Return the rows at `index`."""
-        return Pairs(*(column[index] for column in vars(self).values()))
+        return AgentPairs(*(column[index] for column in vars(self).values()))
 
     def bounds(self, ticks: int) -> Index:
         """Return row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""
         return np.searchsorted(self.tick, np.arange(ticks + 1))
 
 
-def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mask) -> Pairs:
+def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mask) -> AgentPairs:
     """Collect the pairs within the gate.
 
     `truth_xy`, `other_xy` (A, T, 2), (B, T, 2), m: box centers in one frame, NaN where an agent is absent. `gates_m`
@@ -66,12 +66,12 @@ def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mas
         distances.append(distance[i, j])
     if not found:
         none = np.zeros(0, dtype=np.int64)
-        return Pairs(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
+        return AgentPairs(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
     tick, truth, other = (np.concatenate(column) for column in zip(*found))
     distance_m = np.concatenate(distances)
     same = same_group[truth, other]
     similarity = np.where(same, 1 - distance_m / gates_m[truth], 0.0)
-    return Pairs(tick, truth, other, distance_m, similarity, same)
+    return AgentPairs(tick, truth, other, distance_m, similarity, same)
 
 
 def assign(rows: Index, cols: Index, score: Array) -> Index:
@@ -112,7 +112,7 @@ class Association:
     absorbed: Mask  # (B, T) reconstructed agents without such a match that are at a labeled object of another group
 
 
-def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association:
+def associate(pairs: AgentPairs, truths: int, others: int, ticks: int) -> Association:
     """Match agents tick by tick, keeping what was matched before while it is within the gate.
 
     Bernardin and Stiefelhagen (2008), section 2.2.1: previous matches within the gate are kept, then the remaining agents
@@ -137,7 +137,7 @@ def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association
     return Association(match, used, absorbed)
 
 
-def _kept(near: Pairs, rows: Index, last: Index) -> Index:
+def _kept(near: AgentPairs, rows: Index, last: Index) -> Index:
     """Select the candidate `rows` that continue the last match of their truth agent; the nearest of several."""
     rows = rows[last[near.truth[rows]] == near.other[rows]]
     rows = rows[np.argsort(near.distance_m[rows], kind="stable")]
@@ -145,7 +145,7 @@ def _kept(near: Pairs, rows: Index, last: Index) -> Index:
     return rows[first]
 
 
-def _nearest(near: Pairs, rows: Index, last: Index) -> Index:
+def _nearest(near: AgentPairs, rows: Index, last: Index) -> Index:
     """Select of the candidate `rows` the most pairs with the least total distance."""
     distance = near.distance_m[rows]
     # One more pair always outweighs any saving in distance.
@@ -240,7 +240,7 @@ def _thinned(t_s: Array, wanted_s: Array) -> Array:
 def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:
     """Sample reconstructed agents at the ticks (T,); `ego_xy` (T, 2), m, or None."""
     table = AgentTable.of(agents, ticks_s)
-    return _with_range(table, ego_xy, table.present, table.present, np.full(table.yaw_rad.shape, np.nan))
+    return _limit_range(table, ego_xy, table.present, table.present, np.full(table.yaw_rad.shape, np.nan))
 
 
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
@@ -264,10 +264,10 @@ def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_
         max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
         labeled[k] = agent.at(ticks_s, max_gap_s=float(max_gap_s)).valid
     moved = replace(table, center_m=table.center_m + shift_m)
-    return _with_range(moved, ego_xy, visible & labeled, labeled, points)
+    return _limit_range(moved, ego_xy, visible & labeled, labeled, points)
 
 
-def ego_states(
+def states_of_ego(
     scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array
 ) -> StateTable | None:
     """Sample the ego as one row, the true one at the ticks at which it is known; None without an ego."""
@@ -281,7 +281,7 @@ def ego_states(
     return replace(true, center_m=center_m, yaw_rad=np.where(true.present, true.yaw_rad, ours.yaw_rad))
 
 
-def _with_range(
+def _limit_range(
     table: AgentTable, ego_xy: Array | None, visible: Mask, labeled: Mask, lidar_points: Array
 ) -> StateTable:
     away_m = (
@@ -390,7 +390,7 @@ class Comparison:
     # truth, other: truth and reconstruction.
     truth: StateTable
     other: StateTable
-    pairs: Pairs
+    pairs: AgentPairs
     match: Index  # (A, T) index of the reconstructed agent, -1 for none
     counted: Mask  # (A, T) ticks at which a truth agent counts
     # (A, T) where it is labeled: 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not
@@ -407,7 +407,7 @@ class Comparison:
         return np.asarray((self.why_not == COUNTED) | (self.why_not > list(REASONS).index("out_of_range") + 1))
 
 
-def compare(
+def compare_agents(
     truth: StateTable, other: StateTable, tick_s: float, selection: Selection, *, visibility_stated: bool = True
 ) -> Comparison:
     """Match agents and mark what counts.
@@ -457,7 +457,7 @@ def coverage(c: Comparison, selected: Mask) -> dict[str, Any]:
     }
 
 
-def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
+def drop_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
     """Move false ticks in ignore regions, and of categories never labeled, to the ignored ones.
 
     `regions`: None where the labels are complete. `truth_ticks_s` (T,), s. `shift_m` (3,), m: from the truth's map to

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, GROUPS, MIN_TRUSTED_CONFIDENCE, Agent
 from log2sim.evaluation.metrics.comparison import Comparison, Mask, StateTable
-from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_rules, judge
+from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_rules, judge_against_truth
 from log2sim.geometry import Array
 
 BINS = 10
@@ -98,7 +98,7 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
     `agents`: the B reconstructed agents of the comparison. `ticks_s` (T,), s. `ego`: one row; without it there are no
     figures by range. Returns the part `correctness` of a document of `schemas/metrics-1.json`.
     """
-    verdicts, ranged = judge(c, ego), ego is not None
+    verdicts, ranged = judge_against_truth(c, ego), ego is not None
     judged = JudgedAgents(
         states=c.other,
         verdicts=verdicts,

@@ -16,21 +16,21 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.metrics.comparison import (
     GATE_M,
     MIN_COUNTED_S,
+    AgentPairs,
     Comparison,
     Mask,
-    Pairs,
     Selection,
     StateTable,
     assign,
-    compare,
+    compare_agents,
     coverage,
-    ego_states,
+    drop_ignored,
     evaluation_ticks_s,
     matched_ticks,
     mota,
     reconstructed_states,
+    states_of_ego,
     truth_states,
-    without_ignored,
 )
 from log2sim.evaluation.metrics.correctness import correctness
 from log2sim.evaluation.metrics.truth import load_truth
@@ -40,7 +40,7 @@ from log2sim.evaluation.metrics.verdicts import (
     median,
     root_mean_square,
     state_errors,
-    summarize,
+    summarize_verdicts,
 )
 from log2sim.evaluation.road import color_figures, map_figures, signal_figures
 from log2sim.export.exporters import on_map
@@ -55,7 +55,7 @@ from log2sim.geometry import (
 )
 
 if TYPE_CHECKING:
-    from log2sim.pipeline import Result
+    from log2sim.report import Result
 
 
 # Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged.
@@ -71,7 +71,7 @@ class Hota:
     ass_a: float
 
 
-def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
+def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     """Score the tracking.
 
     `pairs`: candidates; those of absent agents and those with similarity 0 are left out. `truth_present`,
@@ -114,7 +114,7 @@ def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
 
 
-def _matched_pairs(pairs: Pairs, score: Array, ticks: int) -> Pairs:
+def _matched_pairs(pairs: AgentPairs, score: Array, ticks: int) -> AgentPairs:
     bounds = pairs.bounds(ticks)
     chosen = [
         begin + assign(pairs.truth[begin:end], pairs.other[begin:end], score[begin:end])
@@ -467,14 +467,14 @@ def compare_scenarios(
         raise ScenarioError(_no_common_time(scenario, truth))
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     shift_m = truth.shift_to(scenario)
-    ego = ego_states(scenario, truth, ticks_s, truth_ticks_s, shift_m)
+    ego = states_of_ego(scenario, truth, ticks_s, truth_ticks_s, shift_m)
     ego_xy = None if ego is None else ego.xy_m[0]
     _check_range(selection.max_range_m, ego_xy)
     true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
     ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
     stated = truth.provenance.get("visibility") != "computed"
-    compared = compare(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
-    return without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
+    compared = compare_agents(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
+    return drop_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
 
 
 def _tick_s(ticks_s: Array) -> float:
@@ -496,7 +496,7 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
         "precision": matched / (matched + wrong) if matched + wrong else None,
         "recall_agents": float(found[agents].mean()) if agents.any() else None,
         "precision_agents": float(real[ours].mean()) if ours.any() else None,
-        **summarize(state_errors(c.truth, c.other, c.match, counted)),
+        **summarize_verdicts(state_errors(c.truth, c.other, c.match, counted)),
         "id_switches": id_switches,
         "mota": mota(truth_ticks, truth_ticks - matched, wrong, id_switches),
         "hota": None if tracking is None else tracking.hota,

@@ -237,7 +237,7 @@ def truth_at(
         if not points:
             return stated
         try:  # by the poses of the log, in whose map its truth is
-            return with_points(stated, open_log(path, sequence=sequence), progress)
+            return count_points(stated, open_log(path, sequence=sequence), progress)
         except (LogError, ConfigError, MissingExtra):  # what can be compared does not need the sweeps
             return stated
     opened = source if isinstance(source, Log) else open_log(source, sequence=sequence, labels=labels)
@@ -367,7 +367,7 @@ def _rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
     return np.split(order, np.flatnonzero(np.diff(track[order])) + 1)
 
 
-def with_points(truth: Scenario, log: Log, progress: Progress | None = None) -> Scenario:
+def count_points(truth: Scenario, log: Log, progress: Progress | None = None) -> Scenario:
     """Return a truth with the LiDAR points of a log in its boxes, which are put where they were at the time of the sweep.
 
     A waypoint gets the points of the sweeps nearest to it within `MAX_LAG_S`; where the log has no LiDAR, nothing changes.

@@ -69,7 +69,7 @@ def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64],
     )
 
 
-def summarize(errors: StateErrors) -> dict[str, float | None]:
+def summarize_verdicts(errors: StateErrors) -> dict[str, float | None]:
     """Summarize all rows; a figure without rows is None.
 
     Notes
@@ -146,7 +146,7 @@ class Verdicts:
         return np.asarray(np.any([self.measures[name] for name in MEASURES], axis=0))
 
 
-def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
+def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     """Judge every selected tick of every reconstructed agent; `ego` has one row.
 
     Agents are associated one to one with labeled objects of their kind (`GROUPS`), visible or hidden, as for recall and
@@ -318,7 +318,7 @@ def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
 
 
 def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str, Any]:
-    """Describe what is wrong with an agent, and when a scenario doubts one; see `verdicts.judge`."""
+    """Describe what is wrong with an agent, and when a scenario doubts one; see `verdicts.judge_against_truth`."""
     return {
         "judged": "ticks of a reconstructed agent at which it matches a labeled object, or matches none and the labels "
         "are complete there; shares are of these ticks, ranges those of the reconstructed agent",

@@ -346,13 +346,13 @@ class OpenScenario:
                 first_s = float(ego.waypoints.t_s[0])
                 raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
         road, placement = add_road_file(scenario, folder, options.map)
-        write(document(scenario, road, placement, revision, external=external), folder / "scenario.xosc")
+        write(openscenario_document(scenario, road, placement, revision, external=external), folder / "scenario.xosc")
 
 
 EXPORTER = OpenScenario()
 
 
-def document(
+def openscenario_document(
     scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision, *, external: bool = False
 ) -> Element:
     """Return the document of a scenario whose road is in the file `road` beside it; an `external` ego is driven from outside."""

@@ -263,7 +263,7 @@ def _across(reference: Array, line: Polyline, s: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Connection:
+class RoadConnection:
     """A connecting road of a junction."""
 
     junction: int
@@ -273,12 +273,12 @@ class Connection:
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class RoadNetwork:
     """Roads and the junctions between them, by their ids and names."""
 
     roads: tuple[Road, ...]
     junctions: Mapping[int, str]
-    connections: tuple[Connection, ...]
+    connections: tuple[RoadConnection, ...]
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class _Place:
         return -1 - self.start
 
 
-def build_network(lanes: Sequence[MapLane]) -> Network:
+def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
     """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
     refused: set[frozenset[str]] = set()
     while True:
@@ -349,8 +349,8 @@ def build_network(lanes: Sequence[MapLane]) -> Network:
         )
         junction = number_of[str(lane.junction)]
         roads.append(replace(road, junction=junction, before=before, after=after))
-        connections.append(Connection(junction, one.road, road.number, one.lane))
-    return Network(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
+        connections.append(RoadConnection(junction, one.road, road.number, one.lane))
+    return RoadNetwork(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
 
 
 def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list[MapLane]]:

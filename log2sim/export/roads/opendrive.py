@@ -13,7 +13,7 @@ import numpy as np
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
-from log2sim.export.roads.network import MarkFinder, Network, Road, RoadMark, build_network
+from log2sim.export.roads.network import MarkFinder, Road, RoadMark, RoadNetwork, build_network
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 from log2sim.geometry import Array, wrap_angle
 from log2sim.road.lane_graph import add_missing_lanes, infer_lanes
@@ -256,7 +256,7 @@ def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tu
     """
     if map_path is None:
         placement = near_origin(scenario)
-        root = document(scenario, placement)
+        root = opendrive_document(scenario, placement)
         require_roads(root, FILE_NAME)
         write(root, folder / FILE_NAME)
         return FILE_NAME, placement
@@ -299,7 +299,7 @@ def _require_near(root: Element, scenario: Scenario, placement: ExportPlacement,
         )
 
 
-def document(scenario: Scenario, placement: ExportPlacement) -> Element:
+def opendrive_document(scenario: Scenario, placement: ExportPlacement) -> Element:
     """Return the OpenDRIVE document of a scenario's roads, with the same origin as the agents."""
     x0, y0, _ = placement.origin_m
     network = build_network(lanes(scenario))
@@ -395,7 +395,7 @@ def _add_mark(lane: Element, mark: RoadMark) -> None:
     )  # fmt: skip
 
 
-def _add_junction(root: Element, junction: int, name: str, network: Network) -> None:
+def _add_junction(root: Element, junction: int, name: str, network: RoadNetwork) -> None:
     parent = element("junction", root, name=escaped(name), id=str(junction), type="default")
     for k, connection in enumerate(c for c in network.connections if c.junction == junction):
         node = element(

@@ -18,7 +18,7 @@ from log2sim.perception.homography.correspondences import (
     undistorted_pixels,
 )
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll, refused_fit, validated_fit
-from log2sim.perception.homography.normalized import NormalizedCorrespondences
+from log2sim.perception.homography.normalized import NormalizedCorrespondences, scaled
 from log2sim.perception.homography.pitch_roll import (
     MIN_SIGNIFICANCE_SIGMA,
     PITCH_SIGMA_PX,
@@ -42,7 +42,7 @@ from log2sim.perception.homography.ransac import (
 STREAM_METHODS = ("time-aware", "calibrated")
 FRAME_METHODS = ("min-frame", "per-frame", "per-frame-skimage", "straw-man")
 METHODS = (*STREAM_METHODS, *FRAME_METHODS)
-# Condition number of intrinsics beyond which they count as singular; a lens of 1e5 px has 1e5.
+# Condition number beyond which intrinsics and calibrated homographies count as singular; a lens of 1e5 px has 1e5.
 MAX_CONDITION = 1e12
 
 
@@ -239,7 +239,7 @@ def fit_camera(
     stable, source = _fit_fixed(stabilized(feet, moving), stabilized(ground, moving), options, rng)
     if not stable.ok:
         return fit, source
-    per_tick = _scaled(stable.ground_H_image @ stabilizing_warps(moving))
+    per_tick = scaled(stable.ground_H_image @ stabilizing_warps(moving))
     return replace(stable, ticks=moving.ticks, per_tick=per_tick, pitch_roll=pitch_roll), source
 
 
@@ -319,11 +319,6 @@ def _finite(correspondences: Correspondences) -> Correspondences:
     """Select the rows whose pixels and positions are finite."""
     values = np.column_stack([correspondences.uv, correspondences.xy_ego])
     return correspondences.take(np.isfinite(values).all(axis=1))
-
-
-def _scaled(h: Array) -> Array:
-    """Scale homographies (T, 3, 3) so that their third rows are unit vectors."""
-    return np.asarray(h / np.linalg.norm(h[:, 2], axis=1)[:, None, None])
 
 
 # Beyond this range one pixel of a camera at car height is several meters.

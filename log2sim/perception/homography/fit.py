@@ -32,62 +32,6 @@ MAX_RELATIVE_SIGMA = 0.25
 PROBES = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
 
 
-@dataclass(frozen=True)
-class FitHealth:
-    """Whether a homography is accepted.
-
-    Attributes
-    ----------
-    reason : str
-        Why it is refused, "" otherwise.
-    condition : float
-        Ratio s1/s8 of the singular values of the normalized design matrix.
-    sigma_m : float
-        Predicted standard deviation on the ground, m, one spread of the inliers from their mean.
-    """
-
-    ok: bool
-    reason: str
-    condition: float
-    sigma_m: float
-
-
-def validate_fit(
-    data: NormalizedCorrespondences,
-    h: Array,
-    linear: Linearization,
-    image_K: Array | None,
-    effective_parameters: float = 0.0,
-) -> FitHealth:
-    """Accept or refuse a homography (3, 3) by the number and the geometry of its inliers.
-
-    Every two `effective_parameters` of single ticks make one correspondence an inlier without evidence, so as many
-    inliers more are required.
-    """
-    inliers, rows = linear.squared[0] < CHI2_2DOF_99, data.image.shape[1]
-    count = int(inliers.sum())
-    minimum = 4 if rows < MIN_INLIERS else MIN_INLIERS
-    absorbed = effective_parameters / 2
-    needed = max(minimum, int(np.ceil(absorbed + MIN_INLIER_SHARE * (rows - absorbed))))
-    if count < needed:
-        reason = f"{count} of {rows} correspondences agree, at least {needed} are needed"
-        return FitHealth(False, reason, float("inf"), float("inf"))
-    s = singular_values(data, inliers)
-    condition = float(s[0] / s[7]) if s[7] > 0 else float("inf")
-    if image_K is None and s[7] < MIN_S8_S1 * s[0]:
-        reason = f"the {count} correspondences that agree lie on a line or a point"
-        return FitHealth(False, reason, condition, float("inf"))
-    sigma, spread = predicted_sigma(data, h, linear, inliers, image_K)
-    sigma_m = float(sigma / data.ground_N_m[0, 0])
-    if not sigma < MAX_RELATIVE_SIGMA * spread:
-        reason = (
-            f"the {count} correspondences that agree do not determine a homography: it would be off by "
-            f"{sigma_m:.1f} m where they spread over {spread / data.ground_N_m[0, 0]:.1f} m"
-        )
-        return FitHealth(False, reason, condition, sigma_m)
-    return FitHealth(True, "", condition, sigma_m)
-
-
 def predicted_sigma(
     data: NormalizedCorrespondences, h: Array, linear: Linearization, use: NDArray[np.bool_], image_K: Array | None
 ) -> tuple[float, float]:
@@ -259,20 +203,34 @@ def refused_fit(reason: str, count: int, ticks: NDArray[Any] | None = None) -> H
 
 
 def validated_fit(robust: RobustFit, image_K: Array | None = None) -> HomographyFit:
-    """Validate a homography and convert it to px and m."""
-    data, count = robust.data, robust.data.image.shape[1]
+    """Accept or refuse a homography by the number and the geometry of its inliers, and convert it to px and m.
+
+    Every two effective parameters of single ticks make one correspondence an inlier without evidence, so as many inliers
+    more are required.
+    """
+    data, rows = robust.data, robust.data.image.shape[1]
     if robust.h is None or robust.linear is None:
-        return refused_fit("every sample of four is collinear or coincident", count)
-    health = validate_fit(data, robust.h, robust.linear, image_K, robust.effective_parameters)
-    if not health.ok:
-        return refused_fit(health.reason, count)
-    inliers = robust.linear.squared[0] < CHI2_2DOF_99
-    ground_H_image = data.to_ground_H_image(robust.h)
-    image = np.vstack([data.image, np.ones((1, count))])
+        return refused_fit("every sample of four is collinear or coincident", rows)
+    inliers, absorbed = robust.linear.squared[0] < CHI2_2DOF_99, robust.effective_parameters / 2
+    count, minimum = int(inliers.sum()), 4 if rows < MIN_INLIERS else MIN_INLIERS
+    needed = max(minimum, int(np.ceil(absorbed + MIN_INLIER_SHARE * (rows - absorbed))))
+    if count < needed:
+        return refused_fit(f"{count} of {rows} correspondences agree, at least {needed} are needed", rows)
+    s = singular_values(data, inliers)
+    if image_K is None and s[7] < MIN_S8_S1 * s[0]:
+        return refused_fit(f"the {count} correspondences that agree lie on a line or a point", rows)
+    sigma, spread = predicted_sigma(data, robust.h, robust.linear, inliers, image_K)
+    scale = data.ground_N_m[0, 0]
+    if not sigma < MAX_RELATIVE_SIGMA * spread:
+        reason = (
+            f"the {count} correspondences that agree do not determine a homography: it would be off by "
+            f"{sigma / scale:.1f} m where they spread over {spread / scale:.1f} m"
+        )
+        return refused_fit(reason, rows)
+    image = np.vstack([data.image, np.ones((1, rows))])
     if robust.warps is not None:
         image = np.linalg.solve(robust.warps, image.T[:, :, None])[:, :, 0].T
     back = np.linalg.inv(robust.h) @ image
-    error = np.hypot(*(back[:2] / back[2] - data.ground[:2])[:, inliers]) / data.ground_N_m[0, 0]
-    return HomographyFit(
-        True, "", ground_H_image, inliers, float(np.median(error)), health.condition, sigma_m=health.sigma_m
-    )
+    error_m = float(np.median(np.hypot(*(back[:2] / back[2] - data.ground[:2])[:, inliers]) / scale))
+    condition, h = float(s[0] / s[7]) if s[7] > 0 else float("inf"), data.to_ground_H_image(robust.h)
+    return HomographyFit(True, "", h, inliers, error_m, condition, sigma_m=float(sigma / scale))

@@ -96,8 +96,12 @@ class NormalizedCorrespondences:
 
     def to_ground_H_image(self, image_H_ground: Array) -> Array:
         """Convert (..., 3, 3) to pixels and m, third row scaled to a unit vector, positive below the horizon."""
-        h = np.linalg.inv(self.ground_N_m) @ np.linalg.inv(image_H_ground) @ self.image_N_px
-        return np.asarray(h / np.linalg.norm(h[..., 2, :], axis=-1)[..., None, None], dtype=np.float64)
+        return scaled(np.linalg.inv(self.ground_N_m) @ np.linalg.inv(image_H_ground) @ self.image_N_px)
+
+
+def scaled(h: Array) -> Array:
+    """Scale homographies (..., 3, 3) so that their third rows are unit vectors."""
+    return np.asarray(h / np.linalg.norm(h[..., 2, :], axis=-1)[..., None, None], dtype=np.float64)
 
 
 def normalize(points: Array) -> tuple[Array, Array]:

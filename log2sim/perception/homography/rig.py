@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, inverse
 from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.normalized import scaled
 
 # Ground ahead of a camera at which the errors of its homography are predicted.
 PROBE_M = 20.0
@@ -169,11 +170,6 @@ def _to_ground(rig: Rig, member: RigCamera, cam_H_ground: Array) -> Array:
     back = np.eye(3)
     back[:2, 2] = rig.origin_m[:2]
     return scaled(back @ np.linalg.inv(member.camera.K @ cam_H_ground))
-
-
-def scaled(h: Array) -> Array:
-    """Scale homographies (..., 3, 3) so that their third rows are unit vectors."""
-    return np.asarray(h / np.linalg.norm(h[..., 2, :], axis=-1)[..., None, None])
 
 
 # Parameters of feet: one that all cameras share, then of each camera the height of feet above the road, m, and its rotation.

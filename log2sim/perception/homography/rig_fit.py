@@ -23,7 +23,7 @@ from log2sim.perception.homography.estimate import (
     MIN_TESTED_FEET,
 )
 from log2sim.perception.homography.fit import MIN_INLIER_SHARE, MIN_INLIERS, HomographyFit, PitchRoll, refused_fit
-from log2sim.perception.homography.normalized import CHI2_2DOF_99
+from log2sim.perception.homography.normalized import CHI2_2DOF_99, MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
 from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, MIN_SIGNIFICANCE_SIGMA, HeldOutErrors
 from log2sim.perception.homography.rig import (
     OF_CAMERA,
@@ -53,8 +53,6 @@ GATES = (16 * CHI2_2DOF_99, 6 * CHI2_2DOF_99, 2 * CHI2_2DOF_99, CHI2_2DOF_99, CH
 LAST_GATES = 4
 # Of the shifts that single feet of a camera ask for so many are tried.
 MAX_CANDIDATES = 48
-# The assumed noise counts as a prior worth this many feet; an estimate departs from it by this factor at most.
-NOISE_PRIOR_ROWS, MAX_NOISE_FACTOR = 20.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,9 +248,10 @@ def fit_rig(
             fit = moving
         else:
             ticks, planes = ticks[:0], planes[:0]
-    result = _RigResult(rig, fit, foot_rows, ticks, planes, decision)
-    fits = {name: result.of_camera(name, feet.get(name) or Correspondences.join([])) for name in rig.cameras}
-    return RigFit("", rig, fits, fit.state, ticks, planes)
+    result = RigFit("", rig, {}, fit.state, ticks, planes)
+    found = {name: feet.get(name) or Correspondences.join([]) for name in rig.cameras}
+    fits = {name: _fit_of_camera(result, fit, foot_rows, name, data, decision) for name, data in found.items()}
+    return replace(result, fits=fits)
 
 
 def _heights(rig: Rig, rows: RigRows) -> HeightRows:
@@ -283,48 +282,27 @@ def _decide(rows: RigRows, fixed: FeetFit, moving: FeetFit, tilt: Array) -> Pitc
     return PitchRoll(significance > MIN_SIGNIFICANCE_SIGMA, "ground points", pitch, roll, (before, after), significance)
 
 
-@dataclass(frozen=True, eq=False)
-class _RigResult:
-    """The fit of a rig, from which the results of its cameras are made."""
-
-    rig: Rig
-    fit: FeetFit
-    rows: RigRows
-    ticks: NDArray[np.int64]
-    planes: Array
-    decision: PitchRoll | None
-
-    def of_camera(self, name: str, data: Correspondences) -> HomographyFit:
-        """Make the result of one camera, refused where its feet contradict the rig."""
-        number = list(self.rig.cameras).index(name)
-        own = self.rows.camera == number
-        count, agree = int(own.sum()), int((own & self.fit.inliers).sum())
-        needed = max(MIN_INLIERS, int(np.ceil(MIN_INLIER_SHARE * count)))
-        if count >= MIN_INLIERS and agree < needed:
-            reason = f"{agree} of {count} feet of its obstacles agree with the rig, at least {needed} are needed"
-            return refused_fit(reason, len(data))
-        h = foot_homography(self.rig, self.fit.state, name)
-        inliers = self._inliers(own, data)
-        distance = np.hypot(*(apply_homography(h, data.uv[inliers])[0] - data.xy_ego[inliers]).T)
-        known = distance[np.isfinite(distance)]
-        s = np.linalg.svd(h, compute_uv=False)
-        per_tick = foot_homography(self.rig, self.fit.state, name, self.planes) if len(self.ticks) else None
-        return HomographyFit(
-            True,
-            "",
-            h,
-            inliers,
-            float(np.median(known)) if len(known) else float("nan"),
-            float(s[0] / s[-1]),
-            self.ticks,
-            per_tick,
-            foot_sigma_m(self.rig, self.fit.state, name, self.fit.covariance_of(number)),
-            self.decision,
-        )
-
-    def _inliers(self, own: NDArray[np.bool_], data: Correspondences) -> NDArray[np.bool_]:
-        """Mark the correspondences (N,) of a camera that agree; the rows of the rig are sorted by tick, and finite."""
-        out = np.zeros(len(data), dtype=bool)
-        usable = np.flatnonzero(np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1))
-        out[usable[np.argsort(data.tick[usable], kind="stable")]] = self.fit.inliers[own]
-        return out
+def _fit_of_camera(
+    result: RigFit, fit: FeetFit, rows: RigRows, name: str, data: Correspondences, decision: PitchRoll | None
+) -> HomographyFit:
+    """Make the result of one camera of a rig, refused where its feet contradict the rig; `rows` are all feet."""
+    number = list(result.rig.cameras).index(name)
+    own = rows.camera == number
+    count, agree = int(own.sum()), int((own & fit.inliers).sum())
+    needed = max(MIN_INLIERS, int(np.ceil(MIN_INLIER_SHARE * count)))
+    if count >= MIN_INLIERS and agree < needed:
+        reason = f"{agree} of {count} feet of its obstacles agree with the rig, at least {needed} are needed"
+        return refused_fit(reason, len(data))
+    h = foot_homography(result.rig, fit.state, name)
+    # The rows of the rig are sorted by tick, and finite.
+    inliers, usable = (
+        np.zeros(len(data), dtype=bool),
+        np.flatnonzero(np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1)),
+    )
+    inliers[usable[np.argsort(data.tick[usable], kind="stable")]] = fit.inliers[own]
+    distance = np.hypot(*(apply_homography(h, data.uv[inliers])[0] - data.xy_ego[inliers]).T)
+    known = distance[np.isfinite(distance)]
+    error_m, s = float(np.median(known)) if len(known) else float("nan"), np.linalg.svd(h, compute_uv=False)
+    per_tick = foot_homography(result.rig, fit.state, name, result.planes) if len(result.ticks) else None
+    sigma_m = foot_sigma_m(result.rig, fit.state, name, fit.covariance_of(number))
+    return HomographyFit(True, "", h, inliers, error_m, float(s[0] / s[-1]), result.ticks, per_tick, sigma_m, decision)

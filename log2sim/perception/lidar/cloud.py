@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import ENDS, VEHICLE, Log, Obstacles, Rays, Sweep, end_of
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.boxes import upper_median
 
 CELL_M = 1.0
 REACH_M = 100.0
@@ -222,22 +221,44 @@ class AzimuthIndex:
         Next to an end of the object, rays at its height reach what lies behind it. If they stop at something nearer, if
         they hit the same surface, or if there are no rays at all, the object may extend beyond what was seen.
         """
-        clusters = _Clusters.of(self, members)
-        end, edge = clusters.ends()
-        range_m = clusters.ranges_near(edge)
+        size, count = len(self.rank), np.array([len(rows) for rows in members])
+        start, group = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
+        # NumPy sorts numbers of 32 bits in half the time.
+        kind = np.uint32 if len(count) * size < 2**32 else np.int64
+        ordered = np.sort((group * size + self.rank.take(np.concatenate(members))).astype(kind)).astype(np.int64)
+        row = ordered - group * size
+        azimuth = self.azimuth[row].astype(np.int64)
+        across = azimuth[start + count - 1] - azimuth[start] > STEPS_PER_TURN // 2
+        if across.any():
+            # Azimuths are negative for the points of a cluster that lie before the azimuth at which a turn begins.
+            azimuth = np.where(across[group] & (azimuth >= STEPS_PER_TURN // 2), azimuth - STEPS_PER_TURN, azimuth)
+            order = np.lexsort((azimuth, group))
+            row, azimuth = row[order], azimuth[order]
+        # Stray points are left out.
+        cut = np.minimum(np.round(TRIM * (count - 1)).astype(np.intp), MAX_TRIMMED_POINTS)
+        end = np.stack([start + cut, start + count - 1 - cut], axis=1)
+        edge = azimuth[end]
+        range_m = _medians_near(self.range_m[row], group, azimuth, edge)
         width = np.clip(WINDOW_M / np.maximum(range_m, 1e-3), MIN_WINDOW_RAD, MAX_WINDOW_RAD) / STEP_RAD
         sign = np.array([-1, 1])
         beside = np.sort([edge + 2 * sign, edge + sign * np.round(width).astype(np.int64)], axis=0)
-        window, row = self._between(*beside.reshape(2, -1))
-        slope, low, high = self.slope[row], *(np.repeat(v, 2)[window] for v in clusters.slopes())
-        found = np.flatnonzero((slope >= low) & (slope <= high))
-        found = found[~clusters.contain(window[found] // 2, row[found])]
-        window, row = window[found], row[found]
-        least_m = np.maximum(clusters.extended_face_ranges(end, window, self.azimuth[row]), range_m.ravel()[window])
-        beyond = self.range_m[row] > least_m + MIN_DEPTH_STEP_M
-        ends = end.size
-        rays = np.bincount(window[beyond], minlength=ends)
-        blocked = np.bincount(window[~beyond & self.obstacle[row]], minlength=ends)
+        window, other = self._between(*beside.reshape(2, -1))
+        # Rays are at the height of a cluster between its slopes.
+        slope, own = self.slope[other], self.slope[row]
+        low = np.minimum.reduceat(own, start) - np.float32(SLOPE_MARGIN)
+        high = np.maximum.reduceat(own, start) + np.float32(SLOPE_MARGIN)
+        found = np.flatnonzero((slope >= np.repeat(low, 2)[window]) & (slope <= np.repeat(high, 2)[window]))
+        window, other = window[found], other[found]
+        place = np.minimum(np.searchsorted(ordered, window // 2 * size + other), len(ordered) - 1)
+        foreign = ordered[place] != window // 2 * size + other
+        window, other = window[foreign], other[foreign]
+        # Some points of each cluster show its faces as well as all do.
+        some = np.flatnonzero((np.arange(len(row)) - start[group]) % -(-count // MAX_FACE_POINTS)[group] == 0)
+        corner, xy = (self.range_m[of][..., None] * _direction(self.azimuth[of]) for of in (row[end], row[some]))
+        goes_on_m = _extended_face_ranges(corner, group[some], xy, window, _direction(self.azimuth[other]))
+        beyond = self.range_m[other] > np.maximum(goes_on_m, range_m.ravel()[window]) + MIN_DEPTH_STEP_M
+        rays = np.bincount(window[beyond], minlength=end.size)
+        blocked = np.bincount(window[~beyond & self.obstacle[other]], minlength=end.size)
         return np.asarray(rays >= np.maximum(MIN_RAYS_BEYOND, blocked)).reshape(-1, 2)
 
     def _between(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -252,123 +273,62 @@ class AzimuthIndex:
         return np.repeat(np.arange(len(count)) // 2, count), np.repeat(start, count) + ordinal
 
 
-@dataclass(frozen=True, eq=False)
-class _Clusters:
-    """Points of R clusters, one cluster after the other, each in the order of their azimuths.
+def _medians_near(
+    range_m: NDArray[np.float32], group: NDArray[np.intp], azimuth: NDArray[np.int64], edge: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Return the upper medians (R, 2) of the ranges (K,) of clusters, in the order of their azimuths, around azimuths (R, 2)."""
+    # Azimuths of different clusters are so far apart that those of all clusters are sorted, windows across their ends included.
+    own = 3 * STEPS_PER_TURN
+    ordered, middle = group * own + azimuth, (own * np.arange(len(edge))[:, None] + edge).ravel()
+    low, high = np.searchsorted(ordered, [middle - MIN_WINDOW_STEPS + 1, middle + MIN_WINDOW_STEPS])
+    count = high - low
+    first, window = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
+    near = range_m[np.arange(len(window)) + np.repeat(low - first, count)]
+    return np.asarray(near[np.lexsort((near, window))][first + count // 2]).reshape(-1, 2)
 
-    Attributes
+
+def _extended_face_ranges(
+    corner: NDArray[np.float64],
+    group: NDArray[np.intp],
+    xy: NDArray[np.float64],
+    window: NDArray[np.intp],
+    ray: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Range (n,) in m, along rays (n, 2), of the face that ends at an end of a cluster, were it to go on; 0 at a corner.
+
+    Parameters
     ----------
-    count, start : (R,) int
-        Number of points of each cluster, and the place of its first.
-    group : (K,) int
-        The cluster of each point.
-    row : (K,) int
-        The point in the index.
-    azimuth : (K,) int64
-        In steps, negative for the points of a cluster that lie before the azimuth at which a turn begins.
-    ordered : (K,) int64
-        Cluster and row of each point in one number, in rising order.
+    corner : (R, 2, 2) float64
+        The points at the right and the left end of each cluster.
+    group, xy : (K,) int, (K, 2) float64
+        Points of the clusters, and which of them they belong to.
+    window : (n,) int
+        Twice the cluster, plus one at its left end.
     """
+    near, points = [], []
+    for side in range(2):
+        x, y = (xy - corner[group, side]).T
+        point = np.flatnonzero(x * x + y * y < FACE_M**2)
+        near.append(2 * group[point] + side)
+        points.append(xy[point])
+    of, (x, y) = np.concatenate(near), np.concatenate(points).T
+    count = np.maximum(np.bincount(of, minlength=2 * len(corner)), 1)
 
-    index: AzimuthIndex
-    count: NDArray[np.intp]
-    start: NDArray[np.intp]
-    group: NDArray[np.intp]
-    row: NDArray[np.intp]
-    azimuth: NDArray[np.int64]
-    ordered: NDArray[np.int64]
+    def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.bincount(of, values, minlength=2 * len(corner)), dtype=np.float64)
 
-    @classmethod
-    def of(cls, index: AzimuthIndex, members: Sequence[NDArray[np.intp]]) -> _Clusters:
-        """Sort the points of clusters, given as rows of the cloud."""
-        count = np.array([len(rows) for rows in members])
-        start, group = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
-        size = len(index.rank)
-        # NumPy sorts numbers of 32 bits in half the time.
-        kind = np.uint32 if len(count) * size < 2**32 else np.int64
-        ordered = np.sort((group * size + index.rank.take(np.concatenate(members))).astype(kind)).astype(np.int64)
-        row = ordered - group * size
-        azimuth = index.azimuth[row].astype(np.int64)
-        across = azimuth[start + count - 1] - azimuth[start] > STEPS_PER_TURN // 2
-        if across.any():
-            azimuth = np.where(across[group] & (azimuth >= STEPS_PER_TURN // 2), azimuth - STEPS_PER_TURN, azimuth)
-            order = np.lexsort((azimuth, group))
-            row, azimuth = row[order], azimuth[order]
-        return cls(index, count, start, group, row, azimuth, ordered)
-
-    def ends(self) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the place (R, 2) of the points at the ends, stray ones left out, and their azimuths (R, 2)."""
-        cut = np.minimum(np.round(TRIM * (self.count - 1)).astype(np.intp), MAX_TRIMMED_POINTS)
-        end = np.stack([self.start + cut, self.start + self.count - 1 - cut], axis=1)
-        return end, self.azimuth[end]
-
-    def ranges_near(self, edge: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the upper median (R, 2) of the ranges of a cluster's points around azimuths (R, 2)."""
-        # Azimuths of different clusters are so far apart that those of all clusters are sorted, windows across their ends included.
-        own = 3 * STEPS_PER_TURN
-        ordered, first = self.group * own + self.azimuth, own * np.arange(len(edge))[:, None] + edge
-        low = np.searchsorted(ordered, first - MIN_WINDOW_STEPS + 1).ravel().tolist()
-        high = np.searchsorted(ordered, first + MIN_WINDOW_STEPS).ravel().tolist()
-        ranges = self.index.range_m[self.row]
-        return np.array([upper_median(ranges[a:b]) for a, b in zip(low, high)]).reshape(-1, 2)
-
-    def slopes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the slopes (R,), (R,) between which rays are at the height of a cluster."""
-        slope = self.index.slope[self.row]
-        low, high = np.minimum.reduceat(slope, self.start), np.maximum.reduceat(slope, self.start)
-        return low - np.float32(SLOPE_MARGIN), high + np.float32(SLOPE_MARGIN)
-
-    def contain(self, group: NDArray[np.intp], row: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Mark points (n,) of the index that belong to a cluster (n,)."""
-        wanted = group * len(self.index.rank) + row
-        place = np.minimum(np.searchsorted(self.ordered, wanted), len(self.ordered) - 1)
-        return np.asarray(self.ordered[place] == wanted)
-
-    def extended_face_ranges(
-        self, end: NDArray[np.intp], window: NDArray[np.intp], azimuth: NDArray[np.uint16]
-    ) -> NDArray[np.float64]:
-        """Range (n,) in m, at azimuths (n,), of the face that ends at an end of a cluster, were it to go on; 0 at a corner.
-
-        Parameters
-        ----------
-        end : (R, 2) int
-            See `ends`.
-        window : (n,) int
-            Twice the cluster, plus one at its left end.
-        azimuth : (n,) uint16
-        """
-        # Some points of each cluster show its faces as well as all do.
-        place = np.arange(len(self.row)) - self.start[self.group]
-        some = np.flatnonzero(place % -(-self.count // MAX_FACE_POINTS)[self.group] == 0)
-        group = self.group[some]
-        corner, xy = (
-            self.index.range_m[row][..., None] * _direction(self.index.azimuth[row])
-            for row in (self.row[end], self.row[some])
-        )
-        near, points = [], []
-        for side in range(2):
-            x, y = (xy - corner[group, side]).T
-            point = np.flatnonzero(x * x + y * y < FACE_M**2)
-            near.append(2 * group[point] + side)
-            points.append(xy[point])
-        of, (x, y) = np.concatenate(near), np.concatenate(points).T
-        count = np.maximum(np.bincount(of, minlength=end.size), 1)
-
-        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(np.bincount(of, values, minlength=end.size), dtype=np.float64)
-
-        center_x, center_y = total(x) / count, total(y) / count
-        x, y = x - center_x[of], y - center_y[of]
-        xx, cross, yy = total(x * x), total(x * y), total(y * y)
-        # Eigenvalues and first eigenvector of a symmetric matrix of two rows.
-        mean, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, cross)
-        is_face = (count > 2) & (mean - radius <= MAX_FLATNESS * (mean + radius))
-        angle, ray = np.arctan2(2 * cross, xx - yy) / 2, _direction(azimuth)
-        along_x, along_y = np.cos(angle), np.sin(angle)
-        sine = ray[:, 0] * along_y[window] - ray[:, 1] * along_x[window]
-        distance = (center_x * along_y - center_y * along_x)[window]
-        meets_m = distance / np.where(sine == 0, np.inf, sine)
-        return np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
+    center_x, center_y = total(x) / count, total(y) / count
+    x, y = x - center_x[of], y - center_y[of]
+    xx, cross, yy = total(x * x), total(x * y), total(y * y)
+    # Eigenvalues and first eigenvector of a symmetric matrix of two rows.
+    mean, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, cross)
+    is_face = (count > 2) & (mean - radius <= MAX_FLATNESS * (mean + radius))
+    angle = np.arctan2(2 * cross, xx - yy) / 2
+    along_x, along_y = np.cos(angle), np.sin(angle)
+    sine = ray[:, 0] * along_y[window] - ray[:, 1] * along_x[window]
+    distance = (center_x * along_y - center_y * along_x)[window]
+    meets_m = distance / np.where(sine == 0, np.inf, sine)
+    return np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
 
 
 def _direction(azimuth: NDArray[np.uint16]) -> NDArray[np.float64]:

@@ -143,7 +143,7 @@ def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
 
 def _rows_of_boxes(boxes: Boxes3D, cloud: Cloud, members: Sequence[Index]) -> Measurements:
     """Return a row for each box (M,) with points of a cloud; with too few of its own it keeps the position of its box."""
-    rows = Measurements.of_boxes(boxes, cloud.sensor + cloud.origin)
+    rows = Measurements.from_boxes(boxes, cloud.sensor + cloud.origin)
     seen_by = np.array([cloud.ends_of(index) for index in members], dtype=bool)
     half_m = boxes.size_m[:, 2] / 2
     return replace(

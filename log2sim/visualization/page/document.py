@@ -20,7 +20,7 @@ from log2sim.datatypes import (
     Scenario,
     Trajectory,
     Waypoints,
-    why_doubtful,
+    explain_doubt,
 )
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
@@ -28,7 +28,7 @@ from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.simulation.expected_motion import ends_of
 from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.plot.layers import lane_arrows, lane_outline, shown_spans
-from log2sim.visualization.plot.viewport import assign_roles, is_moving
+from log2sim.visualization.plot.viewport import assign_view_roles, is_moving
 
 # Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s; standard deviations of cm, mrad and cm/s; predictions of
 # cm and mrad.
@@ -275,7 +275,7 @@ def _warnings(replay: Any) -> dict[str, Any]:
 
 def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
     """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
-    roles, tell_ends = assign_roles(scenario), len(ends_of(scenario)) > 1
+    roles, tell_ends = assign_view_roles(scenario), len(ends_of(scenario)) > 1
     for role in roles.movers:
         entry = _entry(role.agent, role.agent.waypoints, stationary=False, static=False)
         yield {
@@ -310,7 +310,7 @@ def _trust(agent: Agent) -> dict[str, Any]:
     w, points, source = agent.waypoints, agent.quality.get("points_median"), _source(agent)
     columns = {key: getattr(w, key) for key in SIGMAS}
     known = {key: c for key, c in columns.items() if c is not None and np.any(c > 0)}
-    low = () if agent.doubts or not agent.is_doubtful else (Finding("confidence", text=why_doubtful(agent)),)
+    low = () if agent.doubts or not agent.is_doubtful else (Finding("confidence", text=explain_doubt(agent)),)
     return {
         "confidence": round(agent.confidence, 4),
         "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in (*agent.doubts, *low)],

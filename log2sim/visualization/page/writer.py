@@ -114,17 +114,17 @@ def make_page(document: dict[str, Any], scenario: Scenario, recorded: Recorded |
     """
     document["scales"] = SCALES
     if recorded is not None:
-        rest = len(html_of(document).encode()) + MARGIN_BYTES
+        rest = len(page_html(document).encode()) + MARGIN_BYTES
         if rest >= recorded.max_bytes:
             raise ConfigError(f"--max-mb: the page has {rest / 1e6:.2f} MB without any picture; give more than that")
         document["recording"] = recording_document(scenario, recorded, recorded.max_bytes - rest)
-    page = html_of(document).encode()
+    page = page_html(document).encode()
     if recorded is not None and len(page) > recorded.max_bytes:
         raise ConfigError(f"--max-mb: the page has {len(page) / 1e6:.2f} MB at least; give as much")
     return page
 
 
-def html_of(document: dict[str, Any]) -> str:
+def page_html(document: dict[str, Any]) -> str:
     """Assemble the page; its content security policy allows this script and style by their hashes and nothing else.
 
     Only a page of the studio (`document["studio"]`) talks to anybody: the program that serves it.

@@ -24,7 +24,7 @@ from log2sim.datatypes import (
     Scenario,
     Signal,
     Span,
-    why_doubtful,
+    explain_doubt,
 )
 from log2sim.geometry import Array
 from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
@@ -48,7 +48,7 @@ from log2sim.visualization.plot.style import (
     SIGNAL_COLOR,
     WARNING,
     halo,
-    printable,
+    printable_label,
 )
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy
 
@@ -333,7 +333,7 @@ def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[An
     doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
     rows: list[tuple[Any, str]] = []
     for agent, color in doubtful[:MAX_NAMED]:
-        rows.append((_hatched_patch(color), _wrapped(f"{agent.id} is doubtful: {why_doubtful(agent)}")))
+        rows.append((_hatched_patch(color), _wrapped(f"{agent.id} is doubtful: {explain_doubt(agent)}")))
     if len(doubtful) > MAX_NAMED:
         rows.append((Patch(fc="none", ec="none"), f"and {len(doubtful) - MAX_NAMED} more doubtful"))
     if not doubtful and any(a.is_doubtful for a in roles.stationary):
@@ -346,7 +346,7 @@ def _hatched_patch(color: str) -> Patch:
 
 
 def _wrapped(text: str) -> str:
-    whole = printable(text, LINE_LETTERS * MAX_LINES)
+    whole = printable_label(text, LINE_LETTERS * MAX_LINES)
     return "\n".join(textwrap.wrap(whole, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …"))
 
 

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch, Polygon
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
-from log2sim.datatypes import STANDSTILL_MPS, Agent, why_doubtful
+from log2sim.datatypes import STANDSTILL_MPS, Agent, explain_doubt
 from log2sim.geometry import Array
 from log2sim.visualization.plot import viewport
 from log2sim.visualization.plot.style import (
@@ -33,7 +33,7 @@ from log2sim.visualization.plot.style import (
     PARKED_FACE,
     SENSOR_PT,
     halo,
-    printable,
+    printable_label,
 )
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, nice_step
 
@@ -76,7 +76,7 @@ class Placed:
 
 def short_label(role: AgentRole) -> str:
     """Return what marks a mover on the map where there is little room."""
-    return printable(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
+    return printable_label(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
 
 
 def speed_text(agent: Agent) -> str:
@@ -87,7 +87,7 @@ def speed_text(agent: Agent) -> str:
 
 def full_label(role: AgentRole) -> str:
     """Return id and highest speed of a mover."""
-    return f"{printable(role.agent.id, MAX_ID_LETTERS)}{'?' * role.agent.is_doubtful} · {speed_text(role.agent)}"
+    return f"{printable_label(role.agent.id, MAX_ID_LETTERS)}{'?' * role.agent.is_doubtful} · {speed_text(role.agent)}"
 
 
 def place_labels(
@@ -119,7 +119,7 @@ def place_labels(
             _place_doubtful(agent, room, placed)
         elif static:
             anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
-            place = room.place(name := printable(agent.id, MAX_ID_LETTERS), DETAIL_PT, [anchor])
+            place = room.place(name := printable_label(agent.id, MAX_ID_LETTERS), DETAIL_PT, [anchor])
             placed.labels += [] if place is None else [MapLabel(name, MUTED, place, DETAIL_PT, bold=False)]
     if roles.movers and roles.movers[0].is_ego:
         _place_times(roles.movers[0].agent, times_step_s, room, placed)
@@ -239,7 +239,7 @@ def _along(agent: Agent) -> Iterator[Anchor]:
 def _place_doubtful(agent: Agent, room: LabelRoom, placed: Placed) -> None:
     """Write the id of a doubtful stationary agent beside it, with the reason if there is room for it."""
     anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
-    name, reason = f"{printable(agent.id, MAX_ID_LETTERS)}?", printable(why_doubtful(agent))
+    name, reason = f"{printable_label(agent.id, MAX_ID_LETTERS)}?", printable_label(explain_doubt(agent))
     for text in (f"{name} {reason}", name):
         whole = text != name
         place = None if whole and len(reason) > MAX_REASON_LETTERS else room.place(text, DETAIL_PT, [anchor])
@@ -423,8 +423,10 @@ def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
     height = layout.figure.get_figheight()
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
     x = LEFT_IN / layout.width_in
-    layout.figure.text(x, 1 - 0.36 / height, printable(title, 70), fontsize=13, fontweight="bold", color=INK, **style)
-    layout.figure.text(x, 1 - 0.59 / height, printable(subtitle, 130), fontsize=8, color=MUTED, **style)
+    layout.figure.text(
+        x, 1 - 0.36 / height, printable_label(title, 70), fontsize=13, fontweight="bold", color=INK, **style
+    )
+    layout.figure.text(x, 1 - 0.59 / height, printable_label(subtitle, 130), fontsize=8, color=MUTED, **style)
 
 
 def draw_legend(layout: FigureLayout, rows: list[tuple[Any, str]]) -> None:
@@ -513,7 +515,7 @@ def _reading_order(role: AgentRole) -> tuple[bool, str, int, str]:
 
 
 def _name(role: AgentRole) -> str:
-    name, moving = "ego" if role.is_ego else printable(role.agent.id, 20), speed_text(role.agent)
+    name, moving = "ego" if role.is_ego else printable_label(role.agent.id, 20), speed_text(role.agent)
     known = role.is_ego or role.agent.id.startswith(role.agent.category)
     return f"{name} · {moving}" if known else f"{name} · {role.agent.category} · {moving}"
 

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from log2sim.files.documents import replaced
-from log2sim.visualization.plot.style import FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, printable
+from log2sim.visualization.plot.style import FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, printable_label
 
 SIDE_IN = 3.4
 # Area of the mark of the bin with the most boxes; the others in proportion, which shows what they weigh.
@@ -55,5 +55,5 @@ def _draw(axes: Axes, diagram: Reliability) -> None:
     axes.spines[:].set_color(FRAME)
     axes.set_xlabel("mean confidence", fontsize=8, color=MUTED, family=FONT)
     axes.set_ylabel(f"share of right {diagram.noun}", fontsize=8, color=MUTED, family=FONT)
-    title = f"{printable(diagram.name, 40)}: {sum(count)} {diagram.noun}, error {diagram.error:.3f}"
+    title = f"{printable_label(diagram.name, 40)}: {sum(count)} {diagram.noun}, error {diagram.error:.3f}"
     axes.set_title(title, fontsize=8.5, color=INK, family=FONT, loc="left")

@@ -41,7 +41,7 @@ from log2sim.visualization.plot.time_series import TimelineCharts, charts_height
 from log2sim.visualization.plot.viewport import (
     AgentRoles,
     Viewport,
-    assign_roles,
+    assign_view_roles,
     centers_xy,
     choose_viewport,
     is_moving,
@@ -238,7 +238,7 @@ def plot(
         import matplotlib.pyplot as plt
 
         ax = plt.subplots(figsize=SIZE_IN, layout="constrained")[1]
-    roles = assign_roles(scenario)
+    roles = assign_view_roles(scenario)
     view = _set_view(ax, roles)
     step_s = time_step_s(scenario.duration_s, len(roles.movers), _usual_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)

@@ -57,7 +57,7 @@ def halo(width_pt: float = 2.2) -> list[AbstractPathEffect]:
     return [withStroke(linewidth=width_pt, foreground=PAPER, alpha=0.9)]
 
 
-def printable(text: str, longest: int = 80) -> str:
+def printable_label(text: str, longest: int = 80) -> str:
     """Put text on one line of at most `longest` letters, with "?" for characters that the font lacks."""
     known = _characters()
     line = "".join(c if ord(c) in known else "?" for c in " ".join(text.split()))

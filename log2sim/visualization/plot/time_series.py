@@ -23,14 +23,14 @@ from log2sim.visualization.plot.layout import (
     TIME_IN,
     FigureLayout,
 )
-from log2sim.visualization.plot.style import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable
+from log2sim.visualization.plot.style import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable_label
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 
 KMH = 3.6
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class TimeCurve:
     """One curve of a chart."""
 
     label: str
@@ -48,7 +48,7 @@ class Chart:
     name: str
     unit: str
     min_span: float  # smallest range of the value axis, in `unit`
-    lines: tuple[Curve, ...]  # an animation shows the present value of the last one
+    lines: tuple[TimeCurve, ...]  # an animation shows the present value of the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
     out = [
         Chart(
             "speed", "km/h", 4.0,
-            (Curve("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), Curve("replay", t, agent.speed_mps * KMH)),
+            (TimeCurve("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), TimeCurve("replay", t, agent.speed_mps * KMH)),
         )
     ]  # fmt: skip
     if agent.commands is not None:
@@ -90,18 +90,18 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
         # The pedal acts along the gear's direction, which in reverse is against the heading.
         response = agent.accel_mps2 * commands.gear
         out += [
-            Chart("pedal", "m/s²", 1.0, (Curve("command", t, commands.pedal_mps2, "ribbon"), Curve("response", t, response))),
+            Chart("pedal", "m/s²", 1.0, (TimeCurve("command", t, commands.pedal_mps2, "ribbon"), TimeCurve("response", t, response))),
             Chart(
                 "steering", "°", 2.0,
                 (
-                    Curve("command", t, np.degrees(commands.steer_rad), "ribbon"),
-                    Curve("response", t, np.degrees(agent.steer_rad)),
+                    TimeCurve("command", t, np.degrees(commands.steer_rad), "ribbon"),
+                    TimeCurve("response", t, np.degrees(agent.steer_rad)),
                 ),
             ),
         ]  # fmt: skip
     lines = (
-        Curve("along (+ ahead)", t, agent.along_track_m, "muted"),
-        Curve("across (+ left)", t, agent.cross_track_m),
+        TimeCurve("along (+ ahead)", t, agent.along_track_m, "muted"),
+        TimeCurve("across (+ left)", t, agent.cross_track_m),
     )
     return (*out, Chart("tracking error", "m", 0.1, lines))
 
@@ -156,7 +156,7 @@ def draw_charts(
     role = timeline.role
     name = role.agent.id
     layout.figure.text(
-        LEFT_IN / layout.width_in, (top + HEAD_IN - 0.16) / height, f"{printable(name, 40)} in the replay, driven by {_spoken(timeline.driver)}",
+        LEFT_IN / layout.width_in, (top + HEAD_IN - 0.16) / height, f"{printable_label(name, 40)} in the replay, driven by {_spoken(timeline.driver)}",
         family=FONT, fontsize=8.5, fontweight="bold", color=role.color, parse_math=False, va="baseline",
     )  # fmt: skip
     return TimelineCharts(timeline, tuple(axes))
@@ -233,7 +233,7 @@ def _limits(chart: Chart) -> tuple[float, float]:
     return low - below - pad, high + missing - below + pad
 
 
-def _with_largest(line: Curve, chart: Chart) -> str:
+def _with_largest(line: TimeCurve, chart: Chart) -> str:
     largest = float(line.values[np.argmax(np.abs(line.values))])
     return f"{line.label} · max {_number(largest, chart)}"
 

@@ -34,7 +34,7 @@ from log2sim.visualization.plot.selection import (
     cut_scenario,
     select_shown,
 )
-from log2sim.visualization.plot.viewport import AgentRoles, assign_roles
+from log2sim.visualization.plot.viewport import AgentRoles, assign_view_roles
 
 
 def plot_tracks(
@@ -80,7 +80,7 @@ def plot_tracks(
         options=options,
     )
     scenario = cut_scenario(scenario, span)
-    roles = assign_roles(scenario, whole)
+    roles = assign_view_roles(scenario, whole)
     if suffix in MOVING:
         from log2sim.visualization.plot.animation import write_animation
 

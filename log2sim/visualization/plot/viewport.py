@@ -43,7 +43,7 @@ class AgentRoles:
     stationary: tuple[Agent, ...]
 
 
-def assign_roles(scenario: Scenario, whole: Scenario | None = None, max_leading: int = len(PALETTE)) -> AgentRoles:
+def assign_view_roles(scenario: Scenario, whole: Scenario | None = None, max_leading: int = len(PALETTE)) -> AgentRoles:
     """Split agents into movers and static ones; movers by closest approach to the ego, without one by distance driven.
 
     Where `scenario` is a part of a `whole` one, its agents keep their colors of the whole: those of every picture, film and page.

@@ -1,0 +1,252 @@
+"""Where a policy fails in a logical scenario, searched by the cross-entropy method, and how probable that is."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from log2sim.datatypes import EGO, Scenario
+from log2sim.errors import ConfigError
+from log2sim.files.plugins import nearest
+from log2sim.geometry import Array
+from log2sim.scenarios.logical import Base, Logical
+from log2sim.simulation.policy import Policy
+from log2sim.simulation.result import Replay
+from log2sim.simulation.runner import replay
+
+STEP_S = 0.05
+ELITE = 0.2  # share of the runs nearest to a failure that the next are drawn around
+DEFENSIVE = 0.2  # share of the last runs that are drawn from the fitted distribution itself, which bounds the weights
+ROUNDS = 4
+LEVEL_Z = 1.959964  # 95 %
+
+Margins = Callable[[Array], Array]
+
+
+class Estimate(NamedTuple):
+    """A probability of failure with its interval of 95 %."""
+
+    probability: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Runs of a search: independent standard normal scores (R, D), their margins (R,), negative for failures, and the estimate."""
+
+    scores: Array
+    margins: Array
+    estimate: Estimate
+
+
+def search(margins: Margins, dimensions: int, runs: int, rng: np.random.Generator) -> Search:
+    """Search for failures, and estimate how probable they are when scores are standard normal.
+
+    Parameters
+    ----------
+    margins : callable
+        Returns how far (M,) runs with scores (M, D) are from a failure, negative for failures.
+    runs : int
+        In all; half of them search, the others estimate.
+
+    Notes
+    -----
+    Cross-entropy method (Rubinstein and Kroese, "The Cross-Entropy Method", 2004; for driving O'Kelly et al., NeurIPS 2018): the
+    mean of the normal distribution that runs are drawn from moves to those nearest to a failure, weighed by likelihood ratios, until a
+    fifth of them fail. The estimate is by importance sampling from a mixture of that and the given distribution, which bounds weights by
+    1 / `DEFENSIVE` (Hesterberg 1995); its interval is that of the mean of weights. Without any failure the interval's end is that of
+    the rule of three. Failures in several places that are far from each other need more runs.
+    """
+    mean = np.zeros(dimensions)
+    each = max(runs // (2 * ROUNDS), 10)
+    all_z, all_m = [], []
+    for _ in range(ROUNDS):
+        z = mean + rng.standard_normal((each, dimensions))
+        m = margins(z)
+        all_z.append(z)
+        all_m.append(m)
+        level = max(float(np.quantile(m, ELITE)), 0.0)
+        elite = z[m <= level]
+        # Given against drawn: the ratio of the normal densities around 0 and around the mean.
+        logarithm = (mean @ mean) / 2 - elite @ mean
+        weight = np.exp(logarithm - logarithm.max())
+        mean = weight @ elite / weight.sum()
+        if level <= 0.0 and len(all_m) > 1:
+            break
+    last = max(runs - sum(map(len, all_m)), 20)
+    given = rng.random(last) < DEFENSIVE
+    z = rng.standard_normal((last, dimensions)) + np.where(given[:, None], 0.0, mean)
+    m = margins(z)
+    drawn = DEFENSIVE + (1.0 - DEFENSIVE) * np.exp(z @ mean - (mean @ mean) / 2)
+    weight = np.where(m <= 0, 1.0 / drawn, 0.0)
+    p = float(weight.mean())
+    half = LEVEL_Z * float(weight.std(ddof=1)) / np.sqrt(last)
+    high = p + half if p > 0 else 3.0 / DEFENSIVE / last
+    estimate = Estimate(min(p, 1.0), max(p - half, 0.0), min(high, 1.0))
+    return Search(np.concatenate([*all_z, z]), np.concatenate([*all_m, m]), estimate)
+
+
+LIMITS: Mapping[str, tuple[str, float]] = {
+    "min_ttc_s": ("least time to collision of the ego", 1.0),
+    "min_pet_s": ("least post-encroachment time of the ego", 1.0),
+    "min_gap_m": ("least distance of the ego from others", 1.0),
+    "max_brake_mps2": ("hardest braking of the ego", -1.0),
+}
+"""What else than a collision may be a failure: below a limit, or, for the last, above it."""
+
+
+class Outcome(NamedTuple):
+    """What came of a run."""
+
+    margin: float  # how far it was from a failure, negative for failures
+    values: dict[str, float]  # figures of the ego
+    problem: str = ""  # why the policy could not drive
+
+
+def drive(base: Base, logical: Logical, policy: Policy, agents: str, values: Array) -> tuple[Scenario, Replay]:
+    """Run a policy in the concrete scenario of parameters (D,)."""
+    made = base.varied(base.timings(logical, values), base.scenario.name)
+    return made, replay(made, mode="exact", dt_s=STEP_S, ego=policy, agents=agents)
+
+
+def judge_run(
+    base: Base, logical: Logical, policy: Policy, limits: Mapping[str, float], agents: str, values: Array
+) -> Outcome:
+    """Run a policy and say how far it was from a failure: a collision, a figure beyond its limit, or an error of its own.
+
+    The margin is the least gap, m, and after a collision less the speed of the impact; figures count by how far they are within limits.
+    """
+    try:
+        _, done = drive(base, logical, policy, agents, values)
+    except Exception:  # whatever a policy raises is a failure of it, and the other runs go on
+        return Outcome(-1e3, {}, traceback.format_exc(limit=-8))
+    ego, own = done.metrics["ego"], done.metrics["by_agent"].get(EGO, {})
+    hits = [e for e in done.metrics["collisions"] if EGO in e["agents"]]
+    gap, brake = ego["min_gap"], ego["max_brake"]
+    figures = {
+        "min_gap_m": np.inf if gap is None else float(gap["m"]),
+        "max_brake_mps2": 0.0 if brake is None else float(brake["mps2"]),
+        **{name: np.inf if own.get(name) is None else float(own[name]) for name in ("min_ttc_s", "min_pet_s")},
+    }
+    margin = figures["min_gap_m"]
+    if hits:
+        margin = -max(float(e["relative_speed_mps"]) for e in hits) - 1e-3
+    for name, limit in limits.items():
+        margin = min(margin, LIMITS[name][1] * (figures[name] - limit))
+    figures = {name: value for name, value in figures.items() if np.isfinite(value)}
+    return Outcome(min(margin, 1e3), {**figures, **({"impact_mps": -margin} if hits else {})})
+
+
+def parse_limits(texts: Sequence[str]) -> dict[str, float]:
+    """Parse limits such as "min_ttc_s=1.5"; raise `ConfigError` for others."""
+    out = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in LIMITS:
+            raise ConfigError(
+                f"--limit {text}{nearest(name, list(LIMITS))}: expected NAME=VALUE with one of {', '.join(LIMITS)}"
+            )
+        try:
+            out[name] = float(value)
+        except ValueError:
+            raise ConfigError(f"--limit {text}: '{value}' is no number") from None
+    return out
+
+
+def with_ego(base: Base) -> Base:
+    """Return a base whose ego is one of both agents: the one it is, else the other, whose path counts."""
+    if any(a.id == EGO for a in base.scenario.agents):
+        return base
+    driver = base.row.get("other", base.row["agent"])
+    agents = tuple(replace(a, id=EGO) if a.id == driver else a for a in base.scenario.agents)
+    moments = {EGO if id == driver else id: t_s for id, t_s in base.moment_s.items()}
+    row = {**base.row, **{role: EGO for role in ("agent", "other") if base.row.get(role) == driver}}
+    return Base(replace(base.scenario, agents=agents), moments, row)
+
+
+STYLE = """
+:root { --paper: #FFFFFF; --ink: #1B2330; --muted: #667080; --grid: #E4E8ED; color-scheme: light dark; }
+@media (prefers-color-scheme: dark) { :root { --paper: #171C24; --ink: #E9EDF3; --muted: #97A2B2; --grid: #2A323D; } }
+body { padding: 16px 20px 40px; background: var(--paper); color: var(--ink); font: 13px/1.45 "DejaVu Sans", Verdana, system-ui, sans-serif; }
+h1 { font-size: 17px; } h2 { font-size: 14px; } small { color: var(--muted); } pre { overflow-x: auto; }
+td, th { padding: 3px 12px 3px 0; text-align: right; border-bottom: 1px solid var(--grid); }
+svg { width: 320px; margin: 8px; background: var(--grid); border-radius: 4px; }
+circle { fill: #1565C0; fill-opacity: .5; } circle.failed { fill: #C62828; fill-opacity: 1; } text { fill: var(--ink); font-size: 9px; }
+"""
+
+
+def report_page(
+    title: str,
+    logical: Logical,
+    values: Array,
+    outcomes: Sequence[Outcome],
+    estimate: Estimate,
+    links: Mapping[int, str],
+) -> str:
+    """Return the page of a test: the probability, the parameters with failures in red, and the worst runs; `links` by run."""
+    failed = np.array([o.margin <= 0 for o in outcomes])
+    plots = [_scatter(logical.names, values, failed, i, j) for i in range(len(logical.names)) for j in range(i)]
+    worst = sorted(range(len(outcomes)), key=lambda k: outcomes[k].margin)[:30]
+    keys = sorted({key for k in worst for key in outcomes[k].values})
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in ("run", "margin", *logical.names, *keys))
+    rows = []
+    for k in worst:
+        run = f'<a href="{html.escape(links[k])}">{k + 1}</a>' if k in links else str(k + 1)
+        cells = [
+            f"{outcomes[k].margin:.3g}",
+            *(f"{v:.4g}" for v in values[k]),
+            *(f"{outcomes[k].values[key]:.3g}" if key in outcomes[k].values else "" for key in keys),
+        ]
+        rows.append(f"<tr><td>{run}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>")
+    problems = sorted({o.problem for o in outcomes if o.problem})
+    said = "".join(f"<pre>{html.escape(text)}</pre>" for text in problems[:3])
+    digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
+        f"style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'\"><title>{html.escape(title)}</title><style>{STYLE}</style></head>"
+        f"<body><h1>{html.escape(title)}</h1><p>Probability of failure {say_estimate(estimate)}; {failed.sum()} of {len(outcomes)} runs failed, "
+        f"most of which were drawn where it fails.</p>{''.join(plots)}<h2>Nearest to a failure</h2><table><tr>{head}</tr>{''.join(rows)}</table>{said}</body></html>\n"
+    )
+
+
+def say_estimate(estimate: Estimate) -> str:
+    """Say a probability with its interval."""
+    return f"{estimate.probability:.3g} (95 %: {estimate.low:.2g} to {estimate.high:.2g})"
+
+
+def _scatter(names: Sequence[str], values: Array, failed: Array, i: int, j: int) -> str:
+    """Draw two parameters of all runs."""
+    x, y = values[:, j], values[:, i]
+    (x0, x1), (y0, y1) = ((v.min(), max(v.max(), v.min() + 1e-9)) for v in (x, y))
+    dots = "".join(
+        f'<circle{" class=failed" if bad else ""} cx="{20 + 270 * (a - x0) / (x1 - x0):.1f}" cy="{190 - 170 * (b - y0) / (y1 - y0):.1f}" r="2"/>'
+        for a, b, bad in zip(x.tolist(), y.tolist(), failed.tolist())
+    )
+    label = f"{html.escape(names[j])} {x0:.3g} to {x1:.3g}; {html.escape(names[i])} {y0:.3g} to {y1:.3g}"
+    return f'<svg viewBox="0 0 310 215" role="img">{dots}<text x="10" y="208">{label}</text></svg>'
+
+
+def runner(
+    base: Base, logical: Logical, policy: Policy, limits: Mapping[str, float], agents: str
+) -> Callable[[Array], Outcome]:
+    """Return a function that judges the policy at parameters (D,), for processes."""
+    return partial(judge_run, base, logical, policy, limits, agents)
+
+
+def describe(
+    policy: str, condition: str, logical: Logical, found: Search, outcomes: Sequence[Outcome]
+) -> dict[str, Any]:
+    """Return the document of a test."""
+    return {
+        "policy": policy, "condition": condition, "runs": len(outcomes), "failures": int((found.margins <= 0).sum()),
+        "errors": sum(bool(o.problem) for o in outcomes), "probability": found.estimate._asdict(), **logical.to_dict(),
+    }  # fmt: skip

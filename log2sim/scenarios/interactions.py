@@ -1,0 +1,362 @@
+"""Tags of two agents: following, cut-ins, overtaking, crossing paths and near misses.
+
+The other agent is the one whose path and lane count: where it drives in the scenario, so that bends of the road need no map.
+Terms as in ISO 34502:2022 (cut-in, cut-out, deceleration), ISO 34504:2024 and UN Regulation 157.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from log2sim.datatypes import Tag
+from log2sim.geometry import Array, box_corners_bev, wrap_angle
+from log2sim.prediction.motion_table import TICK_S
+from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
+from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
+from log2sim.scenarios.traffic import SAME_WAY_RAD, SIDE_M, Beside, Traffic, latched, probability_above, runs, turned
+from log2sim.simulation.metrics.collisions import BoxTracks
+from log2sim.simulation.metrics.conflicts import CROSSING_RAD, post_encroachment_times, time_to_touch
+
+FOLLOWING_S = 3.0
+"""Time headway up to which a vehicle follows another (HCM 2016, percent time spent following)."""
+
+LEADING_S = 4.0
+"""Time headway up to which a vehicle that changes lanes cuts in or out: with more, drivers choose their speed freely."""
+
+APPROACHING_MPS, APPROACHING_S = 2.0, 10.0
+"""Closing speed and time to collision of who approaches another."""
+
+CROSSING_S = 5.0
+"""Post-encroachment time up to which two that cross each other's path have to do with each other."""
+
+NEAR_TTC_S, NEAR_PET_S, NEAR_DRAC_MPS2 = 1.5, 1.0, 3.35
+"""Limits of near misses: TTC of Hyden (1987), PET of Allen, Shin and Cooper (1978), DRAC of Archer (2005)."""
+
+JOINING_RAD = np.radians(25.0)
+"""Who comes into a lane with more than that turns into it; lane changes have less than 10 degrees."""
+
+KEEPING_MPS = 0.5
+"""Lateral speed of who keeps a lane: a third to a half of those in lane changes."""
+
+ONCOMING_RAD = np.radians(135.0)
+WINDOW = round(4.0 / TICK_S)  # ticks around a lane's edge in which a lane change is looked at
+
+
+def pair_tags(traffic: Traffic) -> Iterator[Tag]:
+    """Find what agents do to each other."""
+    for r in range(len(traffic.ids)):
+        beside = traffic.beside(r)
+        if beside is None:
+            continue
+        for o in np.flatnonzero(np.isfinite(beside.ahead_m).any(axis=1)).tolist():
+            yield from _following(traffic, beside, r, o)
+            if traffic.wheeled[o] and not traffic.table.agents[o].static:
+                yield from _lane_changes(traffic, beside, r, o)
+                yield from _overtaking(traffic, beside, r, o)
+                yield from _oncoming(traffic, beside, r, o)
+            elif traffic.table.group[o] == "pedestrian":
+                yield from _stepping_out(traffic, beside, r, o)
+    yield from _crossings(traffic)
+
+
+def _sigma_ttc(traffic: Traffic, gap_m: float, closing_mps: float, sigma_m: float, a: int, b: int, n: int) -> float:
+    """Return the standard deviation of gap / closing speed, by both their errors."""
+    sigma_mps = float(np.hypot(traffic.sigma_speed_mps[a, n], traffic.sigma_speed_mps[b, n]))
+    return float(np.hypot(sigma_m / closing_mps, gap_m * sigma_mps / closing_mps**2)) if closing_mps > 0 else np.inf
+
+
+def _lane_measures(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> dict[str, float]:
+    """Return gap, relative speed and measures of criticality of agent `r` behind `o` at a tick."""
+    gap, own, speed = b.gap_m[o, n], traffic.speed_mps[r, n], traffic.speed_mps[o, n] * np.cos(b.turn_rad[o, n])
+    closing = own - speed
+    return {
+        "gap_m": gap, "relative_speed_mps": -closing, "ttc_s": float(time_to_collision(gap, closing)),
+        "time_headway_s": float(time_headway(gap, own)), "drac_mps2": float(deceleration_to_avoid(gap, closing)),
+    }  # fmt: skip
+
+
+def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+    """Find when `r` follows or approaches `o`, and where that is a near miss."""
+    if not (traffic.wheeled[o] and (b.leader == o).any()):
+        return
+    own, speed = traffic.speed_mps[r], traffic.speed_mps[o] * np.cos(b.turn_rad[o])
+    closing, gap = own - speed, b.gap_m[o]
+    ahead = (b.leader == o) & (own >= MOVING_MPS) & (gap > 0)
+    ttc = time_to_collision(gap, closing)
+    headway = time_headway(gap, own)
+    for i, j in runs(
+        ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0),
+        round(1.0 / TICK_S),
+        BREAK,
+    ):
+        n = i + int(np.argmin(headway[i : j + 1]))
+        sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
+        yield tag_of(
+            traffic,
+            "following",
+            r,
+            (i, n, j),
+            sure,
+            o,
+            duration_s=(j - i) * TICK_S,
+            **_lane_measures(traffic, b, r, o, n),
+        )
+    for i, j in runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S), BREAK):
+        n = i + int(np.argmin(ttc[i : j + 1]))
+        sigma_mps = np.hypot(traffic.sigma_speed_mps[r, n], traffic.sigma_speed_mps[o, n])
+        sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]) * probability_above(
+            closing[n], 0.0, sigma_mps
+        )
+        yield tag_of(traffic, "approaching", r, (i, n, j), sure, o, **_lane_measures(traffic, b, r, o, n))
+    drac = deceleration_to_avoid(gap, closing)
+    on_course = np.abs(b.aside_m[o]) < (traffic.table.size_m[r, 1] + traffic.table.size_m[o, 1]) / 2
+    near = ahead & on_course & (closing > 1.0) & ((ttc < NEAR_TTC_S) | (drac > NEAR_DRAC_MPS2))
+    for i, j in runs(near, 2):
+        n = i + int(np.argmin(ttc[i : j + 1]))
+        sigma_m = np.hypot(traffic.sigma_m[r, n], traffic.sigma_m[o, n])
+        sigma_mps = np.hypot(traffic.sigma_speed_mps[r, n], traffic.sigma_speed_mps[o, n])
+        by_time = probability_above(-ttc[n], -NEAR_TTC_S, _sigma_ttc(traffic, gap[n], closing[n], sigma_m, r, o, n))
+        peak = i + int(np.argmax(drac[i : j + 1]))
+        sigma_drac = drac[peak] * np.hypot(2 * sigma_mps / closing[peak], sigma_m / max(gap[peak], 0.1))
+        sure = max(by_time, probability_above(drac[peak], NEAR_DRAC_MPS2, sigma_drac))
+        sure *= probability_above(
+            (traffic.table.size_m[[r, o], 1].sum()) / 2 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]
+        )
+        yield tag_of(
+            traffic,
+            "near_miss",
+            r,
+            (i, n, j),
+            sure,
+            o,
+            **{**_lane_measures(traffic, b, r, o, n), "drac_mps2": drac[peak]},
+        )
+
+
+def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+    """Find when `o` comes into the lane of `r` ahead of it, or leaves it there."""
+    known = np.isfinite(b.aside_m[o]) & (b.ahead_m[o] > 0)
+    inside = b.in_lane[o]
+    off = np.abs(b.aside_m[o])
+    for n in (np.flatnonzero(inside[1:] != inside[:-1]) + 1).tolist():
+        enters = bool(inside[n])
+        beyond = ~(off[:n] < b.half_m) if enters else ~(off[:n] > b.half_m)
+        crossing = int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0
+        first, last = max(crossing - WINDOW, 0), min(max(crossing, n) + WINDOW, len(known) - 1)
+        if crossing == 0 or not known[crossing - 1 : n + 1].all() or not b.same_way[o, n if enters else crossing - 1]:
+            continue
+        while not known[first]:
+            first += 1
+        while not known[last]:
+            last -= 1
+        begin, end, lateral = lateral_extent(b.aside_m[o, first : last + 1], crossing - first)
+        begin, end = first + begin, first + end
+        measures = _lane_measures(traffic, b, r, o, crossing)
+        led = (
+            b.leader[crossing - 1 : min(crossing + WINDOW, len(known))]
+            if enters
+            else b.leader[max(crossing - WINDOW, 0) : crossing + 1]
+        ) == o
+        if min(traffic.speed_mps[r, crossing], traffic.speed_mps[o, crossing]) < MOVING_MPS or not led.any():
+            continue
+        if measures["time_headway_s"] > LEADING_S:
+            continue
+        # Who joins turns itself; who was there before the other turned in behind it does not.
+        turn = abs(turned(traffic.course_rad[o], begin, end))
+        joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD and turn > JOINING_RAD
+        if not joins and (turn > JOINING_RAD or not _is_change_of(traffic, b, r, o, crossing)):
+            continue
+        outer, inner = (
+            (off[begin : crossing + 1], off[crossing : end + 1])
+            if enters
+            else (off[crossing : end + 1], off[begin : crossing + 1])
+        )
+        sigma = float(b.sigma_m[o, crossing])
+        sure = probability_above(np.nanmax(outer), b.half_m, sigma) * probability_above(
+            -np.nanmin(inner), -b.half_m, sigma
+        )
+        sure *= probability_above(
+            b.ahead_m[o, crossing], 0.0, np.hypot(traffic.sigma_m[r, crossing], traffic.sigma_m[o, crossing])
+        )
+        tag = "merging" if joins else "cut_in" if enters else "cut_out"
+        yield tag_of(traffic, tag, o, (begin, crossing, end), sure, r, lateral_speed_mps=abs(lateral), duration_s=(end - begin) * TICK_S,
+                     side=np.sign(-lateral if enters else lateral), **measures)  # fmt: skip
+
+
+def _is_change_of(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> bool:
+    """Return whether it is `o` that crosses the edge of a lane at a tick, and not the path of `r` that does, now or on its way there."""
+    found = traffic.path(r)
+    if found is None:
+        return False
+    arrives = found.station_m <= found.station_m[n] + b.ahead_m[o, n]  # False for NaN
+    last = max(int(np.flatnonzero(arrives)[-1]), n)
+    own = np.abs(traffic.drift_mps[r, n : last + 1])
+    return bool(np.nanmax(own, initial=0.0) < KEEPING_MPS and not abs(traffic.drift_mps[o, n]) <= own[-1])
+
+
+def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+    """Find when `o` passes `r`: from behind its rear to ahead of its front, while both go the same way."""
+    reach = (traffic.table.size_m[r, 0] + traffic.table.size_m[o, 0]) / 2
+    ahead = b.ahead_m[o]
+    passed = latched(ahead > reach, ahead < -reach, np.ones(len(ahead), dtype=bool))
+    for n in (np.flatnonzero(passed[1:] & ~passed[:-1]) + 1).tolist():
+        start = int(np.flatnonzero(ahead[:n] < -reach)[-1])
+        part = slice(start, n + 1)
+        if not (
+            np.isfinite(ahead[part]).all()
+            and b.same_way[o, part].all()
+            and (traffic.speed_mps[r, part] >= MOVING_MPS).all()
+        ):
+            continue
+        aside = b.aside_m[o, part]
+        if np.abs(aside).max() > 4.5 * b.half_m:  # two lanes beside: farther is another carriageway
+            continue
+        middle = start + int(np.argmin(np.abs(ahead[part])))
+        sigma = float(np.hypot(traffic.sigma_m[r, middle], traffic.sigma_m[o, middle]))
+        sure = probability_above(-ahead[start], 0.0, sigma) * probability_above(ahead[n], 0.0, sigma)
+        clearance = abs(b.aside_m[o, middle]) - traffic.table.size_m[[r, o], 1].sum() / 2
+        yield tag_of(traffic, "overtaking", o, (start, middle, n), sure, r, lateral_gap_m=clearance, side=np.sign(b.aside_m[o, middle]),
+                     relative_speed_mps=traffic.speed_mps[o, middle] - traffic.speed_mps[r, middle], duration_s=(n - start) * TICK_S)  # fmt: skip
+
+
+def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+    """Find when `o` comes toward `r` where `r` will drive, within `CROSSING_S`."""
+    width = traffic.table.size_m[[r, o], 1].sum() / 2 - SIDE_M
+    speed, own = traffic.speed_mps[o], traffic.speed_mps[r]
+    ttc = time_to_collision(b.gap_m[o], own + speed)
+    state = (
+        (np.abs(b.turn_rad[o]) > ONCOMING_RAD)
+        & (np.abs(b.aside_m[o]) < width)
+        & (b.ahead_m[o] > 0)
+        & (ttc < CROSSING_S)
+    )
+    for i, j in runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S), BREAK):
+        n = i + int(np.argmin(np.where(ttc[i : j + 1] > 0, ttc[i : j + 1], np.inf)))
+        sure = probability_above(width - np.abs(b.aside_m[o, i : j + 1].min()), 0.0, b.sigma_m[o, n])
+        yield tag_of(traffic, "oncoming_in_lane", o, (i, n, j), sure, r, gap_m=b.gap_m[o, n], ttc_s=ttc[n], relative_speed_mps=own[n] + speed[n], overlap_m=width + SIDE_M - abs(b.aside_m[o, n]))  # fmt: skip
+
+
+def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+    """Find when a pedestrian who was hidden from `r` comes into its lane ahead of it."""
+    inside = b.in_lane[o]
+    for n in (np.flatnonzero(inside[1:] & ~inside[:-1]) + 1).tolist():
+        speed = traffic.speed_mps[r, n]
+        arrives_s = float(time_headway(b.ahead_m[o, n], speed))
+        if not (
+            np.isfinite(b.ahead_m[o, n - 1 : n + 1]).all()
+            and b.ahead_m[o, n] > 0
+            and speed >= MOVING_MPS
+            and arrives_s < CROSSING_S
+        ):
+            continue
+        ticks = np.arange(max(n - WINDOW, 0), n + 1)
+        ticks = ticks[np.isfinite(traffic.place_m[r, ticks])]
+        present = ticks[np.isfinite(traffic.place_m[o, ticks])]
+        first = int(present[0])
+        velocity = (traffic.place_m[o, n] - traffic.place_m[o, first]) / (n - first) if n > first else 0.0
+        # Before it was seen first it walked the same way.
+        place = np.where(
+            ticks < first, traffic.place_m[o, first] + (ticks - first) * velocity, traffic.place_m[o, ticks]
+        )
+        hidden = _hidden(traffic, traffic.place_m[r, ticks], place, ticks, (r, o))
+        if not hidden.any() or hidden[-1]:
+            continue
+        seen = int(ticks[np.flatnonzero(hidden)[-1]]) + 1
+        sure = probability_above(b.half_m + 0.5 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
+        yield tag_of(traffic, "stepping_out", o, (seen, n, n), sure, r, visible_s=(n - seen) * TICK_S, speed_mps=traffic.speed_mps[o, n],
+                     ttc_s=arrives_s, gap_m=b.gap_m[o, n])  # fmt: skip
+
+
+def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tuple[int, int]) -> Array:
+    """Return whether the line of sight (N,) from an eye to a place crosses the box of a third road user."""
+    import shapely
+
+    t = traffic.table
+    hidden = np.zeros(len(ticks), dtype=bool)
+    sight = shapely.linestrings(
+        np.stack([np.column_stack([eye.real, eye.imag]), np.column_stack([place.real, place.imag])], axis=1)
+    )
+    for k in range(len(traffic.ids)):
+        if k in pair or not traffic.wheeled[k] or t.size_m[k, 2] <= 1.0:
+            continue
+        there = np.flatnonzero(t.present[k, ticks])
+        if len(there):  # half as wide as it is, since who is hidden in part is seen
+            rows = ticks[there]
+            boxes = shapely.polygons(
+                box_corners_bev(t.xy_m[k, rows], t.size_m[k, 0], t.size_m[k, 1] / 2, t.yaw_rad[k, rows])
+            )
+            hidden[there] |= shapely.intersects(sight[there], boxes)
+    return hidden
+
+
+def _crossings(traffic: Traffic) -> Iterator[Tag]:
+    """Find whose paths cross, who turns across the path of oncoming traffic, and near misses there."""
+    t = traffic.table
+    boxes = BoxTracks(
+        t.center_m[..., 0].T, t.center_m[..., 1].T, t.center_m[..., 2].T, t.yaw_rad.T, t.speed_mps.T, t.size_m
+    )
+    found = post_encroachment_times(boxes, TICK_S)
+    last = len(t.t_s) - 1
+    for a, c, left, came in zip(
+        found.first.tolist(), found.second.tolist(), found.left_row.tolist(), found.came_row.tolist()
+    ):
+        pet = (came - left) * TICK_S
+        i, j = min(int(left), last), min(int(np.ceil(came)), last)
+        speed_a, speed_c = traffic.speed_mps[a, i], traffic.speed_mps[c, j]
+        if pet > CROSSING_S or min(speed_a, speed_c) < 0.5 or not (traffic.wheeled[a] or traffic.wheeled[c]):
+            continue
+        angle = float(abs(wrap_angle(traffic.course_rad[a, i] - traffic.course_rad[c, j])))
+        if not SAME_WAY_RAD <= angle <= ONCOMING_RAD + CROSSING_RAD:
+            continue
+        begin, ttc, touch = _planar_ttc(traffic, a, c, j)
+        sigma_s = float(np.hypot(traffic.sigma_m[a, i] / speed_a, traffic.sigma_m[c, j] / speed_c))
+        sure = probability_above(CROSSING_S - pet, 0.0, sigma_s)
+        way_m = t.size_m[a, 0] + t.size_m[c, 1]
+        measures = {
+            "pet_s": pet, "angle_rad": angle, "speed_mps": speed_a, "other_speed_mps": speed_c, "ttc_s": ttc,
+            "encroachment_time_s": float(encroachment_time(np.asarray(speed_a), np.asarray(way_m))),
+        }  # fmt: skip
+        yield tag_of(traffic, "crossing_path", a, (min(begin, i), i, j), sure, c, **measures)
+        for one, two, n in ((a, c, i), (c, a, j)):
+            if traffic.wheeled[one] and traffic.wheeled[two] and _turns_across(traffic, one, two, n, begin):
+                yield tag_of(traffic, "turning_across", one, (min(begin, i), n, j), sure, two, **measures)
+        near = max(
+            probability_above(NEAR_PET_S - pet, 0.0, sigma_s),
+            probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s) if np.isfinite(ttc) else 0.0,
+        )
+        if pet < NEAR_PET_S or ttc < NEAR_TTC_S:
+            yield tag_of(traffic, "near_miss", a, (min(touch, i), i, j), near, c, **measures)
+
+
+def _planar_ttc(traffic: Traffic, a: int, c: int, until: int) -> tuple[int, float, int]:
+    """Return the first tick within `CROSSING_S` before one at which both are there, the least TTC in the plane since then, and when."""
+    t = traffic.table
+    ticks = np.arange(max(until - round(2 * CROSSING_S / TICK_S), 0), until + 1)
+    ticks = ticks[t.present[a, ticks] & t.present[c, ticks]]
+    if not len(ticks):
+        return until, np.inf, until
+    apart = traffic.place_m[c, ticks] - traffic.place_m[a, ticks]
+    velocity = [traffic.speed_mps[k, ticks] * np.exp(1j * traffic.course_rad[k, ticks]) for k in (a, c)]
+    rate = velocity[1] - velocity[0]
+    size = [np.broadcast_to(t.size_m[k, :2], (len(ticks), 2)) for k in (a, c)]
+    times = time_to_touch(apart.real, apart.imag, rate.real, rate.imag, t.yaw_rad[a, ticks], t.yaw_rad[c, ticks], *size)
+    n = int(np.argmin(times))
+    return int(ticks[0]), float(times[n]), int(ticks[n])
+
+
+def _turns_across(traffic: Traffic, one: int, two: int, n: int, begin: int) -> bool:
+    """Return whether `one`, which is at the crossing at tick `n`, turned before the oncoming `two`."""
+    course = traffic.course_rad
+    known = np.flatnonzero(np.isfinite(course[one, begin : n + 1]) & np.isfinite(course[two, begin : n + 1])) + begin
+    if not len(known):
+        return False
+    came = abs(wrap_angle(course[one, known] - course[two, known]))
+    first = int(known[np.argmax(came)])
+    straight = abs(float(wrap_angle(course[two, known[-1]] - course[two, first]))) < np.radians(30)
+    return bool(
+        came.max() > ONCOMING_RAD
+        and straight
+        and abs(float(wrap_angle(course[one, n] - course[one, first]))) > np.radians(25)
+    )

@@ -1,0 +1,154 @@
+"""Probabilities of failure against closed forms, and policies that fail, do not, and raise."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+from benchmarks.tags import traffic
+from command_line import run
+
+from log2sim.datatypes import EGO, Scenario
+from log2sim.errors import ConfigError
+from log2sim.scenarios import Base, ask, choose_base, fit, open_index
+from log2sim.scenarios.failure import Outcome, judge_run, parse_limits, report_page, search, with_ego
+from log2sim.simulation.policy import Controls
+
+pytest.importorskip("duckdb")
+pytest.importorskip("pyarrow")
+
+
+def half_space(beta: float, dimensions: int):
+    """Failures beyond a plane that is `beta` from the origin: their probability is that of one normal score."""
+    normal = np.ones(dimensions) / np.sqrt(dimensions)
+    return lambda z: beta - z @ normal
+
+
+@pytest.mark.parametrize(("beta", "runs"), [(1.0, 400), (3.0, 600), (4.5, 800)])
+def test_the_interval_holds_the_probability_of_a_half_space_in_95_of_100_runs(beta, runs) -> None:
+    exact = NormalDist().cdf(-beta)
+    found = [search(half_space(beta, 3), 3, runs, np.random.default_rng([7, k])).estimate for k in range(100)]
+    assert sum(e.low <= exact <= e.high for e in found) >= 93
+    assert np.mean([e.probability for e in found]) == pytest.approx(exact, rel=0.05)
+    assert np.median([(e.high - e.low) / exact for e in found]) < 0.8
+
+
+def test_a_ring_of_failures_is_estimated() -> None:
+    """Beyond a circle in two dimensions, exp(-r^2 / 2): failures in all directions, of which the search finds some."""
+    exact = np.exp(-(2.0**2) / 2)
+    found = [search(lambda z: 2.0 - np.hypot(*z.T), 2, 1000, np.random.default_rng([8, k])).estimate for k in range(40)]
+    assert sum(e.low <= exact <= e.high for e in found) >= 36
+
+
+def test_a_policy_that_never_fails_has_an_upper_bound() -> None:
+    found = search(lambda z: np.full(len(z), 5.0), 2, 400, np.random.default_rng(0))
+    assert found.estimate.probability == found.estimate.low == 0
+    assert 0 < found.estimate.high < 0.1
+    assert len(found.scores) == len(found.margins) == 400
+
+
+def test_errors_of_a_policy_are_failures_of_it() -> None:
+    found = search(lambda z: np.where(z[:, 0] > 0, -1e3, 1.0), 2, 400, np.random.default_rng(0))
+    assert found.estimate.low < 0.5 < found.estimate.high
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("found")
+    for seed in range(4):
+        traffic(seed, count=8, duration_s=12.0).scenario.save(root / f"{seed}" / "scenario.json")
+    return root
+
+
+def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
+    index = open_index(folder, jobs=1)
+    rows = ask(index, "cut_in").rows
+    logical, chosen = fit(rows), choose_base(fit(rows), rows)
+    base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
+    assert base.row["other"] == EGO
+    assert {a.id for a in base.scenario.agents} == {EGO, chosen["agent"]}
+    near, far = np.array([18.0, 26.0, 4.0]), np.array([25.0, 20.0, 60.0])
+
+    def keeps(seen):
+        return Controls(0.0, 0.0)
+
+    hit = judge_run(base, logical, keeps, {}, "scenario", near)
+    free = judge_run(base, logical, keeps, {}, "scenario", far)
+    assert hit.margin < 0
+    assert hit.values["impact_mps"] > 1
+    assert free.margin > 10
+    assert free.margin == free.values["min_gap_m"]
+    # 30 m of room and no more are a failure once that is the limit.
+    assert judge_run(
+        base, logical, keeps, {"min_gap_m": free.values["min_gap_m"] + 1}, "scenario", far
+    ).margin == pytest.approx(-1)
+
+    def raises(seen):
+        raise ZeroDivisionError("of my own")
+
+    wrong = judge_run(base, logical, raises, {}, "scenario", far)
+    assert wrong.margin < -100
+    assert "of my own" in wrong.problem
+    values = np.stack([near, far, far])
+    page = report_page(
+        "<b>",
+        logical,
+        values,
+        [hit, free, wrong],
+        search(half_space(1, 2), 2, 60, np.random.default_rng(0)).estimate,
+        {0: "run/view.html"},
+    )
+    assert "<b> in" not in page
+    assert "of my own" in page
+    assert page.count('class="failed"') + page.count("class=failed") >= 2
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("min_tt_s=1", "min_ttc_s"), ("min_ttc_s", "no number"), ("min_ttc_s=x", "no number")]
+)
+def test_limits_that_are_none_are_refused(text, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        parse_limits([text])
+
+
+def test_outcomes_compare_by_their_margins() -> None:
+    assert parse_limits(["min_ttc_s=1.5", "max_brake_mps2=6"]) == {"min_ttc_s": 1.5, "max_brake_mps2": 6.0}
+    assert Outcome(-np.inf, {}, "x").margin < Outcome(-3.0, {}).margin < 0
+
+
+@pytest.mark.slow
+def test_the_command(folder, tmp_path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from log2sim.simulation.policy import Controls\n\n\ndef full(seen):\n    return Controls(2.5, 0.0)\n\n\n"
+        "def broken(seen):\n    raise ValueError('mine')\n"
+    )
+    ran = run(
+        "test",
+        f"{tmp_path / 'mine.py'}:full",
+        folder,
+        "cut_in",
+        "-o",
+        tmp_path / "t",
+        "--runs",
+        60,
+        "--worst",
+        1,
+        "--jobs",
+        1,
+    )
+    assert ran.code == 0, ran.err
+    about = json.loads((tmp_path / "t" / "test.json").read_text())
+    assert about["runs"] == 60
+    assert about["failures"] > 0
+    assert 0 <= about["probability"]["low"] <= about["probability"]["probability"] <= about["probability"]["high"] <= 1
+    (worst,) = (tmp_path / "t").glob("run-*/replay.json")
+    assert worst.with_name("view.html").exists()
+    assert worst.parent.name in (tmp_path / "t" / "report.html").read_text()
+    broken = run(
+        "test", f"{tmp_path / 'mine.py'}:broken", folder, "cut_in", "-o", tmp_path / "u", "--runs", 40, "--jobs", 1
+    )
+    assert "raises in every run" in broken.line
+    assert "mine" in broken.line

@@ -1,0 +1,191 @@
+"""Tags: maneuvers that are known in closed form are found, whatever the road, the side of traffic and the rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+from benchmarks.tags import Stage, crossing, f1, route, score, scripted, traffic, variants
+from metric_scenes import agent, scenario
+
+from log2sim.datatypes import TAGS, MapFeatures, Scenario
+from log2sim.edit import Remove, edit
+from log2sim.errors import ScenarioError
+from log2sim.geometry import wrap_angle
+from log2sim.scenarios import criticality as c
+from log2sim.scenarios import criticality_table, find_tags, tag
+from log2sim.scenarios.traffic import Traffic, latched, runs
+
+# What has to be reached on the truth.
+LEAST_F1 = {"cut_in": 0.95, "overtaking": 0.97}
+
+
+def figures(worlds):
+    return score(worlds, [find_tags(w.scenario) for w in worlds])
+
+
+def test_maneuvers_of_random_traffic_are_found_and_no_others() -> None:
+    found = figures(list(variants(8, 0.0, first=1000)))
+    assert set(found) == {"cut_in", "cut_out", "overtaking", "hard_braking", "lane_change"}
+    for name, (true, invented, missed, error_s, wrong) in found.items():
+        assert true >= 10, name
+        assert f1(true, invented, missed) >= LEAST_F1.get(name, 0.95), wrong
+        assert error_s < 0.5, name
+
+
+def test_scripted_maneuvers_are_found_and_no_others() -> None:
+    found = figures(list(scripted(3, 0.0, first=50)))
+    assert {
+        "turning_across",
+        "merging",
+        "stepping_out",
+        "oncoming_in_lane",
+        "standing_at_light",
+        "u_turn",
+        "approaching",
+    } <= set(found)
+    for true, invented, missed, _, wrong in found.values():
+        assert f1(true, invented, missed) >= 0.95 or true + invented + missed == 0, wrong
+
+
+@pytest.mark.slow
+def test_noise_of_known_sigma_costs_few_maneuvers() -> None:
+    found = figures(list(variants(24, 0.2, first=1000)))
+    for name, least in {
+        "cut_in": 0.9,
+        "overtaking": 0.93,
+        "cut_out": 0.85,
+        "hard_braking": 0.9,
+        "lane_change": 0.95,
+    }.items():
+        true, invented, missed, _, wrong = found[name]
+        assert f1(true, invented, missed) >= least, wrong
+
+
+def moved(s: Scenario, turn: float, dx: float, dy: float) -> Scenario:
+    """The same scenario in a map whose axes are turned, far from its origin."""
+
+    def place(x, y):
+        return np.cos(turn) * x - np.sin(turn) * y + dx, np.sin(turn) * x + np.cos(turn) * y + dy
+
+    def lines(points):
+        return np.column_stack([*place(points[:, 0], points[:, 1]), points[:, 2]])
+
+    agents = []
+    for a in s.agents:
+        x, y = place(a.waypoints.x_m, a.waypoints.y_m)
+        agents.append(
+            replace(a, waypoints=replace(a.waypoints, x_m=x, y_m=y, yaw_rad=wrap_angle(a.waypoints.yaw_rad + turn)))
+        )
+    features = s.map_features.moved(lines) if s.map_features is not None else None
+    return replace(s, agents=tuple(agents), map_features=features)
+
+
+def test_tags_depend_neither_on_the_axes_nor_on_the_origin_of_the_map() -> None:
+    for world in (traffic(3, lanes=True), *islice(scripted(1, 0.0, first=7), 3)):
+        here, there = find_tags(world.scenario), find_tags(moved(world.scenario, 2.1, 4.0e5, -3.0e5))
+        assert here
+        assert [(g.tag, g.agent, g.other, g.lane) for g in here] == [(g.tag, g.agent, g.other, g.lane) for g in there]
+        for one, two in zip(here, there):
+            assert two.t_s == pytest.approx(one.t_s, abs=0.11)
+            assert two.probability == pytest.approx(one.probability, abs=0.01)
+
+
+def test_the_order_of_agents_does_not_matter() -> None:
+    s = traffic(5).scenario
+    assert find_tags(s) == find_tags(replace(s, agents=s.agents[::-1]))
+
+
+def test_probabilities_are_those_of_the_defining_inequality() -> None:
+    """Two cross with a post-encroachment time of a known distribution; the limit is 5 s."""
+    stage = Stage(np.random.default_rng(0), 10.0, False, 0.0)
+    # The rear of the first leaves the path of the other, 1.8 m wide, at 0.9 + 2.2 m; the other's front comes 3.1 m before.
+    stage.add("ego", route([(-200, 0), (300, 0)], 5.0), 10.0, start_m=200 - 40)
+    stage.add("car-1", route([(0, -200), (0, 300)], 5.0), 8.0, start_m=200 - 8.0 * (4.0 + 5.2))
+    s = stage.world("", [], ()).scenario
+    sigma_m = 2.0
+    agents = tuple(
+        replace(a, waypoints=replace(a.waypoints, sigma_xy_m=np.full(len(a.waypoints), sigma_m))) for a in s.agents
+    )
+    (found,) = [g for g in find_tags(replace(s, agents=agents)) if g.tag == "crossing_path"]
+    pet_s = 5.2 - 3.1 / 10.0 - 3.1 / 8.0
+    assert found.quantities["pet_s"] == pytest.approx(pet_s, abs=0.02)
+    expected = NormalDist(0.0, np.hypot(sigma_m / 10.0, sigma_m / 8.0)).cdf(5.0 - pet_s)
+    assert found.probability == pytest.approx(expected, abs=0.01)
+    doubted = tuple(replace(a, confidence=0.5) for a in agents)
+    (half,) = [g for g in find_tags(replace(s, agents=doubted)) if g.tag == "crossing_path"]
+    assert half.probability == pytest.approx(found.probability / 4, abs=1e-3)
+
+
+def test_who_crosses_long_after_is_not_tagged() -> None:
+    stages = [Stage(np.random.default_rng(k), 10.0, False, 0.0) for k in range(8)]
+    worlds = [crossing(s) for s in stages]
+    assert {bool(w.events) for w in worlds} == {True, False}
+
+
+@pytest.mark.parametrize(
+    "agents", [(), (agent("ego", 0.0),), (agent("a", 0.0, t_s=np.zeros(1)),)], ids=["nobody", "standing", "once"]
+)
+def test_scenarios_without_motion_have_no_tags(agents) -> None:
+    assert find_tags(scenario(*agents)) == ()
+    assert len(criticality_table(scenario(*agents))["t_s"]) == 0
+
+
+def test_tags_are_kept_in_the_file_and_dropped_where_they_may_not_hold(tmp_path) -> None:
+    tagged = tag(traffic(3, lanes=True).scenario)
+    assert {g.tag for g in tagged.tags} >= {"in_lane", "lane_change"}
+    assert {g.tag for g in tagged.tags} <= set(TAGS)
+    tagged.save(tmp_path / "s.json")
+    assert Scenario.load(tmp_path / "s.json").tags == tagged.tags
+    assert tagged.to_dict().keys() - traffic(3, lanes=True).scenario.to_dict().keys() == {"tags"}
+    assert edit(tagged, [Remove(agent="car-1")]).scenario.tags is None
+    with pytest.raises(ScenarioError, match="probability"):
+        replace(tagged, tags=(replace(tagged.tags[0], probability=1.5),)).save(tmp_path / "bad.json")
+
+
+def test_measures_have_their_closed_forms() -> None:
+    gap, closing = np.array([20.0, 20.0, 0.0, 10.0]), np.array([5.0, -1.0, 3.0, 10.0])
+    assert c.time_to_collision(gap, closing) == pytest.approx([4.0, np.inf, 0.0, 1.0])
+    assert c.time_headway(gap, np.array([10.0, 0.0, 10.0, 5.0])) == pytest.approx([2.0, np.inf, 0.0, 2.0])
+    assert c.deceleration_to_avoid(gap, closing) == pytest.approx([0.625, 0.0, np.inf, 5.0])
+    # Braking so from the gap, after the reaction for MDRAC, leads to the speed of the one ahead in touch with it.
+    assert c.modified_deceleration(gap, closing, 1.0)[0] == pytest.approx(5.0**2 / (2 * (20.0 - 5.0 * 1.0)))
+    assert c.modified_deceleration(gap, closing, 1.0)[3] == np.inf
+    assert c.braking_required(gap, closing, np.array([-1.0, 0.0, 0.0, 2.0])) == pytest.approx([1.625, 0.0, np.inf, 3.0])
+    assert c.brake_threat_number(gap, closing, np.zeros(4), 8.0)[3] == pytest.approx(0.625)
+    # Within 2 s, 1.8 m less 0.5 m aside are to be gained: a t^2 / 2.
+    assert c.steer_threat_number(
+        np.array([2.0]), np.array([0.5]), np.array([0.0]), np.array([1.8]), 8.0
+    ) == pytest.approx(1.3 / 2.0 / 8.0)
+    assert c.encroachment_time(np.array([4.0]), np.array([6.0])) == pytest.approx(1.5)
+
+
+def test_measures_of_a_follower_over_time() -> None:
+    t = np.arange(61) / 10
+    s = scenario(
+        agent("ego", 12.0 * t, speed=12.0, t_s=t), agent("a", 60.0 + 8.0 * t, speed=8.0, t_s=t), duration_s=6.0
+    )
+    table = criticality_table(s)
+    assert set(table["agent"]) == {"ego"}
+    assert table["t_s"] == pytest.approx(t, abs=1e-6)
+    assert table["gap_m"] == pytest.approx(60.0 - 4.4 - 4.0 * t, abs=1e-3)
+    assert table["ttc_s"] == pytest.approx((60.0 - 4.4 - 4.0 * t) / 4.0, abs=1e-3)
+    assert table["btn"] == pytest.approx(4.0**2 / (2 * (60.0 - 4.4 - 4.0 * t)) / 8.0, abs=1e-3)
+
+
+def test_states_are_held_between_their_limits() -> None:
+    v = np.array([0, 1, 5, 9, 5, 1, 5, 9, 9, 0])
+    assert latched(v > 8, v < 2, v > 4).tolist() == [False, False, False, True, True, False, False, True, True, False]
+    assert latched(v > 10, v < -1, v > 4).tolist() == (v > 4).tolist()
+    assert runs(np.array([1, 1, 0, 1, 0, 0, 1], dtype=bool)) == [(0, 1), (3, 3), (6, 6)]
+    assert runs(np.array([1, 1, 0, 1, 0, 0, 1], dtype=bool), 2, 1) == [(0, 3)]
+    assert runs(np.zeros(3, dtype=bool)) == []
+
+
+def test_lanes_inferred_from_paths_alone_are_no_edges() -> None:
+    world = traffic(3, lanes=True)
+    guessed = tuple(replace(lane, inferred_from="paths") for lane in world.scenario.map_features.lanes)
+    assert Traffic(replace(world.scenario, map_features=MapFeatures(lanes=guessed))).lanes == []
