@@ -92,7 +92,6 @@ ROUNDS = {
 }
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
 RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
-QUANTIZATION_CLOUDS = 24
 # Integer weights ship where they cost less F1 than this.
 MAX_QUANTIZATION_LOSS = 0.004
 
@@ -251,7 +250,7 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
     info["calibration"] = calibrate(exact, calibration)
     describe(exact, info)
     small = out / f"{mount}-int8.onnx"
-    quantize(exact, small, calibration[:QUANTIZATION_CLOUDS])
+    quantize(exact, small)
     card = {"mount": mount, "rounds": [asdict(r) for r in rounds], "batch": BATCH, "torch": torch.__version__}
     reports = {}
     for path in (exact, small):

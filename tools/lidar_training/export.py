@@ -19,14 +19,7 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import calibration, operating_point, precision_recall
 from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, open_network
-from log2sim.perception.detect3d.network import (
-    METADATA_KEY,
-    grid_window,
-    level_points,
-    load_network,
-    rasterize,
-    viewpoints_xy,
-)
+from log2sim.perception.detect3d.network import METADATA_KEY, load_network
 
 CATEGORIES = {
     "vehicle": ["car", "truck", "bus"],
@@ -192,34 +185,28 @@ def logistic(features: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.round(weights, 5)
 
 
-def quantize(path: Path, out: Path, examples: list[Example]) -> None:
-    """Write the network with 8-bit weights and activations, calibrated on clouds."""
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+def quantize(path: Path, out: Path) -> None:
+    """Write the network with the weights of all but its last layer in 8 bits, scaled by output channel; it computes in float32.
 
-    network = load_network(path)
-    info = network.info
+    Activations of 8 bits would save a third of the time of a sweep, and cost up to a third of the vehicles where lines are few.
+    """
+    import onnx
 
-    class Grids(CalibrationDataReader):
-        """Grids of the examples, one by one."""
-
-        def __init__(self) -> None:
-            self._left = iter(examples)
-
-        def get_next(self) -> dict[str, np.ndarray] | None:
-            example = next(self._left, None)
-            if example is None:
-                return None
-            xyz, _ = level_points(example.cloud, info.range_m)
-            low, shape = grid_window(
-                xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=viewpoints_xy(example.cloud)[0]
-            )
-            return {"grid": rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)[None]}
-
-    quantize_static(
-        str(path), str(out), Grids(), quant_format=QuantFormat.QDQ, per_channel=True,
-        activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, nodes_to_exclude=["/head/Conv"],
-    )  # fmt: skip
-    describe(out, json.loads(info.model_dump_json()))
+    model = onnx.load(path)
+    graph = model.graph
+    stored = {v.name: v for v in graph.initializer}
+    for conv in [node for node in graph.node if node.op_type == "Conv" and "maps" not in node.output]:
+        weight = onnx.numpy_helper.to_array(stored[conv.input[1]])
+        scale = np.maximum(np.abs(weight).max(axis=(1, 2, 3)), 1e-12) / 127
+        whole = np.rint(weight / scale[:, None, None, None]).astype(np.int8)
+        name = conv.input[1]
+        graph.initializer.remove(stored.pop(name))
+        for suffix, values in (("_int8", whole), ("_scale", scale.astype(np.float32))):
+            graph.initializer.append(onnx.numpy_helper.from_array(values, name + suffix))
+        graph.node.insert(
+            0, onnx.helper.make_node("DequantizeLinear", [name + "_int8", name + "_scale"], [name], axis=0)
+        )
+    onnx.save(model, out)
 
 
 SCORE = 0.5
