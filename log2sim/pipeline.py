@@ -146,5 +146,5 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
 
     everyone = agents if ego is None else [ego, *agents]
     scenario = draft_scenario(run, observations, homographies, everyone)
-    described = describe(scenario, log, config, plan, run.poses, observations.lights, clock, run.progress)
+    described = describe(scenario, log, config, plan, run.poses, observations, clock, run.progress)
     return conclude(run, observations, by_end, homographies, described)

@@ -130,7 +130,7 @@ def conclude(
         "measurements": {"total": sum(map(len, from_lidar)), "with_lidar": int(sum(map(np.sum, from_lidar)))},
         "agents": _agent_counts(scenario),
         **figures,
-        "unreadable": {**figures["unreadable"], **observations.unreadable},
+        "unreadable": observations.unreadable,
         "poses": run.poses.to_dict(),
         "faults": [fault.to_dict() for fault in (*run.faults, *observations.faults)],
         "registration": list(run.registration),

@@ -119,3 +119,17 @@ def test_the_pipeline_calls_the_functions_of_the_table_in_their_order() -> None:
 def test_every_kind_of_plug_in_is_explained() -> None:
     for kind in plugins.BUILT_IN:
         assert f"kind `{kind}`" in TEXT
+
+
+def test_one_door_leads_to_the_records() -> None:
+    doors = (
+        "logs/",
+        "perception/records.py",
+        "localization/replaced.py",
+    )  # readers, the door, and streams of changed logs
+    package = ROOT / "log2sim"
+    reading = re.compile(r"\bstream\w*(\[[^\]]*\])?\.read\b")
+    files = {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")}
+    around = {name for name, path in files.items() if reading.search(path.read_text(encoding="utf-8"))}
+    assert not [name for name in around if not name.startswith(doors)]
+    assert "perception/records.py" in around

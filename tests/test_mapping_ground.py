@@ -150,7 +150,7 @@ def test_what_the_lowest_beam_meets_hides_the_ground_from_its_foot_on_and_a_sign
     )
     points = apply(np.linalg.inv(map_T_lidar), np.concatenate([xyz[~left], lowest, highest])).astype(np.float32)
     shown = dataclasses.replace(sweep, xyz_m=points, intensity=None)
-    prepared = PointCollector(log, raster, 1, 0.0).prepare("l0", shown, np.zeros(raster.shape, np.uint8))
+    prepared = PointCollector(log, raster, 1, 0.0).prepare("l0", shown, [])
     assert prepared is not None
     above = prepared.hiding[:, 2] - height_at(prepared.hiding[:, :2])
     beside, over = (np.abs(prepared.hiding[:, 1] - y) < 0.01 for y in (lowest[0, 1], highest[0, 1]))

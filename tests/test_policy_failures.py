@@ -148,7 +148,17 @@ def test_the_command(folder, tmp_path) -> None:
     assert worst.with_name("view.html").exists()
     assert worst.parent.name in (tmp_path / "t" / "report.html").read_text()
     broken = run(
-        "test", f"{tmp_path / 'mine.py'}:broken", folder, "cut_in", "-o", tmp_path / "u", "--runs", 40, "--jobs", 1
+        "test",
+        f"{tmp_path / 'mine.py'}:broken",
+        folder,
+        "cut_in",
+        "-o",
+        tmp_path / "u",
+        "--runs",
+        40,
+        "--jobs",
+        1,
+        "-q",
     )
     assert "raises in every run" in broken.line
     assert "mine" in broken.line

@@ -161,7 +161,11 @@ def streams_log(**stamps):
 
 def missing(log):
     schedule = synchronize(log, tuple(log.cameras))
-    return [(f.kind, f.subject, f.start_s, f.end_s, f.values) for f in RecordWatch(log).faults(schedule)]
+    first_ns, last_ns = int(schedule.t_ns[0]), int(schedule.t_ns[-1])
+    return [
+        (f.kind, f.subject, f.start_s, f.end_s, f.values)
+        for f in RecordWatch(log).faults(log.streams, first_ns, last_ns)
+    ]
 
 
 def test_missing_records_are_told_with_start_and_length():

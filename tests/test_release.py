@@ -147,6 +147,10 @@ BASE_ONLY: dict[str, str | None] = {
     "view s.json --log LOG --out page.html": None,
     "synth --traffic vehicle --scenes 1 --out traffic": None,
     "export s.json --to openscenario --out openscenario": None,
+    "tag s.json --out tagged.json --criticality criticality.csv": None,
+    "find s.json standing": "find",
+    "vary s.json cut_in --out varied": "find",
+    "test EGO s.json cut_in --out tested": "find",
     "export s.json --to carla --out carla": None,
     "export s.json --to csv --out csv": None,
     "export s.json --to scenarionet --out scenarionet": None,
@@ -156,7 +160,7 @@ BASE_ONLY: dict[str, str | None] = {
     "export s.json --to rerun --out rerun": "rerun",
     "import openscenario/scenario.xosc --out imported.json": None,
 }
-"""Commands, and the extra that each needs. LOG, BAG, FEATHER and CORRECTIONS stand for paths."""
+"""Commands, and the extra that each needs. LOG, BAG, FEATHER, CORRECTIONS and EGO stand for paths."""
 
 
 @pytest.mark.slow
@@ -174,6 +178,7 @@ def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folde
         "BAG": str(ros.encode(tiny_log()[0], tmp_path / "bag")),
         "FEATHER": str(feather.parent),
         "CORRECTIONS": str(corrections),
+        "EGO": f"{ROOT}/samples/egos.py:BrakeLate",
     }
     commands = [[paths.get(word, word) for word in line.split()] for line in BASE_ONLY]
     program = Path(__file__).with_name("base_only.py")

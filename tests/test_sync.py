@@ -76,7 +76,7 @@ def test_a_sweep_counts_by_the_middle_of_its_points_not_by_its_stamp():
         return Sweep(int(t[i]), np.zeros((3, 3)), "lidar", t[i] + np.array([0, 10, 80], dtype=np.int64) * MS)
 
     log = log_of({"ref": stamps(90, 100, 4)}, {"top": t}, read=read)
-    assert sweep_middle_ns(log.streams["top"]) == 40 * MS
+    assert sweep_middle_ns(log, "top") == 40 * MS
     schedule = synchronize(log, ("ref",))
     # Frame at 90 ms: the sweep from 0 to 80 ms has its middle 50 ms before it, that from 100 ms has it 50 ms after it.
     assert schedule.sweeps["top"][0].tolist() == [0, 1, 2, 3]

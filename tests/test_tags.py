@@ -176,6 +176,20 @@ def test_measures_of_a_follower_over_time() -> None:
     assert table["btn"] == pytest.approx(4.0**2 / (2 * (60.0 - 4.4 - 4.0 * t)) / 8.0, abs=1e-3)
 
 
+def test_measures_are_those_of_commonroad_crime() -> None:
+    """Its version 0.4.1 for the same two vehicles at four moments; it rounds to two digits, and brakes with 11.5 m/s2 for BTN."""
+    t = np.arange(41) / 10
+    s = scenario(
+        agent("b", 15.0 * t, speed=15.0, t_s=t), agent("a", 45.0 + 9.0 * t, 0.0, speed=9.0, t_s=t), duration_s=4.0
+    )
+    table = criticality_table(s)
+    at = np.array([0, 5, 10, 15])
+    assert table["ttc_s"][at] == pytest.approx([6.77, 6.27, 5.77, 5.27], abs=0.005)
+    assert table["braking_required_mps2"][at] == pytest.approx([0.44, 0.48, 0.52, 0.57], abs=0.005)
+    assert table["btn"][at] * c.BRAKES_MPS2 / 11.5 == pytest.approx([0.0383, 0.0417, 0.0452, 0.0496], abs=5e-4)
+    assert table["stn"][at] * c.BRAKES_MPS2 == pytest.approx([0.08, 0.09, 0.11, 0.13], abs=0.006)
+
+
 def test_states_are_held_between_their_limits() -> None:
     v = np.array([0, 1, 5, 9, 5, 1, 5, 9, 9, 0])
     assert latched(v > 8, v < 2, v > 4).tolist() == [False, False, False, True, True, False, False, True, True, False]

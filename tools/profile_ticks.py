@@ -3,7 +3,8 @@
     OPENBLAS_NUM_THREADS=1 python tools/profile_ticks.py LOG [LOG ...] [--detector NAME ...] [--ticks N] [--repeats N] [--json]
 
 Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
-with as many as there are cores. With `--parts`, parts are the packages whose functions a thread is in, found by looking at all threads
+with as many as there are cores. Processor time is told apart as seconds of the log (a fixed number of records is looked at: poses, clocks,
+mounts, what is loaded), milliseconds of a tick, and seconds of 100 m of way (map and lanes). With `--parts`, parts are the packages whose functions a thread is in, found by looking at all threads
 every few milliseconds and giving the processor time that each took since then to the function it is in. Kept detections are
 not used. Linux only.
 """
@@ -20,11 +21,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -33,8 +35,9 @@ from benchmarks.table import markdown
 import log2sim
 from log2sim.config import Config
 from log2sim.datatypes import Log
-from log2sim.errors import Log2SimError, RecordError
+from log2sim.errors import Log2SimError
 from log2sim.logs.opening import open_log
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.report import Run
@@ -46,6 +49,8 @@ DETECTORS = ("labels", "lidar:vehicle", "labels+lidar:vehicle", "ssd-mobilenet-v
 DETECTING = ("perception.detect", "perception.detect3d", "libraries")
 LIBRARIES = "libraries"
 WARM_UP_TICKS = 4
+# Stages that look at so many records of a log at most, and those that draw the ground along the way; all others go tick by tick.
+OF_LOG, OF_WAY = ("poses", "calibration", "registration", "sync"), ("pictures", "lanes")
 
 
 @dataclass
@@ -62,6 +67,7 @@ class Measured:
 
     times: Times
     ticks: int
+    way_m: float
     stages: dict[str, Times]
     parts: Counter[str]
     functions: Counter[str]
@@ -152,20 +158,20 @@ def records_of(schedule: Schedule) -> list[tuple[str, int]]:
     return [(name, i) for name, i in found if i >= 0]
 
 
-def floor_of(log: Log, records: Sequence[tuple[str, int]], threads: int) -> Times:
+def floor_of(log: Log, wanted: Sequence[tuple[str, int]], threads: int) -> Times:
     """Times to read and decode records with some threads."""
+    records = RecordSource(log)
 
     def read(record: tuple[str, int]) -> None:
-        with suppress(RecordError):
-            log.streams[record[0]].read(record[1])
+        records.get(*record)
 
     def read_all() -> None:
         if threads == 1:
-            for record in records:
+            for record in wanted:
                 read(record)
             return
         with ThreadPoolExecutor(threads) as pool:
-            for _ in pool.map(read, records):
+            for _ in pool.map(read, wanted):
                 pass
 
     return times_of(read_all)[1]
@@ -196,7 +202,15 @@ def measure(
     parts: Counter[str] = Counter()
     for name, seconds in functions.items():
         parts[part_of(name)] += seconds
-    return Measured(times, len(run.schedule), stages, parts, functions), run.schedule
+    return Measured(times, len(run.schedule), way_of(run), stages, parts, functions), run.schedule
+
+
+def way_of(run: Run) -> float:
+    """How far the ego goes from the first to the last tick, m; 0 without known poses."""
+    if run.log.ego is None:
+        return 0.0
+    poses, known = run.log.ego.at(run.schedule.t_ns)
+    return float(np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1).sum())
 
 
 def config_of(log: Log, detector: str, ticks: int, settings: Sequence[str]) -> Config:
@@ -246,6 +260,9 @@ def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, lis
     functions = {k: ms([r.functions[k] for r in runs]) for k in {k for r in runs for k in r.functions}}
     wall, cpu = ms([r.times.wall_s for r in runs]), ms([r.times.cpu_s for r in runs])
     floor = {n: {"wall": ms([t.wall_s for t in f]), "cpu": ms([t.cpu_s for t in f])} for n, f in floors.items()}
+    of_way = statistics.median(sum(r.stages[k].cpu_s for k in OF_WAY if k in r.stages) for r in runs)
+    each = [sum(v.cpu_s for k, v in r.stages.items() if k not in (*OF_LOG, *OF_WAY)) for r in runs]
+    fixed_s = statistics.median(r.times.cpu_s - e for r, e in zip(runs, each)) - of_way
     detecting = sum(parts.get(name, 0.0) for name in DETECTING)
     return {
         "log": log.name,
@@ -255,6 +272,9 @@ def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, lis
         "ticks_per_second": round(1e3 / wall, 2),
         "wall_ms": wall,
         "cpu_ms": cpu,
+        "cpu_of_log_s": round(fixed_s, 2),
+        "cpu_of_tick_ms": ms(each),
+        "cpu_of_100_m_s": round(100 * of_way / runs[0].way_m, 2) if runs[0].way_m else None,
         "detector_cpu_ms": round(detecting, 2),
         "floor_ms": floor,
         "cpu_over_floor": round(cpu / floor[1]["cpu"], 2),
@@ -275,7 +295,8 @@ def show(found: list[dict[str, Any]], functions: int) -> str:
         one, most = min(f["floor_ms"]), max(f["floor_ms"])
         rates.append([
             f["log"], f"`{f['detector']}`", str(f["ticks"]), f"{f['ticks_per_second']:.2f}", f"{f['wall_ms']:.0f}",
-            f"{f['cpu_ms']:.0f}", f"{f['detector_cpu_ms']:.0f}", f"{f['floor_ms'][one]['cpu']:.0f}",
+            f"{f['cpu_ms']:.0f}", f"{f['cpu_of_log_s']:.2f}", f"{f['cpu_of_tick_ms']:.0f}", f"{f['cpu_of_100_m_s']}",
+            f"{f['detector_cpu_ms']:.0f}", f"{f['floor_ms'][one]['cpu']:.0f}",
             f"{f['floor_ms'][most]['wall']:.0f}", f"{f['cpu_over_floor']:.2f}",
             f"{f['without_detector_over_floor']:.2f}",
         ])  # fmt: skip
@@ -289,7 +310,7 @@ def show(found: list[dict[str, Any]], functions: int) -> str:
             rows = [[k, f"{v:.1f}"] for k, v in f[key].items() if v >= 0.05][:most_rows]
             rest += ["", markdown([title, "cpu"], rows)] if rows else []
     head = [
-        "log", "detector", "ticks", "ticks/s", "wall ms", "cpu ms", "detector cpu", "floor cpu", "floor wall, all threads",
+        "log", "detector", "ticks", "ticks/s", "wall ms", "cpu ms", "s a log", "ms a tick", "s a 100 m", "detector cpu", "floor cpu", "floor wall, all threads",
         "cpu / floor", "without detector / floor",
     ]  # fmt: skip
     return "\n".join([markdown(head, rates), *rest])

@@ -27,9 +27,9 @@ from log2sim.datatypes import (
     Track,
     Waypoints,
 )
-from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, undistort, yaw_of
 from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule
 from log2sim.tracking.forward import MAX_MISSES
 from log2sim.version import __version__
@@ -284,14 +284,12 @@ def _camera_rays(log: Log, name: str) -> Array:
 
 def _lidar_rays(log: Log, name: str) -> Array:
     """Return rays (N, 3), lidar frame, to the points of some sweeps of a LiDAR that is fixed in the map."""
-    stream = log.streams[name]
+    records, count = RecordSource(log), len(log.streams[name].t_ns)
     lidar_T_map = inverse(log.lidars[name].mount_T_lidar)
     rays = [np.zeros((0, 3))]
-    count = len(stream.t_ns)
     for i in np.unique(np.linspace(0, count, VIEW_SWEEPS, endpoint=False).astype(int))[:count]:
-        try:
-            sweep = stream.read(int(i))
-        except RecordError:
+        sweep = records.get(name, int(i))
+        if sweep is None:
             continue  # the stages before have reported it
         xyz = np.asarray(sweep.xyz_m, dtype=np.float64)
         rays.append(apply(lidar_T_map, xyz) if sweep.frame == "map" else xyz)

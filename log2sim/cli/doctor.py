@@ -38,6 +38,7 @@ PURPOSES = {
     "parquet": "Argoverse 2 and Waymo's parquet as logs, to_parquet",
     "dataframe": "scenario.to_dataframe",
     "xarray": "scenario.to_xarray",
+    "find": "log2sim find, vary and test",
     "odometry": "--poses lidar and auto",
     "rerun": "export --to rerun",
     "carla": "replay --simulator carla",

@@ -35,7 +35,7 @@ def find(
     ] = None,
     probability: Annotated[
         float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
-    ] = 0.5,
+    ] = 0.3,
     fields: Annotated[bool, option("List the fields of these scenarios' tags.", None, "--fields")] = False,
     fresh: Annotated[
         bool, option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")

@@ -52,7 +52,7 @@ def map_(
     from log2sim.files.documents import check_targets
     from log2sim.files.outputs import together
     from log2sim.logs.opening import open_log
-    from log2sim.perception.frames import RecordReader
+    from log2sim.perception.records import RecordSource
     from log2sim.road.builder import map_ground
     from log2sim.road.map_files import (
         HEIGHT_STEP_M,
@@ -81,9 +81,9 @@ def map_(
     opened, loaded, note = _agents_of(opened, scenario)
     for line in (*opened.notes, *((note,) if note else ())):
         say(f"note: {line}", quiet=quiet)
-    reader = RecordReader(opened)
+    records = RecordSource(opened)
     with progress(quiet=quiet) as report_progress:
-        whole = map_ground(opened, loaded, settings, reader, report_progress)
+        whole = map_ground(opened, loaded, settings, records, report_progress)
     ground = whole.around(known_cells(whole, chosen))
     with together():
         write_map(ground, out, chosen, opened.map, overwrite=overwrite)
@@ -91,7 +91,7 @@ def map_(
             write_world_file(ground, world, opened.map, overwrite=overwrite)
     notes = [
         *ground.notes,
-        *(f"{name}: {u['count']} records could not be read" for name, u in reader.summary().items()),
+        *(f"{name}: {u['count']} records could not be read" for name, u in records.summary().items()),
     ]
     problem = geokeys_of(opened.map).problem
     notes += [f"no place on Earth: {problem}"] if problem else []

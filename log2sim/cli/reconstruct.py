@@ -292,11 +292,11 @@ def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
     from log2sim.cli.layers import CELL_M
     from log2sim.config import MapConfig
-    from log2sim.perception.frames import RecordReader
+    from log2sim.perception.records import RecordSource
     from log2sim.road.builder import map_ground
     from log2sim.road.map_files import write_map
 
-    reader = RecordReader(result.log)
-    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), reader)
+    records = RecordSource(result.log)
+    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), records)
     write_map(ground.around(ground.coverage), path, overwrite=overwrite)
-    result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
+    result.report["unreadable"] = {**records.summary(), **result.report["unreadable"]}

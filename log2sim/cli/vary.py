@@ -20,7 +20,7 @@ def vary(
     seed: Annotated[int, option("Seed of the draw.", min=0)] = 0,
     probability: Annotated[
         float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
-    ] = 0.5,
+    ] = 0.3,
     keep: Annotated[bool, option("Write those, too, that something speaks against.", None, "--keep")] = False,
     openscenario: Annotated[
         bool, option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")

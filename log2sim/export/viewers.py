@@ -21,6 +21,7 @@ from log2sim.geometry import (
     inverse,
 )
 from log2sim.perception.lidar.cloud import sweep_to_map
+from log2sim.perception.records import RecordSource
 
 STEP_S = 0.1  # the lowest rate that readers of OSI traces accept, and smooth to watch
 MAX_IMAGE_PX = 960  # wider images are downscaled, which keeps files of several cameras small
@@ -112,7 +113,7 @@ def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
 
 def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -> ViewerRecord:
     try:
-        record = log.streams[name].read(i)
+        record = RecordSource(log).require(name, i)
     except RecordError as error:
         return UnreadableRecord(t_ns, name, str(error))
     if name in log.cameras:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.geometry import (
     NS_PER_S,
     Array,
@@ -29,6 +29,7 @@ from log2sim.geometry import (
     undistort,
     yaw_of,
 )
+from log2sim.perception.records import RecordSource
 
 MIN_CORNER = 1e-4
 # Followed forward and back, a point ends where it began.
@@ -200,13 +201,14 @@ def follow_camera(
     index = np.arange(len(stream.t_ns))
     if during_ns is not None:
         index = index[(stream.t_ns >= during_ns[0]) & (stream.t_ns <= during_ns[1])]
-    follower = _Follower(log, log.cameras[name])
+    follower, records = _Follower(log, log.cameras[name]), RecordSource(log)
     t_ns, poses, predicted = [], [np.eye(4)], [False]
     last, motion, motion_s, dark, unreadable = None, np.eye(4), 1.0, 0, 0
     for done, i in enumerate(index.tolist(), 1):
-        gray = follower.prepare(stream.read, i)
-        unreadable += gray is None
-        if gray is not None:
+        image = records.get(name, i)
+        unreadable += image is None
+        if image is not None:
+            gray = follower.prepare(image)
             dark += float(gray.mean()) < MIN_BRIGHTNESS
             t_ns.append(int(stream.t_ns[i]))
             if last is not None:
@@ -263,19 +265,13 @@ class _Follower:
         self.agreed: list[int] = []
         self.last_mps = np.zeros(2)
 
-    def prepare(self, read: Callable[[int], NDArray[np.uint8]], i: int) -> NDArray[np.uint8] | None:
-        """Read an image as shades of gray, at most `MAX_WIDTH_PX` wide; None where it cannot be read."""
+    def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return an image in shades of gray, at most `MAX_WIDTH_PX` wide."""
         import cv2
 
-        try:
-            gray = cv2.cvtColor(read(i), cv2.COLOR_BGR2GRAY)
-        except RecordError:
-            return None
-        small = (
-            gray
-            if self.scale == 1
-            else cv2.resize(gray, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_AREA)
-        )
+        small = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self.scale < 1:
+            small = cv2.resize(small, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_AREA)
         return np.asarray(small, dtype=np.uint8)
 
     def motion(self, first: NDArray[np.uint8], second: NDArray[np.uint8], dt_s: float) -> Array | None:

@@ -15,49 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.datatypes import Log, Stream, Sweep
-from log2sim.errors import RecordError
+from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, line_time_s, nearest_index, project
 from log2sim.localization.clocks import turn_mount
-from log2sim.logs.records import MAX_IMAGE_PX, image_size
 from log2sim.perception.lidar.cloud import sweep_to_map
+from log2sim.perception.records import RecordSource
 
 # A pixel is then some hundredths of a degree in most cameras.
 MIN_WIDTH_PX = 800
-
-
-def read_gray(stream: Stream, index: int, camera: Camera) -> NDArray[np.uint8] | None:
-    """Read a frame as (H, W) uint8, W between the camera's width and about `MIN_WIDTH_PX`; None where it cannot be read."""
-    import cv2
-
-    try:
-        if stream.encoded is not None:
-            small = _decode_small(stream.encoded(index), camera)
-            if small is not None:
-                return small
-        gray = cv2.cvtColor(stream.read(index), cv2.COLOR_BGR2GRAY)
-    except RecordError:
-        return None
-    scale = MIN_WIDTH_PX / camera.width_px
-    if scale < 0.75:
-        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(gray, dtype=np.uint8)
-
-
-def _decode_small(data: bytes, camera: Camera) -> NDArray[np.uint8] | None:
-    """Decode a JPEG at a reduced size; None for images of another kind or size."""
-    import simplejpeg
-
-    if data[:2] != b"\xff\xd8":
-        return None
-    width, height = image_size(data, camera.name)
-    if (width, height) != (camera.width_px, camera.height_px) or width * height > MAX_IMAGE_PX:
-        return None
-    try:
-        gray = simplejpeg.decode_jpeg(data, colorspace="GRAY", min_width=min(MIN_WIDTH_PX, width))
-    except ValueError:
-        return None
-    return np.asarray(gray[:, :, 0], dtype=np.uint8)
 
 
 # Nearer edges lie elsewhere in a camera's view when its position is off by centimeters; farther ones have few rays.
@@ -86,12 +51,9 @@ class DepthEdges:
 
 def read_depth_edges(log: Log, lidar: str, index: int) -> DepthEdges | None:
     """Find the edges in a sweep of a log; None where it cannot be read or its pose is not known."""
-    try:
-        sweep: Sweep = log.streams[lidar].read(index)
-    except RecordError:
-        return None
-    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
-    if mapped is None or len(mapped[0]) < 2:
+    sweep: Sweep | None = RecordSource(log).get(lidar, index)
+    mapped = None if sweep is None else sweep_to_map(log, lidar, sweep, compensate=True)
+    if sweep is None or mapped is None or len(mapped[0]) < 2:
         return None
     rays = np.asarray(sweep.xyz_m, dtype=np.float64)
     if sweep.frame == "map":
@@ -400,7 +362,7 @@ class EdgeViews:
         if edges is None or abs(int(stamps[frame]) - t_ns) > MAX_APART_NS:
             return None
         points = points_in_mount(log, log.cameras[name], int(stamps[frame]), edges.points_map)
-        gray = None if points is None else read_gray(log.streams[name], frame, log.cameras[name])
+        gray = None if points is None else RecordSource(log).picture(name, frame, MIN_WIDTH_PX, gray=True)
         if points is None or gray is None:
             return None
         return EdgeView(gray, gray.shape[1] / log.cameras[name].width_px, points, edges.left)

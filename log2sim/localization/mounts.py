@@ -18,6 +18,7 @@ from log2sim.localization.camera_motion import FollowSettings, follow_points
 from log2sim.localization.choice import during_ns
 from log2sim.localization.clocks import check_lidars, turn_mount
 from log2sim.localization.edges import (
+    MIN_WIDTH_PX,
     REACH_RAD,
     EdgeView,
     EdgeViews,
@@ -25,10 +26,10 @@ from log2sim.localization.edges import (
     choose_moments,
     estimate_yaw,
     is_near,
-    read_gray,
     score_angles,
 )
 from log2sim.localization.odometry import densest_lidar
+from log2sim.perception.records import RecordSource
 from log2sim.plan import LABELS, Sensors
 
 MAX_PAIRS, MIN_PAIRS = 6, 3
@@ -52,16 +53,16 @@ class FlowPair:
 
 def follow_pairs(log: Log, name: str, during_ns: tuple[int, int] | None) -> list[FlowPair]:
     """Follow points in pairs of frames of a camera on the ego, spread over the log; none where the ego stands."""
-    camera, stream, ego = log.cameras[name], log.streams[name], log.ego
+    camera, t_ns, ego, records = log.cameras[name], log.streams[name].t_ns, log.ego, RecordSource(log)
     if ego is None or camera.mount != "ego":
         return []
     pairs = []
-    for first, second in _choose_pairs(log, stream.t_ns, during_ns):
-        images = [read_gray(stream, row, camera) for row in (first, second)]
+    for first, second in _choose_pairs(log, t_ns, during_ns):
+        images = [records.picture(name, row, MIN_WIDTH_PX, gray=True) for row in (first, second)]
         if images[0] is None or images[1] is None:
             continue
         rays = _follow(camera, images[0], images[1])
-        poses, _ = ego.at(stream.t_ns[[first, second]])
+        poses, _ = ego.at(t_ns[[first, second]])
         pairs.append(FlowPair(rays[0], rays[1], inverse(poses[1]) @ poses[0]))
     return pairs
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Sweep
-from log2sim.errors import LogError, MissingExtra, RecordError
+from log2sim.errors import LogError, MissingExtra
 from log2sim.geometry import (
     NS_PER_S,
     Array,
@@ -25,6 +25,7 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
+from log2sim.perception.records import RecordSource
 
 # Transforms are interpolated between knots this far apart, which errs by 3e-6 rad at 1 rad/s: 0.3 mm at 100 m.
 KNOT_NS = 5_000_000
@@ -120,11 +121,8 @@ def _coverage(log: Log, lidar: str) -> int:
 
 def read_ego_sweep(log: Log, lidar: str, index: int) -> EgoSweep | None:
     """Read a sweep into the ego's frame; None where it cannot be read or, in the map frame, where the ego's pose is not known."""
-    try:
-        sweep: Sweep = log.streams[lidar].read(index)
-    except RecordError:
-        return None
-    return ego_sweep_of(log, lidar, sweep)
+    sweep: Sweep | None = RecordSource(log).get(lidar, index)
+    return None if sweep is None else ego_sweep_of(log, lidar, sweep)
 
 
 def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Boxes3D, Log, Sweep
-from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
 from log2sim.localization.surfaces import (
@@ -27,6 +26,7 @@ from log2sim.localization.surfaces import (
 )
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Ground, assemble_cloud, estimate_ground, sweep_to_map
+from log2sim.perception.records import RecordSource
 
 MAX_VEHICLE_SWEEPS, MAX_ROAD_SWEEPS = 16, 10
 MAX_SWEEP_POINTS = 20_000
@@ -173,9 +173,8 @@ def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, in
 
 def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
     """Read a sweep: points (N, 3) and the place (3,) of the sensor in the map, m; None where that fails."""
-    try:
-        sweep: Sweep = log.streams[lidar].read(index)
-    except RecordError:
+    sweep: Sweep | None = RecordSource(log).get(lidar, index)
+    if sweep is None:
         return None
     step = max(-(-len(sweep.xyz_m) // MAX_SWEEP_POINTS), 1)
     t_ns = None if sweep.t_ns is None else sweep.t_ns[::step]
@@ -323,13 +322,13 @@ def detect_boxes(
 
     `floor_m`: (K, 3): where clouds begin: a place on the ground, map frame.
     """
-    out, before = [], None
+    out, before, records = [], None, RecordSource(log)
     for moment, floor in zip(moments_ns.tolist(), floor_m):
         index = {name: _nearest_moments(log.streams[name].t_ns, moment) for name in lidars}
         if index == before:
             continue
         before = index
-        sweeps = {name: sweep for name, i in index.items() if (sweep := _read_detections(log, name, i)) is not None}
+        sweeps = {name: sweep for name, i in index.items() if (sweep := records.get(name, i)) is not None}
         cloud = (
             assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=MAX_REACH_M)
             if sweeps
@@ -343,14 +342,6 @@ def detect_boxes(
 
 def _nearest_moments(t_ns: NDArray[np.int64], moment: int) -> int:
     return int(np.argmin(np.abs(t_ns - moment)))
-
-
-def _read_detections(log: Log, lidar: str, index: int) -> Sweep | None:
-    try:
-        sweep: Sweep = log.streams[lidar].read(index)
-    except RecordError:
-        return None
-    return sweep
 
 
 def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log
-from log2sim.errors import RecordError
 from log2sim.geometry import (
     NS_PER_S,
     Array,
@@ -23,6 +22,7 @@ from log2sim.geometry import (
     transform,
 )
 from log2sim.localization.odometry import EgoSweep, ego_sweep_of, move_points
+from log2sim.perception.records import RecordSource
 
 # Velocities are those of a second: errors of GNSS and IMU make those of shorter times useless, and vehicles speed up and turn
 # for longer.
@@ -282,12 +282,11 @@ def pair_sweeps(
     if track is None:
         return None
     chosen = choose_sweeps(track, log.streams[lidar].t_ns, during_ns)
-    places, surfaces = [], []
+    records, places, surfaces = RecordSource(log), [], []
     for done, i in enumerate(chosen.tolist()):
         report(done, len(chosen))
-        try:
-            record = log.streams[lidar].read(i)
-        except RecordError:
+        record = records.get(lidar, i)
+        if record is None:
             continue
         if record.frame == "map":
             return None

@@ -93,8 +93,42 @@ def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]
         raise error(f"{where}: {reason or type(problem).__name__}") from problem
 
 
+# Of the sweeps that were read last: all that the stages before and after the first pass share of a log of some 100 sweeps.
+MAX_KEPT_BYTES = 256 * 1024 * 1024
+
+
+class _LastSweeps:
+    """The sweeps of a log that were read last, up to `MAX_KEPT_BYTES`; safe to share between threads."""
+
+    def __init__(self) -> None:
+        self._sweeps: dict[tuple[str, int], Sweep] = {}
+        self._bytes, self._lock = 0, threading.Lock()
+
+    def read(self, stream: str, i: int, read: Callable[[int], Any]) -> Any:
+        """Return record i of a stream, which is read if it is not kept; pictures are never kept."""
+        with self._lock:
+            kept = self._sweeps.pop((stream, i), None)
+            if kept is not None:
+                self._sweeps[stream, i] = kept  # the last one in
+                return kept
+        record = read(i)
+        if isinstance(record, Sweep):
+            with self._lock:
+                self._bytes += 0 if (stream, i) in self._sweeps else _bytes_of(record)
+                self._sweeps[stream, i] = record
+                while self._bytes > MAX_KEPT_BYTES:
+                    self._bytes -= _bytes_of(self._sweeps.pop(next(iter(self._sweeps))))
+        return record
+
+
+def _bytes_of(sweep: Sweep) -> int:
+    return sum(column.nbytes for column in vars(sweep).values() if isinstance(column, np.ndarray))
+
+
 def guard_log(log: Log, where: str) -> Log:
     """Return the log of a reader with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
+
+    The sweeps that were read last are kept.
 
     `where`: its path, for errors. Raises `LogError` for poses of the ego that are not finite, or farther from the origin of
     the map than any place on Earth.
@@ -115,6 +149,8 @@ def guard_log(log: Log, where: str) -> Log:
 
         return reading
 
+    sweeps = _LastSweeps()
+
     def guarded_stream(stream: Stream) -> Stream:
         def record(read: Callable[[int], Any], i: int) -> Any:
             with translate_parser_errors(f"{where}: record {i} of '{stream.name}' cannot be read", RecordError):
@@ -122,7 +158,9 @@ def guard_log(log: Log, where: str) -> Log:
 
         stamps = guarded(lambda: stream.t_ns, f"the stamps of '{stream.name}' cannot be read")
         encoded = None if stream.encoded is None else partial(record, stream.encoded)
-        return Stream(stream.name, stamps, partial(record, stream.read), encoded)
+        return Stream(
+            stream.name, stamps, partial(sweeps.read, stream.name, read=partial(record, stream.read)), encoded
+        )
 
     return log.changed(
         streams={name: guarded_stream(stream) for name, stream in log.streams.items()},
@@ -141,11 +179,14 @@ def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[
     return decode_image(read_bytes(path, t_ns, MAX_IMAGE_BYTES), f"{path} (stamp {t_ns})", (width_px, height_px))
 
 
-def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """Decode a JPEG or PNG file as (H, W, 3) uint8 BGR.
+def decode_image(
+    data: bytes, where: str, size_px: tuple[int, int], *, least_px: int = 0, gray: bool = False
+) -> NDArray[np.uint8]:
+    """Decode a JPEG or PNG file as (H, W, 3) uint8 BGR, or as (H, W) `gray`.
 
-    `where`: names file and stamp in errors. `size_px` (int, int): width and height that the calibration is for. Raises
-    `RecordError` when it is truncated, no JPEG or PNG, or of another size.
+    `where`: names file and stamp in errors. `size_px` (int, int): width and height that the calibration is for. `least_px`: a
+    JPEG is decoded at a smaller scale as far as it stays this wide; 0 for the whole. Raises `RecordError` when it is
+    truncated, no JPEG or PNG, or of another size.
     """
     width, height = image_size(data, where)
     if (width, height) != size_px:
@@ -154,7 +195,9 @@ def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[n
         import simplejpeg
 
         try:
-            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="BGR"))
+            least_px = min(least_px, width)
+            image = simplejpeg.decode_jpeg(data, colorspace="GRAY" if gray else "BGR", min_width=least_px)
+            return np.asarray(image[:, :, 0] if gray else image)
         except ValueError as error:
             raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
     import cv2
@@ -163,7 +206,7 @@ def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[n
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise RecordError(f"{where}: PNG cannot be decoded")
-    return image.astype(np.uint8, copy=False)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image, dtype=np.uint8)
 
 
 def _check_png_chunks(data: bytes, where: str) -> None:

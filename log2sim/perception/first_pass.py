@@ -24,11 +24,11 @@ from log2sim.perception.alignment import align_parts
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.first_pass_cache import FirstPassCache
-from log2sim.perception.frames import FrameDetector, RecordReader
+from log2sim.perception.frames import FrameDetector
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, obstacles_of
 from log2sim.perception.observe_tick import Observed, TickObserver
-from log2sim.perception.records import Look, RecordWatch, SweepSketch, sketch_sweep
+from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.sync import Schedule
 from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox
 from log2sim.plan import FusionLevel, Plan, Stage
@@ -156,7 +156,7 @@ class CloudMaker:
         self._clouds: dict[Key, Cloud | None] = {}
         self._earlier: list[tuple[Key, Cloud | None]] = []
 
-    def clouds(self, tick: int, records: RecordReader) -> list[Cloud | None]:
+    def clouds(self, tick: int, records: RecordSource) -> list[Cloud | None]:
         """Return the clouds of a tick for every row of the schedule."""
         rows = [self._sweeps_of(tick, row) for row in range(self._schedule.rows)]
         earlier = [] if tick == self._next else self._searched_before(tick)
@@ -204,7 +204,7 @@ class CloudMaker:
                 last = sweeps
         return found[::-1]
 
-    def sweeps_of(self, ticks: range, records: RecordReader) -> list[Sweep | None]:
+    def sweeps_of(self, ticks: range, records: RecordSource) -> list[Sweep | None]:
         """Return all sweeps that the clouds of some ticks are made of, None for those that cannot be read."""
         rows = [self._sweeps_of(tick, row) for tick in ticks for row in range(self._schedule.rows)]
         return [self._sweep(*key, records) for key in self._listed([*self._searched_before(ticks.start), *rows])]
@@ -212,12 +212,12 @@ class CloudMaker:
     def _listed(self, keys: Sequence[Key]) -> list[tuple[str, int]]:
         return sorted({(name, i) for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0})
 
-    def _sweep(self, name: str, i: int, records: RecordReader) -> Sweep | None:
+    def _sweep(self, name: str, i: int, records: RecordSource) -> Sweep | None:
         sweep = self._sweeps.pop((name, i)) if (name, i) in self._sweeps else records.get(name, i)
         self._sweeps[name, i] = sweep  # the last one in
         return sweep
 
-    def _read(self, keys: Sequence[Key], records: RecordReader) -> None:
+    def _read(self, keys: Sequence[Key], records: RecordSource) -> None:
         """Read and judge the sweeps of some clouds in their order, and forget those that only earlier ticks needed."""
         wanted, compensates = self._listed(keys), self._plan.keeps(Stage.MOTION_COMPENSATION)
         self._live = set()
@@ -285,7 +285,7 @@ class Observations:
     feet: dict[str, list[Correspondences]] = field(default_factory=dict)
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
     detections: dict[str, int] = field(default_factory=dict)
-    records: RecordReader | None = None
+    records: RecordSource | None = None
     sweeps: Counter[str] = field(default_factory=Counter)
     frames_detected: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
@@ -387,7 +387,7 @@ class FirstPass:
     def observe(self, task: Task) -> tuple[Part, StageClock, tuple[int, int, str | None]]:
         """Detect and measure in some ticks; returns how many were known and how many were kept, and why no more, too."""
         task.watch.attach(self.log)
-        records, clock, count = RecordReader(self.log, task.watch), StageClock(), len(task.ticks)
+        records, clock, count = RecordSource(self.log, task.watch), StageClock(), len(task.ticks)
         if self.cache is not None:
             with clock.stage("recall"):
                 key = self._content(task, records)
@@ -404,7 +404,7 @@ class FirstPass:
             kept = self.cache.put(key, part)
         return part, clock, (0, count * kept, self.cache.store_problem)
 
-    def _content(self, task: Task, records: RecordReader) -> bytes:
+    def _content(self, task: Task, records: RecordSource) -> bytes:
         """Return a digest of the records of some ticks, and of all else that what is seen there depends on."""
         ticks, total = task.ticks, len(self.schedule)
         looked = range(ticks.start, min(ticks.stop + (self.plan.detector_stride > 1), total))
@@ -430,16 +430,16 @@ class FirstPass:
         value.update(pack(described))
         return value.digest()
 
-    def _picture(self, camera: str, index: int, records: RecordReader) -> bytes:
+    def _picture(self, camera: str, index: int, records: RecordSource) -> bytes:
         """Return a digest of a picture: of its file where the log has one, which is not decoded then, else of its pixels."""
         stream = self.log.streams[camera]
         try:
-            content = pack(records.get(camera, index)) if stream.encoded is None else stream.encoded(index)
+            content = pack(records.require(camera, index)) if stream.encoded is None else stream.encoded(index)
         except RecordError as error:
             content = str(error).encode()
         return hashlib.blake2b(content, digest_size=32).digest()
 
-    def _tick(self, tick: int, records: RecordReader, clock: StageClock) -> SeenTick:
+    def _tick(self, tick: int, records: RecordSource, clock: StageClock) -> SeenTick:
         out, plan, live = SeenTick(), self.plan, dict[str, Detections]()
         searched = {} if self.frames is None else self.frames.search(tick, records, clock)
         for camera, findings in searched.items():
@@ -524,7 +524,7 @@ def observe(
         looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
         planned = [plan.detector_stride, plan.picture_stride, plan.fusion, [plan.keeps(stage) for stage in looked_at]]
         cache.begin(log, [list(plan.cameras), planned, mode, max_range_m, sweeps, schedule.reference_row])
-    records = out.records = RecordReader(log)
+    records = out.records = RecordSource(log)
     before: list[tuple[Key, Boxes3D]] = []
     compensated: dict[tuple[str, int], str] = {}
     skipped: Counter[str] = Counter()
@@ -558,6 +558,8 @@ def observe(
     records.require_some()
     if cache is not None:
         cache.finish()
-    out.sweeps, out.faults = Counter(compensated.values()), records.watch.faults(schedule)
+    used = dict.fromkeys([*schedule.frames, *schedule.sweeps])
+    out.sweeps = Counter(compensated.values())
+    out.faults = records.watch.faults(used, int(schedule.t_ns[0]), int(schedule.t_ns[-1]))
     out.frames_skipped = dict(skipped)
     return out

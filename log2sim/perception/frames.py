@@ -1,22 +1,22 @@
-"""Camera frames: records read, images decoded, detections in every frame, and a second look at pictures."""
+"""Camera frames: detections in every frame, and a second look at pictures."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Detections, Frame, Log, Sweep
-from log2sim.errors import LogError, RecordError
+from log2sim.datatypes import Detections, Frame, Log
+from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.perception.detect.detectors import Detector, detect_all
-from log2sim.perception.records import Look, RecordWatch, SweepSketch, Thumbnail, shrink
+from log2sim.perception.records import RecordSource, Thumbnail, shrink
 from log2sim.perception.sync import Schedule
 from log2sim.perception.traffic_light_boxes import LightBox, crop_lights
 from log2sim.plan import Plan, Stage
@@ -25,6 +25,8 @@ Item = TypeVar("Item")
 Out = TypeVar("Out")
 
 BACKGROUND_THREADS = 2
+# More than any picture has, for whole ones.
+MAX_WIDTH_PX = 1 << 16
 # Results that are made ahead of the one in use, which bounds the memory.
 AHEAD = 6
 
@@ -47,80 +49,6 @@ def work_ahead(work: Callable[[Item], Out], items: Iterable[Item], ahead: int = 
         # Without waiting: an iterator that is left early may be closed by the garbage collector, in any thread, while that
         # thread holds a lock that ending threads need.
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-class RecordReader:
-    """Read records of a log, count those that cannot be read, and judge what they show.
-
-    Attributes
-    ----------
-    log : Log
-    read : dict of str to int
-        How many records of each stream were read.
-    failed : dict of str to list of str
-        Messages of the records that could not be read, by stream.
-    watch : RecordWatch
-        Which of them repeat others or show nothing.
-    looks : dict of (str, int) to Look
-        What was judged, by sensor and stamp, in this order.
-    """
-
-    def __init__(self, log: Log, watch: RecordWatch | None = None) -> None:
-        self.log = log
-        self.read: dict[str, int] = {}
-        self.failed: dict[str, list[str]] = {}
-        self.watch = RecordWatch(log) if watch is None else watch
-        self.looks: dict[tuple[str, int], Look] = {}
-
-    def get(self, stream: str, index: int) -> Any | None:
-        """Read a record; None when it cannot be read."""
-        try:
-            record = self.log.streams[stream].read(index)
-            if isinstance(record, Sweep) and not len(record.xyz_m):
-                raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
-        except RecordError as error:
-            self.add({}, {stream: [str(error)]})
-            return None
-        self.count(stream)
-        return record
-
-    def count(self, stream: str) -> None:
-        """Count a record of a stream as read, also one whose content is known already."""
-        self.read[stream] = self.read.get(stream, 0) + 1
-
-    def add(self, read: Mapping[str, int], failed: Mapping[str, Sequence[str]]) -> None:
-        """Add what another reader of the log counted; a record that was requested again failed again."""
-        for stream, number in read.items():
-            self.read[stream] = self.read.get(stream, 0) + number
-        for stream, problems in failed.items():
-            known = self.failed.setdefault(stream, [])
-            known += [problem for problem in problems if problem not in known]
-
-    def is_live(self, sensor: str, index: int, shown: Thumbnail | SweepSketch | None, *, found: bool = False) -> bool:
-        """Judge a record by what is kept of it: whether it shows what is there."""
-        look = Look(sensor, int(self.log.streams[sensor].t_ns[index]), shown, found, "")
-        state = self.watch.judge(look)
-        self.looks[sensor, look.t_ns] = replace(look, state=state)
-        return state == "live"
-
-    def require_some(self) -> None:
-        """Require that every stream of which records were requested gave at least one.
-
-        Raises
-        ------
-        LogError
-            For a stream of which no requested record could be read.
-        """
-        for stream, problems in self.failed.items():
-            if not self.read.get(stream):
-                raise LogError(
-                    f"stream '{stream}': none of the {len(problems)} records asked for can be read, "
-                    f"the first because {problems[0]}. Mend or remove the stream; `log2sim validate` lists all problems"
-                )
-
-    def summary(self) -> dict[str, Any]:
-        """Summarize the unreadable records for the report: count and first message by stream."""
-        return {s: {"count": len(p), "first": p[0]} for s, p in sorted(self.failed.items())}
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +82,7 @@ class FrameDetector:
         self._empty = set[str]()
         self._known: dict[tuple[str, int], PictureFindings | None] = {}
 
-    def search(self, tick: int, reader: RecordReader, clock: StageClock) -> dict[str, PictureFindings | None]:
+    def search(self, tick: int, reader: RecordSource, clock: StageClock) -> dict[str, PictureFindings | None]:
         """Search the frames of a tick by camera; None for one that is skipped.
 
         Ticks come in order, from one that a stride divides. A camera is left out where it has no frame or its frame cannot be
@@ -177,7 +105,7 @@ class FrameDetector:
         return {camera: found.get(camera) for camera in recorded if camera in found or camera in skipped}
 
     def _look(
-        self, tick: int, cameras: Iterable[str], reader: RecordReader, clock: StageClock
+        self, tick: int, cameras: Iterable[str], reader: RecordSource, clock: StageClock
     ) -> dict[str, PictureFindings]:
         """Search a tick's frames of some cameras, each once; those that have none or cannot be read are left out."""
         frames, thumbnails = dict[str, Frame](), dict[str, Thumbnail | None]()
@@ -204,16 +132,13 @@ class FrameDetector:
 class _LazyImage:
     """An image that is decoded at the first call and kept."""
 
-    def __init__(self, reader: RecordReader, stream: str, index: int) -> None:
+    def __init__(self, reader: RecordSource, stream: str, index: int) -> None:
         self._reader, self._stream, self._index = reader, stream, index
         self._image: NDArray[np.uint8] | None = None
 
     def __call__(self) -> NDArray[np.uint8]:
         if self._image is None:
-            image = self._reader.get(self._stream, self._index)
-            if image is None:
-                raise RecordError(f"{self._stream}: frame {self._index} cannot be read")
-            self._image = image
+            self._image = self._reader.require(self._stream, self._index)
         return self._image
 
 
@@ -238,38 +163,28 @@ class PictureConsumer(Protocol):
 
 
 def look_again(
-    log: Log,
-    reader: RecordReader,
+    records: RecordSource,
     consumers: Sequence[PictureConsumer],
     progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    least_px: int = MAX_WIDTH_PX,
 ) -> int:
     """Give every consumer the pictures that it wants; return how many were decoded.
 
-    Pictures that cannot be read, that are black, or that repeat an earlier one are left out.
+    Pictures that cannot be read, that are black, or that repeat an earlier one are left out, as they were judged before, or
+    else now. They are decoded a few ahead in threads, see `RecordSource.picture` for `least_px`.
     """
-    wanted = [consumer.frames() for consumer in consumers]
     takers: dict[tuple[str, int], list[PictureConsumer]] = {}
-    for consumer, frames in zip(consumers, wanted, strict=True):
-        for camera, indices in frames.items():
+    for consumer in consumers:
+        for camera, indices in consumer.frames().items():
             for index in np.unique(indices).tolist():
                 takers.setdefault((camera, index), []).append(consumer)
-    order = sorted(takers, key=lambda key: (int(log.streams[key[0]].t_ns[key[1]]), key[0]))
-    for done, (camera, index, image, thumbnail) in enumerate(_decoded(reader, order)):
-        stamp_ns = int(log.streams[camera].t_ns[index])
-        if image is not None and reader.watch.cameras[camera].judge(stamp_ns, thumbnail) == "live":
+    streams = records.log.streams
+    order = sorted(takers, key=lambda key: (int(streams[key[0]].t_ns[key[1]]), key[0]))
+    images = work_ahead(lambda key: records.picture(*key, least_px), order)
+    for done, ((camera, index), image) in enumerate(zip(order, images, strict=True)):
+        if image is not None and records.watch.is_live(camera, int(streams[camera].t_ns[index]), image):
             for consumer in takers[camera, index]:
                 consumer.add(camera, index, image)
         progress(done + 1, len(order))
     return len(order)
-
-
-def _decoded(
-    reader: RecordReader, order: Sequence[tuple[str, int]]
-) -> Iterator[tuple[str, int, NDArray[np.uint8] | None, Thumbnail]]:
-    """Yield camera, index, picture (None where it cannot be read) and thumbnail, decoded a few ahead in threads."""
-
-    def decode(key: tuple[str, int]) -> tuple[str, int, NDArray[np.uint8] | None, Thumbnail]:
-        image = reader.get(*key)
-        return *key, image, np.zeros((0, 0), np.float32) if image is None else shrink(image)
-
-    return work_ahead(decode, order)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -11,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding, Log, Sweep, Treatment
+from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, Camera
-from log2sim.perception.sync import Schedule
+from log2sim.logs.records import decode_image
 
 Motion = Literal["drives", "stands", "unclear"]
 
@@ -88,10 +91,9 @@ def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[i
     return [(int(around[k]), int(around[k + 1])) for k in np.flatnonzero(np.diff(around) > shortest_ns)]
 
 
-def missing_records(log: Log, schedule: Schedule) -> Iterator[Finding]:
-    """List the interruptions of the streams that a run uses, from its first to its last tick."""
-    start_ns, end_ns = int(schedule.t_ns[0]), int(schedule.t_ns[-1])
-    for name in dict.fromkeys([*schedule.frames, *schedule.sweeps]):
+def missing_records(log: Log, sensors: Iterable[str], start_ns: int, end_ns: int) -> Iterator[Finding]:
+    """List the interruptions of the streams of sensors between two stamps."""
+    for name in sensors:
         gaps = gaps_of(log.streams[name].t_ns, start_ns, end_ns)
         kind = "missing_images" if name in log.cameras else "missing_sweeps"
         for some in [gaps] if len(gaps) > MAX_SPANS else [[gap] for gap in gaps]:
@@ -602,12 +604,16 @@ class RecordWatch:
             return camera.assume_unchanged(look.t_ns)
         return camera.judge(look.t_ns, look.shown, found=look.found)
 
-    def faults(self, schedule: Schedule) -> tuple[Finding, ...]:
-        """List what was found, one for each span of each sensor."""
-        t0_ns = int(schedule.t_ns[0])
-        found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, t0_ns)]
-        found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, t0_ns)]
-        return (*found, *missing_records(self._log, schedule))
+    def is_live(self, camera: str, t_ns: int, image: NDArray[np.uint8]) -> bool:
+        """Return whether a picture (H, W, 3) shows what is there, as it was judged before, or else now."""
+        known = self.cameras[camera].states.get(t_ns)
+        return (known or self.cameras[camera].judge(t_ns, shrink(image))) == "live"
+
+    def faults(self, sensors: Iterable[str], start_ns: int, end_ns: int) -> tuple[Finding, ...]:
+        """List what was found, one for each span of each sensor, and what is missing of some sensors between two stamps."""
+        found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, start_ns)]
+        found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, start_ns)]
+        return (*found, *missing_records(self._log, sensors, start_ns, end_ns))
 
 
 def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Finding]:
@@ -647,3 +653,111 @@ def _finding(kind: str, name: str, treatment: Treatment, span: Span, t0_ns: int,
     start_s, end_s = ((t_ns - t0_ns) / NS_PER_S for t_ns in (span.start_ns, span.end_ns))
     counts = {"count": float(span.count), "total": float(span.total)}
     return Finding(kind, name, treatment, start_s, end_s, counts | values)
+
+
+# A picture is shrunk where it is wider than asked for by more than this: less is not worth the time.
+MAX_OVERSIZE = 4 / 3
+
+
+class RecordSource:
+    """The records of a log: the one door to them for all stages, which counts those that cannot be read and judges what they show.
+
+    `log`: an opened log keeps the sweeps that were read last, so that stages which look at the same ones share them.
+    `watch`: which records repeat others or show nothing, also as stages before found it.
+
+    Attributes
+    ----------
+    read : dict of str to int
+        How many records of each stream were read.
+    failed : dict of str to list of str
+        Messages of the records that could not be read, by stream.
+    looks : dict of (str, int) to Look
+        What was judged, by sensor and stamp, in this order.
+    """
+
+    def __init__(self, log: Log, watch: RecordWatch | None = None) -> None:
+        self.log = log
+        self.read: dict[str, int] = {}
+        self.failed: dict[str, list[str]] = {}
+        self.watch = RecordWatch(log) if watch is None else watch
+        self.looks: dict[tuple[str, int], Look] = {}
+
+    def of(self, log: Log) -> RecordSource:
+        """Return the source of the same records in a log with other poses or mounts, which counts and judges along with this one."""
+        other = copy(self)
+        other.log = log
+        return other
+
+    def require(self, stream: str, index: int) -> Any:
+        """Read a record: a picture (H, W, 3) uint8 BGR, or a `Sweep`; raise `RecordError` when it cannot be read."""
+        try:
+            record = self.log.streams[stream].read(index)
+            if isinstance(record, Sweep) and not len(record.xyz_m):
+                raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
+        except RecordError as error:
+            self.add({}, {stream: [str(error)]})
+            raise
+        self.count(stream)
+        return record
+
+    def get(self, stream: str, index: int) -> Any | None:
+        """Read a record; None when it cannot be read."""
+        try:
+            return self.require(stream, index)
+        except RecordError:
+            return None
+
+    def picture(self, camera: str, index: int, least_px: int, *, gray: bool = False) -> NDArray[np.uint8] | None:
+        """Read a picture at a width, px, from a least one to a third more, if it is wider: (H, W, 3) BGR or (H, W); None if it cannot be.
+
+        A JPEG is decoded at that size, in two thirds of the time of the whole.
+        """
+        image: NDArray[np.uint8] | None = None
+        stream = self.log.streams[camera]
+        width_px, height_px = self.log.cameras[camera].width_px, self.log.cameras[camera].height_px
+        if stream.encoded is not None and (gray or least_px < width_px):
+            with suppress(RecordError):  # which is told when it is read whole
+                file = stream.encoded(index)
+                image = decode_image(file, camera, (width_px, height_px), least_px=least_px, gray=gray)
+                self.count(camera)
+        if image is None:
+            image = self.get(camera, index)
+            if image is None:
+                return None
+            image = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if gray else image
+        scale = least_px / image.shape[1]
+        if scale < 1 / MAX_OVERSIZE:
+            image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        return image
+
+    def count(self, stream: str) -> None:
+        """Count a record of a stream as read, also one whose content is known already."""
+        self.read[stream] = self.read.get(stream, 0) + 1
+
+    def add(self, read: Mapping[str, int], failed: Mapping[str, Sequence[str]]) -> None:
+        """Add what another source of the log counted; a record that was requested again failed again."""
+        for stream, number in read.items():
+            self.read[stream] = self.read.get(stream, 0) + number
+        for stream, problems in failed.items():
+            known = self.failed.setdefault(stream, [])
+            known += [problem for problem in problems if problem not in known]
+
+    def is_live(self, sensor: str, index: int, shown: Thumbnail | SweepSketch | None, *, found: bool = False) -> bool:
+        """Judge a record by what is kept of it: whether it shows what is there."""
+        look = Look(sensor, int(self.log.streams[sensor].t_ns[index]), shown, found, "")
+        state = self.watch.judge(look)
+        self.looks[sensor, look.t_ns] = replace(look, state=state)
+        return state == "live"
+
+    def require_some(self) -> None:
+        """Raise `LogError` for a stream of which records were requested and none could be read."""
+        for stream, problems in self.failed.items():
+            if not self.read.get(stream):
+                raise LogError(
+                    f"stream '{stream}': none of the {len(problems)} records asked for can be read, "
+                    f"the first because {problems[0]}. Mend or remove the stream; `log2sim validate` lists all problems"
+                )
+
+    def summary(self) -> dict[str, Any]:
+        """Summarize the unreadable records for the report: count and first message by stream."""
+        return {s: {"count": len(p), "first": p[0]} for s, p in sorted(self.failed.items())}

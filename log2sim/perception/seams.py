@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, distort, inverse
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography.rig import Rig, RigRows, cam_of_ground, heights_of, rotation_of
 from log2sim.perception.homography.rig_fit import MOUNT_SIGMA_RAD, RigFit
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.observe_tick import base_pose
-from log2sim.perception.records import shrink
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule
 
 # Structure coarser than this is shading, m. Structure finer than this is smoothed: a pixel of a camera of 1000 px focal length,
@@ -545,7 +544,7 @@ class SeamPictures:
 
     @classmethod
     def read(
-        cls, log: Log, schedule: Schedule, observed: Observations, reader: RecordReader, ticks: Sequence[int]
+        cls, log: Log, schedule: Schedule, observed: Observations, reader: RecordSource, ticks: Sequence[int]
     ) -> SeamPictures:
         """Read the pictures of some ticks; black, frozen and unreadable ones are left out."""
         images = {}
@@ -553,7 +552,7 @@ class SeamPictures:
             for camera, index in schedule.frames.items():
                 image = reader.get(camera, int(index[tick])) if index[tick] >= 0 else None
                 t_ns = int(log.streams[camera].t_ns[index[tick]])
-                if image is not None and reader.watch.cameras[camera].judge(t_ns, shrink(image)) == "live":
+                if image is not None and reader.watch.is_live(camera, t_ns, image):
                     images[camera, tick] = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         return cls(log, schedule, observed, images)
 

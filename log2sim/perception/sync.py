@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Stream, Sweep, Tick
-from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.errors import ConfigError, LogError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array, nearest_index
 from log2sim.perception.lidar.cloud import sweep_to_map
+from log2sim.perception.records import RecordSource
 
 PROBED_RECORDS = 5
 
@@ -117,7 +118,7 @@ def synchronize(
         _check_stamps(log.streams[name])
     ticks = log.streams[reference].t_ns
     if not cameras:
-        ticks = ticks + sweep_middle_ns(log.streams[reference])
+        ticks = ticks + sweep_middle_ns(log, reference)
     seconds = (ticks - ticks[0]) / NS_PER_S
     keep = (seconds >= (start_s if start_s is not None else -np.inf)) & (
         seconds <= (stop_s if stop_s is not None else np.inf)
@@ -134,7 +135,7 @@ def synchronize(
     sweeps = {}
     for lidar in log.lidars:
         stream = log.streams[lidar]
-        middle = stream.t_ns + sweep_middle_ns(stream)
+        middle = stream.t_ns + sweep_middle_ns(log, lidar)
         stamps = [np.where(frames[c] >= 0, log.streams[c].t_ns[frames[c]], ticks) for c in cameras]
         asked = np.stack(stamps or [ticks])
         index, _ = nearest_records(middle, asked.ravel(), tolerance_ns)
@@ -215,31 +216,18 @@ def _assign_frames_once(
     return np.where(keep, index, -1), np.where(keep, residual_s, np.nan)
 
 
-def sweep_middle_ns(stream: Stream) -> int:
+def sweep_middle_ns(log: Log, lidar: str) -> int:
     """Return the middle of a sweep's point times relative to its stamp, ns; 0 without point times.
 
-    Taken from the first of `PROBED_RECORDS` sweeps that can be read.
-
-    Raises
-    ------
-    LogError
-        When none of the first sweeps can be read.
+    Taken from the first of `PROBED_RECORDS` sweeps that can be read; 0 where none can.
     """
-    problem: Exception | None = None
-    for i in range(min(PROBED_RECORDS, len(stream.t_ns))):
-        try:
-            sweep: Sweep = stream.read(i)
-        except RecordError as error:
-            problem = error
-            continue
-        if sweep.t_ns is None:
-            return 0
-        if len(sweep.t_ns):
-            return (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2 - int(sweep.stamp_ns)
-    if problem is not None and len(stream.t_ns) <= PROBED_RECORDS:
-        raise LogError(
-            f"stream '{stream.name}': none of its {len(stream.t_ns)} sweeps can be read; the first problem: {problem}"
-        )
+    records = RecordSource(log)
+    for i in range(min(PROBED_RECORDS, len(log.streams[lidar].t_ns))):
+        sweep: Sweep | None = records.get(lidar, i)
+        if sweep is not None:
+            return (
+                0 if sweep.t_ns is None else (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2 - int(sweep.stamp_ns)
+            )
     return 0
 
 
@@ -352,7 +340,7 @@ def points_of(log: Log, sweeps: Mapping[str, Sweep]) -> Array:
 
 
 def _reading(log: Log, name: str, index: int) -> Callable[[], Any]:
-    return lambda: log.streams[name].read(index)
+    return lambda: RecordSource(log).require(name, index)
 
 
 def _ego_pose(log: Log, t_ns: int) -> Array | None:

@@ -16,11 +16,12 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.frames import RecordReader, look_again, work_ahead
+from log2sim.perception.frames import look_again, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.records import RecordSource
 from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
 from log2sim.road.pictures import ColorRaster, Image, StandingPictures, View, find_hidden, sample_nearest, warp_onto
-from log2sim.road.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
+from log2sim.road.road_users import MASK_SHRINK, RoadUsers, covered, draw_footprints, draw_outlines
 from log2sim.road.surface import (
     GroundPoints,
     PointCollector,
@@ -154,7 +155,7 @@ class GroundMapBuilder:
     """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
 
     `log`: with refined poses, see `refine_poses`. `scenario`: its agents hide the ground: moving ones where they are at
-    the time of a record, standing ones always. `reader`: reads the sweeps and counts those that cannot be read.
+    the time of a record, standing ones always. `records`: of this log; reads the sweeps and counts those that cannot be read.
 
     `notes`: what could not be mapped, and why.
 
@@ -166,11 +167,11 @@ class GroundMapBuilder:
         log: Log,
         scenario: Scenario,
         settings: MapConfig,
-        reader: RecordReader | None = None,
+        records: RecordSource | None = None,
         progress: Progress | None = None,
     ) -> None:
         self._log, self._scenario = log, scenario
-        self._reader, self._progress = reader or RecordReader(log), progress or (lambda done, total: None)
+        self._records, self._progress = records or RecordSource(log), progress or (lambda done, total: None)
         self._path = path_of(log, scenario)
         roadside = roadside_places(log, scenario)
         extent = extent_of(self._path, roadside)
@@ -214,13 +215,11 @@ class GroundMapBuilder:
         kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
         kept &= self._likely_ground[warp.rows, warp.columns] > 0
         if view.camera.mount == "ego":
-            ego = draw_footprints([self._users.ego_at(view.t_ns)], self.raster)
-            kept &= ego[warp.rows, warp.columns] == 0
-        warp = warp.take(kept)
-        hiding = self._hiding_at(view.t_ns) if view.camera.mount == "ego" else None
-        if hiding is not None:
-            warp = warp.take(~find_hidden(view, warp, hiding))
-        colors.add(view.camera.name, image, warp)
+            kept &= ~covered([self._users.ego_at(view.t_ns)], self.raster, warp.rows, warp.columns)
+            hiding = self._hiding_at(view.t_ns)
+            if hiding is not None:
+                kept &= ~find_hidden(view, warp, hiding)
+        colors.add(view.camera.name, image, warp.take(kept))
 
     def build(self) -> GroundMap:
         """Return the map of all that was added, as far as anything is known; once, since what it is made of is let go."""
@@ -250,7 +249,7 @@ class GroundMapBuilder:
         """Return how far apart sweeps are taken, m, by how many points the first that can be read has."""
         t_ns = self._log.streams[lidar].t_ns if lidar in self._log.streams else np.zeros(0, np.int64)
         for index in np.flatnonzero(t_ns >= self._scenario.t0_ns)[:PROBED_SWEEPS].tolist():
-            sweep = self._reader.get(lidar, index)
+            sweep = self._records.get(lidar, index)
             if sweep is not None:
                 return sweep_step_m(len(sweep.xyz_m))
         return sweep_step_m(0)
@@ -270,11 +269,10 @@ class GroundMapBuilder:
         collector = PointCollector(self._log, coarse, len(chosen), self._z0_m)
 
         def prepare(key: tuple[str, int]) -> PreparedSweep | None:
-            name, sweep, t_ns = key[0], self._reader.get(*key), int(self._log.streams[key[0]].t_ns[key[1]])
-            if sweep is None or self._reader.watch.lidars[name].repeated.get(t_ns, False):
+            name, sweep, t_ns = key[0], self._records.get(*key), int(self._log.streams[key[0]].t_ns[key[1]])
+            if sweep is None or self._records.watch.lidars[name].repeated.get(t_ns, False):
                 return None
-            hidden = draw_footprints([self._users.at(t_ns), self._users.ego_at(t_ns)], coarse)
-            return collector.prepare(name, sweep, hidden)
+            return collector.prepare(name, sweep, [self._users.at(t_ns), self._users.ego_at(t_ns)])
 
         for done, prepared in enumerate(work_ahead(prepare, chosen)):
             collector.take(prepared)
@@ -334,7 +332,7 @@ def map_ground(
     log: Log,
     scenario: Scenario,
     settings: MapConfig | None = None,
-    reader: RecordReader | None = None,
+    records: RecordSource | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
     *,
     refine: bool = True,
@@ -345,7 +343,7 @@ def map_ground(
     ----------
     scenario : Scenario
         Its agents are left out of the map; its span of time is what is mapped.
-    reader : RecordReader, optional
+    records : RecordSource, optional
         Counts the records that cannot be read.
     progress : callable, optional
         Called as `progress(stage, done, total)`.
@@ -357,12 +355,13 @@ def map_ground(
     LogError
         When no pose is known, or no record that is wanted can be read.
     """
-    reader, settings = reader or RecordReader(log), settings or MapConfig()
+    records, settings = records or RecordSource(log), settings or MapConfig()
     if refine:
         end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
         refined = refine_poses(log, (scenario.t0_ns, end_ns))
         log = log if refined is None else replace_poses(log, refined)
-    builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
-    look_again(log, reader, [builder], partial(progress, "map: pictures"))
-    reader.require_some()
+    records = records.of(log)
+    builder = GroundMapBuilder(log, scenario, settings, records, partial(progress, "map: sweeps"))
+    look_again(records, [builder], partial(progress, "map: pictures"))
+    records.require_some()
     return builder.build()

@@ -7,7 +7,7 @@ vehicles are chosen by where they are, and lanes are inferred from where they dr
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,8 +18,9 @@ from log2sim.files.stages import StageClock
 from log2sim.localization.choice import PoseChoice
 from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.frames import PictureConsumer, RecordReader, look_again
-from log2sim.perception.traffic_light_boxes import LightBox
+from log2sim.perception.first_pass import Observations
+from log2sim.perception.frames import PictureConsumer, look_again
+from log2sim.perception.records import RecordSource
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
@@ -34,27 +35,27 @@ def describe(
     config: Config,
     plan: Plan,
     poses: PoseChoice,
-    lights: Sequence[LightBox],
+    observations: Observations,
     clock: StageClock,
     progress: Callable[[str, int, int], None],
 ) -> tuple[Scenario, list[Decision], dict[str, Any]]:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario; with what the stages did, and figures of the report.
 
-    `poses`: with those by which the ground is drawn. `lights`: traffic lights in frames, from the first pass.
+    `poses`: with those by which the ground is drawn. `observations`: what the first pass found of the records.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if poses.for_map is None else replace_poses(log, poses.for_map)
-    reader = RecordReader(drawn)
+    records = (observations.records or RecordSource(log)).of(drawn)
     builder, features = None, MapFeatures() if plan.keeps(Stage.LANES) else None
     if features is not None:
         try:
-            builder = GroundMapBuilder(drawn, scenario, config.map, reader)
+            builder = GroundMapBuilder(drawn, scenario, config.map, records)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
     with clock.stage("pictures", progress):
-        look_again(log, reader, consumers, lambda done, total: progress("pictures", done, total))
+        look_again(records, consumers, lambda done, total: progress("pictures", done, total))
     with clock.stage("lanes", progress):
         if builder is not None:
             ground = builder.build()
@@ -68,7 +69,9 @@ def describe(
         found = {} if colors is None else colors.colors()
         agents = tuple(replace(agent, color=found.get(agent.id, agent.color)) for agent in scenario.agents)
     with clock.stage("signals"):
-        signals, seen_lights = find_signals(log, scenario, lights) if plan.keeps(Stage.SIGNALS) else ((), "")
+        signals, seen_lights = (
+            find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
+        )
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
     uncolored = () if colors is None else colors.notes()
     colored = sum(agent.color is not None for agent in described.others)
@@ -83,7 +86,6 @@ def describe(
         "map_features": None if features is None else count_features(features),
         "colors": dict(Counter(str(agent.color["name"]) for agent in agents if agent.color is not None)),
         "signals": len(signals),
-        "unreadable": reader.summary(),
     }
     return described, decisions, figures
 

@@ -97,16 +97,30 @@ def _boxes_of(rows: Array) -> Boxes:
     return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6])
 
 
-def draw_footprints(boxes: Sequence[Boxes], raster: Raster) -> NDArray[np.uint8]:
-    """Mask (R, C) of the cells under boxes, 1 there."""
-    mask = np.zeros(raster.shape, dtype=np.uint8)
+def draw_footprints(
+    boxes: Sequence[Boxes], raster: Raster, corner: tuple[int, int] = (0, 0), shape: tuple[int, int] | None = None
+) -> NDArray[np.uint8]:
+    """Mask of the cells under boxes, 1 there: of all cells (R, C), or of a part of a shape from the row and column of its corner on."""
+    mask = np.zeros(shape or raster.shape, dtype=np.uint8)
     for some in boxes:
         corners = box_corners_bev(some.center_m[:, :2], some.size_m[:, 0], some.size_m[:, 1], some.yaw_rad)
         rows, columns = raster.cells_of(corners.reshape(-1, 2))
-        for polygon in np.stack([columns, rows], axis=1).reshape(-1, 4, 2):
-            if np.all(polygon.max(axis=0) >= 0) and np.all(polygon.min(axis=0) < raster.shape[::-1]):
-                cv2.fillConvexPoly(mask, np.rint(polygon).astype(np.int32), 1)
+        for polygon in np.rint(np.stack([columns, rows], axis=1)).astype(np.int32).reshape(-1, 4, 2) - corner[::-1]:
+            if np.all(polygon.max(axis=0) >= 0) and np.all(polygon.min(axis=0) < mask.shape[::-1]):
+                cv2.fillConvexPoly(mask, polygon, 1)
     return mask
+
+
+def covered(
+    boxes: Sequence[Boxes], raster: Raster, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Tell which cells (N,) of a raster are under boxes; takes the time of the part that they are in, however large the raster is."""
+    if not len(rows):
+        return np.zeros(0, dtype=bool)
+    corner = (int(rows.min()), int(columns.min()))
+    shape = (int(rows.max()) - corner[0] + 1, int(columns.max()) - corner[1] + 1)
+    mask = draw_footprints(boxes, raster, corner, shape)
+    return np.asarray(mask[rows - corner[0], columns - corner[1]] > 0)
 
 
 def draw_outlines(boxes: Boxes, camera: Camera, map_T_cam: Array) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import Array
 from log2sim.perception.lidar.cloud import MAX_OBSTACLE_HEIGHT_M, cloud_origin, estimate_ground, sweep_to_map
 from log2sim.road.ground_map import Raster
+from log2sim.road.road_users import Boxes, covered
 
 # With 29 bytes each, 350 MB.
 MAX_POINTS = 12_000_000
@@ -71,10 +73,6 @@ class PointCollector:
         self._parts: list[tuple[NDArray[np.generic], ...]] = []
         self.hiding: dict[int, Array] = {}
 
-    def add(self, lidar: str, sweep: Sweep, hidden: NDArray[np.uint8]) -> None:
-        """Take a sweep; points in cells of the raster at which `hidden` (R, C) is not 0 are left out."""
-        self.take(self.prepare(lidar, sweep, hidden))
-
     def take(self, prepared: PreparedSweep | None) -> None:
         """Take what `prepare` made of a sweep."""
         if prepared is not None:
@@ -82,8 +80,8 @@ class PointCollector:
             self.hiding[prepared.stamp_ns] = np.concatenate([before, prepared.hiding])
             self._parts.append(prepared.columns)
 
-    def prepare(self, lidar: str, sweep: Sweep, hidden: NDArray[np.uint8]) -> PreparedSweep | None:
-        """Find the points of a sweep as for `add`, for `take`; several threads may do so at once. None where no pose is known."""
+    def prepare(self, lidar: str, sweep: Sweep, users: Sequence[Boxes]) -> PreparedSweep | None:
+        """Find the points of a sweep, but for those under road users; several threads may do so at once. None where no pose is known."""
         mapped = sweep_to_map(self._log, lidar, sweep, compensate=True)
         if mapped is None or not len(mapped[0]):
             return None
@@ -106,7 +104,8 @@ class PointCollector:
         near = within[np.abs(height) < NEAR_GROUND_M]
         near = near[:: -(-len(near) // self._most)] if len(near) > self._most else near
         cell, inside = self._raster.index_of(xyz[near, :2])
-        near = near[inside & (hidden.ravel()[cell] == 0)]
+        near, cell = near[inside], cell[inside]
+        near = near[~covered(users, self._raster, *np.divmod(cell, self._raster.shape[1]))]
         away = (xyz[near] - sensor) @ (map_T_lidar[0, :3, :3] if known[0] else np.eye(3))
         range_m = np.linalg.norm(away, axis=1)
         usable = range_m > 0
@@ -312,11 +311,9 @@ def _extended(path: Array) -> Array:
 
 def upsample(values: NDArray[np.float32], factor: int, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Interpolate a coarse raster (r, c) or (r, c, K) bilinearly onto one with `factor` cells for each of its cells, along both axes."""
-    scale, shift = 1 / factor, (0.5 / factor) - 0.5
-    matrix = np.array([[scale, 0, shift], [0, scale, shift]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpAffine(values, matrix, shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(warped, dtype=np.float32)
+    rows, columns = (min(-(-n // factor), k) for n, k in zip(shape, values.shape))
+    fine = cv2.resize(values[:rows, :columns], (columns * factor, rows * factor), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
 
 
 # The usual return of the road is this much of the full scale: paint, of three to ten times its reflectivity, is not clipped at once.

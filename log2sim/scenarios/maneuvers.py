@@ -165,7 +165,8 @@ def _starts_and_stops(traffic: Traffic, k: int) -> Iterator[Tag]:
     stands = latched(speed <= STANDSTILL_MPS, speed > 1.0, speed <= STANDSTILL_MPS) & np.isfinite(speed)
     walks = traffic.table.group[k] == "pedestrian"
     moving = 0.8 if walks else MOVING_MPS
-    for i, j in runs(stands, round(1.0 / TICK_S)):
+    for i, last in runs(stands, round(1.0 / TICK_S)):
+        j = i + int(np.flatnonzero(~(speed[i : last + 1] > STANDSTILL_MPS))[-1])
         place = traffic.place_m[k, i : j + 1]
         still = probability_above(1.0, float(np.median(speed[i : j + 1])), float(np.median(sigma[i : j + 1])))
         yield tag_of(traffic, "standing", k, (i, i, j), still, duration_s=(j - i) * TICK_S)

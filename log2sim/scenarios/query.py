@@ -219,7 +219,7 @@ def _main_tags(node: ast.expr) -> list[str]:
     return []
 
 
-def ask(index: Index, text: str, *, min_probability: float = 0.5) -> Found:
+def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
     """Find the tags of an index that fulfil a condition.
 
     Parameters

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO, Agent, Labels, Log, Scenario, Tick, Waypoints
-from log2sim.errors import RecordError
 from log2sim.files.documents import refuse_existing, replaced
 from log2sim.geometry import NS_PER_S
+from log2sim.perception.records import RecordSource
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.result import AgentReplay, Replay
 from log2sim.visualization.overlay import draw_moment, read_moment
@@ -99,11 +99,8 @@ def _as_agent(driven: AgentReplay) -> Agent:
 
 
 def _middle_record(log: Log, name: str) -> Any:
-    stream = log.streams[name]
-    try:
-        return stream.read(len(stream.t_ns) // 2) if len(stream.t_ns) else None
-    except RecordError:
-        return None
+    count = len(log.streams[name].t_ns)
+    return RecordSource(log).get(name, count // 2) if count else None
 
 
 def _jpeg(image: NDArray[np.uint8], caption: str) -> Thumbnail:

@@ -35,6 +35,7 @@ from log2sim.geometry import (
 from log2sim.perception.detect.detectors import MAX_AGE_S, LabelBoxes, interpolate_pairs, window_ns
 from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_to_map
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, printable_label
 
@@ -181,7 +182,7 @@ class _SweepReader:
 
     def _load(self, name: str, index: int) -> SweepInMap | None:
         try:
-            sweep: Sweep = self.log.streams[name].read(index)
+            sweep: Sweep = RecordSource(self.log).require(name, index)
         except RecordError as error:
             self.problems.append(str(error))
             return None
@@ -204,7 +205,7 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
     t_ns = int(log.streams[name].t_ns[index])
     shot = replace(empty, t_ns=t_ns, image_boxes_px=_image_boxes(log, name, t_ns))
     try:
-        shot = replace(shot, image=log.streams[name].read(index))
+        shot = replace(shot, image=RecordSource(log).require(name, index))
     except RecordError as error:
         shot = replace(shot, problem=str(error))
     if not log.map_T_sensor(name, t_ns)[1][0]:

@@ -28,9 +28,10 @@ from log2sim.geometry import (
     project,
 )
 from log2sim.geometry.boxes import EDGES, NEAR_M
-from log2sim.perception.frames import RecordReader, look_again
+from log2sim.perception.frames import look_again
 from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import sweep_middle_ns
 
 MARGIN_S = 0.05  # records this far outside the scenario are taken too: half a tick of most logs
@@ -237,8 +238,9 @@ def picture_document(
     log: Log,
     scenario: Scenario,
     cameras: tuple[str, ...],
+    *,
     budget_bytes: int,
-    reader: RecordReader,
+    reader: RecordSource,
     progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
     """Return the pictures of cameras within a budget, with the outlines of the agents in them.
@@ -254,7 +256,7 @@ def picture_document(
     probes = _probe(log, within, projector, reader)
     size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
     pictures = ShrunkPictures(chosen, size.width_px)
-    look_again(log, reader, [pictures], progress)
+    look_again(reader, [pictures], progress, least_px=size.width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     _thin_out(entries, budget_bytes)
@@ -269,7 +271,7 @@ def picture_document(
 
 
 def _probe(
-    log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordReader
+    log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordSource
 ) -> dict[str, dict[int, float]]:
     """Return the mean bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
     widths = sorted({size.width_px for size in SIZES})
@@ -387,7 +389,7 @@ class PointsAbove:
 
 
 def point_document(
-    log: Log, scenario: Scenario, budget_bytes: int, reader: RecordReader, progress: Callable[[int, int], None]
+    log: Log, scenario: Scenario, budget_bytes: int, reader: RecordSource, progress: Callable[[int, int], None]
 ) -> dict[str, Any] | None:
     """Return the points of a log's LiDARs within a budget; None where there are none during the scenario.
 
@@ -406,7 +408,9 @@ def point_document(
         return None
     known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in probes])
     bright = max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
-    spacing, chosen = _fit_points(log.streams[main].t_ns, within, scenario.t0_ns, probes, bright, budget_bytes)
+    spacing, chosen = _fit_points(
+        log.streams[main].t_ns, within, scenario.t0_ns, probes=probes, bright=bright, budget_bytes=budget_bytes
+    )
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
         if (points := sweeps.at(main, i)) is not None:
@@ -451,6 +455,7 @@ def _fit_points(
     t_ns: NDArray[np.int64],
     within: NDArray[np.int64],
     start_ns: int,
+    *,
     probes: list[PointsAbove],
     bright: float,
     budget_bytes: int,
@@ -476,9 +481,9 @@ def _fit_points(
 class _Sweeps:
     """Reads the sweeps of all LiDARs around a moment as points from above."""
 
-    def __init__(self, log: Log, lidars: list[str], reader: RecordReader) -> None:
+    def __init__(self, log: Log, lidars: list[str], reader: RecordSource) -> None:
         self._log, self._reader = log, reader
-        self._middle_ns = {name: sweep_middle_ns(log.streams[name]) for name in lidars}
+        self._middle_ns = {name: sweep_middle_ns(log, name) for name in lidars}
 
     def at(self, main: str, index: int) -> PointsAbove | None:
         """Return the points around a sweep of one LiDAR; None where it cannot be read or has no known pose."""
@@ -543,7 +548,7 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     for a single moment. Raises `LogError` when none of the records asked for can be read.
     """
     log, report = recorded.log, recorded.progress
-    reader = RecordReader(log)
+    reader = RecordSource(log)
     cameras = choose_cameras(log, scenario, recorded.cameras)
     share = POINT_SHARE if cameras else 1.0
     points = point_document(
@@ -553,7 +558,12 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     pictures = None
     if cameras:
         pictures = picture_document(
-            log, scenario, cameras, left, reader, lambda done, total: report("page: pictures", done, total)
+            log,
+            scenario,
+            cameras,
+            budget_bytes=left,
+            reader=reader,
+            progress=lambda done, total: report("page: pictures", done, total),
         )
     reader.require_some()
     if pictures is not None and not pictures["cameras"]:

@@ -1,6 +1,9 @@
 """Precision and recall of tags in worlds whose maneuvers are known in closed form.
 
-    python tools/bench.py tags [--worlds 40] [--noise 0.2] [--rendered SCENARIO.json TRUTH.json ...]
+    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json SCENE.toml]
+
+`--write` writes the random traffic as scenarios, for `log2sim find` and `vary`. `--pair` compares the tags of what was reconstructed of a
+rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other.
 
 Random traffic on straight and bent roads with three lanes, on both sides of the road, at 2 to 20 Hz, with and without a map, and
 junctions with turns, crossings and people who step out between parked cars. The truth comes from the stations and lanes of the
@@ -14,6 +17,7 @@ import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from entry import parser_of
@@ -21,9 +25,12 @@ from entry import parser_of
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios.tagging import find_tags
+from log2sim.synth.scene import load_scene
+from log2sim.synth.synthesis import synthesize
 
 LANE_M, LANES = 3.5, 3
 CAR, PERSON = (4.4, 1.8, 1.5), (0.6, 0.6, 1.7)
+LEAST = 0.3
 WITHIN_S = 1.5  # of a tag's moment and the true one's
 FINE_S = 0.01
 WINDING = np.inf
@@ -524,6 +531,37 @@ def variants(count: int, noise_m: float, first: int = 0):
         yield traffic(seed, rate_hz=rate_hz, bend_1pm=bend, keeps_right=right, lanes=lanes, noise_m=noise_m)
 
 
+def compare(made: Scenario, truth: Scenario) -> dict[str, list[int]]:
+    """Count tags that a reconstruction shares with its truth, has alone, and lacks, by kind."""
+    truth = truth.aligned_to(made)
+    agents = [{a.id: a for a in s.agents} for s in (made, truth)]
+    ours, theirs = ([g for g in find_tags(s) if g.probability >= LEAST and g.tag != "in_lane"] for s in (made, truth))
+
+    def same(one: str | None, two: str | None, t_s: float) -> bool:
+        if one is None or two is None:
+            return one is two
+        a, b = (of[id].at([t_s], margin_s=0.3) for of, id in zip(agents, (one, two)))
+        return bool(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m)[0] < 3.0)
+
+    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    for g in ours:
+        fits = (
+            e
+            for e in theirs
+            if e.tag == g.tag
+            and abs(e.t_s - g.t_s) <= WITHIN_S
+            and same(g.agent, e.agent, g.t_s)
+            and same(g.other, e.other, g.t_s)
+        )
+        found = next(fits, None)
+        counts[g.tag][0 if found else 1] += 1
+        if found:
+            theirs.remove(found)
+    for e in theirs:
+        counts[e.tag][2] += 1
+    return counts
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Print a table."""
     parser = parser_of(__doc__)
@@ -531,9 +569,22 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--scripted", type=int, default=12, help="of each scripted scene")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of places, m")
     parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--write", type=Path, metavar="FOLDER")
+    parser.add_argument(
+        "--pair", type=Path, nargs=2, action="append", default=[], metavar=("RECONSTRUCTION.json", "SCENE.toml")
+    )
     parser.add_argument("--wrong", action="store_true", help="list what was wrong")
     asked = parser.parse_args(arguments)
     worlds = [*variants(asked.worlds, asked.noise, asked.first), *scripted(asked.scripted, asked.noise, asked.first)]
+    if asked.write is not None:
+        for k, world in enumerate(worlds):
+            world.scenario.save(asked.write / f"{k:04}" / "scenario.json")
+    sums: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    for made, scene in asked.pair:
+        for tag, counts in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
+            sums[tag] = [a + b for a, b in zip(sums[tag], counts)]
+    for tag, (true, invented, missed) in sorted(sums.items()):
+        print(f"{tag:22} {true:5} of the truth, {invented} alone, {missed} missed in reconstructions")
     begin = time.process_time()
     found = [find_tags(w.scenario) for w in worlds]
     spent = time.process_time() - begin

@@ -33,9 +33,9 @@ from log2sim.geometry import period_of
 from log2sim.perception.cooperative import detector_by_mounting
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.first_pass import Observations, observe
-from log2sim.perception.frames import RecordReader
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, fit_homographies
+from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import Detectors, create_image_detector
 from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
 from log2sim.perception.sync import Schedule, schedule_of
@@ -86,7 +86,7 @@ def detect_once(
     camera can be read.
     """
     recorded = {key: RecordedDetections(d.name, d.default_min_score) for key, d in detectors.items()}
-    records, decoding_s = RecordReader(log), 0.0
+    records, decoding_s = RecordSource(log), 0.0
     for tick in range(len(schedule)):
         for camera, index in schedule.frames.items():
             if index[tick] < 0:
@@ -127,7 +127,7 @@ class SeamBench:
         cls, log: Log, schedule: Schedule, observed: Observations, homographies: Mapping[str, CameraHomography]
     ) -> SeamBench:
         """Read the pictures of a log with several cameras, and register them by homographies of cameras fitted together."""
-        reader, several = RecordReader(log), any(h.rig is not None for h in homographies.values())
+        reader, several = RecordSource(log), any(h.rig is not None for h in homographies.values())
         begin = time.perf_counter()
         aligning = SeamPictures.read(log, schedule, observed, reader, ticks_of(schedule) if several else [])
         reading_s = time.perf_counter() - begin

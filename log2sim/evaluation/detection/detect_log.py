@@ -16,9 +16,9 @@ from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.localization.choice import PoseChoice
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.first_pass import CloudMaker
-from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import outside_ego
+from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import sweep_middle_ns
 from log2sim.pipeline import start
 from log2sim.plan import FusionLevel
@@ -34,7 +34,7 @@ class SearchedCloud:
     boxes: Boxes3D  # empty without a detector
 
 
-def clouds(run: Run, records: RecordReader, detector: LidarDetector | None) -> Iterator[SearchedCloud]:
+def clouds(run: Run, records: RecordSource, detector: LidarDetector | None) -> Iterator[SearchedCloud]:
     """Yield the clouds of all ticks of a run without cameras."""
     maker = CloudMaker(
         run.log, run.schedule, run.plan, max_range_m=run.config.measure.max_range_m, detector=detector,
@@ -52,7 +52,7 @@ def stamps_of(run: Run) -> NDArray[np.int64]:
 
 def middle_ns(run: Run) -> int:
     """Return the time from the stamp of a sweep to its middle, ns."""
-    return sweep_middle_ns(run.log.streams[run.schedule.reference])
+    return sweep_middle_ns(run.log, run.schedule.reference)
 
 
 def only_ticks(run: Run, ticks: NDArray[np.int64]) -> Run:
@@ -110,7 +110,7 @@ def detect_log(
         # Before they are tracked, what both ends find would be there twice.
         config = config.changed(cooperation={"fusion": "boxes"})
     run = start(log, config)
-    records, detector = RecordReader(run.log), run.detectors.sweeps
+    records, detector = RecordSource(run.log), run.detectors.sweeps
     of_sweeps, stamps, boxes = stamps_of(run), [], []
     for searched in clouds(run, records, detector):
         if searched.cloud is not None:

@@ -16,8 +16,8 @@ from log2sim.evaluation.detection.detect_log import clouds, middle_ns, only_tick
 from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of, project_boxes, wrap_angle
 from log2sim.perception.detect3d.box_points import points_of_boxes
-from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.records import RecordSource
 from log2sim.pipeline import start
 from log2sim.report import Run
 
@@ -279,7 +279,7 @@ def _seen_by_lidar(
     known = np.flatnonzero(np.abs(stamps[tick] - t_ns) <= MAX_STAMP_ERROR_NS)
     seen_ns, points = asked.t_ns.copy(), np.zeros(len(asked.sweep), dtype=np.int64)
     needed = known[np.isin(known, asked.sweep)]
-    for done, searched in enumerate(clouds(only_ticks(run, tick[needed]), RecordReader(run.log), None), start=1):
+    for done, searched in enumerate(clouds(only_ticks(run, tick[needed]), RecordSource(run.log), None), start=1):
         mine = np.flatnonzero(asked.sweep == needed[searched.tick])
         if searched.cloud is not None:
             for _ in range(2):  # where objects are in the middle of the sweep, then where they were seen

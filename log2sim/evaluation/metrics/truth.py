@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, IgnoreRegions, Labels, LabelView, Log, Scenario, Sweep, Waypoints
-from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
+from log2sim.errors import ConfigError, LogError, MissingExtra
 from log2sim.files.plugins import nearest
 from log2sim.geometry import (
     MIN_DEPTH_M,
@@ -32,6 +32,7 @@ from log2sim.geometry import (
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import is_log_file, open_log
 from log2sim.perception.lidar.cloud import sweep_to_map
+from log2sim.perception.records import RecordSource
 
 CELL_M = 2.0
 SAMPLES_PER_SIDE = 32
@@ -303,20 +304,19 @@ def points_in_labels(log: Log, labels: Labels, progress: Progress | None = None)
     """Count the points (L,) of all LiDARs inside each box, and the sweeps that could not be read."""
     counts = np.zeros(len(labels.t_ns), dtype=np.int64)
     streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
-    total, done, unreadable = sum(len(s.t_ns) for _, s in streams), 0, 0
+    records, total, done = RecordSource(log), sum(len(s.t_ns) for _, s in streams), 0
     for name, stream in streams:
         index, near = nearest_record(stream.t_ns, labels.t_ns)
         for i in range(len(stream.t_ns)):
             rows = np.flatnonzero((index == i) & near)
             if len(rows):
-                try:
-                    counts[rows] += _points_of_sweep(log, name, stream.read(i), labels, rows)
-                except RecordError:
-                    unreadable += 1
+                sweep = records.get(name, i)
+                if sweep is not None:
+                    counts[rows] += _points_of_sweep(log, name, sweep, labels, rows)
             done += 1
             if progress is not None:
                 progress(done, total)
-    return counts, unreadable
+    return counts, sum(len(problems) for problems in records.failed.values())
 
 
 def _points_of_sweep(
@@ -373,17 +373,15 @@ def count_points(truth: Scenario, log: Log, progress: Progress | None = None) ->
     A waypoint gets the points of the sweeps nearest to it within `MAX_LAG_S`; where the log has no LiDAR, nothing changes.
     """
     streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
-    done, total = 0, sum(len(stream.t_ns) for _, stream in streams)
+    records, done, total = RecordSource(log), 0, sum(len(stream.t_ns) for _, stream in streams)
     totals = [np.zeros(len(agent.waypoints)) for agent in truth.others]
     for name, stream in streams:
         states = [agent.at((stream.t_ns - truth.t0_ns) / NS_PER_S) for agent in truth.others]
         counts = np.zeros((len(states), len(stream.t_ns)))
         for i in range(len(stream.t_ns)):
             rows = [k for k, state in enumerate(states) if state.valid[i]]
-            try:
-                mapped = sweep_to_map(log, name, stream.read(i), compensate=True) if rows else None
-            except RecordError:
-                mapped = None
+            sweep = records.get(name, i) if rows else None
+            mapped = None if sweep is None else sweep_to_map(log, name, sweep, compensate=True)
             grid = PointGrid(np.zeros((0, 3)) if mapped is None else mapped[0])
             for k in rows:
                 s = states[k]

@@ -159,6 +159,7 @@ def road_of_lanes(
     number: int,
     group: Sequence[MapLane],
     opposite: Sequence[MapLane],
+    *,
     headings: tuple[float | None, float | None],
     free: tuple[bool, bool],
     met: Mapping[tuple[str, int], End],
@@ -330,9 +331,9 @@ def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
             number,
             group,
             opposite,
-            (headings.get((number, 0)), headings.get((number, -1))),
-            (before is None, after is None),
-            _met([*group, *opposite], place, (before, after), ends),
+            headings=(headings.get((number, 0)), headings.get((number, -1))),
+            free=(before is None, after is None),
+            met=_met([*group, *opposite], place, (before, after), ends),
         )
         roads.append(replace(road, before=before, after=after))
         ends.update(own)

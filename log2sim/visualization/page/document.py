@@ -184,6 +184,7 @@ MAX_ROWS = 3_000_000  # waypoints of all layers together; a page with this many 
 
 def page_document(
     scenario: Scenario,
+    *,
     truth: Scenario | None = None,
     replay: Any = None,
     predict_s: float | None = None,

@@ -100,7 +100,9 @@ def write_page(
     refuse_existing(out_path, overwrite=overwrite)
     if isinstance(recorded, Log):
         recorded = Recorded(localize_like(recorded, scenario.provenance))
-    document = page_document(scenario, truth, replay, predict_s, background, metrics)
+    document = page_document(
+        scenario, truth=truth, replay=replay, predict_s=predict_s, background=background, metrics=metrics
+    )
     page = make_page(document, scenario, recorded)
     with replaced(out_path) as temporary:
         temporary.write_bytes(page)

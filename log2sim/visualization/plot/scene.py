@@ -107,9 +107,9 @@ def draw_moving(
     roles: AgentRoles,
     view: Viewport,
     step_s: float,
+    *,
     truth: Scenario | None,
     replay: Any,
-    *,
     ghosts: bool = False,
 ) -> None:
     """Draw the tracks of agents, pale where truth or replay lie over them; with `ghosts` also boxes along those."""
@@ -242,7 +242,7 @@ def plot(
     view = _set_view(ax, roles)
     step_s = time_step_s(scenario.duration_s, len(roles.movers), _usual_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
-    draw_moving(ax, roles, view, step_s, aligned, replay)
+    draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
     placed = place_labels(roles, view, step_s, sensors=scenario.sensors)
     draw_labels(ax, placed.labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))

@@ -95,7 +95,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAY
     """Draw a still picture."""
     base = draw_base(scenario, roles, overlays)
     layout, ax, replay = base.layout, base.layout.ax, overlays.replay
-    draw_moving(ax, roles, layout.view, base.step_s, overlays.truth, replay, ghosts=True)
+    draw_moving(ax, roles, layout.view, base.step_s, truth=overlays.truth, replay=replay, ghosts=True)
     if tells_ends(scenario):
         draw_observers(ax, roles, layout.view)
     draw_warnings(ax, warned_places(replay))
