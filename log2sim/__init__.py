@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from log2sim.logs.validation import validate_log
     from log2sim.pipeline import reconstruct
     from log2sim.prediction.prediction import predict_scenario
+    from log2sim.resim.simulate import resimulate
     from log2sim.road.builder import map_ground
     from log2sim.scenarios.failure import search as search_failures
     from log2sim.scenarios.logical import fit as fit_logical
@@ -58,6 +59,7 @@ _PLACES = {
     "reconstruct": "log2sim.pipeline:reconstruct",
     "reconstruct_all": "log2sim.batch.run:reconstruct_all",
     "replay": "log2sim.simulation.runner:replay",
+    "resimulate": "log2sim.resim.simulate:resimulate",
     "search_failures": "log2sim.scenarios.failure:search",
     "show_progress": "log2sim.visualization.progress:show_progress",
     "summarize_log": "log2sim.logs.excerpt:summarize",
@@ -72,7 +74,7 @@ _PLACES = {
 __all__ = [
     "Config", "Log2SimError", "Scenario", "__version__", "bench", "correct_scenario", "detect_log", "edit_scenario", "evaluate", "examine_installation",
     "export_scenario", "find_situations", "fit_logical", "import_scenario", "map_ground", "open_log", "plot", "predict_scenario", "reconstruct", "reconstruct_all",
-    "replay", "search_failures", "show_progress", "summarize_log", "tag_scenario", "validate_log", "view", "write_log", "write_synthetic",
+    "replay", "resimulate", "search_failures", "show_progress", "summarize_log", "tag_scenario", "validate_log", "view", "write_log", "write_synthetic",
 ]  # fmt: skip
 
 

@@ -33,6 +33,7 @@ from log2sim.synth.returns import (
 from log2sim.synth.traffic import Surface, TrafficScene, draw_scene, labeled_cloud, rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, write_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
+from log2sim.synth.traffic_shapes import KINDS
 
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)
 
@@ -312,6 +313,10 @@ def test_boxes_in_space_project_into_boxes_in_the_picture(kitti: Path) -> None:
             left, top, right, bottom = values[3:7]
             assert -1 <= left < right <= w
             assert -1 <= top < bottom <= h
+            # People may push or pull something that is in their silhouette and not in their box.
+            if kind in ("Pedestrian", "Cyclist"):
+                assert np.all(uv.min(0) < [right, bottom]) and np.all(uv.max(0) > [left, top])  # noqa: PT018
+                continue
             # The silhouette lies within the projected box and fills most of it.
             assert np.all(uv.min(0) < [left + 2, top + 2])
             assert np.all(uv.max(0) > [right - 2, bottom - 2])
@@ -356,3 +361,30 @@ def test_sensors_of_ones_own(tmp_path) -> None:
             lidar_model(str(path))
     with pytest.raises(ConfigError, match="vlp16"):
         lidar_model("vpl16")
+
+
+def test_road_users_of_every_kind_stand_on_the_ground_in_their_boxes() -> None:
+    """Wheels and feet touch the ground, a box is as high as its user, who is in its middle; what people hold may be beside it."""
+    rng = np.random.default_rng(8)
+    for category, kinds in KINDS.items():
+        for kind, (_, draw) in kinds.items():
+            for _ in range(4):
+                (length, _, height), parts = draw(rng)
+                low, high = np.min([p.low for p in parts], 0), np.max([p.high for p in parts], 0)
+                assert -0.1 < low[2] < 0.16, kind
+                assert kind == "umbrella" or abs(high[2] - height) < 0.35, kind
+                if category not in ("pedestrian", "seated", "trailer") and kind != "child trailer":
+                    assert max(abs(low[0] + length / 2), abs(high[0] - length / 2)) < 0.7, kind
+
+
+def test_scenes_to_train_on_lack_the_kinds_that_are_left_out() -> None:
+    """So that what is reported on them was never seen."""
+    left_out = frozenset({"walking", "upright", "stall", "tree", "excavator"})
+    for seed in range(6):
+        kinds = {o.kind for o in draw_scene("vehicle", np.random.default_rng(seed), without=left_out).objects}
+        assert not kinds & left_out
+    assert {o.kind for s in range(6) for o in draw_scene("vehicle", np.random.default_rng(s)).objects} >= {
+        "walking",
+        "upright",
+        "tree",
+    }

@@ -29,6 +29,7 @@ from log2sim.cli import (
     predict,
     reconstruct,
     replay,
+    resimulate,
     studio,
     synth,
     tag,
@@ -94,7 +95,7 @@ def root(
 
 for command in (
     reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, correct.correct, tag.tag, find.find, vary.vary, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, resimulate.resimulate, correct.correct, tag.tag, find.find, vary.vary, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, help.help_, "help")

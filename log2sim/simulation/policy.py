@@ -19,7 +19,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import Scenario, Sweep
 from log2sim.errors import ConfigError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import nearest
@@ -169,6 +169,8 @@ class Observation:
     ----------
     dt_s : float
         The returned controls hold for this long.
+    look : callable or None
+        What `sweep` calls; None where no sensors are simulated.
     """
 
     t_s: float
@@ -177,6 +179,21 @@ class Observation:
     others: Others
     route: Route
     path: PathAhead
+    look: Callable[[Observation, str], Sweep] | None = None
+
+    def sweep(self, name: str) -> Sweep:
+        """Return the sweep of a LiDAR that ends now, its points in the LiDAR's frame at their own times; it is cast when asked for.
+
+        Raises
+        ------
+        ConfigError
+            Where no sensors are simulated (`log2sim.resim.simulate.with_sensors` does), or for an unknown LiDAR.
+        """
+        if self.look is None:
+            raise ConfigError(
+                f"sweep '{name}': no sensors are simulated; wrap the policy by log2sim.resim.simulate.with_sensors"
+            )
+        return self.look(self, name)
 
 
 # A function, or an object with `__call__` and, if it has a state of its own, `reset(scenario)`.

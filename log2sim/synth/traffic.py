@@ -18,7 +18,7 @@ from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_poly
 from log2sim.synth.polytopes import Polytope
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel, ReturnModel, Weather, lidar_model
 from log2sim.synth.scene import Environment
-from log2sim.synth.traffic_shapes import ROAD_USERS, own_car
+from log2sim.synth.traffic_shapes import draw_user, own_car
 
 Mount = Literal["vehicle", "roadside"]
 
@@ -103,7 +103,7 @@ class TrafficObject:
     parts: tuple[Polytope, ...]
     speed_mps: float = 0.0  # along the heading
     turn_radps: float = 0.0  # rate of the heading
-    kind: str = ""  # what clutter is: tree, pole, building
+    kind: str = ""  # what it is more exactly: child, tree, pole, building
 
     def pose_at(self, t_s: float) -> tuple[Array, float]:
         """Position (3,) of the middle of its floor and heading, on an arc, at a time relative to the middle of the sweep."""
@@ -189,7 +189,7 @@ def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud
 REACH_M = 60.0
 WALKING_MPS, RIDING_MPS = 1.4, 5.0
 # Shares of what drives on a lane.
-LANE_SHARES = {"car": 0.78, "truck": 0.09, "bus": 0.04, "motorcycle": 0.04, "cyclist": 0.05}
+LANE_SHARES = {"car": 0.71, "truck": 0.08, "bus": 0.04, "motorcycle": 0.07, "cyclist": 0.1}
 
 
 @dataclass(eq=False)
@@ -199,6 +199,7 @@ class _Layout:
     surface: Surface
     roads: tuple[Road, ...]
     rng: np.random.Generator
+    without: frozenset[str]
     objects: list[TrafficObject] = field(default_factory=list)
     circles: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -218,18 +219,38 @@ class _Layout:
         return any(abs(float(road.offset(x, y)[0])) < road.half_width_m for road in self.roads)
 
     def add_user(
-        self, category: str, xy: Array, yaw: float, *, speed: float = 0.0, turn: float = 0.0, margin: float = 0.4
+        self,
+        category: str,
+        xy: Array,
+        yaw: float,
+        *,
+        speed: float = 0.0,
+        turn: float = 0.0,
+        margin: float = 0.4,
+        kinds: str = "",
     ) -> bool:
-        """Add a road user where its place is free."""
-        size, parts = ROAD_USERS[category](self.rng)
+        """Add a road user where its place is free, of the category's kinds or of others."""
+        without = self.without | {"parked"} if speed else self.without
+        kind, (size, parts) = draw_user(kinds or category, self.rng, without)
         circles = _covering(xy, yaw, size)
         if not self.is_free(circles, margin):
             return False
         self.take(circles)
-        self.objects.append(
-            TrafficObject(category, np.append(xy, self.surface.elevation(xy)), yaw, size, parts, speed, turn)
-        )
+        place = np.append(xy, self.surface.elevation(xy))
+        self.objects.append(TrafficObject(category, place, yaw, size, parts, speed, turn, kind))
         return True
+
+    def one_of(self, shares: dict[str, float]) -> str:
+        """Draw one of some kinds of small things that are not left out; "" where all are."""
+        kinds = {kind: share for kind, share in shares.items() if kind not in self.without}
+        total = sum(kinds.values())
+        return str(self.rng.choice(list(kinds), p=[share / total for share in kinds.values()])) if kinds else ""
+
+    def add_small(self, kind: str, xy: Array, yaw: float, spacing: float = 1.0) -> None:
+        """Add a small thing where its place is free."""
+        if kind:
+            _, radius, draw = clutter.SMALL[kind]
+            self.add_thing(kind, xy, yaw, draw(self.rng), spacing * radius)
 
     def add_thing(self, kind: str, xy: Array, yaw: float, parts: tuple[Polytope, ...], radius: float = 0.0) -> bool:
         """Add clutter; with a radius only where its place is free."""
@@ -255,10 +276,14 @@ def _covering(xy: Array, yaw: float, size: tuple[float, float, float]) -> Array:
 
 
 def draw_layout(
-    mount: Mount, roads: tuple[Road, ...], surface: Surface, rng: np.random.Generator
+    mount: Mount,
+    roads: tuple[Road, ...],
+    surface: Surface,
+    rng: np.random.Generator,
+    without: frozenset[str] = frozenset(),
 ) -> list[TrafficObject]:
-    """Draw the objects of a scene."""
-    out = _Layout(surface, roads, rng)
+    """Draw the objects of a scene, without some kinds."""
+    out = _Layout(surface, roads, rng, without)
     # The place of the sensor's own car, or of its pole.
     out.take(np.array([[0.0, 0.0, 0.5 if mount == "roadside" else 2.4]]))
     for road in roads:
@@ -267,6 +292,8 @@ def draw_layout(
     if rng.random() < 0.3:
         _car_park(out, roads[0])
     for road in roads[: 1 + (rng.random() < 0.5)]:
+        if rng.random() < 0.25:
+            _market(out, road)
         _people(out, road)
         _roadside(out, road)
         _fronts(out, road)
@@ -293,7 +320,14 @@ def _traffic(out: _Layout, road: Road) -> None:
                     yaw += rng.uniform(-0.7, 0.7)
                 category = str(rng.choice(kinds, p=shares / shares.sum()))
                 standing = rng.random() < 0.15
-                out.add_user(category, xy, yaw, speed=0.0 if standing else speed, turn=0.0 if standing else turn)
+                placed = out.add_user(
+                    category, xy, yaw, speed=0.0 if standing else speed, turn=0.0 if standing else turn
+                )
+                if placed and category == "car" and rng.random() < 0.04:
+                    back = (out.objects[-1].size_m[0] / 2 + rng.uniform(2.5, 4.5)) * np.array(
+                        [np.cos(yaw), np.sin(yaw)]
+                    )
+                    out.add_user("other", xy - back, yaw, speed=0.0 if standing else speed, margin=0.0, kinds="trailer")
             s += rng.uniform(5.5, 8) if queue else rng.uniform(6, 20)
 
 
@@ -334,58 +368,85 @@ def _car_park(out: _Layout, road: Road) -> None:
 
 
 def _people(out: _Layout, road: Road) -> None:
-    """Put people and riders on the sidewalks, at the kerb and on crossings, alone and in groups."""
+    """Put people and riders on the sidewalks, at the kerb and on crossings, alone, in rows and in groups."""
     rng, half = out.rng, road.half_width_m
-    for _ in range(rng.poisson(4)):
+    for _ in range(rng.poisson(rng.choice([2, 5, 12]))):
         side = rng.choice([-1, 1])
-        xy, direction = road.at(rng.uniform(-35, 35), side * (half + rng.uniform(-1.5, 5)))
+        xy, direction = road.at(rng.uniform(-40, 40), side * (half + rng.uniform(-1.5, 5)))
         across = rng.random() < 0.3
         yaw = direction + (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(0, 0.3)
-        out.add_user("pedestrian", xy, yaw, speed=WALKING_MPS * float(rng.random() < 0.6), margin=0.05)
-    for _ in range(rng.choice(3, p=[0.55, 0.3, 0.15])):
+        out.add_user("pedestrian", xy, yaw, speed=WALKING_MPS * float(rng.random() < 0.6), margin=0.02)
+    for _ in range(rng.choice(3, p=[0.45, 0.35, 0.2])):
         middle, direction = road.at(rng.uniform(-30, 30), rng.choice([-1, 1]) * (half + rng.uniform(-3, 4)))
-        for _ in range(rng.integers(2, 6)):
-            out.add_user("pedestrian", middle + rng.normal(0, 1.0, 2), rng.uniform(-np.pi, np.pi), margin=0.02)
-        if rng.random() < 0.3:
+        spread = rng.uniform(0.4, 1.5)
+        for _ in range(rng.integers(2, 9)):
+            out.add_user("pedestrian", middle + rng.normal(0, spread, 2), rng.uniform(-np.pi, np.pi), margin=0.0)
+        if rng.random() < 0.4:
             out.add_user("other", middle + rng.normal(0, 1.5, 2), direction, margin=0.05)
-    for _ in range(rng.poisson(2.5)):
-        xy, direction = road.at(rng.uniform(-35, 35), rng.choice([-1, 1]) * (half + rng.uniform(-1.8, 2.5)))
+    if rng.random() < 0.2:
+        # A queue, or those who cross together.
+        start, direction = road.at(rng.uniform(-25, 25), rng.choice([-1, 1]) * (half + rng.uniform(-1, 3)))
+        heading = direction + rng.choice([0.0, np.pi / 2]) + np.pi * rng.integers(2)
+        step = rng.uniform(0.6, 1.2) * np.array([np.cos(heading), np.sin(heading)])
+        for k in range(rng.integers(3, 10)):
+            out.add_user(
+                "pedestrian", start + k * step + rng.normal(0, 0.1, 2), heading + rng.normal(0, 0.3), margin=0.0
+            )
+    for _ in range(rng.poisson(rng.choice([1, 4, 8]))):
+        xy, direction = road.at(rng.uniform(-40, 40), rng.choice([-1, 1]) * (half + rng.uniform(-2.5, 2.5)))
         yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
-        out.add_user(
-            str(rng.choice(["cyclist", "motorcycle"], p=[0.7, 0.3])),
-            xy,
-            yaw,
-            speed=RIDING_MPS * float(rng.random() < 0.8),
-        )
-    if rng.random() < 0.3:
-        xy, direction = road.at(rng.uniform(-25, 25), rng.choice([-1, 1]) * (half + rng.uniform(0.5, 4)))
-        step = np.array([np.cos(direction), np.sin(direction)]) * rng.uniform(0.6, 1.1)
+        speed = RIDING_MPS * float(rng.random() < 0.8)
+        out.add_user(str(rng.choice(["cyclist", "motorcycle"], p=[0.65, 0.35])), xy, yaw, speed=speed, margin=0.1)
+    for _ in range(rng.choice(3, p=[0.5, 0.3, 0.2])):
+        xy, direction = road.at(rng.uniform(-25, 25), rng.choice([-1, 1]) * (half + rng.uniform(0.2, 4)))
         kind = str(rng.choice(["bicycle", "motorcycle"]))
-        for k in range(rng.integers(2, 8)):
-            out.add_user(kind, xy + k * step, direction + np.pi / 2 + rng.normal(0, 0.1), margin=-0.3)
+        apart, most = (rng.uniform(0.6, 1.1), 9) if kind == "bicycle" else (rng.uniform(0.9, 2.0), 5)
+        step = np.array([np.cos(direction), np.sin(direction)]) * apart
+        for k in range(rng.integers(1, most)):
+            kinds = "parked motorcycle" if kind == "motorcycle" else ""
+            out.add_user(kind, xy + k * step, direction + np.pi / 2 + rng.normal(0, 0.1), margin=-0.3, kinds=kinds)
+
+
+def _market(out: _Layout, road: Road) -> None:
+    """Line a piece of the road with stalls or tables, people before, behind and at them; some stand on the carriageway."""
+    rng, start = out.rng, out.rng.uniform(-35, 5)
+    cafe = rng.random() < 0.35
+    crowd = rng.uniform(0.3, 2.5)
+    for side in (-1, 1) if rng.random() < 0.5 else (int(rng.choice([-1, 1])),):
+        d, s = side * (road.half_width_m + rng.uniform(-1.5, 2.5)), start
+        while s < start + rng.uniform(10, 40):
+            xy, direction = road.at(s, d + rng.normal(0, 0.15))
+            kind = out.one_of(
+                {"table": 0.8, "parasol": 0.2} if cafe else {"stall": 0.8, "crates": 0.13, "clothes rail": 0.07}
+            )
+            out.add_small(kind, xy, direction + np.pi * rng.integers(2) + rng.normal(0, 0.1), 0.6)
+            for _ in range(rng.poisson(crowd)):
+                away, angle = rng.uniform(0.7, 2.5), rng.uniform(-np.pi, np.pi)
+                place = xy + away * np.array([np.cos(angle), np.sin(angle)])
+                kinds = "seated" if cafe and rng.random() < 0.7 else ""
+                out.add_user("pedestrian", place, angle + np.pi + rng.normal(0, 0.6), margin=0.0, kinds=kinds)
+            s += rng.uniform(1.8, 3.2) if cafe else rng.uniform(2.5, 5)
 
 
 def _roadside(out: _Layout, road: Road) -> None:
     """Scatter small clutter beside the road, some kinds in rows."""
     rng, half = out.rng, road.half_width_m
-    kinds, shares = list(clutter.SMALL), np.array([v[0] for v in clutter.SMALL.values()])
+    shares = {kind: share for kind, (share, _, _) in clutter.SMALL.items()}
     for side in (-1, 1):
         if rng.random() < 0.6:
-            kind = str(rng.choice(["tree", "pole", "bush"]))
-            _, radius, draw = clutter.SMALL[kind]
+            kind = out.one_of({"tree": 0.3, "pole": 0.35, "bush": 0.2, "railing": 0.1, "planter": 0.05})
             step, d = rng.uniform(4, 15), half + rng.uniform(0.4, 3)
             for s in np.arange(-45 + rng.uniform(0, 6), 45, step):
                 xy, direction = road.at(s + rng.normal(0, 0.5), side * d)
                 if not out.on_road(xy):
-                    out.add_thing(kind, xy, direction, draw(rng), radius)
+                    out.add_small(kind, xy, direction)
     for _ in range(rng.poisson(rng.choice([16, 26, 45]))):
-        kind = str(rng.choice(kinds, p=shares / shares.sum()))
-        _, radius, draw = clutter.SMALL[kind]
+        kind = out.one_of(shares)
         d = rng.choice([-1, 1]) * (half + abs(rng.normal(0, 6)) + 0.3)
         xy, direction = road.at(rng.uniform(-42, 42), d)
         if not out.on_road(xy) or kind == "cone":
             yaw = direction + (rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi))
-            out.add_thing(kind, xy, yaw, draw(rng), radius)
+            out.add_small(kind, xy, yaw)
 
 
 def _fronts(out: _Layout, road: Road) -> None:
@@ -407,18 +468,24 @@ def _fronts(out: _Layout, road: Road) -> None:
             s += length + (rng.uniform(1, 9) if rng.random() < 0.4 else 0.0)
 
 
-VEHICLE_LIDARS = ("hdl64e", "pandar64", "os1-64", "os1-128", "vlp32c", "hdl32e", "rslidar-m1")
-VEHICLE_LIDAR_SHARES = (0.28, 0.3, 0.12, 0.08, 0.1, 0.09, 0.03)
+VEHICLE_LIDARS = ("hdl64e", "pandar64", "os1-64", "os1-128", "vlp32c", "hdl32e", "rslidar-m1", "vlp16")
+SPARSE_SHARE = 0.25
+VEHICLE_LIDAR_SHARES = (0.26, 0.28, 0.12, 0.08, 0.1, 0.09, 0.03, 0.04)
 
 
 def draw_scene(
-    mount: Mount, rng: np.random.Generator, *, lidar: LidarModel | None = None, weather: Weather | None = None
+    mount: Mount,
+    rng: np.random.Generator,
+    *,
+    lidar: LidarModel | None = None,
+    weather: Weather | None = None,
+    without: frozenset[str] = frozenset(),
 ) -> TrafficScene:
     """Draw a random scene.
 
     `mount`: "vehicle": the LiDAR is on a car's roof on the road; "roadside": on a pole beside it, tilted down to the
     road. `lidar`: by default one of the common sensors, with elevations and density that vary as between units.
-    `weather`: by default clear, in one scene of ten rain or fog.
+    `weather`: by default clear, in one scene of ten rain or fog. `without`: kinds of `traffic_shapes` that are left out.
     """
     roads, sensor_forward = _draw_roads(mount, rng)
     steep = rng.random() < 0.4
@@ -430,9 +497,9 @@ def draw_scene(
     kerb = float(rng.choice([0.0, rng.uniform(0.02, 0.2), rng.normal(0, 0.2)], p=[0.3, 0.6, 0.1]))
     surface = Surface(np.append(tilt, bend), waves, roads, kerb)
     model = lidar or _draw_lidar(mount, rng)
-    objects = draw_layout(mount, roads, surface, rng)
+    objects = draw_layout(mount, roads, surface, rng, without)
     sensor = _draw_sensor(mount, model, surface, sensor_forward, rng)
-    if mount == "vehicle" and rng.random() < 0.7:
+    if mount == "vehicle" and sensor.position_m[2] > 1.5 and rng.random() < 0.7:
         parts = own_car(float(sensor.position_m[2]), rng)
         speed = float(np.hypot(*sensor.velocity_mps))
         objects.append(TrafficObject("", np.zeros(3), sensor_forward, (4.4, 1.8, 1.5), parts, speed, kind="own car"))
@@ -487,6 +554,19 @@ def _draw_lidar(mount: Mount, rng: np.random.Generator) -> LidarModel:
             lines = int(rng.choice([32, 40, 64]))
             model = model.model_copy(update={"elevation_deg": tuple(np.linspace(-20, 12, lines).tolist())})
         return model.model_copy(update={"range_m": float(rng.choice([80.0, 120.0, 150.0]))})
+    if rng.random() < SPARSE_SHARE:
+        # Any other spinning or solid-state sensor, of few lines or at a high rate.
+        lines, view = (
+            int(rng.choice([16, 24, 32, 40, 64])),
+            float(rng.choice([180.0, rng.uniform(50, 140)], p=[0.75, 0.25])),
+        )
+        elevation = np.linspace(rng.uniform(-30, -12), rng.uniform(2, 15), lines)
+        return LidarModel(
+            elevation_deg=tuple(elevation.tolist()),
+            azimuth_deg=(-view, view),
+            azimuth_step_deg=float(rng.uniform(0.2, 0.7)),
+            range_m=float(rng.uniform(60, 150)),
+        )
     model = LIDAR_MODELS[str(rng.choice(VEHICLE_LIDARS, p=VEHICLE_LIDAR_SHARES))]
     elevation = np.array(model.elevation_deg) + rng.normal(0, 0.15)
     if rng.random() < 0.08:
@@ -502,7 +582,10 @@ def _draw_sensor(
         height, pitch = model.height_m + rng.normal(0, 0.1), np.deg2rad(model.pitch_deg + rng.normal(0, 0.6))
         roll, velocity = np.deg2rad(rng.normal(0, 0.6)), np.zeros(2)
     else:
-        height = float(rng.uniform(1.55, 2.3))
+        # On cars, on robots and carts, on trucks.
+        height = float(
+            rng.choice([rng.uniform(1.55, 2.3), rng.uniform(0.7, 1.5), rng.uniform(2.3, 3.2)], p=[0.86, 0.07, 0.07])
+        )
         sx, sy = surface.slope(np.zeros(1, np.float32), np.zeros(1, np.float32))
         uphill = float(sx[0] * np.cos(forward) + sy[0] * np.sin(forward))
         leftward = float(-sx[0] * np.sin(forward) + sy[0] * np.cos(forward))

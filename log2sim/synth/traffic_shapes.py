@@ -1,4 +1,4 @@
-"""Random vehicles, people and clutter made of convex polytopes.
+"""Random vehicles and clutter made of convex polytopes; the kinds of road users.
 
 Cars: from microcars (2.7 m) to pick-ups (6.1 m) and delivery vans (6.5 m); widths without mirrors. Trucks and buses up to
 Directive 96/53/EC.
@@ -6,12 +6,23 @@ Directive 96/53/EC.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from log2sim.synth.polytopes import Material, Polytope, Shape, box, column, ellipsoid, prism, tube, wheel
+from log2sim.synth.traffic_people import (
+    CYCLISTS,
+    MOTORCYCLES,
+    OTHERS,
+    PEOPLE,
+    Kinds,
+    bicycle,
+    parked_motorcycle,
+    seated,
+    shifted,
+)
 
 
 @dataclass(frozen=True)
@@ -137,17 +148,115 @@ def _delivery_van(rng: np.random.Generator) -> Shape:
 
 
 def truck(rng: np.random.Generator) -> Shape:
-    """Draw a truck: box, flatbed, tipper, tanker or a tractor with its trailer."""
-    if rng.random() < 0.35:
-        return _semitrailer(rng)
+    """Draw a truck: box, flatbed, tipper, tanker, mixer or refuse truck."""
     length, width, height = rng.uniform(5.5, 11.0), rng.uniform(2.1, 2.55), rng.uniform(2.3, 3.9)
     cab, floor = rng.uniform(1.5, 2.2), rng.uniform(0.7, 1.1)
     parts = _cab(length / 2, cab, width * rng.uniform(0.88, 0.98), min(height * rng.uniform(0.75, 1.0), 3.3), rng)
     parts += _load(-length / 2, length / 2 - cab - 0.15, width, floor, height, rng)
     parts += [box((-length * 0.48, -width * 0.25, 0.45), (length * 0.45, width * 0.25, floor + 0.02), Material.DARK)]
+    if rng.random() < 0.3:
+        # A tail lift, a hopper or a ladder at the back.
+        parts.append(
+            box(
+                (-length / 2 - 0.05, -width * 0.45, rng.uniform(0.3, 0.8)),
+                (-length / 2 + 0.3, width * 0.45, floor + rng.uniform(0.2, 1.4)),
+                Material.METAL,
+            )
+        )
     axles = (length * 0.36, -length * 0.28, *((-length * 0.4,) if length > 8 else ()))
     parts += [wheel(0.48, 0.3, x, s * (width / 2 - 0.2)) for x in axles for s in (1, -1)]
     return (length, width, float(max(p.high[2] for p in parts))), tuple(parts)
+
+
+def tractor(rng: np.random.Generator) -> Shape:
+    """Draw a tractor or a wheel loader: large wheels, a hood, a cab of glass."""
+    length, width, height, rear = (
+        rng.uniform(3.6, 5.5),
+        rng.uniform(1.8, 2.5),
+        rng.uniform(2.4, 3.2),
+        rng.uniform(0.65, 0.9),
+    )
+    half, w = length / 2, width / 2
+    parts = [
+        box((0.0, -0.4, 0.6), (half - 0.2, 0.4, 1.5), Material.PAINT),
+        box((-half + 0.3, -0.7, 0.9), (0.2, 0.7, 1.5), Material.PAINT),
+        prism([(-half + 0.5, 1.5), (0.1, 1.5), (-0.1, height - 0.1), (-half + 0.6, height - 0.1)], 1.5, Material.GLASS, taper=0.05),
+        box((-half + 0.5, -0.7, height - 0.1), (0.0, 0.7, height), Material.PAINT),
+        box((-half + 0.8, -0.3, 1.2), (-half + 1.3, 0.3, 2.1), Material.CLOTH),
+    ]  # fmt: skip
+    parts += [wheel(rear, 0.45, -half + rear, s * (w - 0.23)) for s in (1, -1)]
+    parts += [wheel(rear * rng.uniform(0.55, 1.0), 0.35, half - rear, s * (w - 0.25)) for s in (1, -1)]
+    if rng.random() < 0.4:
+        parts.append(box((half - 0.3, -w, 0.3), (half, w, 1.1), Material.METAL))
+    return (length, width, height), tuple(parts)
+
+
+def excavator(rng: np.random.Generator) -> Shape:
+    """Draw an excavator on tracks with its arm before it."""
+    width, height, arm = rng.uniform(2.0, 2.8), rng.uniform(2.5, 3.1), rng.uniform(1.5, 3.5)
+    back, w = -rng.uniform(1.5, 2.3), width / 2
+    parts = [box((back, s * w - 0.25, 0.0), (-back, s * w + 0.25, 0.8), Material.DARK) for s in (0.75, -0.75)]
+    parts += [
+        box((back - 0.2, -w, 1.0), (0.8, w, 1.9), Material.PAINT),
+        box((-0.4, 0.1, 1.9), (1.2, w, height), Material.GLASS),
+        prism([(0.8, 1.2), (1.2, 1.2), (arm + 1.0, height + 0.6), (arm + 0.4, height + 0.6)], 0.4, Material.METAL),
+        box((arm + 0.5, -0.2, 0.8), (arm + 1.0, 0.2, height + 0.5), Material.METAL),
+        box((arm + 0.3, -0.5, 0.1), (arm + 1.1, 0.5, 0.9), Material.METAL),
+    ]  # fmt: skip
+    return _centered(width, parts)
+
+
+def forklift(rng: np.random.Generator) -> Shape:
+    """Draw a forklift."""
+    parts = [
+        box((-1.2, -0.55, 0.25), (0.6, 0.55, 1.0), Material.PAINT),
+        *(box((x - 0.04, y - 0.04, 1.0), (x + 0.04, y + 0.04, 2.1), Material.METAL) for x in (-0.8, 0.5) for y in (-0.5, 0.5)),
+        box((-0.85, -0.55, 2.1), (0.55, 0.55, 2.16), Material.METAL),
+        box((0.65, -0.4, 0.05), (0.8, 0.4, rng.uniform(2.0, 2.6)), Material.MESH),
+        box((0.8, -0.35, 0.08), (1.8, 0.35, 0.14), Material.METAL),
+        box((-0.4, -0.25, 1.0), (0.0, 0.25, 1.8), Material.CLOTH),
+    ]  # fmt: skip
+    return _centered(1.2, parts)
+
+
+def _centered(width: float, parts: list[Polytope]) -> Shape:
+    """Move parts along x so that their middle is that of the object."""
+    low, high = min(p.low[0] for p in parts), max(p.high[0] for p in parts)
+    moved = tuple(shifted(p, -(low + high) / 2, 0.0) for p in parts)
+    return (float(high - low), width, float(max(p.high[2] for p in parts))), moved
+
+
+def small_trailer(rng: np.random.Generator) -> Shape:
+    """Draw a trailer of a car: low sides, some with a cover or a boat."""
+    length, w, top = rng.uniform(1.8, 4.5), rng.uniform(0.65, 1.1), rng.uniform(0.7, 1.1)
+    half = length / 2
+    parts = [
+        box((-half, -w, 0.4), (half, w, 0.5), Material.METAL),
+        box((-half, -w, 0.5), (half, -w + 0.05, top), Material.METAL),
+        box((-half, w - 0.05, 0.5), (half, w, top), Material.METAL),
+        box((-half, -w, 0.5), (-half + 0.05, w, top), Material.METAL),
+        box((half, -0.05, 0.4), (half + 1.0, 0.05, 0.5), Material.METAL),
+        *(wheel(0.28, 0.16, 0.0, y) for y in (-w, w)),
+    ]
+    if rng.random() < 0.5:
+        parts.append(box((-half, -w, top), (half, w, top + rng.uniform(0.2, 1.2)), Material.CLOTH))
+    return (length, 2 * w, float(max(p.high[2] for p in parts))), tuple(parts)
+
+
+def caravan(rng: np.random.Generator) -> Shape:
+    """Draw a caravan."""
+    length, width, height = rng.uniform(4.5, 7.5), rng.uniform(2.0, 2.5), rng.uniform(2.4, 2.8)
+    half = length / 2
+    body = prism(
+        [(-half + 0.2, 0.4), (half - 0.5, 0.4), (half, 1.2), (half - 0.4, height), (-half, height)],
+        width,
+        Material.PAINT,
+    )
+    return (length, width, height), (
+        body,
+        box((half - 0.5, -0.05, 0.4), (half + 0.9, 0.05, 0.5), Material.METAL),
+        *(wheel(0.33, 0.2, 0.0, s * (width / 2 - 0.1)) for s in (1, -1)),
+    )
 
 
 def _cab(front: float, cab: float, width: float, height: float, rng: np.random.Generator) -> list[Polytope]:
@@ -198,7 +307,8 @@ def _load(
     return [*bed, cargo, box((front - 0.08, -w, floor), (front, w, floor + 1.2), Material.METAL)]
 
 
-def _semitrailer(rng: np.random.Generator) -> Shape:
+def semitrailer(rng: np.random.Generator) -> Shape:
+    """Draw a tractor with its semitrailer."""
     length, width, height = rng.uniform(12.0, 20.0), rng.uniform(2.45, 2.6), rng.uniform(3.2, 4.0)
     half, cab, floor = length / 2, rng.uniform(1.9, 2.4), rng.uniform(1.0, 1.25)
     parts = _cab(half, cab, width * 0.97, rng.uniform(2.8, 3.6), rng)
@@ -230,122 +340,6 @@ def bus(rng: np.random.Generator) -> Shape:
     ]
     parts += [wheel(0.48, 0.3, x, s * (w - 0.18)) for x in (half * 0.6, -half * 0.55) for s in (1, -1)]
     return (length, width, height), tuple(parts)
-
-
-def _torso(rng: np.random.Generator, height: float, *, base: float, lean: float, x: float = 0.0) -> list[Polytope]:
-    """Make trunk, head and arms of somebody whose hips are at `base`; `lean` tilts the trunk forward by as much in m."""
-    girth, depth = height * rng.uniform(0.11, 0.145), height * rng.uniform(0.065, 0.09)
-    trunk = 0.3 * height
-    top = base + trunk
-    parts = [
-        prism([(x - depth, base), (x + depth, base), (x + depth + lean, top), (x - depth + lean, top)], 2 * girth, Material.CLOTH, taper=-0.02),
-        ellipsoid((0.085, 0.075, 0.115), (x + lean * 1.15 + 0.02, 0, top + 0.155 * height * 0.75), Material.CLOTH),
-    ]  # fmt: skip
-    for side in (1, -1):
-        swing = rng.normal(0, 0.08) + lean * 0.5
-        parts.append(
-            ellipsoid(
-                (0.055 + abs(swing) * 0.6, 0.05, trunk * 0.52),
-                (x + swing, side * (girth + 0.04), top - trunk * 0.48),
-                Material.CLOTH,
-            )
-        )
-    return parts
-
-
-def pedestrian(rng: np.random.Generator) -> Shape:
-    """Draw a person who stands, walks or sits, some with a bag."""
-    height = float(np.clip(rng.normal(1.7, 0.1), 1.45, 2.0)) if rng.random() < 0.85 else rng.uniform(1.0, 1.45)
-    stride = rng.choice([0.0, 1.0], p=[0.4, 0.6]) * rng.uniform(0.08, 0.22) * height
-    hips = 0.5 * height
-    parts = _torso(rng, height, base=hips, lean=rng.uniform(0, 0.1))
-    for side in (1, -1):
-        x = side * stride
-        ankle, hip = ((0.07, 0.1), 0.09) if stride < 0.05 else ((0.08, 0.12), 0.1)
-        profile = [(x - ankle[0], 0.0), (x + ankle[1], 0.0), (hip, hips + 0.03), (-hip, hips + 0.03)]
-        parts.append(prism(profile, 0.15, Material.CLOTH))
-    if rng.random() < 0.25:
-        parts.append(box((-0.32, -0.16, hips + 0.05), (-0.1, 0.16, hips + 0.27 * height), Material.CLOTH))
-    length = float(np.clip(max(p.high[0] for p in parts) - min(p.low[0] for p in parts), 0.35, 1.1))
-    width = float(max(p.high[1] for p in parts) - min(p.low[1] for p in parts))
-    return (length, width, height), tuple(parts)
-
-
-def _two_wheels(reach: float, radius: float, width: float) -> list[Polytope]:
-    return [wheel(radius, width, s * reach, 0.0) for s in (1, -1)]
-
-
-def cyclist(rng: np.random.Generator) -> Shape:
-    """Draw a bicycle with its rider."""
-    height = rng.normal(1.72, 0.1)
-    length, radius = rng.uniform(1.6, 1.9), rng.uniform(0.31, 0.36)
-    reach = length / 2 - radius
-    seat = rng.uniform(0.85, 1.0)
-    lean = rng.uniform(0.1, 0.4)
-    parts = _two_wheels(reach, radius, 0.05)
-    parts += [
-        box((-reach * 0.5, -0.03, 0.45), (reach * 0.8, 0.03, 0.6), Material.METAL),
-        box((reach * 0.6, -0.28, seat + 0.05), (reach * 0.75, 0.28, seat + 0.14), Material.METAL),
-        prism([(-0.15, 0.3), (0.2, 0.3), (0.15, seat), (-0.3, seat)], 0.36, Material.CLOTH),
-        *_torso(rng, height, base=seat, lean=lean, x=-0.2),
-    ]
-    if rng.random() < 0.2:
-        parts.append(box((-reach - 0.25, -0.22, radius * 1.5), (-reach + 0.25, 0.22, radius * 2.4), Material.CLOTH))
-    return (length, 0.65, float(max(p.high[2] for p in parts))), tuple(parts)
-
-
-def motorcycle(rng: np.random.Generator) -> Shape:
-    """Draw a motorcycle or scooter, mostly with a rider."""
-    length, radius = rng.uniform(1.75, 2.3), rng.uniform(0.26, 0.33)
-    reach, seat = length / 2 - radius, rng.uniform(0.7, 0.85)
-    parts = _two_wheels(reach, radius, 0.14)
-    parts += [
-        box((-reach, -0.15, 0.3), (reach * 0.6, 0.15, seat - 0.05), Material.DARK),
-        box((-reach * 0.9, -0.14, seat - 0.1), (0.1, 0.14, seat), Material.CLOTH),
-        box((0.1, -0.16, seat - 0.15), (reach * 0.6, 0.16, seat + 0.15), Material.PAINT),
-        box((reach * 0.6, -0.35, seat + 0.2), (reach * 0.72, 0.35, seat + 0.3), Material.METAL),
-    ]
-    if rng.random() < 0.4:
-        parts.append(
-            prism(
-                [
-                    (reach * 0.5, seat),
-                    (reach * 0.9, seat - 0.1),
-                    (reach * 0.65, seat + 0.5),
-                    (reach * 0.55, seat + 0.5),
-                ],
-                0.35,
-                Material.GLASS,
-            )
-        )
-    if rng.random() < 0.65:
-        parts += _torso(rng, rng.normal(1.74, 0.08), base=seat, lean=rng.uniform(0.0, 0.3), x=-0.25)
-        parts.append(box((-0.3, -0.3, 0.35), (0.15, 0.3, seat + 0.08), Material.CLOTH))
-    return (length, 0.75, float(max(p.high[2] for p in parts))), tuple(parts)
-
-
-def bicycle(rng: np.random.Generator) -> Shape:
-    """Draw a bicycle without a rider."""
-    length, radius = rng.uniform(1.6, 1.85), rng.uniform(0.31, 0.36)
-    reach = length / 2 - radius
-    parts = _two_wheels(reach, radius, 0.05)
-    parts += [
-        box((-reach * 0.5, -0.03, 0.45), (reach * 0.8, 0.03, 0.6), Material.METAL),
-        box((-0.35, -0.08, 0.85), (-0.1, 0.08, 0.93), Material.DARK),
-        box((reach * 0.6, -0.28, 0.95), (reach * 0.75, 0.28, 1.03), Material.METAL),
-    ]
-    return (length, 0.6, 1.05), tuple(parts)
-
-
-def stroller(rng: np.random.Generator) -> Shape:
-    """Draw a stroller or a shopping cart."""
-    height = rng.uniform(0.95, 1.1)
-    parts = (
-        box((-0.35, -0.25, 0.45), (0.35, 0.25, 0.75), Material.CLOTH),
-        box((-0.35, -0.25, 0.7), (0.0, 0.25, height), Material.CLOTH),
-        *(wheel(0.12, 0.05, sx * 0.32, sy * 0.24) for sx in (1, -1) for sy in (1, -1)),
-    )
-    return (0.9, 0.55, height), parts
 
 
 Parts = tuple[Polytope, ...]
@@ -503,25 +497,193 @@ def own_car(height: float, rng: np.random.Generator) -> Parts:
 
 
 def stand(rng: np.random.Generator) -> Parts:
-    """Draw something slim of a person's height that is none: a meter, a pump, a pillar, a wrapped tree, a hydrant."""
+    """Draw something slim of a person's height that is none: a meter, a pump, a pillar, a wrapped tree."""
     height, width = rng.uniform(0.7, 2.2), rng.uniform(0.15, 0.5)
-    parts = [box((-width / 2, -width * 0.35, 0), (width / 2, width * 0.35, height), Material.METAL)]
+    if rng.random() < 0.4:
+        parts = [column(width / 2, (0.0, height), Material.METAL)]
+    else:
+        parts = [box((-width / 2, -width * 0.35, 0), (width / 2, width * 0.35, height), Material.METAL)]
     if rng.random() < 0.4:
         top = rng.uniform(0.2, 0.5)
         parts.append(box((-top / 2, -top / 2, height), (top / 2, top / 2, height + top), Material.METAL))
     return tuple(parts)
 
 
+def hydrant(rng: np.random.Generator) -> Parts:
+    """Draw a hydrant."""
+    height = rng.uniform(0.6, 1.0)
+    arms = box((-0.08, -0.2, height * 0.6), (0.08, 0.2, height * 0.75), Material.METAL)
+    return (
+        column(0.12, (0.0, height - 0.1), Material.METAL),
+        ellipsoid((0.12, 0.12, 0.1), (0, 0, height - 0.1), Material.METAL),
+        arms,
+    )
+
+
+def planter(rng: np.random.Generator) -> Parts:
+    """Draw a plant in a tub."""
+    w, h, top = rng.uniform(0.2, 0.6), rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.7)
+    leaves = ellipsoid(
+        (w * rng.uniform(0.7, 1.3), w * rng.uniform(0.7, 1.3), top), (0, 0, h + top * 0.7), Material.LEAVES
+    )
+    return (box((-w, -w * rng.uniform(0.5, 1.0), 0.0), (w, w, h), Material.WALL), leaves)
+
+
+def railing(rng: np.random.Generator) -> Parts:
+    """Draw a railing or crowd barrier: bars between posts, or hoops to lean bicycles on."""
+    length, height = rng.uniform(1.0, 5.0), rng.uniform(0.8, 1.2)
+    posts = [
+        box((x - 0.03, -0.03, 0), (x + 0.03, 0.03, height), Material.METAL)
+        for x in np.arange(-length / 2, length / 2 + 0.1, rng.uniform(0.7, 1.5))
+    ]
+    bars = [
+        box((-length / 2, -0.02, z - 0.03), (length / 2, 0.02, z + 0.03), Material.METAL)
+        for z in np.linspace(height, 0.3, rng.integers(1, 4))
+    ]
+    return (*posts, *bars)
+
+
+def corner(rng: np.random.Generator) -> Parts:
+    """Draw the end or corner of a wall, a gate post, a step or a stair's cheek."""
+    a, b, t, h = rng.uniform(0.3, 3.0), rng.uniform(0.0, 2.0), rng.uniform(0.12, 0.5), rng.uniform(0.5, 2.6)
+    return (
+        box((0, 0, 0), (a, t, h), Material.WALL),
+        box((0, 0, 0), (t, t + b, h * rng.uniform(0.6, 1.0)), Material.WALL),
+    )
+
+
+def sign_board(rng: np.random.Generator) -> Parts:
+    """Draw a board that stands on the ground: an A-board, a menu, a flag on a stand."""
+    w, h, foot = rng.uniform(0.25, 0.5), rng.uniform(0.8, 1.9), rng.uniform(0.1, 0.35)
+    return (prism([(-foot, 0.0), (foot, 0.0), (0.03, h), (-0.03, h)], 2 * w, Material.WOOD),)
+
+
+def letterbox(rng: np.random.Generator) -> Parts:
+    """Draw a letter box or fuse box on a foot."""
+    w, d, low, high = rng.uniform(0.2, 0.4), rng.uniform(0.15, 0.3), rng.uniform(0.4, 0.9), rng.uniform(1.1, 1.7)
+    return (box((-d, -w, low), (d, w, high), Material.METAL), column(0.06, (0.0, low), Material.METAL))
+
+
+def crates(rng: np.random.Generator) -> Parts:
+    """Draw stacked crates, sacks or parcels."""
+    parts: list[Polytope] = []
+    for _ in range(rng.integers(1, 5)):
+        x, y, w, z = *rng.normal(0, 0.4, 2), rng.uniform(0.15, 0.4), rng.uniform(0.0, 0.6)
+        parts.append(
+            box(
+                (x - w, y - w * 0.8, z if parts else 0.0),
+                (x + w, y + w * 0.8, z + rng.uniform(0.2, 0.8)),
+                Material.WOOD,
+            )
+        )
+    return tuple(parts)
+
+
+def stall(rng: np.random.Generator) -> Parts:
+    """Draw a market stall: a table with goods, mostly under a canopy on posts, some with a back or sides of cloth."""
+    half, d, h = rng.uniform(0.9, 2.0), rng.uniform(0.4, 0.9), rng.uniform(0.7, 0.95)
+    parts = [box((-half, -d, h - 0.08), (half, d, h), Material.WOOD)]
+    if rng.random() < 0.6:
+        parts.append(box((-half, -d, 0.0), (half, -d + 0.03, h), Material.CLOTH))
+    else:
+        parts += [
+            box((x - 0.03, y - 0.03, 0.0), (x + 0.03, y + 0.03, h), Material.METAL)
+            for x in (-half * 0.9, half * 0.9)
+            for y in (-d, d)
+        ]
+    for _ in range(rng.integers(1, 6)):
+        x, y, w = rng.uniform(-half, half), rng.uniform(-d, d) * 0.6, rng.uniform(0.1, 0.4)
+        parts.append(box((x - w, y - 0.2, h), (x + w, y + 0.2, h + rng.uniform(0.05, 0.6)), Material.WOOD))
+    if rng.random() < 0.8:
+        top, over = rng.uniform(1.9, 2.5), d + rng.uniform(0.1, 0.9)
+        parts += [column(0.025, (0.0, top), Material.METAL, at=(x, y)) for x in (-half, half) for y in (-over, over)]
+        parts.append(
+            prism(
+                [(-half - 0.2, top), (half + 0.2, top), (half, top + 0.4), (-half, top + 0.4)],
+                2 * over,
+                Material.CLOTH,
+                taper=rng.uniform(0.0, 1.5),
+            )
+        )
+        if rng.random() < 0.3:
+            parts.append(box((-half, over - 0.03, 0.0), (half, over, top), Material.CLOTH))
+    return tuple(parts)
+
+
+def clothes_rail(rng: np.random.Generator) -> Parts:
+    """Draw a rail on which clothes hang."""
+    half, top = rng.uniform(0.5, 1.0), rng.uniform(1.3, 1.8)
+    feet = tuple(box((x - 0.02, -0.25, 0.0), (x + 0.02, 0.25, 0.05), Material.METAL) for x in (-half, half))
+    posts = tuple(column(0.02, (0.0, top), Material.METAL, at=(x, 0.0)) for x in (-half, half))
+    return (
+        *feet,
+        *posts,
+        box(
+            (-half * 0.95, -0.22, rng.uniform(0.4, 0.8)),
+            (half * rng.uniform(0.3, 0.95), 0.22, top - 0.05),
+            Material.CLOTH,
+        ),
+    )
+
+
+def parasol(rng: np.random.Generator) -> Parts:
+    """Draw an open or a closed parasol with its foot."""
+    top = rng.uniform(2.0, 2.8)
+    if rng.random() < 0.3:
+        return (column(0.12, (0.9, top), Material.CLOTH), column(0.025, (0.0, top), Material.METAL))
+    r = rng.uniform(0.9, 1.8)
+    return (
+        ellipsoid((r, r, 0.25), (0, 0, top), Material.CLOTH),
+        column(0.025, (0.0, top), Material.METAL),
+        column(0.25, (0.0, 0.12), Material.WALL),
+    )
+
+
+def table(rng: np.random.Generator) -> Parts:
+    """Draw a table, some with empty chairs."""
+    r, h = rng.uniform(0.3, 0.7), rng.uniform(0.7, 1.1)
+    parts = [box((-r, -r, h - 0.05), (r, r, h), Material.WOOD), column(0.06, (0.0, h), Material.METAL)]
+    for k in range(rng.integers(0, 4)):
+        x, y = np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2)]) * (r + 0.3)
+        parts += [
+            box((x - 0.2, y - 0.2, 0.4), (x + 0.2, y + 0.2, 0.45), Material.WOOD),
+            box((x * 1.25 - 0.15, y * 1.25 - 0.15, 0.0), (x * 1.25 + 0.15, y * 1.25 + 0.15, 0.9), Material.MESH),
+        ]
+    return tuple(parts)
+
+
 SMALL: dict[str, tuple[float, float, Callable[[np.random.Generator], Parts]]] = {
-    "tree": (0.18, 0.4, tree), "bush": (0.2, 0.9, bush), "grass": (0.14, 0.3, grass), "pole": (0.2, 0.2, pole),
-    "stand": (0.08, 0.3, stand), "bin": (0.1, 0.8, bin_), "container": (0.05, 3.5, container),
-    "bench": (0.05, 1.0, bench), "shelter": (0.02, 2.5, shelter), "cone": (0.04, 0.5, cone),
+    "tree": (0.15, 0.4, tree), "bush": (0.16, 0.9, bush), "grass": (0.1, 0.3, grass), "pole": (0.17, 0.2, pole),
+    "stand": (0.08, 0.3, stand), "bin": (0.09, 0.8, bin_), "container": (0.04, 3.5, container),
+    "bench": (0.04, 1.0, bench), "shelter": (0.015, 2.5, shelter), "cone": (0.04, 0.5, cone), "hydrant": (0.02, 0.2, hydrant),
+    "planter": (0.04, 0.5, planter), "railing": (0.03, 1.0, railing), "corner": (0.03, 1.0, corner), "sign board": (0.02, 0.4, sign_board),
+    "letterbox": (0.02, 0.3, letterbox), "crates": (0.03, 0.7, crates), "stall": (0.02, 1.8, stall), "clothes rail": (0.01, 0.9, clothes_rail),
+    "parasol": (0.01, 0.3, parasol), "table": (0.02, 0.8, table),
 }  # fmt: skip
 """By kind: share, radius in m that is to be free around it, and how to draw it."""
 
 
-ROAD_USERS: dict[str, Callable[[np.random.Generator], Shape]] = {
-    "car": car, "truck": truck, "bus": bus, "motorcycle": motorcycle, "cyclist": cyclist, "bicycle": bicycle,
-    "pedestrian": pedestrian, "other": stroller,
+KINDS: dict[str, Kinds] = {
+    "car": {"car": (1.0, car)},
+    "truck": {"truck": (0.58, truck), "semitrailer": (0.32, semitrailer), "tractor": (0.05, tractor), "forklift": (0.02, forklift), "excavator": (0.03, excavator)},
+    "bus": {"bus": (1.0, bus)}, "motorcycle": MOTORCYCLES, "cyclist": CYCLISTS, "bicycle": {"bicycle": (1.0, bicycle)},
+    "pedestrian": PEOPLE, "other": OTHERS, "seated": {"seated": (1.0, seated)},
+    "parked motorcycle": {"parked": (1.0, parked_motorcycle)},
+    "trailer": {"small trailer": (0.6, small_trailer), "caravan": (0.4, caravan)},
 }  # fmt: skip
+"""Kinds of each category of road users, and of people at tables and of what cars pull."""
+
+
+def draw_user(category: str, rng: np.random.Generator, without: Collection[str] = ()) -> tuple[str, Shape]:
+    """Draw the kind and the shape of a road user of a category, of other kinds than some."""
+    kinds = {kind: entry for kind, entry in KINDS[category].items() if kind not in without} or KINDS[category]
+    shares = np.array([share for share, _ in kinds.values()])
+    kind = list(kinds)[rng.choice(len(kinds), p=shares / shares.sum())]
+    return kind, kinds[kind][1](rng)
+
+
+ROAD_USERS: dict[str, Callable[[np.random.Generator], Shape]] = {
+    category: (lambda rng, category=category: draw_user(category, rng)[1])  # type: ignore[misc]
+    for category in ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle", "pedestrian", "other")
+}
 """How to draw a road user of a category."""

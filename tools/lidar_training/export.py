@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from lidar_training.clouds import Example
 from lidar_training.network import GROUPS, IN_CHANNELS, BevNetwork
@@ -18,14 +19,7 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import calibration, operating_point, precision_recall
 from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, open_network
-from log2sim.perception.detect3d.network import (
-    METADATA_KEY,
-    grid_window,
-    level_points,
-    load_network,
-    rasterize,
-    viewpoints_xy,
-)
+from log2sim.perception.detect3d.network import METADATA_KEY, load_network
 
 CATEGORIES = {
     "vehicle": ["car", "truck", "bus"],
@@ -70,6 +64,48 @@ def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
     error = float(np.abs(load_network(path).run(grid) - expected).max())
     if not error < MAX_EXPORT_ERROR:
         raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
+
+
+def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
+    """Read a network back from its ONNX file, with integer weights or without, so that its training can go on.
+
+    Normalization was folded into the convolutions. It is put back with the moments of each layer on some grids (B, 12, H, W): the
+    network computes what it did, and still trains on normalized layers.
+    """
+    import onnx
+
+    graph = onnx.load(path).graph
+    values = {v.name: onnx.numpy_helper.to_array(v) for v in graph.initializer}
+    folded = {}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] in values:
+            value, scale = values[node.input[0]].astype(np.float32), values[node.input[1]]
+            values[node.output[0]] = value * scale.reshape(scale.shape + (1,) * (value.ndim - scale.ndim))
+        elif node.op_type == "Conv":
+            # "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0", "maps" of the head.
+            name = node.output[0].split("/")[-2].rsplit(".", 1)[0] if "/" in node.output[0] else "head"
+            folded[name] = [torch.from_numpy(values[k].copy()) for k in node.input[1:]]
+    network = BevNetwork().eval()
+    network.head.weight.data, network.head.bias.data = folded["head"]
+    layers = {
+        m: name for name, m in network.named_modules() if isinstance(m, nn.Sequential) and isinstance(m[0], nn.Conv2d)
+    }
+
+    def restore(layer: Any, inputs: tuple[Tensor, ...], _: Tensor) -> Tensor:
+        conv, norm, relu = layer
+        conv.weight.data, bias = folded[layers[layer]]
+        product = conv(inputs[0])
+        mean, variance = product.mean((0, 2, 3)), product.var((0, 2, 3), unbiased=False)
+        norm.running_mean, norm.running_var = mean, variance
+        norm.weight.data, norm.bias.data = (variance + norm.eps).sqrt(), mean + bias
+        return relu(norm(product))
+
+    hooks = [layer.register_forward_hook(restore) for layer in layers]
+    with torch.no_grad():
+        network(grids)
+    for hook in hooks:
+        hook.remove()
+    return network
 
 
 def describe(path: Path, info: dict[str, Any]) -> None:
@@ -149,34 +185,28 @@ def logistic(features: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.round(weights, 5)
 
 
-def quantize(path: Path, out: Path, examples: list[Example]) -> None:
-    """Write the network with 8-bit weights and activations, calibrated on clouds."""
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+def quantize(path: Path, out: Path) -> None:
+    """Write the network with the weights of all but its last layer in 8 bits, scaled by output channel; it computes in float32.
 
-    network = load_network(path)
-    info = network.info
+    Activations of 8 bits would save a third of the time of a sweep, and cost up to a third of the vehicles where lines are few.
+    """
+    import onnx
 
-    class Grids(CalibrationDataReader):
-        """Grids of the examples, one by one."""
-
-        def __init__(self) -> None:
-            self._left = iter(examples)
-
-        def get_next(self) -> dict[str, np.ndarray] | None:
-            example = next(self._left, None)
-            if example is None:
-                return None
-            xyz, _ = level_points(example.cloud, info.range_m)
-            low, shape = grid_window(
-                xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=viewpoints_xy(example.cloud)[0]
-            )
-            return {"grid": rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)[None]}
-
-    quantize_static(
-        str(path), str(out), Grids(), quant_format=QuantFormat.QDQ, per_channel=True,
-        activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, nodes_to_exclude=["/head/Conv"],
-    )  # fmt: skip
-    describe(out, json.loads(info.model_dump_json()))
+    model = onnx.load(path)
+    graph = model.graph
+    stored = {v.name: v for v in graph.initializer}
+    for conv in [node for node in graph.node if node.op_type == "Conv" and "maps" not in node.output]:
+        weight = onnx.numpy_helper.to_array(stored[conv.input[1]])
+        scale = np.maximum(np.abs(weight).max(axis=(1, 2, 3)), 1e-12) / 127
+        whole = np.rint(weight / scale[:, None, None, None]).astype(np.int8)
+        name = conv.input[1]
+        graph.initializer.remove(stored.pop(name))
+        for suffix, values in (("_int8", whole), ("_scale", scale.astype(np.float32))):
+            graph.initializer.append(onnx.numpy_helper.from_array(values, name + suffix))
+        graph.node.insert(
+            0, onnx.helper.make_node("DequantizeLinear", [name + "_int8", name + "_scale"], [name], axis=0)
+        )
+    onnx.save(model, out)
 
 
 SCORE = 0.5

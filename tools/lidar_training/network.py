@@ -130,6 +130,7 @@ def _category_loss(logits: Tensor, targets: Targets) -> Tensor:
 GROUPS = ("vehicle", "two_wheeler", "pedestrian")
 # An object with fewer points is neither asked for nor punished.
 MIN_POINTS = 4
+MIN_TOWED_M = 1.5
 STRIDE = 2
 # Width of the peak as a share of length and width, and at least of a cell.
 PEAK_LENGTH, PEAK_WIDTH, MIN_PEAK_CELLS = 0.16, 0.18, 0.55
@@ -176,9 +177,10 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
     for k, (sample, low) in enumerate(zip(samples, lows, strict=True)):
         for row, code, points in zip(sample.boxes, sample.category, sample.points, strict=True):
             name = CATEGORIES[code]
-            if name == "other":
-                continue
             x, y, z, length, width, height, yaw = (float(v) for v in row)
+            # Animals and strollers are none of the groups; what is towed may as well pass for a vehicle.
+            if name == "other" and length < MIN_TOWED_M:
+                continue
             u, v = (x - low[0]) / cell, (y - low[1]) / cell
             reach = int((max(length, width) / 2 + 0.6) / cell) + 3
             i0, i1 = max(0, int(u) - reach), min(n, int(u) + reach + 1)
@@ -191,7 +193,7 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
             c, s = np.cos(yaw), np.sin(yaw)
             along, across = dx * c + dy * s, dy * c - dx * s
             inside = (np.abs(along) < length / 2 + 0.1) & (np.abs(across) < width / 2 + 0.1)
-            if points < MIN_POINTS or name == "bicycle" or not (0 <= u < n and 0 <= v < n):
+            if points < MIN_POINTS or name in ("bicycle", "other") or not (0 <= u < n and 0 <= v < n):
                 considered[(k, 0, *area)][inside] = 0
                 continue
             group = GROUPS.index(GROUP_OF[name])

@@ -1,0 +1,64 @@
+"""Simulate the LiDARs of a log in what happens now."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, report_written, say, write_to
+
+if TYPE_CHECKING:
+    from log2sim.datatypes import Scenario
+
+
+def resimulate(
+    scenario: ScenarioPath,
+    log: Annotated[Path, option("Log that the scenario was reconstructed from.", "LOG")],
+    out: Annotated[Path, write_to("DIR", "Log folder to write.")],
+    replay: Annotated[
+        Path | None, option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE")
+    ] = None,
+    sensors: Annotated[str | None, option("Only these LiDARs.", "A,B", default="all")] = None,
+    sequence: Annotated[str | None, option("Sequence of a log with several.", "NAME")] = None,
+    seed: Annotated[int, option("Seed of noise and lost returns.", min=0)] = 0,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write what the LiDARs of a log would have recorded from where the ego drives now, among its agents.
+
+    Examples
+    --------
+    log2sim resimulate s.json --log samples/crossing -o simulated/
+    log2sim edit s.json --lateral ego=2 -o left.json
+    log2sim resimulate s.json --log samples/crossing --replay left.json -o from_the_left/
+    """
+    from log2sim.cli.progress import progress
+    from log2sim.datatypes import Scenario
+    from log2sim.localization.choice import localize_like
+    from log2sim.logs.native.writer import refuse_target
+    from log2sim.logs.opening import open_log
+    from log2sim.resim.simulate import resimulate as run
+
+    refuse_target(out, overwrite=overwrite)
+    source = Scenario.load(scenario)
+    now = source if replay is None else _happening(replay, source)
+    names = tuple(name.strip() for name in sensors.split(",")) if sensors else ()
+    with progress(quiet=quiet) as report:
+        recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
+        notes = run(recorded, source, now, out, sensors=names, seed=seed, overwrite=overwrite, progress=report)
+    for note in notes:
+        say(f"note: {note}", quiet=quiet)
+    report_written(out, quiet=quiet)
+
+
+def _happening(path: Path, source: Scenario) -> Scenario:
+    """Read a replay or an edit of a scenario as a scenario in its time and map."""
+    from log2sim.datatypes import Scenario
+    from log2sim.errors import ScenarioError
+    from log2sim.files.documents import read_json
+    from log2sim.simulation.result import Replay, to_scenario
+
+    document = read_json(path, ScenarioError)
+    if isinstance(document, dict) and "replay_version" in document:
+        return to_scenario(Replay.load(path), source)
+    return Scenario.load(path).aligned_to(source)

@@ -1,0 +1,297 @@
+"""The rays of a LiDAR, read off its sweeps: those that returned as they were recorded, those that did not between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from log2sim.datatypes import Log, Sweep
+from log2sim.geometry import Array, inverse, rotation_from_rpy, wrap_angle
+from log2sim.perception.records import RecordSource
+
+Floats = NDArray[np.float32]
+
+SAMPLED_SWEEPS = 6
+POSE_STEP_NS = 200_000  # a vehicle at 30 m/s moves 6 mm meanwhile, less than a LiDAR resolves
+MIN_PATTERN_RANGE_M = 4.0  # nearer, the lasers of a spinning LiDAR are seen not to start at one point
+MAX_TILT_RAD = np.deg2rad(4.0)
+ELEVATION_BIN_RAD = np.deg2rad(0.02)
+MIN_LINE_SHARE = 0.65  # of points within a quarter of the gap of a line; a half of them where there are no lines
+MIN_LINE_WIDTH_RAD = np.deg2rad(0.06)  # angles of points are not better where poses were taken off them
+MAX_LINES = 300
+MIN_DOWN_RAD = np.deg2rad(5.0)  # below the horizon: a street is not steeper
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """Rays of one sweep in the frame of the sensor, each at its own time.
+
+    Attributes
+    ----------
+    direction : (N, 3) float32
+        Unit vectors.
+    t_ns : (N,) int64
+        Absolute stamps.
+    range_m : (N,) float32
+        As recorded; NaN where nothing came back.
+    intensity : (N,) float32
+        NaN where unknown.
+    """
+
+    direction: Floats
+    t_ns: NDArray[np.int64]
+    range_m: Floats
+    intensity: Floats
+
+    def take(self, index: Any) -> Shots:
+        """Return some of the rays."""
+        return Shots(self.direction[index], self.t_ns[index], self.range_m[index], self.intensity[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """How a LiDAR scans, as far as sweeps show it.
+
+    Attributes
+    ----------
+    level_R_sensor : (3, 3) float64
+        Rotation in which lines have one elevation each: mounts of logs are not exact.
+    elevation_rad : (L,) float64
+        Of the lines, increasing; empty where the sensor has none.
+    step_rad : float
+        Between firings of a line.
+    gap_rad : float
+        Usual angle between lines; `step_rad` without lines.
+    covered : (L + 1, 120) bool
+        Lines by 3 degrees of azimuth from -180 on in which rays may come back; the last row is of any line.
+    """
+
+    level_R_sensor: Array
+    elevation_rad: Array
+    step_rad: float
+    gap_rad: float
+    covered: NDArray[np.bool_]
+
+
+def poses_of(log: Log, name: str, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
+    """Interpolate the pose of a sensor where its rays start.
+
+    Returns
+    -------
+    map_T_sensor : (K, 4, 4) float64
+        Of some moments.
+    moment : (N,) int
+        Of each stamp.
+    valid : (K,) bool
+    """
+    moments, index = np.unique(t_ns // POSE_STEP_NS, return_inverse=True)
+    map_T_sensor, valid = log.map_T_sensor(name, moments * POSE_STEP_NS + POSE_STEP_NS // 2)
+    return map_T_sensor, index, valid
+
+
+def recorded_shots(log: Log, name: str, sweep: Sweep) -> Shots:
+    """Return the rays of a sweep that came back, whatever frame its points are in."""
+    points = np.asarray(sweep.xyz_m, dtype=np.float64)
+    t_ns = np.full(len(points), sweep.stamp_ns) if sweep.t_ns is None else sweep.t_ns
+    if sweep.compensated_ns is not None and sweep.frame == "lidar":
+        pose = log.map_T_sensor(name, sweep.compensated_ns)[0][0]
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+    if sweep.frame == "map" or sweep.compensated_ns is not None:
+        poses, moment, valid = poses_of(log, name, t_ns)
+        poses[~valid] = np.nan
+        points = np.einsum("nji,nj->ni", poses[moment, :3, :3], points - poses[moment, :3, 3])
+    distance = np.linalg.norm(points, axis=1)
+    intensity = np.full(len(points), np.nan) if sweep.intensity is None else sweep.intensity
+    keep = distance > 0.1  # not NaN, and not the origin that some logs put for no return
+    direction = (points[keep] / distance[keep, None]).astype(np.float32)
+    return Shots(direction, t_ns[keep], distance[keep].astype(np.float32), np.asarray(intensity, np.float32)[keep])
+
+
+def angles_of(direction: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return azimuth and elevation (N,) of vectors (N, 3), rad."""
+    return np.arctan2(direction[:, 1], direction[:, 0]), np.arctan2(direction[:, 2], np.hypot(*direction[:, :2].T))
+
+
+def find_pattern(log: Log, name: str) -> Pattern:
+    """Read lines, steps and coverage off some sweeps of a LiDAR."""
+    stream = log.streams[name]
+    chosen = np.unique(np.linspace(0, len(stream.t_ns) - 1, SAMPLED_SWEEPS + 2).astype(int)[1:-1])
+    sweeps = [recorded_shots(log, name, RecordSource(log).require(name, int(i))) for i in chosen]
+    direction = np.concatenate([s.direction[s.range_m > MIN_PATTERN_RANGE_M] for s in sweeps]).astype(np.float64)
+    azimuth, elevation = angles_of(direction)
+    some = np.random.default_rng(0).permutation(len(direction))[:40_000]
+    along, across = _tilt(azimuth[some], elevation[some])
+    rotation = rotation_from_rpy(across, along, 0.0)
+    elevation = angles_of(direction @ rotation.T)[1]
+    lines = _lines(elevation)
+    covered = np.zeros((len(lines) + 1, 120), dtype=bool)
+    covered[:, _cell(azimuth)] = True
+    if len(lines):
+        # What looks down and never comes back is hidden by the vehicle; what looks up may meet something yet.
+        seen = np.zeros_like(covered)
+        every = np.concatenate([s.direction for s in sweeps]) @ rotation.T
+        a, e = angles_of(every)
+        seen[_nearest(lines, e), _cell(a)] = True
+        covered[:-1] &= seen[:-1] | (lines > -MIN_DOWN_RAD)[:, None]
+    # Firings of one line follow each other; without lines, points do.
+    a, e = angles_of(sweeps[len(sweeps) // 2].direction @ rotation.T)
+    line = _nearest(lines, e) if len(lines) else np.zeros(len(a), np.intp)
+    order = np.lexsort((a, line))
+    gap = np.diff(a[order])[np.diff(line[order]) == 0]
+    steps = gap[gap > np.deg2rad(0.03)]
+    step = float(np.median(steps)) if len(lines) and len(steps) else np.deg2rad(0.2)
+    return Pattern(rotation, lines, step, float(np.median(np.diff(lines))) if len(lines) > 1 else step, covered)
+
+
+def _cell(azimuth: NDArray[Any]) -> NDArray[np.int64]:
+    cell: NDArray[np.int64] = np.clip((np.degrees(azimuth) + 180) / 3, 0, 119).astype(np.int64)
+    return cell
+
+
+def _tilt(azimuth: Array, elevation: Array) -> tuple[float, float]:
+    """Find pitch and roll, rad, by which elevations gather most at few values."""
+    best, span = (0.0, 0.0), MAX_TILT_RAD
+    c, s = np.cos(azimuth), np.sin(azimuth)
+
+    def gathered(pitch: float, roll: float, bin_rad: float) -> float:
+        level = elevation - pitch * c + roll * s
+        count = np.bincount(((level + 1.6) / bin_rad).astype(np.int64))
+        return float((count.astype(np.float64) ** 2).sum())
+
+    flat = gathered(0.0, 0.0, np.deg2rad(0.05))
+    while span > np.deg2rad(0.02):
+        bin_rad = max(span / 8, np.deg2rad(0.05))
+        steps = np.linspace(-span, span, 13)
+        tries = [(best[0] + p, best[1] + r) for p in steps for r in steps]
+        best = max(tries, key=lambda t: gathered(t[0], t[1], bin_rad))
+        span /= 5
+    return best if gathered(*best, np.deg2rad(0.05)) > 1.1 * flat else (0.0, 0.0)
+
+
+def _lines(elevation: Array) -> Array:
+    """Return the elevations at which points gather; none where they do not."""
+    low = elevation.min() - 0.02
+    count = np.bincount(((elevation - low) / ELEVATION_BIN_RAD).astype(np.int64), minlength=8).astype(np.float64)
+    smooth = gaussian_filter1d(count, 2.5, mode="constant")
+    peak = np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:])) + 1
+    peak = peak[smooth[peak] > 0.1 * np.median(smooth[peak])] if len(peak) else peak
+    lines = low + (peak + 0.5) * ELEVATION_BIN_RAD
+    if not 1 < len(lines) <= MAX_LINES or np.median(np.diff(lines)) < np.deg2rad(0.15):
+        return np.zeros(0)
+    gap = np.diff(lines, prepend=2 * lines[0] - lines[1], append=2 * lines[-1] - lines[-2])
+    line = _nearest(lines, elevation)
+    near = np.abs(elevation - lines[line]) < np.maximum(np.minimum(gap[1:], gap[:-1])[line] / 4, MIN_LINE_WIDTH_RAD)
+    return lines if near.mean() > MIN_LINE_SHARE else np.zeros(0)
+
+
+def _nearest(lines: Array, elevation: Array) -> NDArray[np.intp]:
+    return np.searchsorted((lines[1:] + lines[:-1]) / 2, elevation)
+
+
+def all_shots(shots: Shots, pattern: Pattern) -> Shots:
+    """Add the rays that must have been sent between those that came back: firings that each line lacks."""
+    lines = pattern.elevation_rad
+    if not len(lines) or not len(shots.t_ns):
+        return shots
+    azimuth, elevation = angles_of(shots.direction @ pattern.level_R_sensor.T.astype(np.float32))
+    line = _nearest(lines, elevation)
+    order = np.lexsort((azimuth, line))
+    a, k = azimuth[order].astype(np.float64), line[order]
+    # Every line begins and ends at the seam at -180 degrees.
+    first, last = np.searchsorted(k, np.arange(len(lines))), np.searchsorted(k, np.arange(len(lines)), side="right")
+    empty = first == last
+    begin = np.insert(a, np.append(first, last), np.append(np.full(len(lines), -np.pi), np.full(len(lines), np.pi)))
+    own = np.insert(k, np.append(first, last), np.append(np.arange(len(lines)), np.arange(len(lines))))
+    width = np.where(own[1:] == own[:-1], np.diff(begin), 0.0)
+    missing = np.maximum(np.rint(width / pattern.step_rad).astype(np.int64) - 1, 0)
+    missing[width < 1.6 * pattern.step_rad] = 0
+    which = np.repeat(np.arange(len(missing)), missing)
+    nth = np.arange(len(which)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
+    fill_a = begin[which] + nth * width[which] / (missing[which] + 1)
+    fill_e = lines[own[which]]
+    inside = pattern.covered[own[which], _cell(fill_a)] & ~empty[own[which]]
+    fill_a, fill_e = fill_a[inside], fill_e[inside]
+    # Lines that are no straight ones in these angles may look like two, either with gaps where the other has points.
+    rows = [np.interp(e, lines, np.arange(len(lines))) for e in (elevation, fill_e)]
+    taken = cKDTree(np.column_stack([azimuth / pattern.step_rad, rows[0]]))
+    alone = np.isinf(taken.query(np.column_stack([fill_a / pattern.step_rad, rows[1]]), distance_upper_bound=0.7)[0])
+    fill_a, fill_e = fill_a[alone], fill_e[alone]
+    level = np.stack([np.cos(fill_e) * np.cos(fill_a), np.cos(fill_e) * np.sin(fill_a), np.sin(fill_e)], 1)
+    # The time of the nearest azimuth: a LiDAR that turns has little else.
+    turn = np.argsort(azimuth)
+    near = turn[np.clip(np.searchsorted(azimuth[turn], fill_a), 0, len(turn) - 1)]
+    nothing = np.full(len(fill_a), np.nan, np.float32)
+    return Shots(
+        np.concatenate([shots.direction, (level @ pattern.level_R_sensor).astype(np.float32)]),
+        np.concatenate([shots.t_ns, shots.t_ns[near]]),
+        np.concatenate([shots.range_m, nothing]),
+        np.concatenate([shots.intensity, nothing]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays of one sweep in the map.
+
+    Attributes
+    ----------
+    azimuth, elevation : (N,) float32, rad
+        In the sensor's frame.
+    origin, direction : (N, 3) float32
+        In the map less `shift_m`, and in the axes of the map.
+    t_ns : (N,) int64
+    shift_m : (3,) float64, m
+        Place near the sensor that keeps the numbers small.
+    bin_T_map : (B, 4, 4) float64
+        For each bin of azimuth, from the shifted map to the sensor when its rays go out.
+    bin_ns : (B,) int64
+        Mean time of the bins' rays.
+    spread_m : float
+        How far rays of one bin start from each other.
+    """
+
+    azimuth: Floats
+    elevation: Floats
+    origin: Floats
+    direction: Floats
+    t_ns: NDArray[np.int64]
+    shift_m: Array
+    bin_T_map: Array
+    bin_ns: NDArray[np.int64]
+    spread_m: float
+
+
+TIME_BINS = 720
+
+
+def bin_of(azimuth: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the bin of time of azimuths (N,), rad."""
+    return np.clip((azimuth + np.pi) * (TIME_BINS / (2 * np.pi)), 0, TIME_BINS - 1).astype(np.int64)
+
+
+def rays_in_map(shots: Shots, map_T_sensor: Array, moment: NDArray[np.intp]) -> Rays:
+    """Place rays by the poses (K, 4, 4) of the moments at which they go out."""
+    shift = np.rint(map_T_sensor[0, :3, 3])
+    local = map_T_sensor.copy()
+    local[:, :3, 3] -= shift
+    azimuth, elevation = angles_of(shots.direction)
+    direction = np.einsum("nij,nj->ni", local[moment, :3, :3].astype(np.float32), shots.direction)
+    bins = bin_of(azimuth)
+    count = np.bincount(bins, minlength=TIME_BINS)
+    begin = int(shots.t_ns.min())
+    mean = np.bincount(bins, shots.t_ns - begin, TIME_BINS) / np.maximum(count, 1)
+    of_moment = np.bincount(bins, moment, TIME_BINS) / np.maximum(count, 1)
+    known = np.flatnonzero(count)
+    nearest = known[np.abs(wrap_angle((np.arange(TIME_BINS)[:, None] - known) * 2 * np.pi / TIME_BINS)).argmin(axis=1)]
+    poses = local[np.rint(of_moment[nearest]).astype(np.intp)]
+    origin = local[moment, :3, 3]
+    spread = np.linalg.norm(origin - poses[bins, :3, 3], axis=1)
+    return Rays(
+        azimuth, elevation, origin.astype(np.float32), direction, shots.t_ns, shift, inverse(poses),
+        begin + np.rint(mean[nearest]).astype(np.int64), float(np.quantile(spread, 0.99)),
+    )  # fmt: skip

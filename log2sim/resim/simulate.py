@@ -1,0 +1,306 @@
+"""Sweeps of the recorded world: where the ego of a scenario drives, among its agents; and a log of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from log2sim.datatypes import EGO, Labels, Log, Scenario, Stream, Sweep, Waypoints
+from log2sim.errors import ConfigError, LogError
+from log2sim.files.outputs import replaced_folder
+from log2sim.geometry import NS_PER_S, PoseTrack, nearest_index, rotation_from_rpy, wrap_angle, yaw_of
+from log2sim.perception.records import RecordSource
+from log2sim.resim.bodies import body_of
+from log2sim.resim.caster import first_hits, grid_of, meetings
+from log2sim.resim.rays import Shots, all_shots, poses_of, rays_in_map, recorded_shots
+from log2sim.resim.surfels import Surfels
+from log2sim.resim.world import Progress, World, build_world, place
+from log2sim.simulation.policy import Controls, Observation, Policy, reset_policy
+
+TRUTH_FILE = "truth.json"
+# An ego that stays this close to its recorded path is where it was: its poses are kept, with all their digits.
+SAME_PATH_M, SAME_YAW_RAD = 0.02, np.deg2rad(0.2)
+# Farther off its recorded path the ego sees mostly what nothing was recorded of.
+MAX_OFF_PATH_M = 6.0
+
+
+@dataclass(eq=False)
+class Simulation:
+    """The sensors of a log in a scenario.
+
+    Attributes
+    ----------
+    log : Log
+        Recorded, with the poses of the scenario.
+    world : World
+    scenario : Scenario
+        What happens now.
+    seed : int
+    driven : Log
+        The same log with the ego's poses in the scenario.
+    agents : mapping of str to Surfels
+        Bodies of agents that were not recorded, and those of the world.
+    """
+
+    log: Log
+    world: World
+    scenario: Scenario
+    seed: int = 0
+    driven: Log = field(init=False)
+    agents: dict[str, Surfels] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Make bodies, and find the path of the ego."""
+        ids = {agent.id: agent for agent in self.scenario.others}
+        self.agents = {id: self.world.agents.get(id) or body_of(agent) for id, agent in ids.items()}
+        self.driven = self.log.changed(ego=ego_poses(self.log, self.scenario))
+
+    def shots(self, name: str, i: int) -> Shots:
+        """Return the rays of sweep `i` as they were sent."""
+        recorded = recorded_shots(self.log, name, RecordSource(self.log).require(name, i))
+        return all_shots(recorded, self.world.models[name].pattern)
+
+    def sweep(self, name: str, i: int) -> Sweep:
+        """Simulate sweep `i` of a LiDAR; every point is in the frame of the LiDAR at its own time."""
+        stamp = int(self.log.streams[name].t_ns[i])
+        return self.cast(name, self.shots(name, i), self.driven, stamp, np.random.default_rng([self.seed, i]))[0]
+
+    def cast(
+        self, name: str, shots: Shots, driven: Log, stamp_ns: int, rng: np.random.Generator
+    ) -> tuple[Sweep, NDArray[np.int64]]:
+        """Cast rays that leave the LiDAR where it is in a log; return the sweep and which of the rays its points are of."""
+        model = self.world.models[name]
+        poses, moment, valid = poses_of(driven, name, shots.t_ns)
+        known = valid[moment]
+        if not known.all():
+            shots, moment = shots.take(known), moment[known]
+        if not len(shots.t_ns):
+            nothing = np.zeros((0, 3), np.float32)
+            return Sweep(stamp_ns, nothing, t_ns=np.zeros(0, np.int64)), np.zeros(0, np.int64)
+        rays = rays_in_map(shots, poses, moment)
+        placed = place(self.world, self.scenario, rays, self.agents)
+        met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
+        hits = first_hits(met, placed.surfels, len(shots.t_ns), rng)
+        back = rng.random(len(shots.t_ns), dtype=np.float32) < hits.returned
+        back &= hits.range_m < model.max_range_m
+        distance = hits.range_m[back] + model.noise_m * rng.standard_normal(int(back.sum()), dtype=np.float32)
+        intensity = None
+        if np.isfinite(model.intensity):
+            intensity = np.clip(hits.intensity[back] * model.intensity, 0, model.max_intensity).astype(np.float32)
+            intensity = np.rint(intensity) if model.whole else intensity
+        sweep = Sweep(
+            stamp_ns, shots.direction[back] * distance[:, None], "lidar", shots.t_ns[back], intensity=intensity
+        )
+        return sweep, np.flatnonzero(known)[back]
+
+
+def with_sensors(policy: Policy, simulation: Simulation) -> Policy:
+    """Return a policy of the ego that also sees: its observations have `sweep(name)`, cast from where it drives now."""
+    return _SeeingPolicy(policy, simulation)
+
+
+@dataclass(frozen=True, eq=False)
+class _SeeingPolicy:
+    inner: Policy
+    simulation: Simulation
+
+    def reset(self, scenario: Scenario) -> None:
+        reset_policy(self.inner, scenario)
+
+    def __call__(self, observation: Observation) -> Controls:
+        return self.inner(replace(observation, look=self.look))
+
+    def look(self, observation: Observation, name: str) -> Sweep:
+        """Cast the rays of the recorded sweep nearest in time, by the speeds of now during the sweep."""
+        log, source = self.simulation.log, self.simulation.scenario
+        if name not in self.simulation.world.models:
+            raise ConfigError(f"sweep '{name}': no such LiDAR; simulated are {', '.join(self.simulation.world.models)}")
+        now_ns = source.t0_ns + round(observation.t_s * NS_PER_S)
+        i = int(nearest_index(log.streams[name].t_ns, [now_ns])[0])
+        shots = self.simulation.shots(name, i)
+        shots = replace(shots, t_ns=shots.t_ns + (now_ns - int(shots.t_ns.max())))
+
+        def steady(x: float, y: float, z: float, yaw: float, vx: float, vy: float, speed: float) -> Waypoints:
+            later_s, one = np.array([-1.0, 1.0]), np.ones(2)
+            t_s, x_m, y_m = observation.t_s + later_s, x + vx * later_s, y + vy * later_s
+            return Waypoints(t_s, x_m, y_m, z * one, yaw * one, speed * one, observed=one > 0, sigma_xy_m=0 * one)
+
+        o, ego = observation.others, observation.ego
+        columns = (o.x_m, o.y_m, o.z_m, o.yaw_rad, o.velocity_x_mps, o.velocity_y_mps, o.speed_mps)
+        moving = {str(id): steady(*(float(c[k]) for c in columns)) for k, id in enumerate(o.id)}
+        heading = ego.speed_mps * np.cos(ego.yaw_rad), ego.speed_mps * np.sin(ego.yaw_rad)
+        moving[EGO] = steady(ego.x_m, ego.y_m, ego.z_m, ego.yaw_rad, *heading, ego.speed_mps)
+        agents = tuple(replace(a, waypoints=moving[a.id], static=False) for a in source.agents if a.id in moving)
+        present = replace(self.simulation, scenario=replace(source, agents=agents))
+        return present.cast(name, shots, present.driven, now_ns, np.random.default_rng([self.simulation.seed, now_ns]))[
+            0
+        ]
+
+
+def ego_poses(log: Log, scenario: Scenario) -> PoseTrack | None:
+    """Return where the ego drives: the recorded pose nearest to each place, moved there; those of the log where it stays.
+
+    Height, pitch and roll are those of the road, so they are taken from where the ego was nearest.
+    """
+    if log.ego is None or scenario.ego is None:
+        return log.ego
+    ego, t_s = scenario.ego, (log.ego.t_ns - scenario.t0_ns) / NS_PER_S
+    w = ego.waypoints
+    there = (t_s >= w.t_s[0] - 0.2) & (t_s <= w.t_s[-1] + 0.2)
+    if not there.any():
+        raise ConfigError(f"scenario '{scenario.name}': its ego is not there during the log; nothing can be simulated")
+    states = ego.trajectory.at(t_s)
+    center, yaw = log.ego_centers(log.ego.map_T_ego), yaw_of(log.ego.map_T_ego[:, :3, :3])
+    off = np.hypot(states.x_m - center[:, 0], states.y_m - center[:, 1])
+    if off[there].max() < SAME_PATH_M and np.abs(wrap_angle(states.yaw_rad - yaw))[there].max() < SAME_YAW_RAD:
+        return log.ego
+    new = np.column_stack([states.x_m, states.y_m])[there]
+    near = cKDTree(center[:, :2]).query(new)[1]
+    turn = rotation_from_rpy(0.0, 0.0, wrap_angle(states.yaw_rad[there] - yaw[near]))
+    poses = log.ego.map_T_ego[near].copy()
+    poses[:, :3, 3] -= center[near]
+    poses[:, :3, :] = turn @ poses[:, :3, :]
+    poses[:, :3, 3] += np.column_stack([new, center[near, 2]])
+    return PoseTrack(log.ego.t_ns[there], poses, log.ego.max_gap_s)
+
+
+def off_path_m(log: Log, driven: PoseTrack | None) -> tuple[float, float]:
+    """Return how far the ego goes off the path that it recorded, m, and when, s after the first pose."""
+    if log.ego is None or driven is None:
+        return 0.0, 0.0
+    distance = cKDTree(log.ego.map_T_ego[:, :2, 3]).query(driven.map_T_ego[:, :2, 3])[0]
+    worst = int(distance.argmax())
+    return float(distance[worst]), float((driven.t_ns[worst] - log.ego.t_ns[0]) / NS_PER_S)
+
+
+def simulated_log(simulation: Simulation, *, notes: Collection[str] = ()) -> Log:
+    """Return the log that the LiDARs would have recorded; sweeps are cast when they are read."""
+    log, driven = simulation.log, simulation.driven
+    names = list(simulation.world.models)
+    streams = {}
+    for name in names:
+        t_ns = log.streams[name].t_ns
+        known = np.flatnonzero(driven.map_T_sensor(name, t_ns)[1])
+        streams[name] = Stream(name, t_ns[known], partial(_read, simulation, name, known))
+    return Log(
+        name=f"{log.name}, simulated",
+        format="simulated",
+        cameras={},
+        lidars={name: log.lidars[name] for name in names},
+        streams=streams,
+        ego=driven.ego,
+        ego_vehicle=log.ego_vehicle,
+        map=log.map,
+        labels=labels_of(simulation.scenario, streams[names[0]].t_ns),
+        ground_z_ego_m=log.ground_z_ego_m,
+        digest=log.digest,
+        notes=(f"simulated from log '{log.name}', seed {simulation.seed}", *simulation.world.notes, *notes),
+    )
+
+
+def _read(simulation: Simulation, name: str, known: NDArray[np.intp], i: int) -> Sweep:
+    return simulation.sweep(name, int(known[i]))
+
+
+def labels_of(scenario: Scenario, t_ns: NDArray[np.int64]) -> Labels:
+    """Return the boxes of all agents but the ego at the stamps of sweeps."""
+    t_s = (t_ns - scenario.t0_ns) / NS_PER_S
+    rows: list[tuple[Any, ...]] = []
+    for agent in scenario.others:
+        w = agent.waypoints
+        there = np.full(len(t_s), agent.is_permanent) | ((t_s >= w.t_s[0]) & (t_s <= w.t_s[-1]))
+        at = agent.trajectory.at(t_s)
+        rows += [
+            (t_ns[k], agent.id, agent.category, (at.x_m[k], at.y_m[k], at.z_m[k]), agent.size_m, at.yaw_rad[k])
+            for k in np.flatnonzero(there)
+        ]
+    rows.sort(key=lambda row: int(row[0]))
+    columns = list(zip(*rows)) if rows else [()] * 6
+    return Labels(
+        np.array(columns[0], np.int64), np.array(columns[1], str), np.array(columns[2], str),
+        np.array(columns[3], float).reshape(-1, 3), np.array(columns[4], float).reshape(-1, 3),
+        np.array(columns[5], float), labeled_ns=t_ns,
+    )  # fmt: skip
+
+
+def resimulate(
+    log: Log,
+    source: Scenario,
+    scenario: Scenario,
+    out: Path | str,
+    *,
+    sensors: Collection[str] = (),
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress = lambda *_: None,
+) -> tuple[str, ...]:
+    """Write what the LiDARs of a log would have recorded in a scenario as a native log folder with `truth.json`.
+
+    Parameters
+    ----------
+    log : Log
+        With the poses of `source`.
+    source : Scenario
+        Reconstructed from the log.
+    scenario : Scenario
+        What happens now: an edit or a replay of `source`, or itself.
+    sensors : collection of str
+        LiDARs; all of the log where it is empty.
+
+    Returns
+    -------
+    notes : tuple of str
+        What the simulation does not know, for people.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown sensor or one that is no LiDAR, and when the folder may not be replaced.
+    LogError
+        For a log without LiDAR, and one of which no sweep can be read.
+    """
+    from log2sim.logs.native.writer import refuse_target, write_log
+
+    refuse_target(Path(out), overwrite=overwrite)
+    simulation = simulate(log, source, scenario, sensors=sensors, seed=seed, progress=progress)
+    off_m, when_s = off_path_m(log, simulation.driven.ego)
+    notes = list(simulation.world.notes)
+    if off_m > MAX_OFF_PATH_M:
+        notes.append(
+            f"at {when_s:.1f} s the ego is {off_m:.1f} m from where anything was recorded; sweeps lack what was hidden"
+        )
+    result = simulated_log(simulation, notes=notes[len(simulation.world.notes) :])
+    with replaced_folder(Path(out), overwrite=overwrite) as folder:
+        write_log(result, folder, progress=partial(progress, "simulate"))
+        scenario.save(folder / TRUTH_FILE)
+    return tuple(notes)
+
+
+def simulate(
+    log: Log,
+    source: Scenario,
+    scenario: Scenario,
+    *,
+    sensors: Collection[str] = (),
+    seed: int = 0,
+    progress: Progress = lambda *_: None,
+) -> Simulation:
+    """Build the world of a log and return its sensors in a scenario; parameters and errors as of `resimulate`."""
+    if not log.lidars:
+        raise LogError(f"log '{log.name}': has no LiDAR, and sweeps alone are simulated")
+    for name in sensors:
+        if name not in log.lidars:
+            kind = "is a camera; LiDARs alone are simulated" if name in log.cameras else "is not in the log"
+            raise ConfigError(f"sensor '{name}' {kind}; its LiDARs: {', '.join(log.lidars)}")
+    names = [name for name in log.lidars if not sensors or name in sensors]
+    if log.ego is None and any(log.lidars[name].mount == "ego" for name in names):
+        raise LogError(f"log '{log.name}': has no poses of the ego; reconstruct with poses from its LiDAR first")
+    ego_poses(log, scenario)  # an error, where the ego is not there, comes before the long work
+    return Simulation(log, build_world(log, source, names, progress=progress), scenario, seed)

@@ -1,0 +1,246 @@
+"""Surfaces as discs: found around the points of each sweep, then joined over sweeps, as fine as they were seen.
+
+Surfels of points: Pfister et al., SIGGRAPH 2000; of LiDAR sweeps: Behley & Stachniss, RSS 2018.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from log2sim.geometry import Array
+from log2sim.resim.rays import Floats, Pattern, Shots, angles_of
+
+NEIGHBORS = 16
+SURFACE_SCALE_M = 0.03  # noise of a LiDAR; what lies farther off a plane counts less for it
+MAX_RADIUS_M = 1.0
+# Of what is flat: its roughness against how wide its points lie across, and as such; and that width, twice the usual noise.
+FLAT_RATIO, FLAT_M, MIN_WIDTH_M = 0.4, 0.08, 0.02
+# Of a cell that is flat: share of its points with a plane, and length of their mean normal.
+FLAT_SHARE, MIN_COHERENCE = 0.35, 0.8
+# Cells of the finest level; each is twice as large as the one before.
+CELL_M, LEVELS = 0.06, 6
+RADIUS_PER_CELL = 0.8  # discs of neighboring cells overlap, so that no ray passes between them
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Discs, S of them.
+
+    Attributes
+    ----------
+    center_m : (S, 3) float32, m
+        In the frame of what they belong to; of the map less its shift.
+    normal : (S, 3) float32
+        Toward where they were seen from; 0 for what has no plane, such as leaves, which faces every ray.
+    radius_m : (S,) float32
+    intensity : (S,) float32
+        Mean; NaN where unknown.
+    share : (S,) float32
+        Of the rays that meet the disc, how many end there: less than 1 for leaves, fences and edges.
+    returned : (S,) float32
+        Of the rays that end there, how many come back.
+    """
+
+    center_m: Floats
+    normal: Floats
+    radius_m: Floats
+    intensity: Floats
+    share: Floats
+    returned: Floats
+
+    def __len__(self) -> int:
+        """Return the number of discs."""
+        return len(self.radius_m)
+
+    def take(self, index: Any) -> Surfels:
+        """Return some of the discs."""
+        return Surfels(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+def joined(parts: Iterable[Surfels]) -> Surfels:
+    """Concatenate surfels of one frame."""
+    some = list(parts) or [no_surfels()]
+    return Surfels(*(np.concatenate([getattr(p, name) for p in some]) for name in Surfels.__dataclass_fields__))
+
+
+def no_surfels() -> Surfels:
+    """Return none."""
+    return Surfels(*(np.zeros((0, 3) if k < 2 else 0, np.float32) for k in range(6)))
+
+
+@dataclass(frozen=True, eq=False)
+class LocalSurface:
+    """What the surface is like around each of the points of a sweep, in the sensor's frame."""
+
+    normal: Floats  # (N, 3): toward the sensor; 0 where there is no plane
+    radius_m: Floats  # (N,): half the distance to the next rays on that surface
+    noise_m: float  # of ranges on flat surfaces that face the sensor; NaN without such
+
+
+def local_surface(shots: Shots, pattern: Pattern) -> LocalSurface:
+    """Fit planes to the rays around each ray by iteratively reweighted least squares."""
+    view = shots.direction.astype(np.float64)
+    points = view * shots.range_m[:, None]
+    azimuth, elevation = angles_of(view @ pattern.level_R_sensor.T)
+    lines = pattern.elevation_rad
+    if len(lines):
+        row = np.interp(elevation, lines, np.arange(len(lines)))
+        gap = np.gradient(lines)[np.rint(row).astype(np.intp)]
+    else:
+        row, gap = elevation / pattern.gap_rad, np.full(len(elevation), pattern.gap_rad)
+    # More firings than lines: they are closer to each other, and their noise is the same.
+    plane = np.column_stack([azimuth / (3 * pattern.step_rad), row])
+    count = min(NEIGHBORS, len(points))
+    near = cKDTree(plane).query(plane, k=count)[1].reshape(len(points), count)
+    offset = points[near] - points[:, None]
+    weight = 1 / (1 + ((shots.range_m[near] - shots.range_m[:, None]) / 0.5) ** 2)
+    for _ in range(3):
+        total = weight.sum(axis=1)
+        mean = np.einsum("nk,nki->ni", weight, offset) / total[:, None]
+        centered = offset - mean[:, None]
+        covariance = np.einsum("nk,nki,nkj->nij", weight, centered, centered) / total[:, None, None]
+        values, normal = smallest_axis(covariance)
+        off = np.abs(np.einsum("nki,ni->nk", centered, normal))
+        weight = 1 / (1 + (off / SURFACE_SCALE_M) ** 2) ** 2
+    rough, narrow, _ = np.sqrt(np.maximum(values, 0)).T
+    away = np.abs(np.einsum("ni,ni->n", mean, normal))
+    flat = (rough < FLAT_RATIO * narrow) & (rough < FLAT_M) & (narrow > MIN_WIDTH_M) & (away < FLAT_M)
+    facing = -np.einsum("ni,ni->n", normal, view)
+    normal *= np.where(facing < 0, -1.0, 1.0)[:, None]
+    facing = np.abs(facing)
+    flat &= facing > 0.01
+    # A step of the ray along azimuth or elevation, and where it leads on the plane.
+    level = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(azimuth))]) @ pattern.level_R_sensor
+    upward = np.cross(view, level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slant = [np.hypot(1, np.einsum("ni,ni->n", normal, axis) / facing) for axis in (level, upward)]
+    reach = np.maximum(pattern.step_rad * np.where(flat, slant[0], 1), gap * np.where(flat, slant[1], 1))
+    normal[~flat] = 0
+    seen = flat & (facing > 0.7)
+    noise = float(np.median(rough[seen] / facing[seen]) * np.sqrt(count / (count - 3))) if seen.sum() > 30 else np.nan
+    radius = np.minimum(0.6 * shots.range_m * reach, MAX_RADIUS_M)
+    return LocalSurface(normal.astype(np.float32), radius.astype(np.float32), noise)
+
+
+def smallest_axis(matrix: Array) -> tuple[Array, Array]:
+    """Return the eigenvalues (N, 3), increasing, of symmetric matrices (N, 3, 3) and the unit axes (N, 3) of the first.
+
+    By the angle of the characteristic cubic (Smith, 1961), and the largest cross product of two rows.
+    """
+    third = np.trace(matrix, axis1=1, axis2=2) / 3
+    rest = matrix - third[:, None, None] * np.eye(3)
+    size = np.sqrt(np.maximum((rest**2).sum(axis=(1, 2)) / 6, 1e-30))
+    unit = rest / size[:, None, None]
+    angle = np.arccos(np.clip(np.linalg.det(unit) / 2, -1, 1)) / 3
+    values = third[:, None] + 2 * size[:, None] * np.cos(angle[:, None] + np.array([2, 4, 0]) * np.pi / 3)
+    left = matrix - values[:, 0, None, None] * np.eye(3)
+    cross = np.cross(left, np.roll(left, 1, axis=1))
+    length = np.linalg.norm(cross, axis=2)
+    best = length.argmax(axis=1)
+    each = np.arange(len(matrix))
+    axis = cross[each, best]
+    norm = length[each, best]
+    axis[norm < 1e-20] = [0, 0, 1]
+    return values, axis / np.where(norm < 1e-20, 1, norm)[:, None]
+
+
+class SurfelGrid:
+    """Joins points of many sweeps cell by cell; its memory grows with the surfaces, not with the sweeps.
+
+    The columns of a cell are sums: of points, center, normal, planes, radius, intensities, and how many of these there are.
+    """
+
+    PENDING_ROWS = 2_000_000
+
+    def __init__(self) -> None:
+        self._key = np.zeros(0, np.int64)
+        self._sums = np.zeros((0, 11))
+        self._pending: list[tuple[NDArray[np.int64], Array]] = []
+
+    def add(self, points: Array, normal: Floats, radius_m: Floats, intensity: Floats) -> None:
+        """Add points (N, 3), m, that are less than 30 km from the origin."""
+        level = np.clip(np.ceil(np.log2(radius_m / (RADIUS_PER_CELL * CELL_M))), 0, LEVELS - 1).astype(np.int64)
+        known = np.isfinite(intensity)
+        sums = np.column_stack(
+            [
+                np.ones(len(points)),
+                points,
+                normal,
+                normal.any(axis=1),
+                radius_m,
+                np.where(known, intensity, 0.0),
+                known.astype(np.float64),
+            ]
+        )
+        self._pending.append(_summed(_keys(points, level), sums))
+        if sum(len(k) for k, _ in self._pending) > self.PENDING_ROWS:
+            self._join()
+
+    def _join(self) -> None:
+        parts = [(self._key, self._sums), *self._pending]
+        self._key, self._sums = _summed(np.concatenate([k for k, _ in parts]), np.concatenate([s for _, s in parts]))
+        self._pending = []
+
+    def surfels(self) -> Surfels:
+        """Return a disc for each cell, without coarse ones where there are finer ones."""
+        self._join()
+        level = self._key >> 60
+        count = self._sums[:, 0]
+        center = self._sums[:, 1:4] / count[:, None]
+        sums, normal = self._sums, self._sums[:, 4:7].copy()
+        length = np.linalg.norm(normal, axis=1)
+        flat = (sums[:, 7] > FLAT_SHARE * count) & (length > MIN_COHERENCE * sums[:, 7])
+        normal[flat] /= length[flat, None]
+        normal[~flat] = 0
+        _lend_planes(center, normal, flat, level)
+        keep = np.ones(len(count), dtype=bool)
+        for coarse in range(1, LEVELS):
+            own, finer = np.flatnonzero(level == coarse), np.flatnonzero(level < coarse)
+            if len(own) and len(finer):
+                covered, cell = np.unique(_keys(center[finer], np.full(len(finer), coarse)), return_inverse=True)
+                points = np.append(np.bincount(cell, count[finer]), 0)
+                at = np.searchsorted(covered, self._key[own])
+                found = np.append(covered, -1)[at] == self._key[own]
+                keep[own] = ~found | (points[at] < count[own])
+        sums, normal, center, count, level = sums[keep], normal[keep], center[keep], count[keep], level[keep]
+        radius = np.maximum(sums[:, 8] / count, RADIUS_PER_CELL * CELL_M * 2.0**level)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            intensity = sums[:, 9] / sums[:, 10]
+        one = np.ones(len(count))
+        columns = (center, normal, radius, intensity, one, one)
+        return Surfels(*(c.astype(np.float32) for c in columns))
+
+
+def _lend_planes(center: Array, normal: Array, flat: NDArray[np.bool_], level: NDArray[np.int64]) -> None:
+    """Give cells without a plane that of a flat one near them on which they lie; `normal` is changed."""
+    some, rough = np.flatnonzero(flat), np.flatnonzero(~flat)
+    if not len(some) or not len(rough):
+        return
+    reach = 4 * CELL_M * 2.0 ** level[rough]
+    distance, near = cKDTree(center[some]).query(center[rough], k=1, distance_upper_bound=float(reach.max()))
+    found = distance < reach
+    rough, near = rough[found], some[near[found]]
+    off = np.abs(np.einsum("ni,ni->n", center[rough] - center[near], normal[near]))
+    on = off < SURFACE_SCALE_M
+    normal[rough[on]] = normal[near[on]]
+
+
+def _keys(points: Array, level: NDArray[np.int64]) -> NDArray[np.int64]:
+    cell = np.floor(points / (CELL_M * 2.0 ** level[:, None])).astype(np.int64) + (1 << 19)
+    keys: NDArray[np.int64] = (level << 60) | (cell[:, 0] << 40) | (cell[:, 1] << 20) | cell[:, 2]
+    return keys
+
+
+def _summed(key: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:
+    if not len(key):
+        return key, sums
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    return key[first], np.add.reduceat(sums[order], first, axis=0)

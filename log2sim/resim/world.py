@@ -1,0 +1,409 @@
+"""The recorded world: what stands in it as one set of surfels, and every agent as one in its own frame.
+
+A point belongs to the agent in whose box it lies at its own time, so that an agent leaves no copy where it was. What no agent
+of the scenario explains is found by the rays: a disc that rays pass through as often as not is one of a tree, a fence or an
+edge and keeps that share; one that nearly all pass through was there for a moment only, and is taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
+from log2sim.localization.pose_refinement import refine_poses
+from log2sim.perception.records import RecordSource
+from log2sim.resim.bodies import body_of
+from log2sim.resim.caster import grid_of, meetings
+from log2sim.resim.rays import (
+    Floats,
+    Pattern,
+    Rays,
+    Shots,
+    all_shots,
+    bin_of,
+    find_pattern,
+    poses_of,
+    rays_in_map,
+    recorded_shots,
+)
+from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
+
+# Around the box of an agent, whose edges are not exact: what is left out of the background, and what is taken for the agent.
+LEFT_OUT_M, TAKEN_M = 0.35, 0.15
+GROUND_M = 0.12  # above the bottom of a box; below that it may be the ground
+HELD_S = 0.3  # before the first and after the last waypoint
+COVERED_M = 0.25  # around a disc of an agent, where none is added
+CHECKED_SWEEPS = 25  # of each LiDAR: enough rays for the share of each disc
+SAME_SURFACE_M = 0.1  # across it, between where a ray met and where it should
+MIN_SHARE = 0.2
+SAME_PLACE_M = 0.5
+# Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
+AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
+PRIOR_RAYS = 2.0
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """How a LiDAR measures."""
+
+    pattern: Pattern
+    noise_m: float
+    intensity: float  # mean; surfels hold intensities relative to it, which makes those of several LiDARs alike
+    max_intensity: float
+    whole: bool  # whether intensities are whole numbers
+    max_range_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What a log shows of its surroundings.
+
+    Attributes
+    ----------
+    shift_m : (3,) float64, m
+        The background is in its own map less this.
+    given, refined : PoseTrack or None
+        Poses of the ego by which agents are placed, and at the same stamps those by which surfaces lie on each other: its
+        background is in the map of the latter.
+    background : Surfels
+    agents : mapping of str to Surfels
+        By id, in the frame of the agent.
+    models : mapping of str to Model
+        By LiDAR.
+    notes : tuple of str
+        What could not be seen.
+    """
+
+    shift_m: Array
+    given: PoseTrack | None
+    refined: PoseTrack | None
+    background: Surfels
+    agents: Mapping[str, Surfels]
+    models: Mapping[str, Model]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """All surfels where they are while a sweep is recorded."""
+
+    surfels: Surfels
+    center: Floats  # (S, 3), m: the map less the shift of the rays
+    normal: Floats  # (S, 3)
+    first: NDArray[np.int64]  # (A + 2,): where the surfels of the background and of each agent begin, and the end
+    ids: tuple[str, ...]  # of these agents
+
+
+def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
+    """Return when an agent is there; one that stands all the time is."""
+    w = agent.waypoints
+    there: NDArray[np.bool_] = (t_s >= w.t_s[0] - HELD_S) & (t_s <= w.t_s[-1] + HELD_S)
+    return there | agent.is_permanent
+
+
+def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
+    """Put the agents of a scenario into the background, each disc where it is when the sensor looks there."""
+    parts, ids = [world.background], []
+    move = _given_T_refined(world, rays)
+    rotation = move[:3, :3].astype(np.float32)
+    offset = move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m
+    center = [world.background.center_m @ rotation.T + offset.astype(np.float32)]
+    normal = [world.background.normal @ rotation.T]
+    t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
+    sensor = rays.bin_T_map[len(rays.bin_T_map) // 2]
+    for agent in scenario.others:
+        there = alive(agent, t_s)
+        if not there.any() or agent.id not in agents:
+            continue
+        surfels, states = agents[agent.id], agent.trajectory.at(t_s)
+        position = np.column_stack([states.x_m, states.y_m, states.z_m]) - rays.shift_m
+        bins = np.full(len(surfels), len(t_s) // 2)
+        for _ in range(2):
+            points, axes = _turned(surfels, states.yaw_rad[bins], position[bins])
+            seen = points @ sensor[:3, :3].T + sensor[:3, 3]
+            bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
+        own = there[bins]
+        parts.append(surfels.take(own))
+        center.append(points[own].astype(np.float32))
+        normal.append(axes[own].astype(np.float32))
+        ids.append(agent.id)
+    first = np.cumsum([0, *(len(p) for p in parts)])
+    return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
+
+
+def _given_T_refined(world: World, rays: Rays) -> Array:
+    """Return the pose (4, 4) of the map of the background in that of the agents, as it was where the ego is now."""
+    if world.given is None or world.refined is None:
+        return np.eye(4)
+    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
+    distance = np.linalg.norm(world.given.map_T_ego[:, :3, 3] - here, axis=1)
+    # Of several times at which it was there, the one nearest to now.
+    late = np.where(
+        distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - rays.t_ns[0]), np.iinfo(np.int64).max
+    )
+    k = int(late.argmin())
+    return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
+
+
+def _turned(surfels: Surfels, yaw: Array, position: Array) -> tuple[Array, Array]:
+    c, s = np.cos(yaw), np.sin(yaw)
+    points, axes = (
+        np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
+        for v in (surfels.center_m, surfels.normal)
+    )
+    return points + position, axes
+
+
+def build_world(
+    log: Log,
+    scenario: Scenario,
+    lidars: Collection[str],
+    *,
+    leave_out: Callable[[str, int], bool] = lambda *_: False,
+    progress: Progress = lambda *_: None,
+) -> World:
+    """Build the world from the sweeps of a log.
+
+    Parameters
+    ----------
+    log : Log
+        With the poses of the scenario.
+    scenario : Scenario
+        What was reconstructed from the log, in its map.
+    lidars : collection of str
+    leave_out : callable
+        Whether sweep `i` of a LiDAR is left out, to be compared with.
+
+    Raises
+    ------
+    LogError
+        Where no sweep of the log can be used.
+    """
+    models: dict[str, Model] = {}
+    scale, top, whole = np.nan, 0.0, False
+    background, own = SurfelGrid(), {agent.id: SurfelGrid() for agent in scenario.others}
+    refined = refine_poses(log)
+    surveyed = log if refined is None else log.changed(ego=refined)
+    shift: Array | None = None
+    done, total = 0, sum(len(log.streams[name].t_ns) for name in lidars)
+    for name in lidars:
+        pattern, noise, far = find_pattern(log, name), [], 1.0
+        for i in range(len(log.streams[name].t_ns)):
+            done += 1
+            progress("build the world", done, total)
+            shots = None if leave_out(name, i) else _readable(log, name, i)
+            if shots is None:
+                continue
+            if shift is None:
+                shift = np.rint(log.map_T_sensor(name, shots.t_ns[:1])[0][0, :3, 3])
+            if name not in models:
+                known = shots.intensity[np.isfinite(shots.intensity)]
+                scale = float(known.mean()) if len(known) and known.mean() > 0 else np.nan
+                top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
+            far = max(far, float(shots.range_m.max()))
+            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, own))
+            models[name] = Model(pattern, 0.0, scale, top, whole, far)
+        if name in models:
+            level = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
+            models[name] = replace(models[name], noise_m=level, max_range_m=far)
+    if shift is None:
+        raise LogError(
+            f"log '{log.name}': no sweep of {', '.join(lidars)} can be used; there is nothing to simulate from"
+        )
+    seen = {id: grid.surfels() for id, grid in own.items()}
+    agents = {agent.id: completed(agent, seen[agent.id]) for agent in scenario.others}
+    unseen = [id for id, surfels in seen.items() if not len(surfels)]
+    notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
+    standing = background.surfels()
+    standing = joined([standing, *(ground_below(a, standing, shift) for a in scenario.others if a.static)])
+    world = World(shift, log.ego if refined is not None else None, refined, standing, agents, models, notes)
+    # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
+    world = _weighed(log, scenario, world, leave_out, progress)
+    trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
+    world = replace(world, background=_trimmed(world.background), agents=trimmed)
+    world = _weighed(log, scenario, world, leave_out, progress)
+    there = {id: surfels.take(surfels.share > MIN_SHARE) for id, surfels in world.agents.items()}
+    return replace(world, background=world.background.take(world.background.share > MIN_SHARE), agents=there)
+
+
+def ground_below(agent: Agent, background: Surfels, shift_m: Array) -> Surfels:
+    """Go on with the ground around an agent that stands, which hides what is below it; nothing where there is no ground."""
+    w, half = agent.waypoints, np.array(agent.size_m) / 2
+    c, s = np.cos(w.yaw_rad[0]), np.sin(w.yaw_rad[0])
+    offset = background.center_m - (np.array([w.x_m[0], w.y_m[0], w.z_m[0] - half[2]]) - shift_m)
+    along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+    near = (np.abs(along) < half[0] + AROUND_M) & (np.abs(across) < half[1] + AROUND_M)
+    near &= (np.abs(offset[:, 2]) < MAX_STEP_M) & (background.normal[:, 2] > 0.95)
+    if near.sum() < 20:
+        return no_surfels()
+    columns = np.column_stack([along[near], across[near], np.ones(near.sum())])
+    plane = np.linalg.lstsq(columns, offset[near, 2], rcond=None)[0]
+    steps = [np.arange(-h, h + GROUND_DISC_M, GROUND_DISC_M) for h in half[:2]]
+    cells = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    cells = cells[np.isinf(cKDTree(columns[:, :2]).query(cells, distance_upper_bound=GROUND_DISC_M)[0])]
+    x, y = c * cells[:, 0] - s * cells[:, 1], s * cells[:, 0] + c * cells[:, 1]
+    place = background.center_m[near][0] - offset[near][0]
+    normal = np.array([-c * plane[0] + s * plane[1], -s * plane[0] - c * plane[1], 1.0])
+    one = np.ones(len(cells), np.float32)
+    return Surfels(
+        (np.column_stack([x, y, cells @ plane[:2] + plane[2]]) + place).astype(np.float32),
+        np.tile(normal / np.linalg.norm(normal), (len(cells), 1)).astype(np.float32),
+        one * GROUND_DISC_M, one * np.median(background.intensity[near]), one, one,
+    )  # fmt: skip
+
+
+def _trimmed(surfels: Surfels) -> Surfels:
+    """Make discs as large as the part of them that rays end on, and leave out those that rays pass through."""
+    return replace(surfels, radius_m=surfels.radius_m * np.sqrt(surfels.share)).take(surfels.share > MIN_SHARE)
+
+
+def _readable(log: Log, name: str, i: int) -> Shots | None:
+    """Return the returns of a sweep; None of one that cannot be read, is empty, or whose pose is not known."""
+    try:
+        shots = recorded_shots(log, name, RecordSource(log).require(name, i))
+    except RecordError:
+        return None
+    if not len(shots.t_ns) or not log.map_T_sensor(name, shots.t_ns[[0, -1]])[1].all():
+        return None
+    return shots
+
+
+def _add_sweep(
+    log: Log,
+    surveyed: Log,
+    scenario: Scenario,
+    name: str,
+    shots: Shots,
+    pattern: Pattern,
+    scale: float,
+    shift: Array,
+    background: SurfelGrid,
+    own: Mapping[str, SurfelGrid],
+) -> float:
+    """Share out the points of a sweep to the background and the agents; return the noise of its ranges, m."""
+    surface = local_surface(shots, pattern)
+    poses, moment, _ = poses_of(log, name, shots.t_ns)
+    rotation = poses[moment, :3, :3]
+    points = np.einsum("nij,nj->ni", rotation, shots.direction * shots.range_m[:, None]) + poses[moment, :3, 3]
+    normal = np.einsum("nij,nj->ni", rotation, surface.normal)
+    intensity = (shots.intensity / scale).astype(np.float32)
+    free = ~_on_ego(log, name, shots, points)
+    t_s = (shots.t_ns - scenario.t0_ns) / NS_PER_S
+    middle_s = np.array([t_s.mean()])
+    for agent in scenario.others:
+        half = np.array(agent.size_m) / 2
+        x, y, _, _, speed = (v[0] for v in agent.trajectory.at(middle_s))
+        reach = np.hypot(half[0], half[1]) + LEFT_OUT_M + 0.2 * abs(speed)
+        near = np.flatnonzero((np.abs(points[:, 0] - x) < reach) & (np.abs(points[:, 1] - y) < reach))
+        near = near[alive(agent, t_s[near])]
+        if not len(near):
+            continue
+        at = agent.trajectory.at(t_s[near])
+        c, s = np.cos(at.yaw_rad), np.sin(at.yaw_rad)
+
+        def local(v: Array, c: Array = c, s: Array = s) -> Array:
+            return np.column_stack([c * v[:, 0] + s * v[:, 1], c * v[:, 1] - s * v[:, 0], v[:, 2]])
+
+        inside = local(points[near] - np.column_stack([at.x_m, at.y_m, at.z_m]))
+        high = inside[:, 2] > GROUND_M - half[2]
+        out = high & (np.abs(inside) < half + LEFT_OUT_M).all(axis=1)
+        taken = out & free[near] & (np.abs(inside) < half + TAKEN_M).all(axis=1)
+        free[near[out]] = False
+        rows = near[taken]
+        if len(rows):
+            axes = local(normal[near])[taken].astype(np.float32)
+            own[agent.id].add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
+    poses, moment, _ = poses_of(surveyed, name, shots.t_ns[free])
+    rotation = poses[moment, :3, :3]
+    points = np.einsum("nij,nj->ni", rotation, shots.direction[free] * shots.range_m[free, None])
+    points += poses[moment, :3, 3] - shift
+    normal = np.einsum("nij,nj->ni", rotation, surface.normal[free])
+    background.add(points, normal.astype(np.float32), surface.radius_m[free], intensity[free])
+    return surface.noise_m
+
+
+def _on_ego(log: Log, name: str, shots: Shots, points: Array) -> NDArray[np.bool_]:
+    """Find points on the ego itself, which go with it."""
+    if log.ego is None:
+        return np.zeros(len(points), dtype=bool)
+    near = np.flatnonzero(shots.range_m < 8.0) if log.lidars[name].mount == "ego" else np.arange(len(points))
+    moments, index = np.unique(shots.t_ns[near] // 1_000_000, return_inverse=True)
+    poses, valid = log.ego.at(moments * 1_000_000)
+    local = np.einsum("nji,nj->ni", poses[index, :3, :3], points[near] - poses[index, :3, 3])
+    half = np.array(log.ego_vehicle.size_m) / 2
+    off = np.abs(local - [log.ego_vehicle.rear_axle_offset_m, 0.0, log.ground_z_ego_m + half[2]])
+    on = valid[index] & (off[:, :2] < half[:2] + 0.1).all(axis=1)
+    on &= local[:, 2] > log.ground_z_ego_m + GROUND_M
+    out = np.zeros(len(points), dtype=bool)
+    out[near[on]] = True
+    return out
+
+
+def completed(agent: Agent, seen: Surfels) -> Surfels:
+    """Mirror what was seen of an agent about its middle plane, and put a body where it was seen from neither side."""
+    whole = seen
+    flip = np.array([1, -1, 1], np.float32)
+    mirrored = replace(seen, center_m=seen.center_m * flip, normal=seen.normal * flip)
+    for more in (mirrored, body_of(agent)):
+        if len(whole):
+            far = np.isinf(cKDTree(whole.center_m).query(more.center_m, distance_upper_bound=COVERED_M)[0])
+            more = more.take(far)
+        whole = joined([whole, more])
+    return whole
+
+
+def _weighed(
+    log: Log, scenario: Scenario, world: World, leave_out: Callable[[str, int], bool], progress: Progress
+) -> World:
+    """Count which rays end on each disc, pass through it or do not come back; leave out what is not there."""
+    ids = list(world.agents)
+    begin = dict(zip(["", *ids], np.cumsum([0, len(world.background), *(len(world.agents[i]) for i in ids)])))
+    hit, passed, lost = np.zeros((3, len(world.background) + sum(len(a) for a in world.agents.values())))
+    # Whole agents: what `place` takes of them depends on the time.
+    numbered = {k: replace(a, returned=np.arange(len(a), dtype=np.float32)) for k, a in world.agents.items()}
+    for name, model in world.models.items():
+        usable = [i for i in range(len(log.streams[name].t_ns)) if not leave_out(name, i)]
+        chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, CHECKED_SWEEPS).astype(int))]
+        for done, i in enumerate(chosen):
+            progress(f"rays of {name} through the world", done + 1, len(chosen))
+            shots = _readable(log, name, i)
+            if shots is None:
+                continue
+            shots = all_shots(shots, model.pattern)
+            poses, moment, _ = poses_of(log, name, shots.t_ns)
+            rays = rays_in_map(shots, poses, moment)
+            placed = place(world, scenario, rays, numbered)
+            met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
+            column = np.arange(len(placed.surfels))
+            for k, id in enumerate(placed.ids):
+                part = slice(placed.first[k + 1], placed.first[k + 2])
+                column[part] = begin[id] + placed.surfels.returned[part].astype(np.int64)
+            behind = (shots.range_m[met.ray] - met.range_m) * met.facing
+            there = np.abs(behind) < SAME_SURFACE_M
+            np.add.at(hit, column[met.surfel[there]], met.weight[there])
+            through = behind > SAME_SURFACE_M
+            np.add.at(passed, column[met.surfel[through]], met.weight[through])
+            # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
+            nothing = np.isnan(shots.range_m)[met.ray]
+            nearest = np.full(len(shots.t_ns), np.inf, np.float32)
+            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing])
+            first = nothing & (met.range_m == nearest[met.ray])
+            np.add.at(lost, column[met.surfel[first]], met.weight[first])
+    share = ((hit + PRIOR_RAYS) / (hit + passed + PRIOR_RAYS)).astype(np.float32)
+    returned = ((hit + PRIOR_RAYS) / (hit + lost + PRIOR_RAYS)).astype(np.float32)
+
+    def judged(surfels: Surfels, at: int) -> Surfels:
+        rows = slice(at, at + len(surfels))
+        return replace(surfels, share=share[rows], returned=returned[rows])
+
+    agents = {id: judged(world.agents[id], begin[id]) for id in ids}
+    return replace(world, background=judged(world.background, 0), agents=agents)

@@ -1,0 +1,238 @@
+"""Simulated sweeps: closed forms of the caster, worlds without ghosts, sweeps that were left out, edited scenarios."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from log2sim.datatypes import Log, Scenario
+from log2sim.errors import ConfigError, LogError
+from log2sim.geometry import NS_PER_S
+from log2sim.logs.opening import open_log
+from log2sim.resim.bodies import body_of
+from log2sim.resim.caster import first_hits, grid_of, meetings
+from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
+from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
+from log2sim.resim.surfels import Surfels, smallest_axis
+from log2sim.resim.world import World, build_world, ground_below
+from log2sim.simulation.policy import Controls, Observation
+from log2sim.simulation.runner import replay
+from log2sim.synth import Scene, load_scene, synthesize
+
+SCENES = Path(__file__).resolve().parents[1] / "samples" / "scenes"
+
+
+def shots_toward(direction: np.ndarray) -> Shots:
+    unit = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    nothing = np.full(len(unit), np.nan, np.float32)
+    return Shots(unit, np.zeros(len(unit), np.int64), nothing, nothing)
+
+
+def disc_surfels(center: np.ndarray, normal: np.ndarray, radius: float) -> Surfels:
+    one = np.ones(len(center), np.float32)
+    return Surfels(center.astype(np.float32), normal.astype(np.float32), radius * one, one, one, one)
+
+
+def cast(shots: Shots, surfels: Surfels, seed: int = 0) -> np.ndarray:
+    rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
+    met = meetings(rays, grid_of(rays), surfels, surfels.center_m, surfels.normal)
+    return first_hits(met, surfels, len(shots.t_ns), np.random.default_rng(seed)).range_m
+
+
+def test_a_plane_of_discs_is_met_where_the_plane_is() -> None:
+    grid = np.stack(np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25)), -1).reshape(-1, 2)
+    normal = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
+    height = -1.8 - (grid @ normal[:2]) / normal[2]
+    plane = disc_surfels(np.column_stack([grid, height]), np.tile(normal, (len(grid), 1)), 0.25)
+    rng = np.random.default_rng(1)
+    # All around, the seam at the back included.
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 3000), rng.uniform(-0.9, -0.35, 3000)
+    ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+    expected = -1.8 * normal[2] / (ray @ normal)
+    near = (expected > 0) & (expected < 15)
+    np.testing.assert_allclose(cast(shots_toward(ray[near]), plane)[:], expected[near], rtol=1e-4)
+
+
+def test_the_nearer_of_two_discs_stops_a_ray_and_one_of_a_fence_its_share() -> None:
+    wall, near = np.array([[10.0, 0, 0]]), np.array([[4.0, 0, 0]])
+    axis = np.tile([-1.0, 0, 0], (2, 1))
+    both = disc_surfels(np.vstack([wall, near]), axis, 0.5)
+    rays = shots_toward(np.column_stack([np.ones(4000), np.linspace(-0.01, 0.01, 4000), np.zeros(4000)]))
+    assert np.allclose(cast(rays, both), 4, atol=1e-2)
+    fence = replace(both, share=np.array([1, 0.3], np.float32))
+    ended = cast(rays, fence)
+    assert np.isclose((ended < 5).mean(), 0.3, atol=0.03)
+    assert np.allclose(ended[ended > 5], 10, atol=1e-2)
+
+
+def test_smallest_axes_are_those_of_an_eigenvalue_solver() -> None:
+    a = np.random.default_rng(0).normal(size=(200, 3, 3))
+    a = a @ a.transpose(0, 2, 1)
+    values, axis = smallest_axis(a)
+    expected, vectors = np.linalg.eigh(a)
+    np.testing.assert_allclose(values, expected, atol=1e-9)
+    np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", axis, vectors[:, :, 0])), 1, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A street with houses and cars, 2 s long, its LiDAR of fewer rays."""
+    bare = load_scene(SCENES / "bare.toml")
+    lidar = bare.lidar[0].model_copy(update={"azimuth_step_deg": 0.8})
+    return bare.model_copy(update={"camera": (), "lidar": (lidar,), "duration_s": 2.0})
+
+
+@pytest.fixture(scope="module")
+def recorded(scene: Scene) -> tuple[Log, Scenario]:
+    return synthesize(scene, observe=False)
+
+
+@pytest.fixture(scope="module")
+def world(recorded: tuple[Log, Scenario]) -> World:
+    log, truth = recorded
+    return build_world(log, truth, list(log.lidars), leave_out=lambda _, i: i % 5 == 2)
+
+
+def points_of(simulation: Simulation, name: str, i: int, log: Log) -> np.ndarray:
+    sweep = simulation.sweep(name, i)
+    poses, moment, _ = poses_of(log, name, sweep.t_ns)
+    return np.einsum("nij,nj->ni", poses[moment, :3, :3], sweep.xyz_m) + poses[moment, :3, 3]
+
+
+def count_in_box(points: np.ndarray, scenario: Scenario, id: str, t_s: float) -> int:
+    agent = scenario[id]
+    at = agent.trajectory.at(np.array([t_s]))
+    c, s = np.cos(at.yaw_rad[0]), np.sin(at.yaw_rad[0])
+    offset = points - [at.x_m[0], at.y_m[0], at.z_m[0]]
+    local = np.column_stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]])
+    half = np.array(agent.size_m) / 2
+    return int(((np.abs(local) < half + 0.2).all(axis=1) & (local[:, 2] > 0.3 - half[2])).sum())
+
+
+def test_sweeps_that_were_left_out_come_back_as_recorded(recorded: tuple[Log, Scenario], world: World) -> None:
+    log, truth = recorded
+    simulation, (name,) = Simulation(log, world, truth), log.lidars
+    for i in (7, 17):
+        shots = simulation.shots(name, i)
+        sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(0))
+        simulated = np.full(len(shots.t_ns), np.nan)
+        simulated[rows] = np.linalg.norm(sweep.xyz_m, axis=1)
+        came, comes = np.isfinite(shots.range_m), np.isfinite(simulated)
+        error = np.abs(simulated - shots.range_m)[came & comes & (shots.range_m < 40)]
+        assert np.median(error) < 0.04
+        assert np.quantile(error, 0.9) < 0.15
+        assert (came == comes).mean() > 0.93
+
+
+def test_an_agent_leaves_no_copy_and_stands_where_it_is_moved(recorded: tuple[Log, Scenario], world: World) -> None:
+    log, truth = recorded
+    (name,) = log.lidars
+    t_s = (log.streams[name].t_ns - truth.t0_ns) / NS_PER_S - 0.05
+    there = max(
+        truth.others,
+        key=lambda a: count_in_box(points_of(Simulation(log, world, truth), name, 12, log), truth, a.id, t_s[12]),
+    )
+    before = count_in_box(points_of(Simulation(log, world, truth), name, 12, log), truth, there.id, t_s[12])
+    assert before > 50
+    without = replace(truth, agents=tuple(a for a in truth.agents if a.id != there.id))
+    assert count_in_box(points_of(Simulation(log, world, without), name, 12, log), truth, there.id, t_s[12]) <= 2
+    w = there.waypoints
+    aside = replace(there, waypoints=replace(w, y_m=w.y_m + 3.0))
+    edited = replace(truth, agents=tuple(aside if a.id == there.id else a for a in truth.agents))
+    points = points_of(Simulation(log, world, edited), name, 12, log)
+    assert count_in_box(points, edited, there.id, t_s[12]) > 0.5 * before
+    assert count_in_box(points, truth, there.id, t_s[12]) <= 2
+
+
+def test_the_same_seed_gives_the_same_sweep(recorded: tuple[Log, Scenario], world: World) -> None:
+    log, truth = recorded
+    (name,) = log.lidars
+    one, two, other = (Simulation(log, world, truth, seed).sweep(name, 9) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.xyz_m, two.xyz_m)
+    assert len(one.xyz_m) != len(other.xyz_m) or not np.array_equal(one.xyz_m, other.xyz_m)
+
+
+def test_rays_that_did_not_return_are_found_between_those_that_did(recorded: tuple[Log, Scenario]) -> None:
+    log, _ = recorded
+    (name,) = log.lidars
+    shots, pattern = recorded_shots(log, name, log.streams[name].read(12)), find_pattern(log, name)
+    whole = all_shots(shots, pattern)
+    kept = np.random.default_rng(0).random(len(shots.t_ns)) < 0.8
+    assert len(all_shots(shots.take(kept), pattern).t_ns) == pytest.approx(len(whole.t_ns), rel=0.02)
+
+
+def test_a_body_fills_its_box(recorded: tuple[Log, Scenario]) -> None:
+    for category, size in (
+        ("car", (4.5, 1.8, 1.5)),
+        ("truck", (8, 2.4, 3)),
+        ("bus", (12, 2.5, 3)),
+        ("pedestrian", (0.6, 0.6, 1.7)),
+        ("cyclist", (1.8, 0.6, 1.7)),
+    ):
+        agent = replace(recorded[1].others[0], category=category, size_m=size)
+        np.testing.assert_allclose(np.ptp(body_of(agent).center_m, axis=0), size, atol=0.25)
+
+
+def test_the_ground_goes_on_below_what_stands(recorded: tuple[Log, Scenario]) -> None:
+    grid = np.stack(np.meshgrid(np.arange(-6, 6, 0.1), np.arange(-6, 6, 0.1)), -1).reshape(-1, 2)
+    grid = grid[(np.abs(grid) > [2.2, 0.9]).any(axis=1)]
+    slope = np.column_stack([grid, 0.05 * grid[:, 0] - 0.03 * grid[:, 1]])
+    normal = np.array([-0.05, 0.03, 1]) / np.linalg.norm([-0.05, 0.03, 1])
+    at = replace(
+        recorded[1].others[0].waypoints.take([0]), x_m=np.array([100.0]), y_m=np.array([50.0]), z_m=np.array([7.75])
+    )
+    car = replace(
+        recorded[1].others[0], size_m=(4.4, 1.8, 1.5), static=True, waypoints=replace(at, yaw_rad=np.zeros(1))
+    )
+    below = ground_below(car, disc_surfels(slope, np.tile(normal, (len(slope), 1)), 0.1), np.array([100.0, 50, 7]))
+    assert np.ptp(below.center_m[:, :2], axis=0) == pytest.approx([4.2, 1.6], abs=0.3)
+    np.testing.assert_allclose(below.center_m @ normal, 0, atol=1e-5)
+    np.testing.assert_allclose(below.normal @ normal, 1, atol=1e-5)
+
+
+def test_a_simulated_log_opens_with_its_truth(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
+    log, truth = recorded
+    short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:6]) for k, s in log.streams.items()})
+    resimulate(short, truth, truth, tmp_path / "out")
+    back = open_log(tmp_path / "out")
+    (name,) = back.lidars
+    assert list(back.streams[name].t_ns) == list(short.streams[name].t_ns)
+    assert len(back.streams[name].read(3).xyz_m) == pytest.approx(len(log.streams[name].read(3).xyz_m), rel=0.1)
+    assert Scenario.load(tmp_path / "out" / "truth.json").digest == truth.digest
+
+
+def test_what_cannot_be_simulated_is_said_and_nothing_written(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
+    log, truth = recorded
+    with pytest.raises(LogError, match="no LiDAR"):
+        resimulate(log.changed(lidars={}, streams={}), truth, truth, tmp_path / "out")
+    with pytest.raises(ConfigError, match="'tower' is not in the log"):
+        simulate(log, truth, truth, sensors=["tower"])
+    gone = truth.ego
+    assert gone is not None
+    late = replace(gone, waypoints=replace(gone.waypoints, t_s=gone.waypoints.t_s + 1000))
+    with pytest.raises(ConfigError, match="ego is not there"):
+        resimulate(log, truth, replace(truth, agents=(late, *truth.others)), tmp_path / "out")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], world: World) -> None:
+    log, truth = recorded
+    (name,) = log.lidars
+    ahead: list[float] = []
+
+    def drive(observation: Observation) -> Controls:
+        if len(ahead) < 2 and observation.t_s >= len(ahead) * 1.5:
+            # The house beside the street: 10 m to the left of the path, wherever along it the ego is.
+            points = observation.sweep(name).xyz_m
+            beside = (np.abs(points[:, 0]) < 5) & (points[:, 1] > 3) & (points[:, 2] > 0)
+            ahead.append(float(np.median(points[beside, 1])))
+        return Controls(0.0, 0.0)
+
+    replay(truth, ego=with_sensors(drive, Simulation(log, world, truth)), dt_s=0.05)
+    assert len(ahead) == 2
+    np.testing.assert_allclose(ahead, 10 + 1.8, atol=0.3)
+    with pytest.raises(ConfigError, match="no sensors are simulated"):
+        replay(truth, ego=lambda observation: observation.sweep(name), dt_s=0.05)  # type: ignore[arg-type,return-value]
