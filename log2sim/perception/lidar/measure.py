@@ -379,8 +379,8 @@ def _measure_as_paper(view: View, cloud: Cloud, columns: dict[str, Any], rows: I
         columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
 
 
-# Points of a cluster that are kept as evidence, of which extents and heights are measured.
-MAX_KEPT_POINTS = 256
+# Points of a cluster that are kept as evidence; its extents are those of all, since ends are told by their outermost points.
+MAX_KEPT_POINTS = 400
 
 
 def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequence[Index], cloud: Cloud) -> None:
@@ -411,9 +411,10 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
 
 def _write_view(columns: dict[str, Any], rows: Index, members: Sequence[Index], cloud: Cloud) -> None:
     """Write what the points of one viewpoint, R arrays (n,), show into rows (R,)."""
-    index, count, of_sensor = _sampled(cloud, members)
+    index, count = np.concatenate(members), np.array([len(points) for points in members])
     edges = np.concatenate([[0], np.cumsum(count)])
-    xy, start, xyz = of_sensor[:, :2], edges[:-1], of_sensor + cloud.sensor.astype(np.float64)
+    xyz = cloud.xyz.take(index, axis=0).astype(np.float64)
+    xy, start, of_sensor = xyz[:, :2] - cloud.sensor[:2], edges[:-1], xyz - cloud.sensor
     typical = np.array([TYPICAL_SIZE_M[str(category)] for category in columns["category"][rows]])
     yaw, low, high = fit_extents_of_clusters(xy, count, typical, columns["box_yaw_rad"][rows])
     columns["yaw_rad"][rows], columns["low_m"][rows], columns["high_m"][rows] = yaw, low, high
@@ -427,27 +428,18 @@ def _write_view(columns: dict[str, Any], rows: Index, members: Sequence[Index], 
     columns["sensor_m"][rows] = cloud.sensor + cloud.origin
     timed = np.column_stack([xyz + cloud.origin, t_s - np.repeat(mean_ns, count) / NS_PER_S])
     columns["ends_visible"][rows] = cloud.azimuth_index.ends_visible(members)
-    for row, points in zip(rows.tolist(), np.split(timed, edges[1:-1])):
-        columns["cluster"][row] = points
-
-
-def _sampled(cloud: Cloud, members: Sequence[Index]) -> tuple[Index, NDArray[np.intp], Array]:
-    """Sample the surfaces of R clusters: points (n,) of the cloud, how many of each (R,), and their places (n, 3) from the sensor."""
-    index, count = np.concatenate(members), np.array([len(points) for points in members])
-    of_sensor = cloud.xyz.take(index, axis=0) - cloud.sensor
     kept = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count, MAX_KEPT_POINTS)
-    count = np.diff(np.searchsorted(kept, np.concatenate([[0], np.cumsum(count)])))
-    return index[kept], count, of_sensor[kept].astype(np.float64)
+    for row, points in zip(rows.tolist(), np.split(timed[kept], np.searchsorted(kept, edges[1:-1]))):
+        columns["cluster"][row] = points
 
 
 def _other_view(cloud: Cloud, members: Index, t_ns: int) -> OtherView:
     """Describe what the points at `members` (n,) of a second viewpoint show of an object that is measured at a time."""
-    index, _, of_sensor = _sampled(cloud, [members])
-    late_s = cloud.t_s[index].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
-    place = cloud.sensor + cloud.origin
-    return OtherView(
-        place, cloud.azimuth_index.ends_visible([members])[0], np.column_stack([of_sensor + place, late_s])
-    )
+    of_sensor = cloud.xyz.take(members, axis=0).astype(np.float64) - cloud.sensor
+    kept = sample_surfaces(np.linalg.norm(of_sensor, axis=1), np.array([len(members)]), MAX_KEPT_POINTS)
+    late_s = cloud.t_s[members[kept]].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
+    place, ends = cloud.sensor + cloud.origin, cloud.azimuth_index.ends_visible([members])[0]
+    return OtherView(place, ends, np.column_stack([of_sensor[kept] + place, late_s]))
 
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
