@@ -6,16 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Detections
 from log2sim.geometry import box_iou
-from log2sim.perception.detect.layouts import InputSpec, Preprocessing, ssd_anchors
+from log2sim.perception.detect.layouts import InputSpec, Preprocessing
 from log2sim.perception.detect.onnx_detector import (
     OVERLAP,
     Tile,
     join_riders,
-    joined_to_strip,
     merge,
     plan_tiles,
     suppress,
@@ -70,33 +68,6 @@ def test_tiles_cover_every_column_and_overlap(width: int, height: int, tiles: in
         assert tile.v1 - tile.v0 <= tile.u1 - tile.u0
     for left, right in pairwise(row):
         assert left.u1 - right.u0 >= (OVERLAP - 0.05) * (left.u1 - left.u0)
-
-
-@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (1242, 375), (640, 400), (700, 60)])
-def test_a_strip_shows_what_its_tiles_show_at_their_scale(width: int, height: int) -> None:
-    tiles = plan_tiles(width, height, "auto", 300)
-    whole, strip = joined_to_strip(tiles, 300, 64)
-    assert whole == tiles[0]
-    assert (strip.u0, strip.v0, strip.u1, strip.v1) == (0, tiles[1].v0, width, tiles[1].v1)
-    assert strip.input_px is not None
-    assert (strip.input_px[0] - 300) % 64 == 0
-    assert strip.input_px[0] / width == pytest.approx(300 / (tiles[1].u1 - tiles[1].u0), abs=33 / width)
-    assert joined_to_strip(tiles[:1], 300, 64) == tiles[:1]
-
-
-@pytest.mark.parametrize("stride", [16, 32])
-def test_anchors_of_a_wider_input_lie_a_stride_apart_around_those_of_training(stride: int) -> None:
-    def centers(width: int) -> NDArray[np.float64]:
-        _v, u, *shape = ssd_anchors((width, 300)).T
-        side = {16: 30.0, 32: 105.0}[stride]  # of the square shapes of the two finest layers
-        return np.unique(u[np.isclose(shape[0], side) & np.isclose(shape[1], side)])
-
-    cells = {16: 19, 32: 10}[stride]
-    np.testing.assert_allclose(centers(300), (np.arange(cells) + 0.5) * 300 / cells)
-    wide = centers(300 + 5 * 64)
-    np.testing.assert_allclose(np.diff(wide), stride)
-    assert wide[:cells].mean() == pytest.approx(centers(300).mean())
-    assert wide[-1] < 300 + 5 * 64
 
 
 def test_boxes_cut_by_an_inner_border_are_dropped_and_those_at_the_picture_border_stay() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.config import AUTO, Config, Section
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
-from log2sim.perception.detect.onnx_detector import OnnxDetector
+from log2sim.perception.detect.onnx_detector import OnnxDetector, plan_tiles
 from log2sim.perception.run_detectors import create_image_detector
 from log2sim.plan import IMAGE_DETECTOR, choose_detector
 
@@ -231,17 +231,16 @@ def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str,
         if plan not in seen:
             seen.add(plan)
             inputs.append(("tiles", tiles))
-    spec = detector.model.spec
-    if spec.width_px is None and spec.height_px is None and detector.layout.strip_step_px is None:
+    if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
         inputs += [("input_px", side) for side in SIDES_PX if side != detector.layout.preprocessing.default_px]
     return inputs
 
 
-def _tile_plan(log: Log, config: Config, detector: OnnxDetector, tiles: int) -> tuple[Any, ...]:
-    """Plan the tiles of a frame of each camera."""
-    of_count = replace(detector, tiles=tiles or "auto")
+def _tile_plan(log: Log, config: Config, detector: OnnxDetector, tiles: int) -> tuple[int, ...]:
+    """Count the tiles of a frame of each camera."""
+    side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
     cameras = [log.cameras[name] for name in config.cameras or log.cameras]
-    return tuple(tuple(of_count.tiles_of(camera.width_px, camera.height_px)) for camera in cameras)
+    return tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
 
 
 def _input_name(key: str, value: int) -> str:

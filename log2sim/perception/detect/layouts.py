@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -54,15 +53,10 @@ class Preprocessing:
     unit: bool  # values 0-1 instead of 0-255; never for integer inputs
     default_px: int | None = 640  # side of the input of a model that takes any size, None for the image's own
 
-    def __call__(
-        self, image_bgr: NDArray[np.uint8], spec: InputSpec, size: tuple[int, int] | None = None
-    ) -> tuple[NDArray[Any], Placement]:
-        """Convert an image (H, W, 3) uint8 BGR to the input (1, 3, h, w) or (1, h, w, 3), with its placement there.
-
-        `size`: (w, h) of the input, where it is not the model's own.
-        """
+    def __call__(self, image_bgr: NDArray[np.uint8], spec: InputSpec) -> tuple[NDArray[Any], Placement]:
+        """Convert an image (H, W, 3) uint8 BGR to the input (1, 3, h, w) or (1, h, w, 3), with its placement there."""
         height, width = image_bgr.shape[:2]
-        size = size or (spec.width_px or self.default_px or width, spec.height_px or self.default_px or height)
+        size = (spec.width_px or self.default_px or width, spec.height_px or self.default_px or height)
         image, placement = self._place(image_bgr, size)
         if self.rgb:
             image = reversed_channels(image)
@@ -253,9 +247,6 @@ class Layout:
     decode: Callable[[Outputs, Size, Classes, float], Candidates] = field(repr=False)
     default_classes: Classes = COCO_80  # of a model whose output holds class ids without names
     default_min_score: float = 0.4  # in [0, 1], below which boxes are more often wrong than useful
-    # By multiples of this an input may be wider than it is high: models that are convolutions all through see one strip as
-    # they would see tiles of it.
-    strip_step_px: int | None = None
 
 
 def corners_from_centers(center_and_size: Array) -> Array:
@@ -421,58 +412,6 @@ def _from_tf_od_raw(outputs: Outputs, size: Size, classes: Classes, min_score: f
     return Candidates(from_normalized(box, size), score, category)
 
 
-# SSD before decoding: `encoded` (1, N, 4), offsets v, u and logarithms of height, width, and `scores` (1, N, C) after the sigmoid.
-
-# Side of the training images, cells of the layers there, and the strides of these.
-SSD_PX, SSD_CELLS, SSD_STRIDES_PX = 300, (19, 10, 5, 3, 2, 1), (16, 32, 64, 128, 256, 512)
-# ssd_anchor_generator of the model's pipeline configuration.
-SSD_SCALES = (*np.linspace(0.2, 0.95, len(SSD_CELLS)), 1.0)
-CENTER_VARIANCE, SIZE_VARIANCE = 0.1, 0.2
-
-
-@lru_cache(maxsize=8)
-def ssd_anchors(size: Size) -> Array:
-    """Build the anchors (N, 4) center v, u, height, width in px: by layer, cell row by row, then shape.
-
-    SSD (Liu et al., 2016) with the object detection API's reduced lowest layer: three shapes there, six elsewhere. Cells divide
-    the training images evenly, though features lie a stride apart; in a longer side anchors keep that stride, and are as far
-    from their features as they are on average in the training images.
-    """
-    layers = []
-    for layer, (cells, stride) in enumerate(zip(SSD_CELLS, SSD_STRIDES_PX)):
-        scale = SSD_SCALES[layer]
-        shapes = [(scale, ratio) for ratio in (1.0, 2.0, 0.5, 3.0, 1 / 3)] + [
-            (np.sqrt(scale * SSD_SCALES[layer + 1]), 1.0)
-        ]
-        if layer == 0:
-            shapes = [(0.1, 1.0), (scale, 2.0), (scale, 0.5)]
-        shape = SSD_PX * np.array([(s / np.sqrt(ratio), s * np.sqrt(ratio)) for s, ratio in shapes])
-        along_u, along_v = (
-            (np.arange(cells) + 0.5) * SSD_PX / cells
-            if side == SSD_PX
-            else SSD_PX / 2 + stride * (np.arange(-(-side // stride)) - (cells - 1) / 2)
-            for side in size
-        )
-        v, u = np.meshgrid(along_v, along_u, indexing="ij")
-        center = np.stack([v.ravel(), u.ravel()], axis=1)
-        layers.append(np.concatenate([np.repeat(center, len(shape), axis=0), np.tile(shape, (len(center), 1))], axis=1))
-    return np.concatenate(layers)
-
-
-def _is_ssd(outputs: Outputs, size: Size) -> bool:
-    encoded, score = find_output(outputs, "encoded"), find_output(outputs, "scores")
-    return encoded is not None and score is not None and encoded.shape[1] == score.shape[1] == len(ssd_anchors(size))
-
-
-def _from_ssd(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
-    row, score, category = classes.best(required_output(outputs, "scores")[0], min_score)
-    encoded, anchor = required_output(outputs, "encoded")[0][row].astype(np.float64), ssd_anchors(size)[row]
-    center = anchor[:, :2] + CENTER_VARIANCE * encoded[:, :2] * anchor[:, 2:]
-    extent = np.exp(SIZE_VARIANCE * encoded[:, 2:]) * anchor[:, 2:]
-    box_vuvu = corners_from_centers(np.concatenate([center, extent], axis=1))
-    return Candidates(box_vuvu[:, [1, 0, 3, 2]], score, category)
-
-
 def from_normalized(box_vuvu: Array, size: Size) -> Array:
     """Convert boxes from v0, u0, v1, u1 in 0-1 to u0, v0, u1, v1 in px."""
     return box_vuvu.reshape(-1, 4)[:, [1, 0, 3, 2]] * np.array([*size, *size], dtype=np.float64)
@@ -513,11 +452,6 @@ LAYOUTS: Mapping[str, Layout] = {
         Layout(
             "tf-od-raw", _AS_TF1, _is_tf_od_raw, lambda outputs: int(required_output(outputs, "scores").shape[2]),
             _from_tf_od_raw, COCO_91,
-        ),
-        # At steps of 64 px borders cut strides as they do in the training images.
-        Layout(
-            "ssd", _AS_TF1, _is_ssd, lambda outputs: int(required_output(outputs, "scores").shape[2]), _from_ssd, COCO_91,
-            strip_step_px=64,
         ),
         Layout("yolox", _CORNER, _is_yolox, _count_in_rows, _from_yolox),
         Layout("yolov5", _CENTERED, _is_yolov5, _count_in_rows, _from_rows),

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -125,17 +126,17 @@ def suppress(detections: Detections, max_overlap: float) -> Detections:
     a person in front of a car is kept. O(M^2) time.
     """
     ordered = strongest_first(detections).take(slice(MAX_CANDIDATES))
-    group, keep = groups_of(ordered.category), np.ones(len(ordered), dtype=bool)
-    same = np.triu((box_iou(ordered.box_px, ordered.box_px) > max_overlap) & (group[:, None] == group), 1)
-    for i in np.flatnonzero(same.any(axis=1)).tolist():
+    box, group, keep = ordered.box_px, groups_of(ordered.category), np.ones(len(ordered), dtype=bool)
+    for i in range(len(box)):
         if keep[i]:
-            keep &= ~same[i]
+            later = np.flatnonzero(keep[i + 1 :] & (group[i + 1 :] == group[i])) + i + 1
+            keep[later] = box_iou(box[i], box[later])[0] <= max_overlap
     return ordered.take(keep)
 
 
 # Overlap of neighboring tiles as a share of a tile's width; wider objects are detected in the whole image.
 OVERLAP = 0.35
-# Margin at a tile's border as a share of its shorter side: about how exactly models place the edge of a cut object.
+# Margin at a tile's border as a share of its width: about how exactly models place the edge of a cut object.
 BORDER = 0.025
 # Pixels of a tile for each pixel of the input: with more, far cars are missed, with less, time is lost.
 MAX_DOWNSCALING = 1.6
@@ -150,9 +151,6 @@ class Tile:
     v0: int
     u1: int
     v1: int
-    input_px: tuple[int, int] | None = (
-        None  # width and height of the input that it is resized to; None for the model's own
-    )
 
     def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Crop the tile (h, w, 3) from an image (H, W, 3), without a copy."""
@@ -178,19 +176,6 @@ def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, inpu
     return [whole, *(Tile(u, v0, u + tile_width, v0 + tile_height) for u in starts)]
 
 
-def joined_to_strip(tiles: Sequence[Tile], input_px: int, step_px: int) -> list[Tile]:
-    """Join the row of tiles of a plan to one strip at their scale, whose input is a number of steps wider than it is high.
-
-    What tiles have in common is seen once, and no object is cut.
-    """
-    whole, *row = tiles
-    if not row:
-        return [whole]
-    wider_px = whole.u1 * input_px / (row[0].u1 - row[0].u0) - input_px
-    size = (input_px + step_px * max(round(wider_px / step_px), 0), input_px)
-    return [whole, Tile(0, row[0].v0, whole.u1, row[0].v1, size)]
-
-
 def auto_tile_count(width_px: int, input_px: int | None) -> int:
     """Count the tiles in a row so that none is downscaled by more than `MAX_DOWNSCALING`; 1 if the image is not."""
     if input_px is None or width_px <= MAX_DOWNSCALING * input_px:
@@ -201,7 +186,7 @@ def auto_tile_count(width_px: int, input_px: int | None) -> int:
 
 def is_cut_by_tile(box_px: Array, tile: Tile, width_px: int, height_px: int) -> NDArray[np.bool_]:
     """Compute the mask (M,) of boxes (M, 4), px of the whole image, that end at a border of the tile inside the image."""
-    margin = BORDER * min(tile.u1 - tile.u0, tile.v1 - tile.v0)
+    margin = BORDER * (tile.u1 - tile.u0)
     return (
         ((tile.u0 > 0) & (box_px[:, 0] < tile.u0 + margin))
         | ((tile.v0 > 0) & (box_px[:, 1] < tile.v0 + margin))
@@ -318,9 +303,7 @@ class OnnxDetector:
     max_overlap: float  # IoU above which two boxes of one group are duplicates
     tiles: Literal["auto"] | int
     default_min_score: float  # lowest score where none is set
-    together_px: int = (
-        0  # pixels of inputs of one size in one run of a model that takes any number of them; 0 for all others
-    )
+    together: int = 1  # tiles in one run of a model of one size that takes any number of inputs; 1 for all others
 
     @property
     def cache_key(self) -> str | None:
@@ -328,9 +311,7 @@ class OnnxDetector:
         import onnxruntime
 
         digest = self.model.digest()
-        settings = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model", "together_px")
-        }
+        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model", "together")}
         return None if digest is None else f"{digest} onnxruntime {onnxruntime.__version__} {settings!r}"
 
     def detect(self, frame: Frame) -> Detections:
@@ -343,27 +324,16 @@ class OnnxDetector:
 
     def detect_images(self, images: Sequence[NDArray[np.uint8]]) -> list[Detections]:
         """Detect road users and traffic lights in each of several images (H, W, 3) uint8 BGR."""
-        preprocessing, spec = self.layout.preprocessing, self.model.spec
-        by_size: dict[tuple[int, int] | None, list[tuple[int, Tile]]] = {}
-        for k, image in enumerate(images):
-            for tile in self.tiles_of(image.shape[1], image.shape[0]):
-                by_size.setdefault(tile.input_px, []).append((k, tile))
-        found: list[list[tuple[Tile, Detections]]] = [[] for _ in images]
-        for size, jobs in by_size.items():
-            step = max(self.together_px // math.prod(size or (preprocessing.default_px or 1,) * 2), 1)
-            for run in (jobs[first : first + step] for first in range(0, len(jobs), step)):
-                inputs = [preprocessing(tile.cut(images[k]), spec, size) for k, tile in run]
-                outputs = self.model.run(np.concatenate([tensor for tensor, _ in inputs]))
-                for n, ((k, tile), (_, placement)) in enumerate(zip(run, inputs)):
-                    own = {name: array[n : n + 1] for name, array in outputs.items()} if len(run) > 1 else outputs
-                    found[k].append((tile, suppress(self._boxes_of(own, tile, placement), self.max_overlap)))
-        return [self._merged(of_image, image) for of_image, image in zip(found, images)]
+        tiles = [self._tiles_of(image) for image in images]
+        jobs = [(image, tile) for image, planned in zip(images, tiles) for tile in planned]
+        runs = [jobs[i : i + self.together] for i in range(0, len(jobs), self.together)]
+        found = chain.from_iterable(map(self._detect_tiles, runs))
+        return [self._merged([(tile, next(found)) for tile in planned], image) for image, planned in zip(images, tiles)]
 
-    def tiles_of(self, width_px: int, height_px: int) -> list[Tile]:
-        """Plan the parts of an image that are searched."""
+    def _tiles_of(self, image: NDArray[np.uint8]) -> list[Tile]:
+        height, width = image.shape[:2]
         input_px = self.model.spec.width_px or self.layout.preprocessing.default_px
-        tiles, step_px = plan_tiles(width_px, height_px, self.tiles, input_px), self.layout.strip_step_px
-        return tiles if step_px is None or input_px is None else joined_to_strip(tiles, input_px, step_px)
+        return plan_tiles(width, height, self.tiles, input_px)
 
     def _merged(self, found: list[tuple[Tile, Detections]], image: NDArray[np.uint8]) -> Detections:
         """Merge what was found in the tiles of an image, and separate the traffic lights from the road users."""
@@ -372,6 +342,19 @@ class OnnxDetector:
         light = merged.category == TRAFFIC_LIGHT
         users = join_riders(merged.take(~light), sure_score=self.min_score)
         return replace(users, traffic_lights=np.column_stack([merged.box_px[light], merged.score[light]]))
+
+    def _detect_tiles(self, jobs: Sequence[tuple[NDArray[np.uint8], Tile]]) -> list[Detections]:
+        """Detect in tiles of images by one run of the model, each without duplicates."""
+        inputs = [self.layout.preprocessing(tile.cut(image), self.model.spec) for image, tile in jobs]
+        if len(inputs) == 1:
+            outputs = [self.model.run(inputs[0][0])]
+        else:
+            joined = self.model.run(np.concatenate([tensor for tensor, _ in inputs]))
+            outputs = [{name: array[k : k + 1] for name, array in joined.items()} for k in range(len(inputs))]
+        return [
+            suppress(self._boxes_of(of_tile, tile, placement), self.max_overlap)
+            for of_tile, (_, tile), (_, placement) in zip(outputs, jobs, inputs, strict=True)
+        ]
 
     def _boxes_of(self, outputs: Outputs, tile: Tile, placement: Placement) -> Detections:
         """Decode the outputs of one tile; boxes in px of the whole image, clipped to the tile."""

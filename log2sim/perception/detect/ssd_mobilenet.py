@@ -121,6 +121,7 @@ def read_tensor(tensor: Any) -> NDArray[Any] | None:
 
 OPSET = 13
 IR_VERSION = 8
+INPUT_PX = 300
 # Classes by their column among the 91 of the graph, 0 of which is the background: those that are no road users are left out,
 # and with them most of the work, since classes are chosen for each of thousands of boxes.
 CLASS_NAMES = {
@@ -131,6 +132,11 @@ CLASS_HEAD = "/ClassPredictor/"
 SCALED, SHIFTED = "Preprocessor/mul/x", "Preprocessor/sub/y"
 PICTURE = "Preprocessor/sub"
 ENCODED_BOXES, CLASS_LOGITS = "concat", "concat_1"
+
+# ssd_anchor_generator of the model's pipeline configuration.
+FEATURE_CELLS = (19, 10, 5, 3, 2, 1)
+MIN_SCALE, MAX_SCALE = 0.2, 0.95
+CENTER_VARIANCE, SIZE_VARIANCE = 0.1, 0.2
 
 
 class Converter:
@@ -241,9 +247,7 @@ class Converter:
 
 
 def convert(graph: bytes) -> onnx.ModelProto:
-    """Convert the frozen graph: `images` (N, H, W, 3) uint8 RGB to `encoded` (N, A, 4) and `scores` (N, A, 7).
-
-    H and W are 300 by training, A is then 1917; see the layout "ssd".
+    """Convert the frozen graph: `images` (N, 300, 300, 3) uint8 RGB to `boxes` (N, 1917, 4) and `scores` (N, 1917, 7).
 
     Raises `ValueError` when the bytes are not that model's graph.
     """
@@ -256,12 +260,13 @@ def convert(graph: bytes) -> onnx.ModelProto:
         encoded, logits = converter.translate(ENCODED_BOXES), converter.translate(CLASS_LOGITS)
     except KeyError as error:
         raise ValueError(f"the graph has no node {error}") from None
-    converter.add("Identity", [encoded], "encoded")
+    anchors = anchor_boxes()
+    decode_boxes(converter, encoded, anchors)
     converter.add("Sigmoid", [logits], "scores")
-    picture = helper.make_tensor_value_info("images", TensorProto.UINT8, ["N", "H", "W", 3])
+    picture = helper.make_tensor_value_info("images", TensorProto.UINT8, ["N", INPUT_PX, INPUT_PX, 3])
     outputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", "A", columns])
-        for name, columns in (("encoded", 4), ("scores", len(CLASS_NAMES)))
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", len(anchors), columns])
+        for name, columns in (("boxes", 4), ("scores", len(CLASS_NAMES)))
     ]
     body = helper.make_graph(converter.onnx_nodes, "ssd_mobilenet_v2_coco", [picture], outputs, converter.initializers)
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
@@ -288,6 +293,44 @@ def normalize_picture(converter: Converter) -> None:
     converter.add("Mul", ["picture/float", scale], "picture/scaled")
     converter.add("Sub", ["picture/scaled", shift], "picture/shifted")
     converter.add("Transpose", ["picture/shifted"], "picture_nchw", perm=[0, 3, 1, 2])
+
+
+def decode_boxes(converter: Converter, encoded: str, anchors: NDArray[np.float32]) -> None:
+    """Append the decoding: center = c * 0.1 * anchor size + anchor center, size = exp(s * 0.2) * anchor size."""
+    store, add = converter.store, converter.add
+    halves = store("decode/halves", np.array([2, 2], dtype=np.int64))
+    anchor_center = store("decode/anchor_center", anchors[None, :, :2])
+    center_step = store("decode/center_step", np.float32(CENTER_VARIANCE) * anchors[None, :, 2:])
+    half_anchor = store("decode/half_anchor", np.float32(0.5) * anchors[None, :, 2:])
+    size_step = store("decode/size_step", np.float32(SIZE_VARIANCE))
+    converter.onnx_nodes.append(
+        converter._helper.make_node("Split", [encoded, halves], ["decode/c", "decode/s"], axis=2)
+    )
+    center = add("Add", [add("Mul", ["decode/c", center_step], "decode/offset"), anchor_center], "decode/center")
+    growth = add("Exp", [add("Mul", ["decode/s", size_step], "decode/log_size")], "decode/growth")
+    half = add("Mul", [growth, half_anchor], "decode/half")
+    low, high = add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")
+    add("Concat", [low, high], "boxes", axis=2)
+
+
+def anchor_boxes() -> NDArray[np.float32]:
+    """Build the anchors (1917, 4) center v, u, height, width in 0-1: by layer, cell row by row, then shape.
+
+    SSD (Liu et al., 2016) with the object detection API's reduced lowest layer: three shapes there, six elsewhere.
+    """
+    scales = [*np.linspace(MIN_SCALE, MAX_SCALE, len(FEATURE_CELLS)), 1.0]
+    layers = []
+    for layer, cells in enumerate(FEATURE_CELLS):
+        scale = scales[layer]
+        shapes = [(scale, ratio) for ratio in (1.0, 2.0, 0.5, 3.0, 1 / 3)] + [(np.sqrt(scale * scales[layer + 1]), 1.0)]
+        if layer == 0:
+            shapes = [(0.1, 1.0), (scale, 2.0), (scale, 0.5)]
+        size = np.array([(s / np.sqrt(ratio), s * np.sqrt(ratio)) for s, ratio in shapes])
+        v, u = np.mgrid[:cells, :cells]
+        center = (np.stack([v.ravel(), u.ravel()], axis=1) + 0.5) / cells
+        pairs = [np.repeat(center, len(size), axis=0), np.tile(size, (len(center), 1))]
+        layers.append(np.concatenate(pairs, axis=1))
+    return np.concatenate(layers).astype(np.float32)
 
 
 LEVELS, MAX_WEIGHT = 255, 127
@@ -341,7 +384,7 @@ def known_ranges() -> dict[str, tuple[float, float]]:
 
 
 def quantize(model: onnx.ModelProto, ranges: Mapping[str, tuple[float, float]]) -> onnx.ModelProto:
-    """Return the model with quantized convolutions and sums; `encoded` and `scores` stay floats.
+    """Return the model with quantized convolutions and sums; `boxes` and `scores` stay floats.
 
     `model`: of `log2sim.perception.detect.ssd_mobilenet.convert`. `ranges` mapping of str to (float, float): least and
     greatest value of what no ReLU6 bounds, see `known_ranges`. Raises `ValueError` for a convolution or sum without a
@@ -529,9 +572,9 @@ GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad
 GRAPH_LIMIT_BYTES = 256 * 1024**2
 MAX_DIGEST_BYTES = 1024
 # To be raised when the conversion changes, so that cached models of older versions are not used.
-CONVERSION = 5
+CONVERSION = 4
 # The weights are larger than the caches near a core; more inputs at once gain no more.
-TOGETHER_PX = 3 * 300 * 300
+TOGETHER = 3
 PROCESSOR = Path("/proc/cpuinfo")
 PROCESSOR_LIMIT_BYTES = 16 * 1024**2
 # Processors that add up products of bytes in 32 bits; others saturate at 16.
@@ -547,7 +590,7 @@ def create(
     `ConfigError` when the weights are others than the ones known, or the cache cannot be written.
     """
     detector = open_onnx(converted_model(), min_score=min_score, max_overlap=max_overlap, tiles=tiles, name=NAME)
-    return replace(detector, together_px=TOGETHER_PX)
+    return replace(detector, together=TOGETHER)
 
 
 def converted_model() -> Path:
