@@ -141,6 +141,7 @@ BASE_ONLY: dict[str, str | None] = {
     "edit s.json --drop-doubtful --out edited.json": None,
     "correct s.json CORRECTIONS --out corrected.json": None,
     "replay s.json --out replay.json": None,
+    "resimulate s.json --log LOG --out simulated": None,
     "replay s.json --simulator carla": "carla",
     "plot s.json --out plot.svg": None,
     "plot s.json --out film.mp4 --stop 0.2": None,
