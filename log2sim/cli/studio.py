@@ -67,10 +67,10 @@ def studio(
         raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
     for line in served.result.lost:
         say(f"warning: {line}", quiet=quiet)
-    say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")
-    if browser:
-        webbrowser.open(served.address)
     try:
+        say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")
+        if browser:
+            webbrowser.open(served.address)
         served.serve()
     except KeyboardInterrupt:
         count = len(served.document["corrections"])

@@ -135,7 +135,7 @@ def run(path: Path, sequence: str | None, source: str) -> dict[str, Any]:
         "log": log.name,
         "source": choice.source,
         "estimate": dict(choice.estimate),
-        "notes": choice.notes,
+        "notes": [str(finding) for finding in choice.findings],
     }
     result["ms"] = spent_s * 1e3 / max(choice.estimate.get("sweeps", choice.estimate.get("frames", 1)), 1)
     if log.ego is None:

@@ -272,8 +272,9 @@ def figures(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
                 hidden = np.concatenate([np.array(s["hidden"], bool) for s in sweeps])
                 right = match_detections(found.take(found.score >= REPORTED_SCORE), truth, criterion).truth
                 got = np.isin(np.arange(len(truth)), right[right >= 0])
-                recall["seen"][way] = float(got[~truth.ignored & ~hidden].mean())
-                recall["hidden"][way] = float(got[~truth.ignored & hidden].mean())
+                for name, of in (("seen", ~hidden), ("hidden", hidden)):
+                    counted = ~truth.ignored & of
+                    recall[name][way] = float(got[counted].mean()) if counted.any() else float("nan")
                 count, share = int((~truth.ignored).sum()), float(hidden[~truth.ignored].mean())
     return {"ap": ap, "recall": recall, "vehicles": count, "hidden_from_vehicle": share}
 
