@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from browser import CHROMIUM, DRIVER, Browser, browsing
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
@@ -124,3 +125,12 @@ def tiny_scenario(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -
     path = tmp_path_factory.mktemp("scenario") / "scenario.json"
     reconstruct(open_log(tiny_folder), Config.load(detect={"name": "labels"})).scenario.save(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all tests of a module; skips where there is none."""
+    if CHROMIUM is None or DRIVER is None:
+        pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
+    with browsing(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser

@@ -32,7 +32,7 @@ def document(*entries: dict[str, Any], **more: Any) -> dict[str, Any]:
 
 def after(source: Scenario, *entries: dict[str, Any], **more: Any) -> Scenario:
     corrected = correct(source, document(*entries, **more))
-    assert corrected.lost == ()
+    assert corrected.unmatched == ()
     assert Scenario.from_dict(json.loads(json.dumps(corrected.scenario.to_dict()))).digest == corrected.scenario.digest
     return corrected.scenario
 
@@ -139,7 +139,7 @@ def test_lines_are_drawn_and_erased_and_lanes_forget_them() -> None:
     features = after(source, {"kind": "erase", "at": [25.0, 0.3, 0.0]}, drawn).map_features
     assert features.markings == ()
     assert [b.kind for b in features.borders] == ["curb"]
-    lost = correct(source, document({"kind": "erase", "at": [25.0, 3.0, 0.0]})).lost
+    lost = correct(source, document({"kind": "erase", "at": [25.0, 3.0, 0.0]})).unmatched
     assert len(lost) == 1
     assert lost[0].startswith("correction 1 (erase): no marking")
 
@@ -188,7 +188,7 @@ def test_contradictions_and_impossible_ones_are_refused() -> None:
         with pytest.raises(ConfigError):
             correct(source, document(*entries))
     # A correction never moves the ego, whose poses are those of the log.
-    assert correct(source, document({"kind": "flip", "agent": at(1.0, 10.0, 0.0)})).lost
+    assert correct(source, document({"kind": "flip", "agent": at(1.0, 10.0, 0.0)})).unmatched
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,11 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import NS_PER_S
 from log2sim.logs.opening import open_log
-from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
 from log2sim.resim.surfels import Surfels, smallest_axis
-from log2sim.resim.world import World, build_world, ground_below
+from log2sim.resim.world import World, body_of, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import replay
 from log2sim.synth import Scene, load_scene, synthesize

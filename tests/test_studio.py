@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import CHROMIUM, DRIVER, Browser, browsing
+from browser import Browser
 from command_line import run
 from test_edit import parked, scenario, straight
 
@@ -76,7 +76,7 @@ def test_what_is_corrected_is_kept_and_gone_on_with(tmp_path: Path) -> None:
     with serving(file) as studio:
         code, reply = put(studio, FLIP)
         assert code == 200
-        assert reply["lost"] == []
+        assert reply["unmatched"] == []
         assert [a["doubts"] for a in reply["agents"] if a["id"] == "car-3"] == [[]]
     assert load_corrections(file)["corrections"] == [FLIP]
     with serving(file) as studio:
@@ -131,7 +131,7 @@ def test_contradicting_corrections_are_one_line_and_not_kept(tmp_path: Path) -> 
         Studio(world(), tmp_path / "c.json")
 
 
-def test_a_second_studio_on_a_file_is_refused(tmp_path: Path) -> None:
+def test_a_second_studio_on_a_file_is_refused(tmp_path: Path, interruptible: None) -> None:
     world().save(tmp_path / "s.json")
     arguments = ["studio", tmp_path / "s.json", "--corrections", tmp_path / "c.json", "--no-browser"]
     command = [sys.executable, "-m", "log2sim", *map(str, arguments)]
@@ -150,14 +150,6 @@ def test_a_second_studio_on_a_file_is_refused(tmp_path: Path) -> None:
 
 
 # The page
-
-
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    if CHROMIUM is None or DRIVER is None:
-        pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
-    with browsing(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, DRIVER, Browser, browsing
+from browser import Browser
 from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -158,15 +158,6 @@ def test_view_shows_a_log(log_folder: Path, tmp_path: Path) -> None:
 
 
 # What it does
-
-
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """One browser for all tests of this module; skips where there is none."""
-    if CHROMIUM is None or DRIVER is None:
-        pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
-    with browsing(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")

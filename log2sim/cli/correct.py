@@ -37,8 +37,8 @@ def correct(
     document = load_corrections(corrections)
     result = run(Scenario.load(scenario), document)
     result.scenario.save(out)
-    for line in result.lost:
+    for line in result.unmatched:
         say(f"warning: {line}", quiet=quiet)
-    done = len(document["corrections"]) - len(result.lost)
-    lost = f", {len(result.lost)} without its agent" if result.lost else ""
+    done = len(document["corrections"]) - len(result.unmatched)
+    lost = f", {len(result.unmatched)} without its agent" if result.unmatched else ""
     say(f"{out}: {counted(done, 'correction')} applied{lost}", quiet=quiet)

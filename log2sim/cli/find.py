@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,7 +11,11 @@ from log2sim.cli.options import AsJson, Overwrite, Quiet, counted, option, repor
 from log2sim.cli.shared import format_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
     from log2sim.scenarios.index import Index, Row
+
+    MapFiles = Callable[[Callable[[str], Any], Sequence[str]], Iterator[Any]]
 
 MAX_LISTED = 40
 
@@ -69,15 +73,16 @@ def find(
     from log2sim.scenarios.query import ask
 
     check_targets(out, table, overwrite=overwrite)
+    quiet = quiet or as_json
     if scheduler is not None and jobs is not None:
         raise ConfigError("--jobs: the scheduler decides how many workers there are; leave out --jobs or --scheduler")
-    with progress(quiet=quiet or as_json) as report_progress:
+    with progress(quiet=quiet) as report_progress:
         index = open_index(
             path, fresh=fresh, jobs=jobs, map_files=_on_workers(scheduler) if scheduler else None,
             progress=lambda done, total: report_progress("scenarios", done, total),
         )  # fmt: skip
     for problem in index.problems:
-        say(f"left out: {problem}", quiet=quiet or as_json)
+        say(f"left out: {problem}", quiet=quiet)
     if fields or not condition:
         for line in format_rows(_overview(index, fields=fields)):
             say(line)
@@ -90,30 +95,30 @@ def find(
     for k, row in enumerate(found.rows[:MAX_LISTED]):
         say(
             f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}",
-            quiet=quiet or as_json,
+            quiet=quiet,
         )
     more = len(found.rows) - MAX_LISTED
     if more > 0:
-        say(f"and {more} more; --out and --table have all", quiet=quiet or as_json)
-    say(f"{counted(len(found.rows), 'hit')} in {counted(index.scenarios, 'scenario')}", quiet=quiet or as_json)
+        say(f"and {more} more; --out and --table have all", quiet=quiet)
+    say(f"{counted(len(found.rows), 'hit')} in {counted(index.scenarios, 'scenario')}", quiet=quiet)
     for line in found.closest:
-        say(line, quiet=quiet or as_json)
+        say(line, quiet=quiet)
     if out is not None:
         write_hits(out, index, condition, found.rows)
     if table is not None:
         write_table(table, found.rows)
-    report_written(out, table, quiet=quiet or as_json)
+    report_written(out, table, quiet=quiet)
     if open_ is not None:
         if open_ > len(found.rows):
             raise ConfigError(f"--open {open_}: there are {counted(len(found.rows), 'hit')}")
-        say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet or as_json)
+        say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet)
 
 
-def _on_workers(scheduler: str):  # type: ignore[no-untyped-def]
+def _on_workers(scheduler: str) -> MapFiles:
     """Return a function that maps over files on the workers of a scheduler."""
     from log2sim.batch.run import workers_of
 
-    def run(work, names):  # type: ignore[no-untyped-def]
+    def run(work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
         with workers_of(scheduler) as workers:
             from distributed import as_completed
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from pathlib import Path
 from typing import Annotated
@@ -11,20 +10,18 @@ import typer
 
 from log2sim.cli.options import say
 from log2sim.errors import ConfigError
-
-# In a wheel the pages lie in the package, in a checkout beside it.
-PAGES = next(
-    p for p in (Path(__file__).parents[1] / "cookbook", Path(__file__).parents[2] / "samples/cookbook") if p.is_dir()
-)
+from log2sim.files.plugins import nearest
 
 
-def titles() -> dict[str, str]:
-    """Return the heading of each page by its topic."""
-    return {p.stem: p.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for p in sorted(PAGES.glob("*.md"))}
+def pages() -> dict[str, str]:
+    """Return the text of each page by its topic; in a wheel they lie in the package, in a checkout in its samples."""
+    package = Path(__file__).parents[1]
+    folder = package / "cookbook" if (package / "cookbook").is_dir() else package.parent / "samples/cookbook"
+    return {page.stem: page.read_text(encoding="utf-8") for page in sorted(folder.glob("*.md"))}
 
 
 def _topics() -> list[str]:
-    return list(titles())
+    return list(pages())
 
 
 def help_(
@@ -39,12 +36,10 @@ def help_(
     log2sim help
     log2sim help doubts
     """
-    known = titles()
+    known = pages()
     if topic is None:
-        say("\n".join(f"{name:<11} {title}" for name, title in known.items()))
+        say("\n".join(f"{name:<11} {text.partition(chr(10))[0].lstrip('# ')}" for name, text in known.items()))
         return
     if topic not in known:
-        near = difflib.get_close_matches(topic, known, n=1)
-        raise ConfigError(f"no page '{topic}'{f', but {near[0]!r}' if near else ''}; log2sim help lists them")
-    text = (PAGES / f"{topic}.md").read_text(encoding="utf-8").rstrip()
-    say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", text))
+        raise ConfigError(f"no page '{topic}'{nearest(topic, list(known))}; log2sim help lists them")
+    say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", known[topic].rstrip()))

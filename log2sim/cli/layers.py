@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
     from log2sim.road.ground_map import GroundMap
     from log2sim.simulation.result import Replay
+    from log2sim.visualization.recording import Recorded
 
 CELL_M = 0.06  # edge of a cell, m: pictures on paper and screens show no more of a hundred meters
 
@@ -46,6 +47,29 @@ def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], Non
     from log2sim.road.builder import map_ground
 
     return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress).as_picture()
+
+
+def open_recorded(
+    path: Path,
+    scenario: Scenario,
+    sequence: str | None,
+    max_bytes: int,
+    cameras: tuple[str, ...],
+    progress: Callable[[str, int, int], None],
+) -> Recorded:
+    """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
+    from log2sim.localization.choice import localize_like
+    from log2sim.logs.opening import open_log
+    from log2sim.visualization.recording import Recorded, require_overlap
+
+    log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
+    require_overlap(log, scenario)
+    return Recorded(log, max_bytes, cameras, progress)
+
+
+def shows_ground(log: Log) -> bool:
+    """Whether a log has a camera whose place is known, so that its ground can be mapped."""
+    return any(camera.mount == "map" or log.ego is not None for camera in log.cameras.values())
 
 
 def load_placed_truth(path: Path, scenario: Scenario, sequence: str | None) -> Scenario:

@@ -272,7 +272,7 @@ def reconstruct(
     if by_hand is not None:
         corrected = correct(result.scenario, by_hand)
         result = replace(result, scenario=corrected.scenario)
-        for line in corrected.lost:
+        for line in corrected.unmatched:
             say(f"warning: {line}", quiet=quiet)
     with together():
         if topdown is not None:

@@ -43,9 +43,8 @@ def studio(
     log2sim studio s.json --log samples/crossing
     log2sim studio s.json --corrections mine.json --no-browser
     """
-    from log2sim.cli.layers import map_of
+    from log2sim.cli.layers import map_of, open_recorded, shows_ground
     from log2sim.cli.progress import progress
-    from log2sim.cli.view import open_recorded, shows_ground
     from log2sim.datatypes import Scenario
     from log2sim.errors import ConfigError
     from log2sim.files.outputs import claim
@@ -65,7 +64,7 @@ def studio(
         served = Studio(loaded, path, port=port, **layers)
     except OSError as error:
         raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
-    for line in served.result.lost:
+    for line in served.result.unmatched:
         say(f"warning: {line}", quiet=quiet)
     try:
         say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")

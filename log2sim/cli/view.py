@@ -18,10 +18,7 @@ from log2sim.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from log2sim.datatypes import Log, Scenario
-    from log2sim.visualization.recording import Recorded
+    pass
 
 
 def view(
@@ -64,7 +61,7 @@ def view(
     log2sim view s.json --log samples/crossing -o s.html
     log2sim view s.json --replay replay.json --truth samples/crossing -o s.html
     """
-    from log2sim.cli.layers import load_background, load_placed_truth, load_replay, map_of
+    from log2sim.cli.layers import load_background, load_placed_truth, load_replay, map_of, open_recorded, shows_ground
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario, count_agents
     from log2sim.errors import ConfigError
@@ -98,29 +95,6 @@ def view(
     for note in notes:
         say(note, quiet=quiet)
     say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}", quiet=quiet)
-
-
-def open_recorded(
-    path: Path,
-    scenario: Scenario,
-    sequence: str | None,
-    max_bytes: int,
-    cameras: tuple[str, ...],
-    progress: Callable[[str, int, int], None],
-) -> Recorded:
-    """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
-    from log2sim.localization.choice import localize_like
-    from log2sim.logs.opening import open_log
-    from log2sim.visualization.recording import Recorded, require_overlap
-
-    log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
-    require_overlap(log, scenario)
-    return Recorded(log, max_bytes, cameras, progress)
-
-
-def shows_ground(log: Log) -> bool:
-    """Whether a log has a camera whose place is known, so that its ground can be mapped."""
-    return any(camera.mount == "map" or log.ego is not None for camera in log.cameras.values())
 
 
 def _metrics(path: Path) -> tuple[str, str]:

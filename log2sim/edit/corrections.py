@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import (
-    CATEGORIES,
     EGO,
     TYPICAL_SIZE_M,
     Agent,
@@ -24,8 +23,9 @@ from log2sim.datatypes import (
     Scenario,
     Waypoints,
 )
-from log2sim.datatypes.agent import STANDSTILL_MPS
+from log2sim.datatypes.agent import STANDSTILL_MPS, hermite, hermite_slope
 from log2sim.datatypes.map_features import BORDER_KINDS
+from log2sim.edit.edits import ground_at, new_id
 from log2sim.edit.motion import STEP_S, insert_steps, resampled
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check, read_json
@@ -37,6 +37,7 @@ MAX_AWAY_M = 1.0
 MAX_OUTSIDE_S = 1.0
 # What a trajectory has wrong it has wrong for about as long as the view of an object stays the same.
 CORRELATION_S = 2.0
+# Some pixels of a map in which a car fills a tenth of the screen.
 POSE_SIGMA_M, POSE_SIGMA_RAD = 0.05, 0.02
 # Where a scenario does not state how sure a heading is; of a box in a LiDAR sweep.
 YAW_SIGMA_RAD = 0.05
@@ -60,7 +61,7 @@ class Corrected:
     """The corrected scenario, and a line for each correction that did not find what it is about."""
 
     scenario: Scenario
-    lost: tuple[str, ...]
+    unmatched: tuple[str, ...]
 
 
 def load_corrections(path: Path | str) -> dict[str, Any]:
@@ -97,27 +98,27 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     ConfigError
         When two corrections contradict each other, or one cannot be: a split outside of the life of an agent.
     """
-    work = _Work(scenario, corrections.get("map_offset_m"))
-    lost, applied = [], []
+    draft = _Draft(scenario, corrections.get("map_offset_m"))
+    unmatched, applied = [], []
     for number, entry in enumerate(corrections["corrections"], 1):
-        missing = work.apply(number, entry)
+        missing = draft.apply(number, entry)
         if missing:
-            lost.append(f"correction {number} ({entry['kind']}): {missing}")
+            unmatched.append(f"correction {number} ({entry['kind']}): {missing}")
         else:
             applied.append(dict(entry))
     history = [*scenario.provenance.get("corrections", []), {"source_digest": scenario.digest, "corrections": applied}]
-    return Corrected(work.result(history), tuple(lost))
+    return Corrected(draft.result(history), tuple(unmatched))
 
 
-class _Work:
-    """A scenario on the way: agents by id, features of the map, and what was said of whom."""
+class _Draft:
+    """A scenario while it is corrected: agents by id, features of the map, and the values that corrections gave to each agent."""
 
     def __init__(self, scenario: Scenario, offset_m: Sequence[float] | None) -> None:
         self.scenario = scenario
         self.agents = {a.id: a for a in scenario.agents}
         self.deleted: dict[str, Agent] = {}
         self.features = scenario.map_features or MapFeatures()
-        self.said: dict[tuple[str, str], tuple[int, Any]] = {}
+        self.given: dict[tuple[str, str], tuple[int, Any]] = {}
         self.shift = np.zeros(3) if offset_m is None else np.array(offset_m) - np.array(scenario.map.offset_m)
 
     def result(self, history: list[Any]) -> Scenario:
@@ -139,7 +140,7 @@ class _Work:
         if kind == "erase":
             return self._erase(np.array(entry["at"]) + self.shift)
         if kind == "add":
-            agent = added(entry["category"], entry.get("size_m"), self._poses(entry), self._new_id(entry["category"]))
+            agent = self._added(entry)
             self.agents[agent.id] = agent
             return ""
         agent_id = self._find(number, entry["agent"])
@@ -148,7 +149,7 @@ class _Work:
         agent = self.agents[agent_id]
         if kind in SINGLE:
             value = {k: entry.get(k) for k in ("category", "size_m", "rgb", "name")}
-            earlier = self.said.setdefault((agent_id, kind), (number, value))
+            earlier = self.given.setdefault((agent_id, kind), (number, value))
             if earlier[1] != value:
                 raise ConfigError(
                     f"corrections {earlier[0]} and {number} contradict each other: two values of '{kind}' for {agent_id}"
@@ -165,8 +166,8 @@ class _Work:
             t_s = self._time_s(entry["t_ns"])
             first, second = split(agent, t_s)
             self.agents[agent_id] = settled(first, kind)
-            new_id = self._new_id(agent.category)
-            self.agents[new_id] = settled(replace(second, id=new_id), kind)
+            name = new_id(agent.category, {*self.agents, *self.deleted})
+            self.agents[name] = settled(replace(second, id=name), kind)
         elif kind == "confirm":
             self.agents[agent_id] = replace(agent, confidence=1.0, doubts=(), quarantined=False)
         elif kind == "move":
@@ -194,9 +195,14 @@ class _Work:
     def _time_s(self, t_ns: int) -> float:
         return (t_ns - self.scenario.t0_ns) / NS_PER_S
 
-    def _new_id(self, category: str) -> str:
-        taken = {*self.agents, *self.deleted}
-        return next(name for k in range(1, len(taken) + 2) if (name := f"{category}-{k}") not in taken)
+    def _added(self, entry: Mapping[str, Any]) -> Agent:
+        """Make a new agent, on the ground that the agents nearest to its poses stand on where these have no height."""
+        category, poses = entry["category"], self._poses(entry)
+        size = entry.get("size_m") or TYPICAL_SIZE_M[category]
+        x, y = (np.array([p[k] for p in poses]) for k in ("x_m", "y_m"))
+        ground = ground_at(self.agents.values(), x, y) if self.agents else np.zeros(len(poses))
+        poses = [{"z_m": z + size[2] / 2, **p} for p, z in zip(poses, ground)]
+        return added(category, size, poses, new_id(category, {*self.agents, *self.deleted}))
 
     def _poses(self, entry: Mapping[str, Any]) -> list[dict[str, float]]:
         """Return key poses in time and map of the scenario, in the order of time."""
@@ -210,8 +216,7 @@ class _Work:
     def _draw(self, entry: Mapping[str, Any]) -> None:
         points = np.array(entry["points_m"], dtype=np.float64) + self.shift
         items: list[Marking | RoadBorder] = [*self.features.markings, *self.features.borders]
-        taken = {item.id for item in items}
-        name = next(n for k in range(1, len(taken) + 2) if (n := f"drawn-{k}") not in taken)
+        name = new_id("drawn", {item.id for item in items})
         if entry["feature"] in BORDER_KINDS:
             border = RoadBorder(name, entry["feature"], points)
             self.features = replace(self.features, borders=(*self.features.borders, border))
@@ -221,7 +226,9 @@ class _Work:
 
     def _erase(self, at: Array) -> str:
         items: list[Marking | RoadBorder] = [*self.features.markings, *self.features.borders]
-        far = [_distance_to_line(item.points_m[:, :2], at[:2]) for item in items]
+        import shapely
+
+        far = [shapely.LineString(item.points_m[:, :2]).distance(shapely.Point(at[:2])) for item in items]
         if not far or min(far) > MAX_AWAY_M:
             return f"no marking or border within {MAX_AWAY_M:g} m of ({at[0]:.1f}, {at[1]:.1f}) m"
         gone = items[int(np.argmin(far))].id
@@ -356,7 +363,7 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
     if static:
         waypoints = _mean_of_static(agent.waypoints, other.waypoints)
     else:
-        first, last = sorted((_unfolded(agent), _unfolded(other)), key=lambda a: float(a.waypoints.t_s[0]))
+        first, last = sorted((_in_steps(agent), _in_steps(other)), key=lambda a: float(a.waypoints.t_s[0]))
         waypoints = _joined(first, last)
     doubts = tuple(dict.fromkeys(d for a in (agent, other) for d in a.doubts))
     seen = {
@@ -370,7 +377,7 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
     )  # fmt: skip
 
 
-def _unfolded(agent: Agent) -> Agent:
+def _in_steps(agent: Agent) -> Agent:
     """Return the agent with steps of a tenth of a second, so that two can be averaged."""
     w = agent.waypoints
     return replace(
@@ -416,24 +423,21 @@ def _joined(first: Agent, last: Agent) -> Waypoints:
         yaw = wrap_angle(states[0].yaw_rad + share * wrap_angle(states[1].yaw_rad - states[0].yaw_rad))
         known = [np.interp(t_s, w.t_s, w.observed.astype(np.float64), left=0.0, right=0.0) > 0.5 for w in (a, b)]
         return Waypoints(t_s=t_s, **mean, yaw_rad=yaw, observed=known[0] | known[1], sigma_xy_m=1 / np.sqrt(total))
-    span = float(b.t_s[0] - a.t_s[-1])
-    s = np.linspace(0.0, span, max(int(np.ceil(span / STEP_S)), 1) + 1)[1:-1]
-    f = s / span
+    length_s = float(b.t_s[0] - a.t_s[-1])
+    s = np.linspace(0.0, length_s, max(int(np.ceil(length_s / STEP_S)), 1) + 1)[1:-1]
+    f, span = s / length_s, np.full(len(s), length_s)
 
-    def ends(column: str) -> tuple[float, float]:
-        return float(getattr(a, column)[-1]), float(getattr(b, column)[0])
+    def ends(column: str) -> Array:
+        return np.array([getattr(a, column)[-1], getattr(b, column)[0]])
 
-    yaw0, yaw1 = ends("yaw_rad")
-    v0, v1 = ends("speed_mps")
-    place, rate = {}, {}
-    for k, trig in (("x_m", np.cos), ("y_m", np.sin)):
-        p0, p1 = ends(k)
-        begin, end, rise = span * v0 * trig(yaw0), span * v1 * trig(yaw1), p1 - p0
-        c2, c3 = 3 * rise - 2 * begin - end, begin + end - 2 * rise
-        place[k], rate[k] = p0 + f * (begin + f * (c2 + f * c3)), (begin + f * (2 * c2 + 3 * f * c3)) / span
+    (yaw0, yaw1), speed, at = ends("yaw_rad"), ends("speed_mps"), np.zeros(len(s), dtype=np.intp)
+    place: dict[str, Any] = {}
+    rate: dict[str, Array] = {}
+    for k, slope in (("x_m", speed * np.cos(ends("yaw_rad"))), ("y_m", speed * np.sin(ends("yaw_rad")))):
+        place[k], rate[k] = hermite(ends(k), slope, at, s, span), hermite_slope(ends(k), slope, at, s, span)
     pace = np.hypot(rate["x_m"], rate["y_m"])
     turned = yaw0 + f * wrap_angle(np.array([yaw1 - yaw0]))[0]
-    sign = 1.0 if v0 + v1 >= 0 else -1.0
+    sign = 1.0 if speed.sum() >= 0 else -1.0
     course = np.arctan2(sign * rate["y_m"], sign * rate["x_m"])
     moves = pace > STANDSTILL_MPS
     z0, z1 = ends("z_m")
@@ -447,15 +451,13 @@ def _joined(first: Agent, last: Agent) -> Waypoints:
     return Waypoints(**{k: np.concatenate([w.columns()[k] for w in (a, middle, b)]) for k in common})
 
 
-def added(category: str, size_m: Sequence[float] | None, poses: Sequence[Mapping[str, float]], name: str) -> Agent:
+def added(category: str, size_m: Sequence[float], poses: Sequence[Mapping[str, float]], name: str) -> Agent:
     """Return an agent that passes key poses on the path of least acceleration, static where there is one pose or all are one place."""
     from scipy.interpolate import CubicSpline
 
-    if category not in CATEGORIES:
-        raise ConfigError(f"add: no category '{category}'")
-    length, width, height = map(float, TYPICAL_SIZE_M[category] if size_m is None else size_m)
+    length, width, height = map(float, size_m)
     key_s = np.array([p["t_s"] for p in poses])
-    at = np.array([[p["x_m"], p["y_m"], p.get("z_m", height / 2)] for p in poses])
+    at = np.array([[p["x_m"], p["y_m"], p["z_m"]] for p in poses])
     sigma = np.array([p.get("sigma_m", POSE_SIGMA_M) for p in poses])
     given = np.array([p.get("yaw_rad", np.nan) for p in poses])
     static = bool(np.ptp(at[:, :2], axis=0).max() <= POSE_SIGMA_M)
@@ -483,12 +485,3 @@ def added(category: str, size_m: Sequence[float] | None, poses: Sequence[Mapping
         np.interp(t_s, key_s, sigma),
     )
     return Agent(name, category, (length, width, height), waypoints)
-
-
-def _distance_to_line(points: Array, at: Array) -> float:
-    """Distance in m from a point (2,) to a polyline (N, 2)."""
-    begin, along = points[:-1], np.diff(points, axis=0)
-    share = np.clip(
-        np.einsum("ni,ni->n", at - begin, along) / np.maximum(np.einsum("ni,ni->n", along, along), 1e-12), 0, 1
-    )
-    return float(np.hypot(*(begin + share[:, None] * along - at).T).min())

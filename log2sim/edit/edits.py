@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
@@ -30,6 +30,18 @@ from log2sim.geometry import Array
 
 MAX_STEP_S = 1.0  # waypoints of an agent that is added are at most so far apart, as those of a reconstruction
 Agents = Mapping[str, Agent]  # agents by id, in the order of the scenario
+
+
+def new_id(category: str, taken: Container[str]) -> str:
+    """Return the first id of a category that is free, such as "car-3"."""
+    return next(name for k in itertools.count(1) if (name := f"{category}-{k}") not in taken)
+
+
+def ground_at(agents: Iterable[Agent], x_m: Array, y_m: Array) -> Array:
+    """Return the height (N,), m, on which the agents nearest to places (N,) stand."""
+    ground = [(a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m - a.size_m[2] / 2) for a in agents]
+    gx, gy, gz = (np.concatenate(column) for column in zip(*ground))
+    return np.array([gz[np.argmin(np.hypot(gx - x, gy - y))] for x, y in zip(x_m, y_m)])
 
 
 class Edit:
@@ -301,7 +313,6 @@ class Add(Edit):
     def applied(self, agents: Agents) -> Agents:
         """Append the agent, on the ground that the agents nearest to it stand on."""
         size = TYPICAL_SIZE_M[self.category]
-        number = next(k for k in itertools.count(1) if f"{self.category}-{k}" not in agents)
         end_s = max(float(a.waypoints.t_s[-1]) for a in agents.values())
         if self.ahead_of:
             leader = agents[self.ahead_of]
@@ -311,14 +322,12 @@ class Add(Edit):
             t_s = np.linspace(0.0, end_s, int(end_s / MAX_STEP_S) + 2) if self.speed_mps and end_s > 0 else np.zeros(1)
             x = self.x_m + self.speed_mps * np.cos(self.yaw_rad) * t_s
             y = self.y_m + self.speed_mps * np.sin(self.yaw_rad) * t_s
-            ground = [(a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m - a.size_m[2] / 2) for a in agents.values()]
-            gx, gy, gz = (np.concatenate(column) for column in zip(*ground))
-            z = np.array([gz[np.argmin(np.hypot(gx - a, gy - b))] for a, b in zip(x, y)]) + size[2] / 2
+            z = ground_at(agents.values(), x, y) + size[2] / 2
             still = np.zeros(len(t_s))
             w = Waypoints(t_s, x, y, z, still + self.yaw_rad, still + self.speed_mps, still > 0, still)
         w = replace(w, observed=np.zeros(len(w), dtype=bool), visible=None)
         static = bool(len(w) == 1 or not np.any(w.speed_mps))
-        name = f"{self.category}-{number}"
+        name = new_id(self.category, agents)
         added = Agent(name, self.category, size, w, static=static, quality={"added": True})
         return {**agents, name: added}
 

@@ -17,11 +17,10 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, PoseTrack, nearest_index, rotation_from_rpy, wrap_angle, yaw_of
 from log2sim.perception.records import RecordSource
-from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.surfels import Surfels
-from log2sim.resim.world import Progress, World, build_world, place
+from log2sim.resim.world import Progress, World, body_of, build_world, place
 from log2sim.simulation.policy import Controls, Observation, Policy, reset_policy
 
 TRUTH_FILE = "truth.json"

@@ -19,7 +19,6 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.perception.records import RecordSource
-from log2sim.resim.bodies import body_of
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import (
     Floats,
@@ -34,6 +33,7 @@ from log2sim.resim.rays import (
     recorded_shots,
 )
 from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
+from log2sim.synth import shapes
 
 # Around the box of an agent, whose edges are not exact: what is left out of the background, and what is taken for the agent.
 LEFT_OUT_M, TAKEN_M = 0.35, 0.15
@@ -47,6 +47,7 @@ SAME_PLACE_M = 0.5
 # Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
 AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
 PRIOR_RAYS = 2.0
+BODY_DISC_M = 0.08  # radius of the discs of a body that nobody saw
 
 Progress = Callable[[str, int, int], None]
 
@@ -407,3 +408,33 @@ def _weighed(
 
     agents = {id: judged(world.agents[id], begin[id]) for id in ids}
     return replace(world, background=judged(world.background, 0), agents=agents)
+
+
+def body_of(agent: Agent) -> Surfels:
+    """Return a body of an agent's category and size in its frame, with the shapes of `synth`, its discs as far apart as they are wide."""
+    size = (float(agent.size_m[0]), float(agent.size_m[1]), float(agent.size_m[2]))
+    makers = {
+        "car": lambda: shapes.car(size, "hatch"),
+        "truck": lambda: shapes.truck(size),
+        "bus": lambda: shapes.bus(size),
+        "pedestrian": lambda: shapes.pedestrian(size, 0, bool(agent.static)),
+    }
+    mesh = makers.get(agent.category, lambda: shapes.cyclist(size, 0))()
+    mesh = mesh.fitted(size)
+    corner = mesh.vertices_m[mesh.faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = np.linalg.norm(cross, axis=1) / 2
+    solid = area > 1e-8
+    corner, normal, area = corner[solid], cross[solid] / (2 * area[solid, None]), area[solid]
+    # As many points on a triangle as its area takes, spread by a low-discrepancy sequence of the whole body.
+    total = np.cumsum(area) / BODY_DISC_M**2
+    count = np.diff(np.floor(total), prepend=0).astype(np.int64)
+    face = np.repeat(np.arange(len(corner)), count)
+    n = np.arange(len(face)) + 1
+    u, v = (n * 0.7548776662466927) % 1, (n * 0.5698402909980532) % 1  # Roberts' R2
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    a, b, c = corner[face].transpose(1, 0, 2)
+    one = np.ones(len(face), np.float32)
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    return Surfels(points.astype(np.float32), normal[face].astype(np.float32), one * BODY_DISC_M, one, one, one)

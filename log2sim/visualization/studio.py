@@ -86,7 +86,6 @@ class Studio:
             if self._page is not None and self._page[0] is self.result:
                 return self._page[1]
             document = page_document(self.result.scenario, background=self.background)
-            ego = self.scenario.ego
             document["studio"] = {
                 "address": f"/{self._token}/corrections",
                 "t0_ns": self.scenario.t0_ns,
@@ -94,8 +93,6 @@ class Studio:
                 "log": self.scenario.name,
                 "categories": list(CATEGORIES),
                 "corrections": self.document["corrections"],
-                # The height of the ground where an agent is added, by where the ego stands.
-                "ground_m": None if ego is None else float(ego.waypoints.z_m[0]) - ego.size_m[2] / 2,
             }
             self._page = self.result, make_page(document, self.result.scenario, self.recorded)
             return self._page[1]
@@ -115,7 +112,7 @@ class Studio:
             write_json(self.path, document)
             self.document, self.result = document, result
             agents = page_document(result.scenario)["layers"]["scenario"]
-        return {"agents": agents, "scales": SCALES, "lost": list(result.lost)}
+        return {"agents": agents, "scales": SCALES, "unmatched": list(result.unmatched)}
 
     def allows(self, path: str, host: str | None, origin: str | None) -> bool:
         """Whether a request is for this run, asked of this computer by its own page."""

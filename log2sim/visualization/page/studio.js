@@ -87,8 +87,7 @@ class Editor {
     if (this.mode !== "add") return this.mode === "move";
     this.toggle(null);
     const pose = { t_ns: this.stamp(), x_m: view.mx(sx), y_m: view.my(sy), yaw_rad: 0 };
-    const height = this.entry.ground_m;
-    this.send([...this.made, { kind: "add", category: byId("studio-category").value || "car", poses: [height === null ? pose : { ...pose, z_m: height + 0.8 }], time: new Date().toISOString() }], null);
+    this.send([...this.made, { kind: "add", category: byId("studio-category").value || "car", poses: [pose], time: new Date().toISOString() }], null);
     return true;
   }
 
@@ -171,7 +170,7 @@ class Editor {
       if (!answer.ok) throw new Error(reply.error);
       done();
       this.made = made;
-      this.say(reply.lost.length ? reply.lost.join("; ") : `${made.length} correction${made.length === 1 ? "" : "s"} kept.`);
+      this.say(reply.unmatched.length ? reply.unmatched.join("; ") : `${made.length} correction${made.length === 1 ? "" : "s"} kept.`);
       replaceTracks(reply.agents, reply.scales, id);
     } catch (error) {
       this.say(error instanceof TypeError ? "The program that serves this page does not answer; download the corrections." : error.message);
