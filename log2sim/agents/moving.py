@@ -14,14 +14,13 @@ from log2sim.agents.candidate import (
     AgentCandidate,
     Timeline,
     candidate_of,
-    followed_confidence,
     spans_of,
 )
 from log2sim.agents.size import TrackGeometry, independent, moving_geometry
 from log2sim.agents.smooth import motion_model
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
-from log2sim.agents.static import BoxState, LidarMatch, left_free, track_with_lidar
+from log2sim.agents.static import BoxState, LidarMatch, track_with_lidar
 from log2sim.config import TrackConfig
 from log2sim.datatypes import (
     GROUP_OF,
@@ -319,10 +318,7 @@ def moving_candidate(
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
-    ordered = sorted(matches, key=lambda match: match.tick)
-    free = left_free(obstacles, ordered, geometry.size_m, float(np.median(geometry.z_m)) - geometry.size_m[2] / 2)
-    followed = followed_confidence(track, np.array([match.xy_m for match in ordered]).reshape(-1, 2)[free])
-    return candidate_of(track, geometry, waypoints, quality, static=False, followed=followed).doubted(doubts)
+    return candidate_of(track, geometry, waypoints, quality, static=False).doubted(doubts)
 
 
 def _one_at_a_moment(track: Track) -> Track:

@@ -21,27 +21,11 @@ from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
 
 # Errors of one detector about one object are alike at neighboring ticks: correlation between any two of them.
 TICK_CORRELATION = 0.5
-# So many places of a long track do for how much its ticks have in common.
-MAX_PLACES = 200
 
 
 def independent(count: int) -> float:
     """Return how many independent ticks are worth as much as `count` correlated ones, at most 1 / `TICK_CORRELATION`."""
     return count / (1 + (count - 1) * TICK_CORRELATION) if count else 0.0
-
-
-def independent_along(xy_m: Array, length_m: float) -> float:
-    """Return how many independent ticks are worth as much as those at which an object of a length was at places (n, 2).
-
-    What a detector mistakes for a road user stays where it is. Something that moves on is seen from other sides and before other
-    things, so that errors at two places are the less alike the more lengths they are from each other.
-    """
-    count = min(len(xy_m), MAX_PLACES)
-    places = xy_m[np.linspace(0, len(xy_m) - 1, count).round().astype(np.intp)]
-    apart_m = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
-    alike = TICK_CORRELATION * np.exp(-apart_m / length_m)
-    np.fill_diagonal(alike, 1.0)
-    return float(count**2 / alike.sum())
 
 
 def typical_box_size(m: BoxEvidence) -> Array | None:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
-from log2sim.agents.evidence import Ending, classify_rays
 from log2sim.agents.hypotheses import Part, main_place
+from log2sim.agents.rays import Ending, classify_rays
 from log2sim.agents.size import TrackGeometry, independent, static_geometry
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
@@ -245,26 +245,6 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     )
 
 
-def left_free(
-    obstacles: Sequence[Obstacles | None], matches: Sequence[LidarMatch], size_m: Array, bottom_m: float
-) -> NDArray[np.bool_]:
-    """Mark the matches (n,), in rising time, whose place rays pass when the box is more than its length from there.
-
-    What a moving object was taken for does so; clutter along which a box drifts stays where it is.
-    """
-    places = np.array([match.xy_m for match in matches]).reshape(-1, 2)
-    marked = np.zeros(len(matches), dtype=bool)
-    for k, match in enumerate(matches):
-        away = np.flatnonzero(np.hypot(*(places - match.xy_m).T) > size_m[0])
-        # The last moment before it came, the first one after it went.
-        for other in (*away[away < k][-1:].tolist(), *away[away > k][:1].tolist()):
-            cloud = obstacles[matches[other].tick]
-            if cloud is not None and cloud.free is not None and not marked[k]:
-                box = BoxState(match.t_ns, match.xy_m, np.zeros(2), match.yaw_rad, size_m, bottom_m)
-                marked[k] = _passes(*_rays_to(box, cloud.origin, cloud.free), np.zeros(2), size_m)
-    return marked
-
-
 def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
     """Return where rays that pass near a box start and end (K, 3) along its axes, relative to the middle of its bottom then."""
     position, velocity = rays.position[:, :2].astype(np.float64), rays.velocity_mps[:, :2]
@@ -312,7 +292,7 @@ def _ends_by_rays(
 def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
     """Return whether most of several rays toward the solid part of a box of a size (3,) at a center (2,) go on behind it."""
     first = start - np.append(center, size[2] / 2)
-    (ending,) = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
+    ending = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
     passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
     return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
 
