@@ -14,9 +14,21 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.rays import count_rays
 from log2sim.agents.size import independent
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, AgentTable, Log, Measurements, Obstacles, Track
+from log2sim.datatypes import (
+    GROUP_OF,
+    MAX_SIZE_M,
+    MIN_SIZE_M,
+    TYPICAL_SIZE_M,
+    Agent,
+    AgentTable,
+    Log,
+    Measurements,
+    Obstacles,
+    Track,
+)
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
+from log2sim.perception.boxes import LIMIT_SIGMAS
 from log2sim.perception.lidar.measure import logit
 from log2sim.perception.sync import Schedule
 
@@ -44,14 +56,15 @@ class Recording:
 
 
 SIGNS = {
-    "sweep": 1, "image": 1, "no_image": -1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
+    "sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
 - sweep, image: log-odds of its detections in LiDAR sweeps and in images; 0 without any.
-- no_image: 1 without any detection in an image.
+- no_sweep, no_image: 1 without any detection in a sweep, in an image, where others have some.
+- travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
 - range: logarithm of the median distance, in units of 20 m.
 - scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
@@ -64,7 +77,8 @@ SIGNS = {
 - other_category: share of its measurements of another category.
 - impossible: 1 where its motion is doubted.
 - sigma_speed: logarithm of the standard deviation of the speed of what moves, in units of 0.3 m/s.
-- through: share of the rays toward its solid part that go on behind it; 0 with few.
+- through, through_gaps: share of the rays toward its solid part that go on behind it, of vehicles and of what has gaps, as people
+  and bicycles have; 0 with few.
 - pointless: 1 where the LiDAR looks toward it and none of its detections has a point.
 - nearer: 1 where its points are those of something nearer, which the heights of its image boxes tell.
 - missing: nats against it by the images that show its place well and in which it is not detected.
@@ -85,11 +99,11 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
     parts = [_sensed_columns(candidates[k : k + most], recording) for k in range(0, len(rows), most)]
     table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return table | {"missing": _missing(table), "bias": np.ones(len(rows))}
+    for name in ("no_sweep", "no_image"):
+        table[name] *= table[name].min() == 0
+    return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
 
 
-# Standard deviation of the lengths and widths within a category, as a share: of cars it is a tenth, of trucks more.
-SIZE_SPREAD = 0.15
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
 LIMITS = {
     "range": np.log([0.1, 5.0]), "sigma": np.log([0.1, 50.0]), "scatter": np.log([1.0, 31.0]), "odd_size": (0.0, 3.0),
@@ -106,14 +120,16 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     columns = {
         "sweep": sweep_log_odds(track) if in_sweep.any() else 0.0,
         "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
+        "no_sweep": float(not in_sweep.any()),
         "no_image": float(not in_image.any()),
+        "travel": np.log1p(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m)) / agent.size_m[0]) if moving else 0.0,
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         "range": np.log(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)) / 20.0 + 1e-3),
         "scatter": np.log1p(_scatter(candidate, timeline)),
         "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
         "unlikely_size": float(not candidate.geometry.is_likely),
-        "odd_size": np.hypot(*np.log(np.array(agent.size_m[:2]) / TYPICAL_SIZE_M[agent.category][:2])) / SIZE_SPREAD,
+        "odd_size": _odd_size(agent),
         "odd_height": _odd_height(candidate),
         "heading": float(log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), 0.01, 0.99))),
         "other_category": float((m.category != agent.category).mean()),
@@ -126,6 +142,12 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "pedestrian": float(group == "pedestrian"),
     }
     return columns | {name: float(np.clip(columns[name], *limits)) for name, limits in LIMITS.items()}
+
+
+def _odd_size(agent: Agent) -> float:
+    """Return by how many standard deviations of the category length and width differ from the typical ones."""
+    smallest, typical, largest = (np.array(t[agent.category][:2]) for t in (MIN_SIZE_M, TYPICAL_SIZE_M, MAX_SIZE_M))
+    return float(np.hypot(*(np.log(np.array(agent.size_m[:2]) / typical) * LIMIT_SIGMAS / np.log(largest / smallest))))
 
 
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
@@ -222,8 +244,11 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     shown = shown_in_images(AgentTable.of(agents, recording.t_s), recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
+    through_share = np.where(known, sums[1] / np.maximum(sums[0], 1), 0.0)
+    solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
     return {
-        "through": np.where(known, sums[1] / np.maximum(sums[0], 1), 0.0),
+        "through": np.where(solid, through_share, 0.0),
+        "through_gaps": np.where(solid, 0.0, through_share),
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
         "nearer": np.array([_height_share(m) < MIN_HEIGHT_SHARE for m in of], dtype=np.float64),
         "shown_ticks": shown.sum(axis=1).astype(np.float64),
@@ -274,17 +299,15 @@ def _shown(camera: Camera, map_T_cam: Array, center_m: Array, height_m: Array) -
 FALSE_RATE, MAX_USUAL_RATE, MIN_SHOWN_TICKS = 0.05, 0.9, 8
 
 
-def _missing(table: Table) -> Array:
-    """Return the nats (C,) against candidates by the share of the ticks that show them well at which an image detects them.
+def missing_nats(shown: Array, detected: Array) -> Array:
+    """Return the nats (C,) against candidates by the ticks at which images show them well, and those at which one detects them.
 
     Notes
     -----
     The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, that of all that is detected
     in images at all, nothing at `FALSE_RATE`. Successive images err alike, which is why they count as few independent ones.
     """
-    shown, detected = table["shown_ticks"], table["image_ticks"]
-    found = detected > 0
-    usual = min(detected.sum() / max(float(shown[found].sum()), 1.0), MAX_USUAL_RATE)
+    usual = min(detected.sum() / max(float(shown[detected > 0].sum()), 1.0), MAX_USUAL_RATE)
     if usual <= FALSE_RATE:
         return np.zeros(len(shown))
     rate = detected / np.maximum(shown, 1)

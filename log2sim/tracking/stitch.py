@@ -60,7 +60,10 @@ def voted_category(m: Measurements) -> str:
     A motorcycle, a bicycle and their riders have much the same points but look different: within two-wheelers the
     measurements with an image decide, if there are any.
     """
-    groups = np.array([GROUP_OF[c] for c in m.category.tolist()])
+    categories = m.category.tolist()
+    if len(set(categories)) == 1:
+        return str(categories[0])
+    groups = np.array([GROUP_OF[c] for c in categories])
     group = _most_scored(groups, m.score)
     voters = groups == group
     with_image = voters & (m.camera != "")
@@ -129,6 +132,16 @@ class _Ends:
     last: tuple[Array, Array]
     group: NDArray[np.str_]
 
+    def join(self, other: _Ends) -> _Ends:
+        pairs = (zip(getattr(self, side), getattr(other, side)) for side in ("first", "last"))
+        states = [tuple(np.concatenate(columns) for columns in of) for of in pairs]
+        times = [np.concatenate([getattr(self, n), getattr(other, n)]) for n in ("first_ns", "last_ns")]
+        return _Ends(*times, *states, np.concatenate([self.group, other.group]))
+
+    def take(self, rows: list[int]) -> _Ends:
+        first, last = (tuple(column[rows] for column in side) for side in (self.first, self.last))
+        return _Ends(self.first_ns[rows], self.last_ns[rows], first, last, self.group[rows])
+
 
 def stitch(
     tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False
@@ -139,19 +152,23 @@ def stitch(
     uncertainty.
     """
     current = list(tracks)
-    while len(current) > 1:
-        i, j = _choose_joins(_joining_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s))
+    ends = _ends(current, whole_boxes=whole_boxes) if len(current) > 1 else None
+    while ends is not None:
+        i, j = _choose_joins(_joining_costs(ends, max_gap_s))
         if not len(i):
             break
         following = dict(zip(i.tolist(), j.tolist()))
-        heads = sorted(set(range(len(current))) - set(following.values()))
-        joined = []
-        for head in heads:
-            chain = [head]
+        chains = [[head] for head in sorted(set(range(len(current))) - set(following.values()))]
+        for chain in chains:
             while chain[-1] in following:
                 chain.append(following[chain[-1]])
-            joined.append(_concatenate([current[k] for k in chain], whole_boxes=whole_boxes))
-        current = joined
+        joined = [_concatenate([current[k] for k in c], whole_boxes=whole_boxes) for c in chains if len(c) > 1]
+        # Only what was joined is filtered again.
+        number = iter(range(len(current), len(current) + len(joined)))
+        rows = [next(number) if len(c) > 1 else c[0] for c in chains]
+        everyone = [*current, *joined]
+        ends = ends.join(_ends(joined, whole_boxes=whole_boxes)).take(rows)
+        current = [everyone[k] for k in rows]
     return current
 
 

@@ -27,7 +27,7 @@ from log2sim import pipeline
 from log2sim.agents import judge as judging
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import SIGNS, Table, gather
-from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, variance_terms
+from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, prior_shift, variance_terms
 from log2sim.datatypes import CATEGORIES, GROUP_OF
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.comparison import Selection
@@ -46,7 +46,7 @@ PRIOR_SIGMA, MIN_EFFECT = 0.5, 0.05
 # of the standard deviation: it alone knows gaps, ends and turns.
 MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
 # Columns that say nothing of whether something is there, and those that say nothing of whether it is right where it is.
-ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_image", "missing", "pointless", "nearer", "image", "sweep", "few")  # fmt: skip
+ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_sweep", "no_image", "travel", "missing", "pointless", "nearer", "image", "sweep", "few")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def agents_of(case: Case, log: str) -> list[Rated]:
         return judged
 
     with (
-        patch.object(judging, "MIN_THERE", 0.0),
+        patch.object(judging, "MIN_THERE", {True: 0.0, False: 0.0}),
         patch.object(judging, "gather", keep_table),
         patch.object(pipeline, "judge", keep_candidates),
     ):
@@ -140,7 +140,9 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
     return float(w[0] - (w[1:] / scale) @ mean), w[1:] / scale
 
 
-def fit_table(agents: Sequence[Rated], target: Callable[[Rated], float], weight: Callable[[Rated], float], out: Sequence[str]) -> Weights:
+def fit_table(
+    agents: Sequence[Rated], target: Callable[[Rated], float], weight: Callable[[Rated], float], out: Sequence[str]
+) -> Weights:
     """Fit weights with and without a LiDAR of all columns but some; those without effect are left out, and the others fitted again."""
     tables = {}
     for lidar in sorted({a.lidar for a in agents}, reverse=True):
@@ -164,17 +166,32 @@ def fit_there_and_right(agents: Sequence[Rated]) -> tuple[Weights, Weights]:
     return there, right
 
 
-def probabilities(agents: Sequence[Rated], tables: tuple[Weights, Weights]) -> tuple[Array, Array]:
+def shares_of(agents: Sequence[Rated]) -> dict[bool, float]:
+    """Return the share of candidates that are there, with and without a LiDAR."""
+    return {lidar: float(np.mean([a.there for a in agents if a.lidar == lidar])) for lidar in {a.lidar for a in agents}}
+
+
+def probabilities(
+    agents: Sequence[Rated], tables: tuple[Weights, Weights], shares: dict[bool, float]
+) -> tuple[Array, Array]:
     """Rate agents (A,): the probabilities that they are there and that they are right."""
     there, state = (
-        probability_of([sum(w * a.evidence.get(n, 1.0) for n, w in table[a.lidar].items()) for a in agents]) for table in tables
+        np.array([sum(w * a.evidence.get(n, 1.0) for n, w in table[a.lidar].items()) for a in agents]) for table in tables
     )  # fmt: skip
-    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
+    runs = np.array([f"{a.log} {a.case}" for a in agents])
+    for run in np.unique(runs):
+        rows = np.flatnonzero(runs == run)
+        there[rows] += prior_shift(there[rows], shares[agents[rows[0]].lidar])
+    there = probability_of(there)
+    return there, np.clip(there * probability_of(state), MIN_CONFIDENCE, MAX_CONFIDENCE)
 
 
 def terms_of(a: Rated, kind: str, confidence: float) -> dict[str, float]:
     """Return the means of the terms of a variance at a confidence."""
-    return {n: v * ((1 - confidence) ** 2 if n in ("wrong", "standing", "moving") else 1.0) for n, v in a.terms[kind].items()}
+    return {
+        n: v * ((1 - confidence) ** 2 if n in ("wrong", "standing", "moving") else 1.0)
+        for n, v in a.terms[kind].items()
+    }
 
 
 def fit_variances(terms: Array, squared: Array, least: Array) -> Array:
@@ -214,7 +231,7 @@ def say(text: str) -> None:
 
 def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
     """Print what is kept, and of this reliability and what is doubted: by a probability below one half, or by a doubt."""
-    kept = there >= MIN_THERE
+    kept = there >= [MIN_THERE[a.lidar] for a in agents]
     ticks, exists = np.array([a.ticks for a in agents]), np.array([a.there for a in agents])
     recall = (ticks * exists)[kept].sum() / max((ticks * exists).sum(), 1)
     invented = (ticks * (1 - exists))[kept].sum() / max(ticks[kept].sum(), 1)
@@ -235,15 +252,18 @@ def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> No
 def report(agents: Sequence[Rated]) -> None:
     """Print tables of agents rated by what fits other logs, and other kinds of content."""
     logs = np.unique([a.log for a in agents], return_inverse=True)[1] % FOLDS
-    kinds = np.array([f"{a.case.split('-')[0]}, {a.case.split('(')[-1].rstrip(')').split(',')[0]}, {a.hz:.0f} Hz" for a in agents])
+    kinds = np.array(
+        [f"{a.case.split('-')[0]}, {a.case.split('(')[-1].rstrip(')').split(',')[0]}, {a.hz:.0f} Hz" for a in agents]
+    )
     for title, group in (("other logs", logs), ("other kinds of content", kinds)):
         there, p, variance = np.zeros(len(agents)), np.zeros(len(agents)), {}
         for fold in np.unique(group):
             rows = np.flatnonzero(group == fold)
             rest = [a for a, g in zip(agents, group) if g != fold]
             tables = fit_there_and_right(rest)
-            there[rows], p[rows] = probabilities([agents[k] for k in rows], tables)
-            weights = fit_all_variances(rest, probabilities(rest, tables)[1])
+            shares = shares_of(rest)
+            there[rows], p[rows] = probabilities([agents[k] for k in rows], tables, shares)
+            weights = fit_all_variances(rest, probabilities(rest, tables, shares)[1])
             for kind, found in weights.items():
                 for k in (k for k in rows if kind in agents[k].errors):
                     variance[k, kind] = sum(found[n] * v for n, v in terms_of(agents[k], kind, p[k]).items())
@@ -256,27 +276,40 @@ def report(agents: Sequence[Rated]) -> None:
         for name, rows in sets.items():
             say_rated(f"{title}, {name}", [a for a, use in zip(agents, rows) if use], there[rows], p[rows])
         for kind in ("sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"):
-            ratio = [a.errors[kind] / variance[k, kind] for k, a in enumerate(agents) if kind in a.errors and there[k] >= MIN_THERE]
+            ratio = [
+                a.errors[kind] / variance[k, kind]
+                for k, a in enumerate(agents)
+                if kind in a.errors and there[k] >= MIN_THERE[a.lidar]
+            ]
             say(f"{title}, {kind}: NEES {np.mean(ratio):.2f}, median {np.median(ratio):.2f}")
 
 
 def module_text(command: str, agents: Sequence[Rated]) -> str:
     there, right = fit_there_and_right(agents)
-    variances = fit_all_variances(agents, probabilities(agents, (there, right))[1])
+    shares = shares_of(agents)
+    variances = fit_all_variances(agents, probabilities(agents, (there, right), shares)[1])
     logs = len({a.log for a in agents})
     lines = [
         '"""Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.',
         "",
-        f"Printed by `{command}`: {len(agents)} candidates of {logs} simulated logs. `THERE` tells whether something is",
-        "where a candidate is, `RIGHT` whether a candidate is right where something is, `VARIANCES` weigh the terms of variances.",
+        f"Printed by `{command}`: {len(agents)} candidates of {logs} simulated logs.",
+        "`THERE` tells whether something is where a candidate is, which holds for `SHARES` of those; `RIGHT` whether a candidate is right",
+        "where something is; `VARIANCES` weigh the terms of variances.",
         '"""',
         "",
     ]
     for name, table in (("THERE", there), ("RIGHT", right), ("VARIANCES", variances)):
         lines.append(f"{name} = {{")
         for key, weights in table.items():
-            lines += [f"    {key!r}: {{", *(f"        {n!r}: {float(f'{w:.3g}')}," for n, w in weights.items()), "    },"]
+            lines += [
+                f"    {key!r}: {{",
+                *(f"        {n!r}: {float(f'{w:.3g}')}," for n, w in weights.items()),
+                "    },",
+            ]
         lines.append("}")
+    lines.append(
+        f"SHARES = {{{', '.join(f'{lidar}: {share:.3f}' for lidar, share in sorted(shares.items(), reverse=True))}}}"
+    )
     return "\n".join(lines).replace("'", '"')
 
 
