@@ -63,13 +63,6 @@ class CameraHomography:
     refusal: str = ""
     rig: RigFit | None = None
 
-    def road_at_tick(self, tick: int) -> Array | None:
-        """Return the homography (3, 3) from the image to the ground for the road itself; None where there is none.
-
-        Fitted apart, it is that of the feet of obstacles.
-        """
-        return self.fit.at_tick(tick) if self.rig is None else self.rig.road_at_tick(self.camera.name, tick)
-
 
 def fit_homographies(
     log: Log, observed: Observations, plan: Plan, config: TopdownConfig, *, rng: np.random.Generator

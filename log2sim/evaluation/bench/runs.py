@@ -37,7 +37,6 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, fit_homographies
 from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import Detectors, create_image_detector
-from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
 from log2sim.perception.sync import Schedule, schedule_of
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, Stage, make_plan, select_sensors
@@ -110,53 +109,6 @@ def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
             "a detector needs the image, but no image was decoded because all detectors were expected to need none"
         )
     return image
-
-
-@dataclass(frozen=True, eq=False)
-class SeamBench:
-    """Pictures to align mounts by, and registered seams of other ticks to measure homographies by."""
-
-    aligning: SeamPictures
-    measuring: SeamPictures
-    # Which pixels of two cameras show one point of the road 15 m away, registered once for all homographies.
-    survey: SeamSurvey
-    reading_s: float  # time of reading the pictures to align by
-
-    @classmethod
-    def of(
-        cls, log: Log, schedule: Schedule, observed: Observations, homographies: Mapping[str, CameraHomography]
-    ) -> SeamBench:
-        """Read the pictures of a log with several cameras, and register them by homographies of cameras fitted together."""
-        reader, several = RecordSource(log), any(h.rig is not None for h in homographies.values())
-        begin = time.perf_counter()
-        aligning = SeamPictures.read(log, schedule, observed, reader, ticks_of(schedule) if several else [])
-        reading_s = time.perf_counter() - begin
-        ticks = ticks_of(schedule, 2 * TICKS, held_out=True) if several else []
-        measuring = SeamPictures.read(log, schedule, observed, reader, ticks)
-        aligned, _ = align_seams(aligning, homographies)
-        return cls(aligning, measuring, measuring.survey(aligned), reading_s)
-
-    def figures(self, homographies: Mapping[str, CameraHomography]) -> dict[str, Any]:
-        """Compute the median misalignment, m, 15 m from the cameras, as fitted and with mounts aligned; None where none is seen."""
-        if len(homographies) < 2 or not self.survey.places:
-            return {}
-        out: dict[str, Any] = {
-            "seam_m": self._median_m(homographies),
-            "seams": len(self.survey.seams),
-            "seam_places": self.survey.places,
-            "seam_places_covered": self.survey.covered,
-        }
-        if all(h.rig is None for h in homographies.values()):
-            return out
-        begin = time.perf_counter()
-        aligned, _ = align_seams(self.aligning, homographies)
-        spent_s = time.perf_counter() - begin + self.reading_s
-        return out | {"seam_aligned_m": self._median_m(aligned), "aligning_s": spent_s}
-
-    def _median_m(self, homographies: Mapping[str, CameraHomography]) -> float | None:
-        found = self.measuring.misalignments_m(self.survey.seams, homographies)
-        known = found[~np.isnan(found)]
-        return float(np.median(known)) if len(known) else None
 
 
 REPEATS = 3  # repetitions of short stages, taking turns; the least time counts, since other processes only add to it
@@ -351,14 +303,9 @@ def homography_points(context: BenchContext, observations: Observations, report:
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
-    # Those fitted together register the pictures best, whatever the settings are.
-    together = [found for found in fits.values() if any(g.rig is not None for g in found.values())]
-    seams = SeamBench.of(context.log, context.schedule, observations, together[0] if together else {})
     for setting in settings:
         score = score_homographies(context.log, holdout, fits[setting.name])
         figures = score.figures | fit_figures(fits[setting.name])
-        if setting in context.grid.homography:
-            figures |= seams.figures(fits[setting.name])
         ms = context.ms_per_tick(min(spent[setting.name]))
         out.append(Point(setting.name, setting.present, ms, figures["error_m"], figures, score.by_object["error_m"]))
     return out

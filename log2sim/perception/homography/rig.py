@@ -77,23 +77,20 @@ class RigState:
     lift_m : mapping of str to float
         Height above the road at which the feet of boxes in a camera seem to lie: boxes end at the tires, which stand behind the
         nearest side of a vehicle, by more where a camera sees its ends than where it sees its sides.
-    mount : mapping of str to (3,) float64
-        Rotation of each camera against its calibration, rad, camera frame.
     feet : mapping of str to (3,) float64
-        Rotation that the feet of boxes in a camera ask for beyond that of the mount, rad.
+        Rotation of each camera against its calibration that the feet of boxes ask for, rad, camera frame.
     """
 
     plane: Array
     below_px: float
     lift_m: Mapping[str, float]
-    mount: Mapping[str, Array]
     feet: Mapping[str, Array]
 
     @classmethod
     def calibrated(cls, rig: Rig, plane: Array | None = None) -> RigState:
         """Make the state of a rig that is as its calibration says, over flat ground or a `plane` (3,)."""
         none = {name: np.zeros(3) for name in rig.cameras}
-        return cls(np.zeros(3) if plane is None else plane, 0.0, dict.fromkeys(rig.cameras, 0.0), none, dict(none))
+        return cls(np.zeros(3) if plane is None else plane, 0.0, dict.fromkeys(rig.cameras, 0.0), none)
 
 
 def rotation_of(vector: Array) -> Array:
@@ -121,20 +118,13 @@ def cam_of_ground(member: RigCamera, plane: Array, turn: Array) -> Array:
     return np.asarray(np.column_stack([r[:, :2], t]) + rise)
 
 
-def road_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
-    """Compute `ground_H_image` (..., 3, 3) of the road itself, px and m, in the ground frame of the correspondences.
+def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
+    """Compute `ground_H_image` (..., 3, 3) of the feet of boxes at the nearest sides of obstacles.
 
-    `plane` (..., 3) replaces that of the state, as that of a tick does.
+    px and m, in the ground frame of the correspondences; `plane` (..., 3) replaces that of the state, as that of a tick does.
     """
     member = rig.cameras[name]
-    turn = rotation_of(state.mount[name])
-    return _to_ground(rig, member, cam_of_ground(member, state.plane if plane is None else plane, turn))
-
-
-def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
-    """Compute `ground_H_image` (..., 3, 3) from the feet of boxes to the nearest sides of obstacles, like `road_homography`."""
-    member = rig.cameras[name]
-    turn = rotation_of(state.feet[name]) @ rotation_of(state.mount[name])
+    turn = rotation_of(state.feet[name])
     lifted = (state.plane if plane is None else plane) + [0.0, 0.0, state.lift_m[name]]
     below = np.eye(3)
     below[1, 2] = state.below_px
@@ -152,7 +142,7 @@ def foot_sigma_m(rig: Rig, state: RigState, name: str, covariance: Array) -> flo
     if not np.hypot(*axis[:2]) > 0:
         return float("nan")
     at = place + PROBE_M * axis[:2] / np.hypot(*axis[:2])
-    turn = rotation_of(state.feet[name]) @ rotation_of(state.mount[name])
+    turn = rotation_of(state.feet[name])
     matrix = cam_of_ground(member, state.plane, turn)
     point = matrix @ [*at, 1.0]
     if not point[2] > 0:
@@ -274,7 +264,6 @@ def linearize_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | Non
     """Linearize the errors of feet; `planes` (N, 3) replaces the plane of the state, as each tick has its own."""
     members = list(rig.cameras.values())
     turns = rotation_of(np.array([state.feet[n] for n in rig.cameras]))
-    turns = turns @ rotation_of(np.array([state.mount[n] for n in rig.cameras]))
     poses = turns @ np.array([m.cam_T_rig[:3] for m in members])
     flat = np.concatenate([poses[:, :, :2], poses[:, :, 3:]], axis=2)[rows.camera]
     up = poses[rows.camera, :, 2]

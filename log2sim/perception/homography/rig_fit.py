@@ -39,7 +39,6 @@ from log2sim.perception.homography.rig import (
     foot_sigma_m,
     heights_of,
     linearize_feet,
-    road_homography,
     tilt_of_ticks,
 )
 
@@ -192,22 +191,6 @@ class RigFit:
     state: RigState | None = None
     ticks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     planes: Array = field(default_factory=lambda: np.zeros((0, 3)))
-
-    def road_at_tick(self, camera: str, tick: int) -> Array | None:
-        """Return the homography (3, 3) of the road itself for a camera at a tick; None where nothing was fitted."""
-        plane = self._plane_at_tick(tick)
-        return None if self.state is None or plane is None else road_homography(self.rig, self.state, camera, plane)
-
-    def road_z_m(self, xy: Array, tick: int) -> float | None:
-        """Return the height of the road at a ground position (2,), m; None where nothing was fitted."""
-        plane = self._plane_at_tick(tick)
-        return None if plane is None else float(plane @ [*(xy - self.rig.origin_m[:2]), 1.0] + self.rig.origin_m[2])
-
-    def _plane_at_tick(self, tick: int) -> Array | None:
-        if self.state is None:
-            return None
-        k = int(np.searchsorted(self.ticks, tick))
-        return np.asarray(self.planes[k] if k < len(self.ticks) and self.ticks[k] == tick else self.state.plane)
 
 
 def fit_rig(
