@@ -11,9 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log
+from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
-from log2sim.localization.odometry import densest_lidar, read_ego_sweep
+from log2sim.localization.odometry import densest_lidar
 from log2sim.localization.surfaces import (
     Registration,
     Surfaces,
@@ -24,6 +24,7 @@ from log2sim.localization.surfaces import (
     surfaces_of_sweep,
 )
 from log2sim.perception.frames import work_ahead
+from log2sim.perception.records import RecordSource
 
 # Poses between sweeps that are registered are interpolated: so many cover braking and curves of a log, unless they are farther
 # apart than errors of GNSS last.
@@ -177,9 +178,6 @@ def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registra
 
 def _keyframe(log: Log, lidar: str, index: int) -> Keyframe | None:
     """Read a sweep and find its surfaces, in the ego's frame at its stamp; None where it has too few."""
-    sweep = read_ego_sweep(log, lidar, index)
-    if log.ego is None or sweep is None:
-        return None
-    pose, known = log.ego.at(sweep.t_ref_ns)
-    surfaces = surfaces_of_sweep(sweep, log.ego) if known[0] else None
-    return None if surfaces is None else Keyframe(sweep.t_ref_ns, pose[0], surfaces)
+    sweep: Sweep | None = RecordSource(log).get(lidar, index)
+    found = None if sweep is None else surfaces_of_sweep(log, lidar, sweep)
+    return None if found is None else Keyframe(*found)

@@ -176,10 +176,7 @@ def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
     sweep: Sweep | None = RecordSource(log).get(lidar, index)
     if sweep is None:
         return None
-    step = max(-(-len(sweep.xyz_m) // MAX_SWEEP_POINTS), 1)
-    t_ns = None if sweep.t_ns is None else sweep.t_ns[::step]
-    sweep = Sweep(sweep.stamp_ns, sweep.xyz_m[::step], sweep.frame, t_ns, sweep.compensated_ns)
-    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
+    mapped = sweep_to_map(log, lidar, sweep.thinned(MAX_SWEEP_POINTS), compensate=True)
     pose, known = log.map_T_sensor(lidar, sweep.stamp_ns)
     return (mapped[0], pose[0, :3, 3]) if mapped is not None and known[0] and len(mapped[0]) else None
 

@@ -244,6 +244,7 @@ def expect_change(
 CELL_M = 0.01
 # Hashes of a sketch; the share of common points errs by 1 / sqrt(this), 3 %.
 SKETCH_SIZE = 1024
+SLICES, MIN_SLICED_POINTS = 8, 4096
 # Rays that hit flat ground do so at the same distance wherever the ego is, and those that hit the ego itself always do.
 MIN_HEIGHT_M, MIN_DISTANCE_M = 0.3, 3.0
 AXIS_BITS = 21
@@ -256,7 +257,7 @@ class SweepSketch:
     Attributes
     ----------
     points, obstacles : int
-        How many points it has, and how many of them are above the ground and beyond the ego.
+        How many points it has, and how many of those that were looked at are above the ground and beyond the ego.
     hashes : (K,) uint64
         The smallest hashes of the cells of its obstacle points, sorted, at most `SKETCH_SIZE`.
     """
@@ -267,10 +268,15 @@ class SweepSketch:
 
 
 def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
-    """Return the sketch of a sweep of a LiDAR."""
+    """Return the sketch of a sweep of a LiDAR.
+
+    Of many points those are looked at whose cells along x are of one slice in `SLICES`, the same in every sweep.
+    """
     xyz = sweep.xyz_m
-    obstacles = xyz[_is_obstacle(log, name, sweep)]
-    return SweepSketch(len(xyz), len(obstacles), _smallest(_hash_cells(obstacles)))
+    if len(xyz) > SLICES * MIN_SLICED_POINTS:
+        xyz = xyz.take(np.flatnonzero(np.floor(xyz[:, 0] / CELL_M).astype(np.int64) % SLICES == 0), axis=0)
+    obstacles = xyz[_is_obstacle(log, name, sweep, xyz)]
+    return SweepSketch(len(sweep.xyz_m), len(obstacles), _smallest(_hash_cells(obstacles)))
 
 
 def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -280,9 +286,9 @@ def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return chosen[:SKETCH_SIZE] if len(chosen) >= SKETCH_SIZE else np.unique(hashes)[:SKETCH_SIZE]
 
 
-def _is_obstacle(log: Log, name: str, sweep: Sweep) -> NDArray[np.bool_]:
-    """Mark the points (N,) well above flat ground under the ego, and not on the ego; all of a LiDAR that stands."""
-    xyz, lidar = sweep.xyz_m, log.lidars[name]
+def _is_obstacle(log: Log, name: str, sweep: Sweep, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Mark points (N, 3) well above flat ground under the ego, and not on the ego; all of a LiDAR that stands."""
+    lidar = log.lidars[name]
     if lidar.mount == "map":
         return np.ones(len(xyz), dtype=bool)
     above_ground_m = float(lidar.mount_T_lidar[2, 3]) - log.ground_z_ego_m

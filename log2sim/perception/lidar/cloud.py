@@ -736,7 +736,7 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     """Take the points above the ground, one a voxel, and a sample of the rays, so that a long log fits in memory."""
     x, y, _ = cloud.obstacle_columns
     near = np.flatnonzero(np.hypot(x, y) < OBSTACLE_REACH_M)
-    index = cloud.obstacles[near[_first_of_voxels(cloud.obstacle_columns.take(near, axis=1), OBSTACLE_VOXEL_M)]]
+    index = cloud.obstacles[near[first_of_voxels(cloud.obstacle_columns.take(near, axis=1), OBSTACLE_VOXEL_M)]]
     kept = cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
     if not cloud.parts:
         return Obstacles(*kept)
@@ -745,7 +745,7 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     return Obstacles(*kept, np.array([part.sensor for part in cloud.parts]), seen_from)
 
 
-def _first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
+def first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
     """Return the indices of the first point of every voxel among points (3, N), in the order of the points.
 
     Notes
