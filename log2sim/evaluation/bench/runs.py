@@ -184,15 +184,9 @@ def timed_first_pass(
     """Measure what a detector found; returns the observations and the seconds of all stages so far."""
     clock, what = StageClock(), detect.name if measure.present else measure.name
     observations = observe(
-        context.log,
-        context.schedule,
-        context.found[detect.name],
-        context.plan,
-        mode=measure.config.measure.mode,
-        max_range_m=measure.config.measure.max_range_m,
-        clock=clock,
-        progress=lambda done, total: report(f"measure ({what})", done, total),
-    )
+        context.log, context.schedule, context.plan, detectors=Detectors(context.found[detect.name], None),
+        config=measure.config, clock=clock, progress=lambda done, total: report(f"measure ({what})", done, total),
+    )  # fmt: skip
     shared = {k: v for k, v in context.shared_s.items() if k != "decode" or detect.config.detect.name != LABELS}
     return observations, {**clock.seconds, **shared, "detect": context.found[detect.name].seconds}
 
