@@ -70,10 +70,7 @@ class ObstacleList(Sequence["Obstacles | None"]):
     What is asked for is new each time: its stamp, its origin and the place of its sensor are at hand, and its points and rays are
     read when they are looked at.
 
-    Parameters
-    ----------
-    file : ArrayFile
-        What keeps points and rays.
+    `file`: what keeps points and rays.
     """
 
     def __init__(self, file: ArrayFile) -> None:
@@ -116,20 +113,8 @@ Key = tuple[int, ...]
 class CloudMaker:
     """Make the clouds of successive ticks and search them; ticks share the clouds of the same sweeps, each read once.
 
-    Parameters
-    ----------
-    config : Config
-        `measure.max_range_m`: points farther from the origin along an axis are left out; `lidar.sweeps`: successive clouds that the
-        detector sees as one.
-    detector : LidarDetector, optional
-        Searches the clouds of the reference sensor.
-
-    Attributes
-    ----------
-    before : list of (Key, Boxes3D)
-        The last two clouds that were searched, and what was found in them.
-    compensated : dict
-        How each sweep was compensated, see `compensation_of`, by LiDAR and index.
+    `config`: `measure.max_range_m`: points farther from the origin along an axis are left out; `lidar.sweeps`: successive
+    clouds that the detector sees as one. `detector`: searches the clouds of the reference sensor.
     """
 
     def __init__(
@@ -246,44 +231,26 @@ class CloudMaker:
 
 @dataclass(eq=False)
 class Observations:
-    """Results of the first pass, by tick.
+    """Results of the first pass, by tick."""
 
-    Attributes
-    ----------
-    measurements : T Measurements
-        Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position.
-    obstacles : T Obstacles, None at ticks without LiDAR
-    points : ArrayFile
-        Keeps the points of all measurements and obstacles.
-    feet, ground : dict of str to list of Correspondences
-        Foot points of measured objects and ground points of the LiDAR, by camera.
-    detections : dict of str to int
-        Number of detections by camera and by name of the detector in sweeps.
-    sweeps : Counter of str
-        Number of sweeps by how they were compensated, see `compensation_of`.
-    frames_skipped : mapping of str to int
-        By camera.
-    unseen : mapping of str to list of int
-        Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched.
-    faults : tuple of Finding
-        Of the records.
-    lights : list of LightBox
-        Traffic lights in frames, which are no agents.
-    """
-
+    # T Measurements: of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position
     measurements: list[Measurements] = field(default_factory=list)
-    obstacles: Sequence[Obstacles | None] = field(default_factory=list)
-    points: ArrayFile = field(default_factory=ArrayFile)
+    obstacles: Sequence[Obstacles | None] = field(default_factory=list)  # T Obstacles, None at ticks without LiDAR
+    points: ArrayFile = field(default_factory=ArrayFile)  # keeps the points of all measurements and obstacles
+    # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera
     feet: dict[str, list[Correspondences]] = field(default_factory=dict)
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
+    # Number of detections by camera and by name of the detector in sweeps
     detections: dict[str, int] = field(default_factory=dict)
     records: RecordSource | None = None
+    # Number of sweeps by how they were compensated, see `compensation_of`
     sweeps: Counter[str] = field(default_factory=Counter)
     frames_detected: int = 0
-    frames_skipped: Mapping[str, int] = field(default_factory=dict)
+    frames_skipped: Mapping[str, int] = field(default_factory=dict)  # by camera
+    # Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched
     unseen: dict[str, list[int]] = field(default_factory=dict)
-    faults: tuple[Finding, ...] = ()
-    lights: list[LightBox] = field(default_factory=list)
+    faults: tuple[Finding, ...] = ()  # of the records
+    lights: list[LightBox] = field(default_factory=list)  # traffic lights in frames, which are no agents
 
     @property
     def unreadable(self) -> dict[str, Any]:
@@ -299,20 +266,14 @@ class Observations:
 
 @dataclass(eq=False)
 class Part:
-    """What the first pass takes from successive ticks, with what it knew of their records.
-
-    Attributes
-    ----------
-    before : list of (Key, Boxes3D)
-        See `CloudMaker`, after these ticks.
-    """
+    """What the first pass takes from successive ticks, with what it knew of their records."""
 
     ticks: list[SeenTick]
     looks: list[Look]
     read: dict[str, int]
     failed: dict[str, list[str]]
     compensated: dict[tuple[str, int], str]
-    before: list[tuple[Key, Boxes3D]]
+    before: list[tuple[Key, Boxes3D]]  # list of (Key, Boxes3D): see `CloudMaker`, after these ticks
 
 
 PACKED = (
@@ -322,22 +283,12 @@ PACKED = (
 
 @dataclass(eq=False)
 class Task:
-    """Ticks that are to be observed.
-
-    Attributes
-    ----------
-    watch : RecordWatch
-        What is known of the records before them.
-    before : list of (Key, Boxes3D)
-        See `CloudMaker`, before these ticks.
-    judged : bool
-        Whether all that is to be known of the records is known already.
-    """
+    """Ticks that are to be observed."""
 
     ticks: range
-    watch: RecordWatch
-    before: list[tuple[Key, Boxes3D]]
-    judged: bool = False
+    watch: RecordWatch  # what is known of the records before them
+    before: list[tuple[Key, Boxes3D]]  # list of (Key, Boxes3D): see `CloudMaker`, before these ticks
+    judged: bool = False  # whether all that is to be known of the records is known already
 
 
 class FirstPass:
@@ -464,16 +415,10 @@ def observe(
 ) -> Observations:
     """Run detection and measurement over all ticks.
 
-    Parameters
-    ----------
-    detectors : Detectors
-        Those of pictures search the frames of the plan's cameras, those of sweeps the clouds of the reference sensor; ticks that
-        their cache knows are not looked at again.
-    config : Config
-        How to measure, and how many successive clouds are searched as one.
-    jobs : int
-        Processes that share the ticks. The result is the same for any number; with fusion of points each cloud needs the
-        one before, so that one process does all.
+    `detectors`: those of pictures search the frames of the plan's cameras, those of sweeps the clouds of the reference
+    sensor; ticks that their cache knows are not looked at again. `config`: how to measure, and how many successive clouds
+    are searched as one. `jobs`: processes that share the ticks. The result is the same for any number; with fusion of
+    points each cloud needs the one before, so that one process does all.
 
     Notes
     -----

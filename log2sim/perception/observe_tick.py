@@ -25,29 +25,20 @@ MAX_GROUND_POINTS_PER_FRAME = 40
 
 @dataclass(eq=False)
 class SeenTick:
-    """What the first pass takes from one tick.
+    """What the first pass takes from one tick."""
 
-    Attributes
-    ----------
-    measurements : Measurements
-        Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position.
-    feet, ground : dict of str to Correspondences
-        Foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs them.
-    found : dict of str to int
-        Number of detections by camera and by name of the detector in sweeps.
-    frames : int
-        How many were searched.
-    skipped, unseen : list of str
-        Cameras whose frame was not searched, and those of which it says nothing.
-    """
-
+    # Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position
     measurements: Measurements = field(default_factory=Measurements.empty)
+    # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs
+    # them
     feet: dict[str, Correspondences] = field(default_factory=dict)
     ground: dict[str, Correspondences] = field(default_factory=dict)
     obstacles: Obstacles | None = None
     lights: list[LightBox] = field(default_factory=list)
+    # Number of detections by camera and by name of the detector in sweeps
     found: dict[str, int] = field(default_factory=dict)
-    frames: int = 0
+    frames: int = 0  # how many were searched
+    # `skipped`, `unseen`: cameras whose frame was not searched, and those of which it says nothing
     skipped: list[str] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
 

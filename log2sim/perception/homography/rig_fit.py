@@ -56,22 +56,12 @@ MAX_CANDIDATES = 48
 
 @dataclass(frozen=True, eq=False)
 class FeetFit:
-    """What the feet of boxes say about a rig.
-
-    Attributes
-    ----------
-    errors : FootErrors
-        Of all rows, by the assumed noise.
-    noise : float
-        Factor by which the noise exceeds that.
-    covariance : (P, P) float64
-        Of the shared parameters of feet, m and px, then of the rotation of each camera, rad.
-    """
+    """What the feet of boxes say about a rig."""
 
     state: RigState
-    errors: FootErrors
-    noise: float
-    covariance: Array
+    errors: FootErrors  # of all rows, by the assumed noise
+    noise: float  # factor by which the noise exceeds that
+    covariance: Array  # (P, P): of the shared parameters of feet, m and px, then of the rotation of each camera, rad
 
     def covariance_of(self, camera: int) -> Array:
         """Return the covariance (5, 5) of the parameters of the feet in a camera, given by its number."""
@@ -172,25 +162,16 @@ MIN_ROWS = 30
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
-    """The homographies of the cameras of a rig, fitted together.
+    """The homographies of the cameras of a rig, fitted together."""
 
-    Attributes
-    ----------
-    reason : str
-        Why nothing was fitted, "" otherwise.
-    fits : mapping of str to HomographyFit
-        From the feet of boxes to the ground, by camera; refused ones state why.
-    ticks : (T,) int64
-        Ticks with a plane of their own, ascending.
-    planes : (T, 3) float64
-    """
-
-    reason: str
+    reason: str  # why nothing was fitted, "" otherwise
     rig: Rig
+    # From the feet of boxes to the ground, by camera; refused ones state why
     fits: Mapping[str, HomographyFit] = field(default_factory=dict)
     state: RigState | None = None
+    # (T,): ticks with a plane of their own, ascending
     ticks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    planes: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    planes: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (T, 3)
 
 
 def fit_rig(
@@ -203,12 +184,8 @@ def fit_rig(
 ) -> RigFit:
     """Fit the homographies of all cameras of a rig.
 
-    Parameters
-    ----------
-    feet, ground : mapping of str to Correspondences
-        Of obstacles and of LiDAR ground points, by camera.
-    samples : int
-        Planes that RANSAC draws for the whole rig.
+    `feet`, `ground`: of obstacles and of LiDAR ground points, by camera. `samples`: planes that RANSAC draws for the whole
+    rig.
     """
     foot_rows = RigRows.of(rig, feet, FOOT_SIGMA_PX, FOOT_SIGMA_M)
     ground_rows = RigRows.of(rig, ground, GROUND_SIGMA_PX, GROUND_SIGMA_M)
