@@ -64,8 +64,13 @@ def refine_poses(log: Log, during_ns: tuple[int, int] | None = None) -> PoseTrac
     if log.ego is None or lidar is None:
         return None
     chosen = _choose(log, lidar, during_ns)
-    made = work_ahead(lambda index: _keyframe(log, lidar, index), chosen.tolist())
-    keyframes = [keyframe for keyframe in made if keyframe is not None]
+    records = RecordSource(log)
+
+    def surfaces_at(index: int) -> tuple[int, Array, Surfaces] | None:
+        sweep: Sweep | None = records.get(lidar, index)
+        return None if sweep is None else surfaces_of_sweep(log, lidar, sweep)
+
+    keyframes = [Keyframe(*found) for found in work_ahead(surfaces_at, chosen.tolist()) if found is not None]
     if len(keyframes) < MIN_KEYFRAMES:
         return None
     pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
@@ -174,10 +179,3 @@ def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registra
             right[i : i + 6] += of_i.T @ scaled @ measured
         twists = np.asarray(np.linalg.solve(normal, right))
     return twists.reshape(-1, 6)
-
-
-def _keyframe(log: Log, lidar: str, index: int) -> Keyframe | None:
-    """Read a sweep and find its surfaces, in the ego's frame at its stamp; None where it has too few."""
-    sweep: Sweep | None = RecordSource(log).get(lidar, index)
-    found = None if sweep is None else surfaces_of_sweep(log, lidar, sweep)
-    return None if found is None else Keyframe(*found)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Boxes3D, Log, Sweep
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, nearest_index
 from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
 from log2sim.localization.surfaces import (
     CAUCHY,
@@ -321,7 +321,7 @@ def detect_boxes(
     """
     out, before, records = [], None, RecordSource(log)
     for moment, floor in zip(moments_ns.tolist(), floor_m):
-        index = {name: _nearest_moments(log.streams[name].t_ns, moment) for name in lidars}
+        index = {name: int(nearest_index(log.streams[name].t_ns, moment)[0]) for name in lidars}
         if index == before:
             continue
         before = index
@@ -335,10 +335,6 @@ def detect_boxes(
             boxes = detector.detect(cloud)
             out.append(boxes.take(boxes.score >= MIN_SCORE))
     return out
-
-
-def _nearest_moments(t_ns: NDArray[np.int64], moment: int) -> int:
-    return int(np.argmin(np.abs(t_ns - moment)))
 
 
 def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector]:

@@ -313,7 +313,7 @@ def choose_sweeps(
     spaced = _spaced(t_ns, rows)
     velocity, known = velocities_at(track, t_ns[spaced])
     spaced, velocity = spaced[known], velocity[known]
-    if len(spaced) == 0 or _path_m(track, t_ns[spaced]) < MIN_PATH_M:
+    if len(spaced) == 0 or np.linalg.norm(np.ptp(track.at(t_ns[spaced])[0][:, :3, 3], axis=0)) < MIN_PATH_M:
         return rows[:0]
     if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
         return np.sort(np.concatenate(_fastest_changes(spaced, velocity)))
@@ -328,12 +328,6 @@ def _spaced(t_ns: NDArray[np.int64], rows: NDArray[np.intp]) -> NDArray[np.intp]
         return rows
     slot = (t_ns[rows] - t_ns[rows[0]]) // round(SPACING_S * NS_PER_S)
     return np.asarray(rows[np.unique(slot, return_index=True)[1]])
-
-
-def _path_m(track: PoseTrack, t_ns: NDArray[np.int64]) -> float:
-    """Compute how far the ego gets, m, as the diagonal of the box around its places."""
-    places = track.at(t_ns)[0][:, :3, 3]
-    return float(np.linalg.norm(np.ptp(places, axis=0)))
 
 
 def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:

@@ -185,7 +185,8 @@ def direct_strips(
         news = {}
         for pair in beside:
             if known[pair.route] and not known[pair.other] and pair.other not in news:
-                alone = not _has_more(beside, pair)
+                both = {pair.route, pair.other}
+                alone = not any(other.route in both and other.other not in both for other in beside)
                 news[pair.other] = _from_neighbor(found[pair.route], found[pair.other], pair, (traffic, alone), sides)
         if not news:
             break
@@ -227,12 +228,6 @@ def _driven(strip: LaneStrip, paths: Sequence[DrivenPath]) -> LaneStrip:
     if along == 0:
         return strip
     return replace(strip if along > 0 else strip.reversed(), directed=DRIVEN)
-
-
-def _has_more(beside: Sequence[Beside], pair: Beside) -> bool:
-    """Whether a road has more lanes than two strips side by side."""
-    both = {pair.route, pair.other}
-    return any(other.route in both and other.other not in both for other in beside)
 
 
 def _from_neighbor(
