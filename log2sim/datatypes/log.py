@@ -291,7 +291,8 @@ class Sweep:
     def thinned(self, most: int) -> Sweep:
         """Return every second, third ... of the points, at most so many; all as they are where there are no more."""
         kept = slice(None, None, max(-(-len(self.xyz_m) // most), 1))
-        t_ns, intensity = (None if column is None else column[kept] for column in (self.t_ns, self.intensity))
+        t_ns = None if self.t_ns is None else self.t_ns[kept]
+        intensity = None if self.intensity is None else self.intensity[kept]
         return replace(self, xyz_m=self.xyz_m[kept], t_ns=t_ns, intensity=intensity)
 
 

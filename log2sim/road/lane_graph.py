@@ -329,7 +329,7 @@ def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
     whole = [continued(routes, path, match) for path, match in zip(paths, seen)]
     matches = [match_path(routes, path) for path in whole]
     beside = find_beside([route.line for route in routes])
-    areas = join_conflicts(routes, find_conflicts(routes, whole, matches), beside)
+    areas = join_conflicts(find_conflicts(routes, whole, matches))
     sections = cut_sections(routes, areas, beside, _passed_ends(routes, whole, matches))
     strips = lay_out(routes, sections, beside)
     drivers: list[list[str]] = [[] for _ in strips]

@@ -179,17 +179,14 @@ class Union:
         self._parent[max(one, two)] = min(one, two)
 
 
-def join_conflicts(routes: Sequence[Route], conflicts: Sequence[Conflict], beside: Sequence[Beside]) -> Areas:
-    """Join conflicts whose stretches overlap, on any route, and let lanes side by side enter a junction together."""
+def join_conflicts(conflicts: Sequence[Conflict]) -> Areas:
+    """Join conflicts whose stretches overlap, on any route."""
     union = Union(len(conflicts))
     stretches: dict[int, list[Stretch]] = {}
     for k, conflict in enumerate(conflicts):
         for interval in conflict.intervals:
             stretches.setdefault(interval.route, []).append((interval.first_m, interval.last_m, k))
-    for _ in range(len(routes) + 1):
-        stretches = {route: _merge(items, union) for route, items in stretches.items()}
-        if not _spread(routes, stretches, beside):
-            break
+    stretches = {route: _merge(items, union) for route, items in stretches.items()}
     crossing = frozenset(union.root(k) for k, conflict in enumerate(conflicts) if conflict.crossing)
     merged = {route: _merge(items, union) for route, items in stretches.items()}
     return Areas({route: [(a, b, union.root(k)) for a, b, k in items] for route, items in merged.items()}, crossing)
@@ -205,37 +202,6 @@ def _merge(items: Iterable[Stretch], union: Union) -> list[Stretch]:
         else:
             out.append((first, last, union.root(k)))
     return out
-
-
-def _spread(routes: Sequence[Route], stretches: dict[int, list[Stretch]], beside: Sequence[Beside]) -> bool:
-    """Add the stretches of each route to those beside it; return whether any was new."""
-    grown = False
-    for pair in beside:
-        if not pair.same_way:
-            continue
-        for first, last, k in list(stretches.get(pair.route, ())):
-            if last < pair.s_m[0] or first > pair.s_m[-1]:
-                continue
-            ends = [
-                np.interp(v, pair.s_m, pair.other_s_m) if pair.s_m[0] <= v <= pair.s_m[-1] else None
-                for v in (first, last)
-            ]
-            a = (
-                ends[0]
-                if ends[0] is not None
-                else ends[1] - (last - first)
-                if ends[1] is not None
-                else pair.other_s_m[0]
-            )
-            b = ends[1] if ends[1] is not None else a + (last - first)
-            held = hold(routes[pair.other], pair.other, float(a), float(b))
-            own = stretches.setdefault(pair.other, [])
-            if held.last_m > held.first_m and not any(
-                low <= held.first_m + 0.1 and high >= held.last_m - 0.1 and j == k for low, high, j in own
-            ):
-                own.append((held.first_m, held.last_m, k))
-                grown = True
-    return grown
 
 
 # What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes.

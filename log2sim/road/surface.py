@@ -51,9 +51,8 @@ class GroundPoints:
     def join(cls, parts: Sequence[GroundPoints]) -> GroundPoints:
         """Concatenate those of several sweeps; none give none."""
         if not parts:
-            return cls(
-                np.zeros((0, 2), np.float32), *np.zeros((3, 0), np.float32), np.zeros(0, np.int16), np.zeros(0, np.int8)
-            )
+            xy, none = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+            return cls(xy, none, none, none, np.zeros(0, np.int16), np.zeros(0, np.int8))
         return cls(*(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
