@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.datatypes import Agent, Lidar, Log, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.exporters import Options, SampledMotion, sample_steps
 from log2sim.export.viewers import STEP_S, agent_steps, ego_pose
@@ -49,10 +49,11 @@ class OpenLabel:
         for uid, (agent, move) in enumerate(moves, start=1):
             for k in np.flatnonzero(move.valid).tolist():
                 data[k][str(uid)] = {"cuboid": [_cuboid(scenario, agent, move, k)]}
-        for k, shown in enumerate(pictures):
-            for camera, t_ns in shown.items() if log is not None else ():
-                for row, box in _boxes_px(scenario, log, camera, t_ns):
-                    data[k].setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
+        if log is not None:
+            for found, shown in zip(data, pictures, strict=True):
+                for camera, t_ns in shown.items():
+                    for row, box in _boxes_px(scenario, log, camera, t_ns):
+                        found.setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
         content = {
             str(k): {
                 "frame_properties": {
@@ -149,7 +150,7 @@ def _systems(scenario: Scenario, log: Log | None) -> dict[str, Any]:
     systems: dict[str, Any] = {"map": {"type": "scene_cs", "parent": "", "children": []}}
     if scenario.ego is not None or (log is not None and log.ego is not None):
         systems["ego"] = {"type": "local_cs", "parent": "map", "children": []}
-    sensors = [] if log is None else [*log.cameras.values(), *log.lidars.values()]
+    sensors: list[Camera | Lidar] = [] if log is None else [*log.cameras.values(), *log.lidars.values()]
     for sensor in sensors:
         mount_T_sensor = (sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar).copy()
         if sensor.mount == "map":

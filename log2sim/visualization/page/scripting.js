@@ -13,6 +13,10 @@ window.log2sim = {
     track?.moveTo(state.t);
     return track?.present ? [view.sx(track.px), view.sy(track.py)] : null;
   },
+  // Position of a place of the map on the canvas, CSS pixels.
+  pixelOf: (x, y) => [view.sx(x), view.sy(y)],
+  // Where the box that is moved stands in the map.
+  poseOf: () => (editor?.pose ? [editor.pose.x, editor.pose.y] : null),
   // Its heading in rad, counter-clockwise from east; null when it is absent.
   headingOf: (id) => {
     const track = tracks.find((other) => other.id === id);
