@@ -3,7 +3,7 @@
     python tools/cookbook_pictures.py WORK [--only NAME ...]
 
 WORK is a folder for logs and scenarios; what is there is not made again (all of it takes some ten minutes of two cores). Pictures become JPEGs of at most
-60 kB in samples/pictures/. The pages in a browser need a Chromium with its driver.
+42 kB in samples/pictures/. The pages in a browser need a Chromium with its driver.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from entry import parser_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "samples/pictures"
-WIDTH_PX, MAX_BYTES = 800, 60_000
+WIDTH_PX, MAX_BYTES = 800, 42_000
 SCENES = ("market", "motorway", "roadside", "two_hertz")
 SIZE = "--size 900x600"
 # By name: commands of log2sim, in which {work}, {sample} and {out} are the folder, the sample's scenario and the picture.
@@ -31,7 +31,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "doubts": (f"plot {{work}}/market.json {SIZE} --out {{out}}",),
     "evaluation": (f"plot {{sample}} --truth samples/crossing {SIZE} --out {{out}}",),
-    "exports": ("plot {work}/motorway.json --size 900x420 --out {out}",),
+    "exports": ("plot {work}/motorway.json --extent 60,-15,130,20 --size 900x480 --out {out}",),
     "faults": ("inspect {work}/yawed --overlay {out}",),
     "logs": ("inspect samples/crossing --overlay {out}",),
     "python": (f"plot {{sample}} --predict 2 --start 1 --stop 3 {SIZE} --out {{out}}",),
@@ -40,7 +40,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "replay {work}/blocked.json --ego samples/egos.py:BrakeLate --out {work}/late.json",
         "plot {work}/blocked.json --replay {work}/late.json --size 900x640 --out {out}",
     ),
-    "road": ("plot {work}/motorway.json --background {work}/motorway --size 900x420 --out {out}",),
+    "road": (
+        "plot {work}/motorway.json --background {work}/motorway --extent 60,-15,130,20 --size 900x480 --out {out}",
+    ),
     "roadside": (f"plot {{work}}/roadside.json {SIZE} --out {{out}}",),
     "synthetic": ("inspect {work}/roadside --overlay {out}",),
 }
@@ -110,7 +112,7 @@ def screenshots(work: Path, sample: Path, names: set[str]) -> None:
             front = "[...document.querySelectorAll('#cameras button')].find((b) => b.textContent === 'front').click()"
             move = "document.getElementById('studio-move').click()"
             photograph(
-                browser, "corrections", studio.address, f"log2sim.time = 1; {front}; log2sim.choose('car-1')", move
+                browser, "corrections", studio.address, f"log2sim.time = 1; {front}; log2sim.choose('cyclist-1')", move
             )
             studio.close()
         if "batch" in names:
@@ -119,7 +121,8 @@ def screenshots(work: Path, sample: Path, names: set[str]) -> None:
                     f"synth --traffic vehicle --no-pictures --scenes 4 --duration 3 --layout log2sim --seed 1 --out {work}/clouds"
                 )
                 log2sim(f"batch {work}/clouds --out {work}/batch")
-            photograph(browser, "batch", (work / "batch/table.html").as_uri())
+            name = "document.querySelector('h1').textContent = 'Batch of clouds'"  # no path of a machine
+            photograph(browser, "batch", (work / "batch/table.html").as_uri(), name)
 
 
 def main(arguments: list[str] | None = None) -> int:
