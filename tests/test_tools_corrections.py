@@ -32,7 +32,9 @@ def spoiled() -> Scenario:
     turned = replace(b, waypoints=replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi)))
     long = replace(a, size_m=(12.0, *a.size_m[1:]), doubts=(Finding("heading_ambiguous"),), confidence=0.3)
     first = replace(c, id="c-1", waypoints=c.waypoints.take(c.waypoints.t_s <= 2.5))
-    last = replace(c, id="c-2", waypoints=c.waypoints.take(c.waypoints.t_s > 1.5), doubts=(Finding("heading_ambiguous"),))
+    last = replace(
+        c, id="c-2", waypoints=c.waypoints.take(c.waypoints.t_s > 1.5), doubts=(Finding("heading_ambiguous"),)
+    )
     ghost = replace(b, id="ghost", waypoints=replace(w, y_m=w.y_m - 20.0), confidence=0.45)
     return scenario(ego, long, turned, first, last, ghost)
 
