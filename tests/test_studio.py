@@ -341,6 +341,22 @@ def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, 
         # A pixel of the picture is up to half a meter of the ground there.
         moved = np.array([entry["poses"][0]["x_m"] - at.x_m[0], entry["poses"][0]["y_m"] - at.y_m[0]])
         np.testing.assert_allclose(moved, [-5.0, 1.0], atol=0.6)
+        # Loaded again, its box is in the picture where it is now.
+        browser.open(served.address)
+        browser.run(
+            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
+        )
+        browser.run("log2sim.time = arguments[0]", t_s)
+        browser.wait("log2sim.pictures.front !== null")
+        now = served.result.scenario[name].at(t_s)
+        browser.mouse(
+            tuple(
+                browser.run(
+                    "return log2sim.inPicture('front', ...arguments)", float(now.x_m[0]), float(now.y_m[0]), 0.7
+                )
+            )
+        )
+        browser.wait(f"log2sim.chosen === '{name}'")
         assert [line for line in browser.log("browser") if line["level"] == "SEVERE"] == []
     finally:
         served.close()

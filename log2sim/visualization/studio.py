@@ -17,7 +17,7 @@ from log2sim.errors import Log2SimError, ScenarioError
 from log2sim.files.documents import check, write_json
 from log2sim.geometry import NS_PER_S, fold_radius, inverse
 from log2sim.visualization.page.document import SCALES, feature_columns, page_document, second_differences
-from log2sim.visualization.page.writer import make_page
+from log2sim.visualization.page.writer import make_page, page_html
 from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.recording import Recorded, records_within
 
@@ -61,7 +61,8 @@ class Studio:
         self.result: Corrected = correct(scenario, self.document)
         self._token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
-        self._page: tuple[Corrected, bytes] | None = None  # pictures take seconds to gather
+        # Pictures and points take long to gather: once, with the corrections of then.
+        self._recording: tuple[Corrected, dict[str, Any] | None] | None = None
         studio = self
 
         class Handler(_Handler):
@@ -86,8 +87,6 @@ class Studio:
     def page(self) -> bytes:
         """Return the page with the scenario as it is corrected now."""
         with self._lock:
-            if self._page is not None and self._page[0] is self.result:
-                return self._page[1]
             document = page_document(self.result.scenario, background=self.background)
             document["layers"]["scenario"] = _agents(self.result.scenario)
             document["studio"] = {
@@ -100,9 +99,14 @@ class Studio:
                 "before": [{**entry, "doubts": [], "doubted": []} for entry in _agents(self.scenario)],
                 "scales": SCALES,
                 "cameras": [] if self.recorded is None else _calibrations(self.recorded.log, self.scenario),
+                "corrected": self._recording is not None and self._recording[0] is not self.result,
             }
-            self._page = self.result, make_page(document, self.result.scenario, self.recorded)
-            return self._page[1]
+            if self._recording is None:
+                page = make_page(document, self.result.scenario, self.recorded)
+                self._recording = self.result, document["recording"]
+                return page
+            document |= {"scales": SCALES, "recording": self._recording[1]}
+            return page_html(document).encode()
 
     def keep(self, body: bytes) -> dict[str, Any]:
         """Apply a document of corrections, write it to the file, and return what the page shows of the scenario then.

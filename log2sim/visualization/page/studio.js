@@ -19,7 +19,7 @@ class Editor {
     this.line = [];  // points of the line that is drawn
     this.cameras = new Map((entry.cameras ?? []).map((camera) => [camera.name, new Calibrated(camera)]));
     this.before = new Map(entry.before.map((agent) => [agent.id, new Track(agent, entry.scales)]));
-    this.corrected = false;  // since the page was loaded
+    this.corrected = entry.corrected;  // since the boxes in the pictures were projected
     this.changes = 0;  // so that pictures know when to draw again
     this.busy = false;
     byId("studio").hidden = false;
