@@ -213,7 +213,8 @@ class Editor {
     });
     // Small boxes are all handles: then the box itself is held unless the pointer is outside it.
     const small = pixels.length > 0 && Math.max(...[0, 1].map((axis) => Math.max(...pixels.map((p) => p[axis])) - Math.min(...pixels.map((p) => p[axis])))) < 4 * slack;
-    this.held = far(best) < slack && (!small || best.name === "turn") ? best : inside ? body : null;
+    const handled = far(best) < slack && far(best) < far(body) && (!small || best.name === "turn");
+    this.held = handled ? best : inside ? body : null;
     if (!this.held) return false;
     const at = this.handle(this.held, surface);
     this.offset = at ? [sx - at[0], sy - at[1]] : [0, 0];
