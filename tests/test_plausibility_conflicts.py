@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import rows_at
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents
 from log2sim.agents.conflicts import (
@@ -15,7 +16,7 @@ from log2sim.agents.conflicts import (
     resolve_conflicts,
 )
 from log2sim.agents.judge import suppress_duplicates
-from log2sim.datatypes import Agent, Waypoints
+from log2sim.datatypes import Agent, Track, Waypoints
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -118,8 +119,9 @@ def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4
 
 
 def candidate(built, confidence=0.5):
-    """A candidate; duplicates and conflicts are judged without its track."""
-    return AgentCandidate(replace(built, confidence=confidence), None, None)
+    """A candidate; duplicates and conflicts are judged without its geometry."""
+    track = Track(built.category, np.arange(3), rows_at(np.zeros((3, 2)), built.category))
+    return AgentCandidate(replace(built, confidence=confidence), track, None)
 
 
 def kept(*built, ego=None):

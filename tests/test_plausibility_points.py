@@ -98,9 +98,10 @@ def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
 
 
 def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
-    row = dict.fromkeys((*SIGNS, "shown_ticks", "image_ticks"), 0.0)
+    row = dict.fromkeys((*SIGNS, "shown_ticks", "image_ticks"), 0.0) | {"confirmed": 1.0}
     assert decide(agent(5.0), row, MIN_THERE[True] - 0.01, lidar=True) is None
     assert decide(agent(5.0), row, MIN_THERE[True], lidar=True) == []
+    assert decide(agent(5.0), row | {"confirmed": 0.0}, 0.9, lidar=True) is None
     (doubt,) = decide(agent(5.0), row | {"through": 0.9}, 0.9, lidar=True)
     assert (doubt.kind, doubt.values["through_share"]) == ("empty", 0.9)
 

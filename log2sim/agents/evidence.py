@@ -56,13 +56,13 @@ class Recording:
 
 
 SIGNS = {
-    "sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
+    "sweep": 1, "weak_sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
     "through_gaps": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
-- sweep, image: log-odds of its detections in LiDAR sweeps and in images; 0 without any.
+- sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, where positive and where negative, and in images; 0 without any.
 - no_sweep, no_image: 1 without any detection in a sweep, in an image, where others have some.
 - travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
@@ -85,7 +85,8 @@ SIGNS = {
 - moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
 """
 
-# Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, and `shown_ticks` and `image_ticks`:
+# Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, `confirmed`, 1
+# where the detections suffice, and `shown_ticks` and `image_ticks`:
 # the ticks at which a searched image shows a candidate well, and at which it is detected in one of these.
 Table = dict[str, Array]
 
@@ -93,7 +94,7 @@ Table = dict[str, Array]
 def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
     """Gather the evidence for and against each of C candidates."""
     if not candidates:
-        return {name: np.zeros(0) for name in ("bias", *SIGNS, "shown_ticks", "image_ticks")}
+        return {name: np.zeros(0) for name in ("bias", "confirmed", *SIGNS, "shown_ticks", "image_ticks")}
     rows = [_own_columns(c, recording.timeline) for c in candidates]
     most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
     parts = [_sensed_columns(candidates[k : k + most], recording) for k in range(0, len(rows), most)]
@@ -105,9 +106,9 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
 
 
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
-LIMITS = {
-    "range": np.log([0.1, 5.0]), "sigma": np.log([0.1, 50.0]), "scatter": np.log([1.0, 31.0]), "odd_size": (0.0, 3.0),
-    "odd_height": (0.0, np.log(2.0)), "heading": (-4.6, 4.6), "sigma_speed": np.log([0.07, 17.0]),
+LIMITS: dict[str, tuple[float, float]] = {
+    "range": (np.log(0.1), np.log(5.0)), "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
+    "odd_height": (0.0, np.log(2.0)), "heading": (-4.6, 4.6), "sigma_speed": (np.log(0.07), np.log(17.0)),
 }  # fmt: skip
 
 
@@ -117,12 +118,15 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_sweep, in_image = np.isfinite(m.box_yaw_rad), m.camera != ""
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
-    columns = {
-        "sweep": sweep_log_odds(track) if in_sweep.any() else 0.0,
+    sweep = sweep_log_odds(track) if in_sweep.any() else 0.0
+    travel = float(np.log1p(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m)) / agent.size_m[0])) if moving else 0.0
+    columns: dict[str, float] = {
+        "sweep": max(sweep, 0.0),
+        "weak_sweep": min(sweep, 0.0),
         "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
         "no_sweep": float(not in_sweep.any()),
         "no_image": float(not in_image.any()),
-        "travel": np.log1p(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m)) / agent.size_m[0]) if moving else 0.0,
+        "travel": travel,
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         "range": np.log(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)) / 20.0 + 1e-3),
@@ -138,16 +142,29 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         if moving and w.sigma_speed_mps is not None
         else 0.0,
         "moving": float(moving),
+        "confirmed": float(_is_confirmed(candidate, sweep, travel)),
         "two_wheeler": float(group == "two_wheeler"),
         "pedestrian": float(group == "pedestrian"),
     }
-    return columns | {name: float(np.clip(columns[name], *limits)) for name, limits in LIMITS.items()}
+    return columns | {name: float(np.clip(columns[name], low, high)) for name, (low, high) in LIMITS.items()}
 
 
 def _odd_size(agent: Agent) -> float:
     """Return by how many standard deviations of the category length and width differ from the typical ones."""
     smallest, typical, largest = (np.array(t[agent.category][:2]) for t in (MIN_SIZE_M, TYPICAL_SIZE_M, MAX_SIZE_M))
     return float(np.hypot(*(np.log(np.array(agent.size_m[:2]) / typical) * LIMIT_SIGMAS / np.log(largest / smallest))))
+
+
+# Confidence by images that suffices. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes
+# and signs look like. Boxes in sweeps suffice where an object is twice as likely as none; what moves on is not what stays.
+MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS = 0.3, 0.6, float(np.log(2.0))
+
+
+def _is_confirmed(candidate: AgentCandidate, sweep: float, travel: float) -> bool:
+    """Return whether the detections of a candidate suffice, given its columns."""
+    ordinary = candidate.geometry.is_likely and GROUP_OF[candidate.agent.category] != "pedestrian"
+    least = MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE
+    return image_confidence(candidate.track) >= least or (sweep > 0 and sweep + travel >= MIN_SWEEP_LOG_ODDS)
 
 
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video

@@ -11,16 +11,14 @@ from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents
 from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
 from log2sim.agents.evidence import Recording, Table, gather
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
-from log2sim.agents.weights import RIGHT, SHARES, THERE, VARIANCES
+from log2sim.agents.weights import RIGHT, THERE, VARIANCES
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Finding
-from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import Array, overlap_of_smaller
 
-# By whether there is a LiDAR: an invented agent in the way costs a simulation three times what a missing one does. Without a LiDAR,
-# what is not there is mostly placed wrong, which is for doubts.
-MIN_THERE = {True: 0.75, False: 0.25}
-# A log is taken to be as those of the fit, by the weight of so many candidates; the rounds converge long before.
-PRIOR_CANDIDATES, PRIOR_ROUNDS = 100, 50
+# What was detected well enough is dropped where it is rather not there. Without a LiDAR, what is not there is mostly placed wrong,
+# which is for doubts.
+MIN_THERE = {True: 0.5, False: 0.25}
 # A reason that makes an agent e times less likely is told.
 DOUBT_NATS = 1.0
 # Never 0 or 1: an agent may be right or wrong for a reason that no evidence shows.
@@ -61,25 +59,11 @@ def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
     is right where it is. Each weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points
     is rather wrong; without one, nothing has points, and what images say of the distance counts instead: each case has its weights.
     """
-    there, state = (sum(weight * table[name] for name, weight in weights[lidar].items()) for weights in (THERE, RIGHT))
-    there = probability_of(there + prior_shift(there, SHARES[lidar]))
-    return there, np.clip(there * probability_of(state), MIN_CONFIDENCE, MAX_CONFIDENCE)
-
-
-def prior_shift(log_odds: Array, share: float) -> float:
-    """Return by how much the log-odds (C,) of candidates that something is there are off, given the share that they were fitted for.
-
-    Notes
-    -----
-    One log has more clutter than another, which its candidates tell together: the share of real ones and the probabilities that
-    agree with it, by expectation and maximization (Saerens, Latinne, Decaestecker, "Adjusting the outputs of a classifier to new a
-    priori probabilities", Neural Computation 14, 2002). `PRIOR_CANDIDATES` with the usual share keep few candidates from telling much.
-    """
-    shift, usual = 0.0, float(log_odds_of(share))
-    for _ in range(PRIOR_ROUNDS):
-        real = float(probability_of(log_odds + shift).sum()) + PRIOR_CANDIDATES * share
-        shift = float(log_odds_of(real / (len(log_odds) + PRIOR_CANDIDATES))) - usual
-    return shift
+    there, state = (
+        probability_of(np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0))
+        for weights in (THERE, RIGHT)
+    )
+    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
 
 
 def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: bool) -> list[Finding] | None:
@@ -92,7 +76,7 @@ def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: 
     there : float
         Probability that something is there, from `probabilities`.
     """
-    if there < MIN_THERE[lidar]:
+    if not evidence["confirmed"] or there < MIN_THERE[lidar]:
         return None
     counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
     reasons = {
@@ -135,8 +119,8 @@ SAMPLES = 12
 
 
 def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
-    """Keep, of the candidates that overlap, the one with the highest confidence, and none that overlaps the ego."""
-    ordered = sorted(built, key=lambda b: -b.agent.confidence)
+    """Keep, of the candidates that overlap, the one with most detections that count by its confidence, and none that overlaps the ego."""
+    ordered = sorted(built, key=lambda b: -b.agent.confidence * float(b.track.measurements.score.sum()))
     agents = [*([] if ego is None else [ego]), *(c.agent for c in ordered)]
     ways = [a.waypoints for a in agents]
     # First and last time and place: agents that are not there at the same time and near enough are no duplicates.

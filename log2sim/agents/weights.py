@@ -1,31 +1,32 @@
 """Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.
 
 Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --seed 11`: 2081 candidates of 60 simulated logs.
-`THERE` tells whether something is where a candidate is, which holds for `SHARES` of those; `RIGHT` whether a candidate is right
+`THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right
 where something is; `VARIANCES` weigh the terms of variances.
 """
 
 THERE = {
     True: {
-        "bias": 2.18,
-        "sweep": 0.458,
-        "image": 0.292,
-        "no_image": -0.313,
-        "travel": 0.424,
-        "few": -1.83,
-        "scatter": -0.118,
-        "sigma": -0.424,
-        "odd_size": -0.603,
-        "odd_height": -0.768,
-        "other_category": -0.675,
-        "impossible": -0.636,
-        "through": -2.39,
-        "through_gaps": -0.622,
-        "pointless": -0.98,
-        "nearer": -1.75,
-        "moving": 0.606,
-        "two_wheeler": -0.593,
-        "pedestrian": -0.397,
+        "bias": 2.66,
+        "weak_sweep": 1.0,
+        "sweep": 0.276,
+        "image": 0.219,
+        "no_image": -0.193,
+        "travel": 0.476,
+        "few": -1.99,
+        "scatter": -0.0771,
+        "sigma": -0.58,
+        "odd_size": -0.61,
+        "odd_height": -0.985,
+        "other_category": -0.634,
+        "impossible": -0.577,
+        "through": -2.56,
+        "through_gaps": -0.852,
+        "pointless": -1.06,
+        "nearer": -1.9,
+        "moving": 0.57,
+        "two_wheeler": -0.687,
+        "pedestrian": -0.347,
     },
     False: {
         "bias": 2.8,
@@ -76,20 +77,19 @@ RIGHT = {
 }
 VARIANCES = {
     "sigma_xy_m": {
-        "given": 2.07,
-        "given_moving": 0.931,
-        "hidden": 0.0134,
-        "range": 0.000421,
-        "wrong": 0.0496,
+        "given": 2.01,
+        "given_moving": 0.891,
+        "hidden": 0.0137,
+        "range": 0.00072,
+        "wrong": 0.0509,
     },
     "sigma_yaw_rad": {
-        "given": 0.436,
+        "given": 0.498,
         "wrong": 0.353,
     },
     "sigma_speed_mps": {
-        "given": 9.54,
-        "standing": 5.95,
-        "moving": 0.407,
+        "given": 7.85,
+        "standing": 6.68,
+        "moving": 0.434,
     },
 }
-SHARES = {True: 0.761, False: 0.503}

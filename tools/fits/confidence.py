@@ -27,7 +27,7 @@ from log2sim import pipeline
 from log2sim.agents import judge as judging
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import SIGNS, Table, gather
-from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, prior_shift, variance_terms
+from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, variance_terms
 from log2sim.datatypes import CATEGORIES, GROUP_OF
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.comparison import Selection
@@ -45,8 +45,11 @@ PRIOR_SIGMA, MIN_EFFECT = 0.5, 0.05
 # A weight of a variance is not below this, so that its logarithm exists. Of what smoothing says remains at least a quarter, half
 # of the standard deviation: it alone knows gaps, ends and turns.
 MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
+# Recorded logs have more that looks a little like a road user than simulated ones, so that a score that speaks against an object
+# counts in full, as the calibrated probability that it is.
+FIXED = {"weak_sweep": 1.0}
 # Columns that say nothing of whether something is there, and those that say nothing of whether it is right where it is.
-ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_sweep", "no_image", "travel", "missing", "pointless", "nearer", "image", "sweep", "few")  # fmt: skip
+ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_sweep", "no_image", "travel", "missing", "pointless", "nearer", "image", "sweep", "weak_sweep", "few")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,7 @@ def agents_of(case: Case, log: str) -> list[Rated]:
 
     def keep_table(candidates: Sequence[Any], recording: Any) -> Table:
         gathered.append((list(candidates), gather(candidates, recording)))
-        return gathered[-1][1]
+        return gathered[-1][1] | {"confirmed": np.ones(len(candidates))}
 
     def keep_candidates(*arguments: Any) -> Any:
         judged.extend(judging.judge(*arguments))
@@ -120,8 +123,11 @@ def half_verdict(share: Array) -> Array:
     return (share + (share >= 1 - MAX_WRONG_SHARE)) / 2
 
 
-def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> tuple[float, Array]:
-    """Find the most likely bias and weights (F,) of evidence (A, F) for agents that are right to some share (A,)."""
+def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int], known: Array) -> tuple[float, Array]:
+    """Find the most likely bias and weights (F,) of evidence (A, F) for agents that are right to some share (A,).
+
+    `known` (A,) are log-odds of which it is known how much they count.
+    """
     from scipy.optimize import minimize
 
     mean, scale = x.mean(axis=0), x.std(axis=0)
@@ -129,7 +135,7 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
     z = (x - mean) / scale
 
     def loss(w: Array) -> tuple[float, Array]:
-        odds = w[0] + z @ w[1:]
+        odds = w[0] + z @ w[1:] + known
         value = weight @ (np.logaddexp(0.0, odds) - right * odds) + (w[1:] ** 2).sum() / (2 * PRIOR_SIGMA**2)
         slope = weight * (probability_of(odds) - right)
         return float(value), np.append(slope.sum(), z.T @ slope + w[1:] / PRIOR_SIGMA**2)
@@ -147,14 +153,18 @@ def fit_table(
     tables = {}
     for lidar in sorted({a.lidar for a in agents}, reverse=True):
         own = [a for a in agents if a.lidar == lidar]
-        names = [name for name in SIGNS if name not in out]
+        names = [name for name in SIGNS if name not in (*out, *FIXED)]
+        fixed = {
+            name: weight for name, weight in FIXED.items() if name not in out and any(a.evidence[name] for a in own)
+        }
+        known = np.array([sum(w * a.evidence[name] for name, w in fixed.items()) for a in own], dtype=np.float64)
         for _ in range(2):
             x = np.array([[a.evidence[name] for name in names] for a in own])
             # An agent of many ticks counts more, since they do in the calibration of ticks, but less than they are.
             w = np.sqrt([a.ticks for a in own]) * [weight(a) for a in own]
             y = half_verdict(np.array([target(a) for a in own]))
-            bias, found = fit_weights(x, y, w / w.mean(), [SIGNS[name] for name in names])
-            tables[lidar] = {"bias": bias, **dict(zip(names, found.tolist()))}
+            bias, found = fit_weights(x, y, w / w.mean(), [SIGNS[name] for name in names], known)
+            tables[lidar] = {"bias": bias, **fixed, **dict(zip(names, found.tolist()))}
             names = [n for n, effect in zip(names, np.abs(found) * x.std(axis=0)) if effect > MIN_EFFECT]
     return tables
 
@@ -166,24 +176,13 @@ def fit_there_and_right(agents: Sequence[Rated]) -> tuple[Weights, Weights]:
     return there, right
 
 
-def shares_of(agents: Sequence[Rated]) -> dict[bool, float]:
-    """Return the share of candidates that are there, with and without a LiDAR."""
-    return {lidar: float(np.mean([a.there for a in agents if a.lidar == lidar])) for lidar in {a.lidar for a in agents}}
-
-
-def probabilities(
-    agents: Sequence[Rated], tables: tuple[Weights, Weights], shares: dict[bool, float]
-) -> tuple[Array, Array]:
+def probabilities(agents: Sequence[Rated], tables: tuple[Weights, Weights]) -> tuple[Array, Array]:
     """Rate agents (A,): the probabilities that they are there and that they are right."""
     there, state = (
-        np.array([sum(w * a.evidence.get(n, 1.0) for n, w in table[a.lidar].items()) for a in agents]) for table in tables
-    )  # fmt: skip
-    runs = np.array([f"{a.log} {a.case}" for a in agents])
-    for run in np.unique(runs):
-        rows = np.flatnonzero(runs == run)
-        there[rows] += prior_shift(there[rows], shares[agents[rows[0]].lidar])
-    there = probability_of(there)
-    return there, np.clip(there * probability_of(state), MIN_CONFIDENCE, MAX_CONFIDENCE)
+        probability_of([sum(w * a.evidence.get(n, 1.0) for n, w in table[a.lidar].items()) for a in agents])
+        for table in tables
+    )
+    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
 
 
 def terms_of(a: Rated, kind: str, confidence: float) -> dict[str, float]:
@@ -231,7 +230,7 @@ def say(text: str) -> None:
 
 def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
     """Print what is kept, and of this reliability and what is doubted: by a probability below one half, or by a doubt."""
-    kept = there >= [MIN_THERE[a.lidar] for a in agents]
+    kept = np.array([bool(a.evidence["confirmed"]) and p >= MIN_THERE[a.lidar] for a, p in zip(agents, there)])
     ticks, exists = np.array([a.ticks for a in agents]), np.array([a.there for a in agents])
     recall = (ticks * exists)[kept].sum() / max((ticks * exists).sum(), 1)
     invented = (ticks * (1 - exists))[kept].sum() / max(ticks[kept].sum(), 1)
@@ -261,9 +260,8 @@ def report(agents: Sequence[Rated]) -> None:
             rows = np.flatnonzero(group == fold)
             rest = [a for a, g in zip(agents, group) if g != fold]
             tables = fit_there_and_right(rest)
-            shares = shares_of(rest)
-            there[rows], p[rows] = probabilities([agents[k] for k in rows], tables, shares)
-            weights = fit_all_variances(rest, probabilities(rest, tables, shares)[1])
+            there[rows], p[rows] = probabilities([agents[k] for k in rows], tables)
+            weights = fit_all_variances(rest, probabilities(rest, tables)[1])
             for kind, found in weights.items():
                 for k in (k for k in rows if kind in agents[k].errors):
                     variance[k, kind] = sum(found[n] * v for n, v in terms_of(agents[k], kind, p[k]).items())
@@ -286,14 +284,13 @@ def report(agents: Sequence[Rated]) -> None:
 
 def module_text(command: str, agents: Sequence[Rated]) -> str:
     there, right = fit_there_and_right(agents)
-    shares = shares_of(agents)
-    variances = fit_all_variances(agents, probabilities(agents, (there, right), shares)[1])
+    variances = fit_all_variances(agents, probabilities(agents, (there, right))[1])
     logs = len({a.log for a in agents})
     lines = [
         '"""Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.',
         "",
         f"Printed by `{command}`: {len(agents)} candidates of {logs} simulated logs.",
-        "`THERE` tells whether something is where a candidate is, which holds for `SHARES` of those; `RIGHT` whether a candidate is right",
+        "`THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right",
         "where something is; `VARIANCES` weigh the terms of variances.",
         '"""',
         "",
@@ -307,9 +304,6 @@ def module_text(command: str, agents: Sequence[Rated]) -> str:
                 "    },",
             ]
         lines.append("}")
-    lines.append(
-        f"SHARES = {{{', '.join(f'{lidar}: {share:.3f}' for lidar, share in sorted(shares.items(), reverse=True))}}}"
-    )
     return "\n".join(lines).replace("'", '"')
 
 
