@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import scan, standing
+from worlds import Solid, scan, standing
 
-from log2sim.agents.static import BoxState, match_box, match_standing, track_with_lidar
+from log2sim.agents.static import BoxState, LidarMatch, left_free, match_box, match_standing, track_with_lidar
 from log2sim.datatypes import Obstacles, Rays
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.boxes import rotate
@@ -150,6 +150,9 @@ def test_a_bus_beside_the_sensor_is_found_by_its_flank_and_one_end(x, azimuth_de
     assert np.hypot(*(match.xy_m - [x, y])) < 0.3
 
 
+WALL = Solid((0.0, 3.0, 1.5), (80.0, 2.55, 3.0))
+
+
 @pytest.mark.parametrize(("azimuth_deg", "forward"), [(ALL_AROUND, True), (ALL_AROUND, False), (AHEAD, True)])
 def test_a_bus_is_followed_past_the_sensor_for_as_long_as_points_show_it(azimuth_deg, forward):
     x = 16.0 - 1.4 * np.arange(20)
@@ -161,3 +164,12 @@ def test_a_bus_is_followed_past_the_sensor_for_as_long_as_points_show_it(azimuth
     found = track_with_lidar(clouds, [*rest, *range(shown[-1] + 1, 20)] if forward else rest, t_ns, start)
     assert [m.tick for m in found] == rest
     assert max(np.hypot(*(m.xy_m - [x[m.tick], 3.0])) for m in found) < 0.6
+
+
+def test_what_moves_leaves_its_place_free_and_clutter_does_not():
+    x = 16.0 - 1.4 * np.arange(20)
+    matches = [LidarMatch(k, T0_NS + k * STEP_NS, np.array([p, 3.0]), np.eye(2), np.pi, 50) for k, p in enumerate(x)]
+    bus = [around([standing(p, 3.0, 180, BUS)]) for p in x]
+    assert left_free(bus, matches, np.array(BUS), 0.0)[[0, -1]].all()
+    row = [around([WALL])] * len(x)
+    assert not left_free(row, matches, np.array(BUS), 0.0).any()

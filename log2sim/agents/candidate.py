@@ -53,11 +53,14 @@ class AgentCandidate:
         Whose measurements, one at each of its ticks, the agent is made of.
     geometry : TrackGeometry
         Size of the track, and positions at its measurements.
+    followed : float
+        As many independent ticks as those at which points fit the predicted box at places without a detection, free at other times.
     """
 
     agent: Agent
     track: Track
     geometry: TrackGeometry
+    followed: float = 0.0
 
     def doubted(self, doubts: Sequence[Finding]) -> Self:
         """Return the candidate with more doubts of its agent."""

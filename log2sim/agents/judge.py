@@ -119,8 +119,8 @@ SAMPLES = 12
 
 
 def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
-    """Keep, of the candidates that overlap, the one with most detections that count by its confidence, and none that overlaps the ego."""
-    ordered = sorted(built, key=lambda b: -b.agent.confidence * float(b.track.measurements.score.sum()))
+    """Keep, of the candidates that overlap, the one with most ticks that are right by its confidence, and none that overlaps the ego."""
+    ordered = sorted(built, key=lambda b: -b.agent.confidence * len(b.track))
     agents = [*([] if ego is None else [ego]), *(c.agent for c in ordered)]
     ways = [a.waypoints for a in agents]
     # First and last time and place: agents that are not there at the same time and near enough are no duplicates.

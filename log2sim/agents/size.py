@@ -28,6 +28,20 @@ def independent(count: int) -> float:
     return count / (1 + (count - 1) * TICK_CORRELATION) if count else 0.0
 
 
+def independent_along(xy_m: Array, length_m: float) -> float:
+    """Return how many independent ticks are worth as much as those at which an object of a length was at places (n, 2).
+
+    What a detector mistakes for a road user stays where it is. Something that moves on is seen from other sides and before other
+    things, so that errors at two places are the less alike the more lengths they are from each other.
+    """
+    if not len(xy_m):
+        return 0.0
+    apart_m = np.hypot(*(xy_m[:, None] - xy_m[None]).transpose(2, 0, 1))
+    alike = TICK_CORRELATION * np.exp(-apart_m / length_m)
+    np.fill_diagonal(alike, 1.0)
+    return float(len(xy_m) ** 2 / alike.sum())
+
+
 def typical_box_size(m: BoxEvidence) -> Array | None:
     """Return the size (3,) of the boxes of a track, the median weighted by their points; None without boxes."""
     rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))

@@ -245,6 +245,26 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     )
 
 
+def left_free(
+    obstacles: Sequence[Obstacles | None], matches: Sequence[LidarMatch], size_m: Array, bottom_m: float
+) -> NDArray[np.bool_]:
+    """Mark the matches (n,), in rising time, whose place rays pass when the box is more than its length from there.
+
+    What a moving object was taken for does so; clutter along which a box drifts stays where it is.
+    """
+    places = np.array([match.xy_m for match in matches]).reshape(-1, 2)
+    marked = np.zeros(len(matches), dtype=bool)
+    for k, match in enumerate(matches):
+        away = np.flatnonzero(np.hypot(*(places - match.xy_m).T) > size_m[0])
+        # The last moment before it came, the first one after it went.
+        for other in (*away[away < k][-1:].tolist(), *away[away > k][:1].tolist()):
+            cloud = obstacles[matches[other].tick]
+            if cloud is not None and cloud.free is not None and not marked[k]:
+                box = BoxState(match.t_ns, match.xy_m, np.zeros(2), match.yaw_rad, size_m, bottom_m)
+                marked[k] = _passes(*_rays_to(box, cloud.origin, cloud.free), np.zeros(2), size_m)
+    return marked
+
+
 def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
     """Return where rays that pass near a box start and end (K, 3) along its axes, relative to the middle of its bottom then."""
     position, velocity = rays.position[:, :2].astype(np.float64), rays.velocity_mps[:, :2]
