@@ -62,7 +62,8 @@ SIGNS = {
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
-- sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, where positive and where negative, and in images; 0 without any.
+- sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
+  where negative; and of its detections in images. 0 without any.
 - no_sweep, no_image: 1 without any detection in a sweep, in an image, where others have some.
 - travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
@@ -105,10 +106,15 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
     return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
 
 
+# Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
+# of ten of clutter. A box of one size that is moved on by its velocity alone seldom does by chance.
+MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), 4.6
+
+
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
 LIMITS: dict[str, tuple[float, float]] = {
     "range": (np.log(0.1), np.log(5.0)), "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
-    "odd_height": (0.0, np.log(2.0)), "heading": (-4.6, 4.6), "sigma_speed": (np.log(0.07), np.log(17.0)),
+    "odd_height": (0.0, np.log(2.0)), "heading": (-MAX_LOG_ODDS, MAX_LOG_ODDS), "sigma_speed": (np.log(0.07), np.log(17.0)),
 }  # fmt: skip
 
 
@@ -119,6 +125,8 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
     sweep = sweep_log_odds(track) if in_sweep.any() else 0.0
+    if group == "vehicle" and in_sweep.any():
+        sweep = min(sweep + MATCH_NATS * candidate.followed, MAX_LOG_ODDS)
     travel = float(np.log1p(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m)) / agent.size_m[0])) if moving else 0.0
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
@@ -158,20 +166,13 @@ def _odd_size(agent: Agent) -> float:
 # Confidence by images that suffices. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes
 # and signs look like. Boxes in sweeps suffice where an object is twice as likely as none; what moves on is not what stays.
 MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS = 0.3, 0.6, float(np.log(2.0))
-# Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
-# of ten of clutter.
-MATCH_NATS = float(np.log(0.8 / 0.1))
 
 
 def _is_confirmed(candidate: AgentCandidate, sweep: float, travel: float) -> bool:
     """Return whether the detections of a candidate suffice, given its columns."""
     ordinary = candidate.geometry.is_likely and GROUP_OF[candidate.agent.category] != "pedestrian"
     least = MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE
-    if image_confidence(candidate.track) >= least or (sweep > 0 and sweep + travel >= MIN_SWEEP_LOG_ODDS):
-        return True
-    # A box of one size that is moved on by its velocity alone seldom fits the points of other places by chance.
-    followed = MATCH_NATS * candidate.followed if GROUP_OF[candidate.agent.category] == "vehicle" else 0.0
-    return sweep < 0 and sweep + followed >= MIN_SWEEP_LOG_ODDS
+    return image_confidence(candidate.track) >= least or (sweep > 0 and sweep + travel >= MIN_SWEEP_LOG_ODDS)
 
 
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
