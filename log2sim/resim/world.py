@@ -114,7 +114,7 @@ def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
 def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
     """Put the agents of a scenario into the background, each disc where it is when the sensor looks there."""
     parts, ids = [world.background], []
-    move = _given_T_refined(world, rays)
+    move = given_T_refined(world, rays.origin[len(rays.origin) // 2] + rays.shift_m, int(rays.t_ns[0]))
     rotation = move[:3, :3].astype(np.float32)
     offset = move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m
     center = [world.background.center_m @ rotation.T + offset.astype(np.float32)]
@@ -141,15 +141,14 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
     return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
 
 
-def _given_T_refined(world: World, rays: Rays) -> Array:
-    """Return the pose (4, 4) of the map of the background in that of the agents, as it was where the ego is now."""
+def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
+    """Return the pose (4, 4) of the map of the background in that of the agents, as it was where a sensor is now, (3,) m."""
     if world.given is None or world.refined is None:
         return np.eye(4)
-    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
     distance = np.linalg.norm(world.given.map_T_ego[:, :3, 3] - here, axis=1)
     # Of several times at which it was there, the one nearest to now.
     late = np.where(
-        distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - rays.t_ns[0]), np.iinfo(np.int64).max
+        distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - t_ns), np.iinfo(np.int64).max
     )
     k = int(late.argmin())
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
@@ -410,8 +409,8 @@ def _weighed(
     return replace(world, background=judged(world.background, 0), agents=agents)
 
 
-def body_of(agent: Agent) -> Surfels:
-    """Return a body of an agent's category and size in its frame, with the shapes of `synth`, its discs as far apart as they are wide."""
+def mesh_of(agent: Agent) -> shapes.Mesh:
+    """Return the body of an agent's category and size in its frame, with the shapes of `synth`."""
     size = (float(agent.size_m[0]), float(agent.size_m[1]), float(agent.size_m[2]))
     makers = {
         "car": lambda: shapes.car(size, "hatch"),
@@ -419,8 +418,12 @@ def body_of(agent: Agent) -> Surfels:
         "bus": lambda: shapes.bus(size),
         "pedestrian": lambda: shapes.pedestrian(size, 0, bool(agent.static)),
     }
-    mesh = makers.get(agent.category, lambda: shapes.cyclist(size, 0))()
-    mesh = mesh.fitted(size)
+    return makers.get(agent.category, lambda: shapes.cyclist(size, 0))().fitted(size)
+
+
+def body_of(agent: Agent) -> Surfels:
+    """Return discs on the body of an agent, as far apart as they are wide."""
+    mesh = mesh_of(agent)
     corner = mesh.vertices_m[mesh.faces]
     cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = np.linalg.norm(cross, axis=1) / 2
