@@ -101,10 +101,10 @@ class Recorded(NamedTuple):
 
 
 def nodes_of(camera: Camera) -> tuple[int, Array]:
-    """Return the step, px, and the pixels (h, w, 2) of the nodes of a camera; the last ones may lie beyond the border."""
+    """Return the step, px, and the pixels (h, w, 2) of the nodes of a camera, the last ones at the border."""
     step = max(2, round(camera.width_px / NODES))
-    size = [-(-(n - 1) // step) + 1 for n in (camera.height_px, camera.width_px)]
-    v, u = np.meshgrid(*(np.arange(n, dtype=np.float64) * step for n in size), indexing="ij")
+    sides = [np.append(np.arange(0.0, n - 1, step), n - 1.0) for n in (camera.height_px, camera.width_px)]
+    v, u = np.meshgrid(*sides, indexing="ij")
     return step, np.stack([u, v], -1)
 
 
@@ -139,6 +139,9 @@ def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfel
         ego = middle @ inverse(camera.mount_T_cam)
         up, above_m = ego[:3, 2], float((middle[:3, 3] - ego[:3, 3]) @ ego[:3, 2]) - log.ground_z_ego_m
     depth = _without_gaps(depth, owner, (towards @ up).reshape(shape), above_m)
+    # Discs are rough: surfaces are smooth, but what is thin stays.
+    smooth = cv2.medianBlur(depth.astype(np.float32), 5).astype(np.float64)
+    depth = np.where(np.abs(smooth - depth) < SAME_DEPTH * depth + SAME_DEPTH_M, smooth, depth)
     owner, depth, met = _with_rims(owner, depth, met.reshape(shape))
     points = poses[moment, :3, 3] + towards * depth.reshape(-1, 1)
     local = apply(inverse(given_T_refined(world, middle[:3, 3], t_ns)), points)
