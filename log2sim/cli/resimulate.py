@@ -18,7 +18,9 @@ def resimulate(
     replay: Annotated[
         Path | None, option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE")
     ] = None,
-    sensors: Annotated[str | None, option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")] = None,
+    sensors: Annotated[
+        str | None, option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
+    ] = None,
     cameras: Annotated[bool, option("All cameras, too.", None, "--cameras")] = False,
     sequence: Annotated[str | None, option("Sequence of a log with several.", "NAME")] = None,
     seed: Annotated[int, option("Seed of noise and lost returns.", min=0)] = 0,

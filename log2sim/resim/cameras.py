@@ -25,6 +25,7 @@ from log2sim.geometry import (
     Array,
     Camera,
     apply,
+    cross_slab,
     inverse,
     line_time_s,
     nearest_index,
@@ -50,6 +51,8 @@ FAR_M = 300.0  # of what no ray meets
 MAX_GROUND_M = 60.0  # ahead, where level ground goes on that no LiDAR saw
 # Around an agent, whose outline is not exact, its pixels bring a rim with them, and its shadow on the ground.
 RIM_NODES, SHADOW_M = 2, 0.4
+# Farther around its box and on the ground around it a picture may show the agent where it should not; there are others.
+BESIDE_M, BESIDE_GROUND_M = 0.25, 1.2
 SAME_DEPTH, SAME_DEPTH_M = 0.06, 0.25
 # Recorded pictures that are tried: places in the order of distance, which grow so that some of another time are among them.
 TRIED = (0, 1, 2, 3, 5, 8, 12, 18, 27, 40, 60)
@@ -76,6 +79,8 @@ class Seen:
         Whether a surface is there; elsewhere the depth is guessed.
     point : (h, w, 3) float64, m
         In the frame of the agent, or the map of the background.
+    beside : (h, w) int64
+        0, or k + 1 before the box of agent k or the ground around it, where its outline and shadow may be.
     """
 
     step: int
@@ -83,6 +88,7 @@ class Seen:
     depth_m: Array
     met: NDArray[np.bool_]
     point: Array
+    beside: NDArray[np.int64]
     ids: tuple[str, ...]
 
     @cached_property
@@ -143,16 +149,27 @@ def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfel
     smooth = cv2.medianBlur(depth.astype(np.float32), 5).astype(np.float64)
     depth = np.where(np.abs(smooth - depth) < SAME_DEPTH * depth + SAME_DEPTH_M, smooth, depth)
     owner, depth, met = _with_rims(owner, depth, met.reshape(shape))
+    # Outlines of the background are no more exact: what is beside something nearer goes with it.
+    near = np.asarray(cv2.erode(np.where(owner == 0, depth, FAR_M), np.ones((3, 3), np.uint8)))
+    depth = np.where((owner == 0) & (near * (1 + 2 * SAME_DEPTH) + SAME_DEPTH_M < depth), near, depth)
     points = poses[moment, :3, 3] + towards * depth.reshape(-1, 1)
     local = apply(inverse(given_T_refined(world, middle[:3, 3], t_ns)), points)
-    flat = owner.reshape(-1)
+    flat, beside = owner.reshape(-1), np.zeros(len(points), np.int64)
     for k, id in enumerate(placed.ids):
-        own = apply(inverse(pose_of(scenario, id, t_ns)), points)
-        half = np.array(scenario[id].size_m) / 2
+        agent_T_map = inverse(pose_of(scenario, id, t_ns))
+        own, half = apply(agent_T_map, points), np.array(scenario[id].size_m) / 2
+        for low, high in (
+            (-half - BESIDE_M, half + BESIDE_M),
+            (-half - [BESIDE_GROUND_M, BESIDE_GROUND_M, 0.3], [*(half[:2] + BESIDE_GROUND_M), 0.3 - half[2]]),
+        ):
+            start = agent_T_map[:3, :3] @ middle[:3, 3] + agent_T_map[:3, 3]
+            slabs = cross_slab(start, own - start, low, np.asarray(high))
+            enter, leave = np.fmax.reduce(slabs[0], axis=1), np.fmin.reduce(slabs[1], axis=1)
+            beside[(enter < 1) & (leave > enter) & (leave > 0)] = k + 1
         ground = (np.abs(own[:, :2]) < half[:2] + SHADOW_M).all(axis=1) & (np.abs(own[:, 2] + half[2]) < 0.3)
         flat[(flat == 0) & ground] = k + 1
         local[flat == k + 1] = own[flat == k + 1]
-    return Seen(step, owner, depth, met, local.reshape(*shape, 3), placed.ids)
+    return Seen(step, owner, depth, met, local.reshape(*shape, 3), beside.reshape(shape), placed.ids)
 
 
 def pose_of(scenario: Scenario, id: str, t_ns: int) -> Array:
@@ -249,10 +266,16 @@ class Pictures:
             then = inverse(transform(rotation_from_rpy(0.0, 0.0, yaw), np.column_stack([x, y, z])))
             offset = np.column_stack([x, y, z]) - place
             distance = np.linalg.norm(offset, axis=1)
-            wide = [np.hypot(c.width_px, c.height_px) / 2 / c.K[0, 0] for c in map(self.log.cameras.get, self.camera) if c]
+            wide = [
+                np.hypot(c.width_px, c.height_px) / 2 / c.K[0, 0] for c in map(self.log.cameras.get, self.camera) if c
+            ]
             off = np.arccos(np.clip(np.einsum("ni,ni->n", axis, offset) / np.maximum(distance, 0.1), -1, 1))
-            usable = alive(agent, t_s) & (off < np.arctan(wide) + np.arctan2(np.linalg.norm(agent.size_m) / 2, distance))
-            place, axis = (np.einsum("nij,nj->ni", then[:, :3, :3], v) + s * then[:, :3, 3] for v, s in ((place, 1), (axis, 0)))
+            usable = alive(agent, t_s) & (
+                off < np.arctan(wide) + np.arctan2(np.linalg.norm(agent.size_m) / 2, distance)
+            )
+            place, axis = (
+                np.einsum("nij,nj->ni", then[:, :3, :3], v) + s * then[:, :3, 3] for v, s in ((place, 1), (axis, 0))
+            )
             now = inverse(map_T_agent)
             here, ahead = now[:3, :3] @ here + now[:3, 3], now[:3, :3] @ ahead
         away = np.linalg.norm(place - here, axis=1) + OTHER_CAMERA_M * (self.camera != name)
@@ -262,8 +285,10 @@ class Pictures:
             if rank < len(order):
                 yield int(order[rank])
 
-    def find(self, frame: int, id: str, point: Array, met: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-        """Find points (N, 3) of the background ("") or an agent in a recorded picture.
+    def find(
+        self, frame: int, id: str, point: Array, met: NDArray[np.bool_], beside: NDArray[np.str_]
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Find points (N, 3) of the background ("") or an agent in a recorded picture; `beside` (N,): of which agents they are.
 
         Returns
         -------
@@ -281,6 +306,9 @@ class Pictures:
             shown = ((uv > -0.01) & (uv < [camera.width_px - 0.99, camera.height_px - 0.99])).all(axis=1)
         column, row = np.rint(np.where(shown[:, None], uv, 0) / seen.step).astype(np.int64).T
         shown &= seen.owner[row, column] == (seen.ids.index(id) + 1 if id else 0)
+        if not id:
+            other = np.array(["", *seen.ids])[seen.beside[row, column]]
+            shown &= (other == "") | (other == beside)
         near, far = seen.bounds
         same = (depth > near[row, column] * (1 - SAME_DEPTH) - SAME_DEPTH_M) & (
             depth < far[row, column] * (1 + SAME_DEPTH) + SAME_DEPTH_M
@@ -291,11 +319,13 @@ class Pictures:
     def _gain(self, frame: int, reference: int) -> Array:
         """Return by how much brighter each channel (3,) of a reference is than that of another picture of the same background."""
         seen, images = self.seen(reference), (self.image(frame), self.image(reference))
-        rows = np.flatnonzero(((seen.owner == 0) & seen.met).ravel())
+        rows = np.flatnonzero(((seen.owner == 0) & seen.met & (seen.beside == 0)).ravel())
         if frame == reference or not len(rows) or images[0] is None or images[1] is None:
             return np.ones(3)
         rows = rows[:: max(1, len(rows) // (4 * COMPARED))]
-        uv, shown = self.find(frame, "", seen.point.reshape(-1, 3)[rows], np.ones(len(rows), dtype=bool))
+        uv, shown = self.find(
+            frame, "", seen.point.reshape(-1, 3)[rows], np.ones(len(rows), dtype=bool), np.full(len(rows), "")
+        )
         own = nodes_of(self.log.cameras[self.frames[reference].camera])[1].reshape(-1, 2)[rows]
         colors = []
         for image, at in ((images[0], uv[shown]), (images[1], own[shown])):
@@ -328,6 +358,7 @@ class Pictures:
         seen = look(self.world, log, scenario, there, name, t_ns)
         shape = seen.owner.shape
         owner, point, met = seen.owner.ravel(), seen.point.reshape(-1, 3), seen.met.ravel()
+        beside = np.array(["", *seen.ids])[seen.beside.ravel()]
         nodes = nodes_of(camera)[1].reshape(-1, 2)
         source, flow = np.full(len(owner), -1), np.zeros((len(owner), 2), np.float32)
         for k in np.unique(owner):
@@ -340,7 +371,7 @@ class Pictures:
                     rows = own[source[own] < 0]
                     if len(rows) <= MIN_LEFT * len(own):
                         break
-                    uv, shown = self.find(frame, id, point[rows] * mirror, met[rows])
+                    uv, shown = self.find(frame, id, point[rows] * mirror, met[rows], beside[rows])
                     rows = rows[shown]
                     source[rows], flow[rows] = frame, uv[shown] - nodes[rows]
             if id and (source[own] < 0).mean() > DRAWN_SHARE:
@@ -348,7 +379,9 @@ class Pictures:
         same = (self.camera == name).nonzero()[0]
         reference = int(same[nearest_index(self.t_ns[same], [t_ns])[0]]) if len(same) else -1
         image, unknown = self._composed(camera, seen, source.reshape(shape), flow.reshape(*shape, 2), reference)
-        bodies = [a for a in scenario.others if a.id in drawn and alive(a, np.array([(t_ns - scenario.t0_ns) / NS_PER_S]))[0]]
+        bodies = [
+            a for a in scenario.others if a.id in drawn and alive(a, np.array([(t_ns - scenario.t0_ns) / NS_PER_S]))[0]
+        ]
         if bodies:
             image, covered = _draw(image, camera, map_T_cam, seen, [(a, pose_of(scenario, a.id, t_ns)) for a in bodies])
             unknown |= covered
@@ -382,7 +415,11 @@ class Pictures:
             smooth = cv2.remap(flow, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             moved = np.where(even[cell[0][r]][:, cell[1][c], None], smooth, flow[near[0][r]][:, near[1][c]])
             taken = cv2.remap(
-                recorded, moved[..., 0] + u[c], moved[..., 1] + v[r, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                recorded,
+                moved[..., 0] + u[c],
+                moved[..., 1] + v[r, None],
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
             )
             gain = self.gain(int(frame), reference) if reference >= 0 else np.ones(3)
             if (gain != 1).any():
@@ -419,7 +456,9 @@ def _draw(
     view, light = RenderCamera.of(camera, map_T_cam), OVERCAST
     instant = SceneInstant(cast(Backdrop, None), bodies, light)
     size = (camera.width_px, camera.height_px)
-    wide = cv2.resize(seen.depth_m.astype(np.float32), None, fx=seen.step, fy=seen.step, interpolation=cv2.INTER_NEAREST)
+    wide = cv2.resize(
+        seen.depth_m.astype(np.float32), None, fx=seen.step, fy=seen.step, interpolation=cv2.INTER_NEAREST
+    )
     depth = wide[: size[1], : size[0]]
     shade = np.ones((*depth.shape, 3), np.float32)
     draw_shadows(view, bodies, instant, shade, np.ones(depth.shape, dtype=bool))

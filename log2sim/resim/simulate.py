@@ -32,7 +32,9 @@ SAME_PATH_M, SAME_YAW_RAD = 0.02, np.deg2rad(0.2)
 MAX_OFF_PATH_M = 6.0
 # At 3 m beside it pictures of `samples/crossing.toml` have lost 8 dB of the 31 dB that they have on it, and 8 % of them is made up.
 MAX_PICTURES_OFF_M = 3.0
-MASKS = "masks"  # folder of a log: by camera a mask for each picture, white where no recorded picture shows what is there
+MASKS = (
+    "masks"  # folder of a log: by camera a mask for each picture, white where no recorded picture shows what is there
+)
 
 
 @dataclass(eq=False)
@@ -318,6 +320,8 @@ def resimulate(
     from log2sim.logs.native.writer import refuse_target, write_log
 
     refuse_target(Path(out), overwrite=overwrite)
+    if cameras or any(name in log.cameras for name in sensors):
+        refuse_far(off_path_m(log, ego_poses(log, scenario)))
     simulation = simulate(log, source, scenario, sensors=sensors, cameras=cameras, seed=seed, progress=progress)
     off_m, when_s = off_path_m(log, simulation.driven.ego)
     notes = list(simulation.world.notes)
@@ -358,8 +362,6 @@ def simulate(
     filmed = [name for name in log.cameras if cameras or name in sensors]
     if log.ego is None and any((log.cameras.get(n) or log.lidars[n]).mount == "ego" for n in [*lidars, *filmed]):
         raise LogError(f"log '{log.name}': has no poses of the ego; reconstruct with poses from its LiDAR first")
-    driven = ego_poses(log, scenario)  # an error, where the ego is not there, comes before the long work
-    if filmed:
-        refuse_far(off_path_m(log, driven))
+    ego_poses(log, scenario)  # an error, where the ego is not there, comes before the long work
     world = build_world(log, source, lidars or list(log.lidars), progress=progress)
     return Simulation(log, world, scenario, seed, Pictures(log, world, source) if filmed else None, (*lidars, *filmed))

@@ -147,9 +147,7 @@ def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
         return np.eye(4)
     distance = np.linalg.norm(world.given.map_T_ego[:, :3, 3] - here, axis=1)
     # Of several times at which it was there, the one nearest to now.
-    late = np.where(
-        distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - t_ns), np.iinfo(np.int64).max
-    )
+    late = np.where(distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - t_ns), np.iinfo(np.int64).max)
     k = int(late.argmin())
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
 
