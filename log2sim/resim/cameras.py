@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -99,10 +99,10 @@ class Seen:
 
 
 class Recorded(NamedTuple):
-    """A recorded picture: record `index` of a camera."""
+    """A recorded picture."""
 
     camera: str
-    index: int
+    record: int
     t_ns: int
 
 
@@ -120,7 +120,7 @@ def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfel
     step, uv = nodes_of(camera)
     shape, uv = uv.shape[:2], uv.reshape(-1, 2)
     xy = undistort(camera, uv)
-    usable = np.isfinite(xy).all(axis=1)
+    usable = np.asarray(np.isfinite(xy).all(axis=1))
     ray = np.column_stack([np.where(usable[:, None], xy, 0), np.ones(len(xy))])
     length = np.linalg.norm(ray, axis=1)
     # Where the camera is when the line of each node is read.
@@ -303,7 +303,8 @@ class Pictures:
         own = given_T_refined(self.world, map_T_cam[:3, 3], t_ns) if not id else pose_of(self.source, id, t_ns)
         uv, depth = View(camera, map_T_cam, t_ns, self.log).project(apply(own, point))
         with np.errstate(invalid="ignore"):
-            shown = ((uv > -0.01) & (uv < [camera.width_px - 0.99, camera.height_px - 0.99])).all(axis=1)
+            inside = (uv > -0.01) & (uv < [camera.width_px - 0.99, camera.height_px - 0.99])
+        shown = np.asarray(inside.all(axis=1))
         column, row = np.rint(np.where(shown[:, None], uv, 0) / seen.step).astype(np.int64).T
         shown &= seen.owner[row, column] == (seen.ids.index(id) + 1 if id else 0)
         if not id:
@@ -334,7 +335,7 @@ class Pictures:
         fair = ((np.minimum(*colors) > 10) & (np.maximum(*colors) < 245)).all(axis=1)
         if fair.sum() < 50:
             return np.ones(3)
-        return np.clip(np.median(colors[1][fair] / colors[0][fair], axis=0), 1 / MAX_GAIN, MAX_GAIN)
+        return np.asarray(np.clip(np.median(colors[1][fair] / colors[0][fair], axis=0), 1 / MAX_GAIN, MAX_GAIN))
 
     def make(
         self,
@@ -396,9 +397,9 @@ class Pictures:
         cell = [np.minimum((a / seen.step).astype(np.intp), n - 2) for a, n in zip((v, u), source.shape)]
         even = np.ones((source.shape[0] - 1, source.shape[1] - 1), dtype=bool)
         corners = [(slice(a, a - 1 or None), slice(b, b - 1 or None)) for a in (0, 1) for b in (0, 1)]
-        for c in corners[1:]:
-            even &= (source[c] == source[corners[0]]) & (seen.owner[c] == seen.owner[corners[0]])
-        depths = np.stack([seen.depth_m[c] for c in corners])
+        for k in corners[1:]:
+            even &= (source[k] == source[corners[0]]) & (seen.owner[k] == seen.owner[corners[0]])
+        depths = np.stack([seen.depth_m[k] for k in corners])
         even &= depths.max(axis=0) < depths.min(axis=0) * (1 + 2 * SAME_DEPTH) + 2 * SAME_DEPTH_M
         image = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
         unknown = np.ones(image.shape[:2], dtype=bool)
@@ -414,7 +415,7 @@ class Pictures:
             at = np.meshgrid(u[c] / seen.step, v[r] / seen.step)
             smooth = cv2.remap(flow, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             moved = np.where(even[cell[0][r]][:, cell[1][c], None], smooth, flow[near[0][r]][:, near[1][c]])
-            taken = cv2.remap(
+            taken: NDArray[Any] = cv2.remap(
                 recorded,
                 moved[..., 0] + u[c],
                 moved[..., 1] + v[r, None],
@@ -438,9 +439,9 @@ def _filled(image: Image, unknown: NDArray[np.bool_], step: int) -> Image:
     size = (max(1, image.shape[1] // step), max(1, image.shape[0] // step))
     known = cv2.resize((~unknown).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     small = cv2.resize(image * ~unknown[..., None], size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    small = np.clip(small / np.maximum(known, 1e-3)[..., None], 0, 255).astype(np.uint8)
-    small = cv2.inpaint(small, (known < 0.5).astype(np.uint8), 3, cv2.INPAINT_TELEA)
-    wide = cv2.resize(small, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+    mean = np.clip(small / np.maximum(known, 1e-3)[..., None], 0, 255).astype(np.uint8)
+    filled = cv2.inpaint(mean, (known < 0.5).astype(np.uint8), 3, cv2.INPAINT_TELEA)
+    wide = cv2.resize(filled, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(np.where(unknown[..., None], wide, image), np.uint8)
 
 
@@ -459,7 +460,7 @@ def _draw(
     wide = cv2.resize(
         seen.depth_m.astype(np.float32), None, fx=seen.step, fy=seen.step, interpolation=cv2.INTER_NEAREST
     )
-    depth = wide[: size[1], : size[0]]
+    depth = np.asarray(wide[: size[1], : size[0]], np.float32)
     shade = np.ones((*depth.shape, 3), np.float32)
     draw_shadows(view, bodies, instant, shade, np.ones(depth.shape, dtype=bool))
     black, white = np.zeros_like(shade), np.ones_like(shade)
