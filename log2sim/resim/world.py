@@ -46,7 +46,7 @@ MIN_SHARE = 0.2
 SAME_PLACE_M = 0.5
 # Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
 AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
-PRIOR_RAYS = 2.0
+PRIOR_RAYS, PRIOR_UNSEEN = 2.0, 0.15  # that end on a disc before any is counted; share of them for one that nobody saw
 BODY_DISC_M = 0.08  # radius of the discs of a body that nobody saw
 
 Progress = Callable[[str, int, int], None]
@@ -355,7 +355,7 @@ def completed(agent: Agent, seen: Surfels) -> Surfels:
         if len(whole):
             far = np.isinf(cKDTree(whole.center_m).query(more.center_m, distance_upper_bound=COVERED_M)[0])
             more = more.take(far)
-        whole = joined([whole, more])
+        whole = joined([whole, replace(more, share=np.full(len(more), PRIOR_UNSEEN, np.float32))])
     return whole
 
 
@@ -396,7 +396,8 @@ def _weighed(
             np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing])
             first = nothing & (met.range_m == nearest[met.ray])
             np.add.at(lost, column[met.surfel[first]], met.weight[first])
-    share = ((hit + PRIOR_RAYS) / (hit + passed + PRIOR_RAYS)).astype(np.float32)
+    prior = PRIOR_RAYS * np.concatenate([world.background.share, *(world.agents[id].share for id in ids)])
+    share = ((hit + prior) / (hit + passed + prior)).astype(np.float32)
     returned = ((hit + PRIOR_RAYS) / (hit + lost + PRIOR_RAYS)).astype(np.float32)
 
     def judged(surfels: Surfels, at: int) -> Surfels:
