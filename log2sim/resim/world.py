@@ -226,9 +226,10 @@ def build_world(
     world = World(shift, log.ego if refined is not None else None, refined, standing, agents, models, notes)
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
-    trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
-    world = replace(world, background=_trimmed(world.background), agents=trimmed)
-    world = _weighed(log, scenario, world, leave_out, progress)
+    for _ in range(2):
+        trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
+        world = replace(world, background=_trimmed(world.background), agents=trimmed)
+        world = _weighed(log, scenario, world, leave_out, progress)
     there = {id: surfels.take(surfels.share > MIN_SHARE) for id, surfels in world.agents.items()}
     return replace(world, background=world.background.take(world.background.share > MIN_SHARE), agents=there)
 
