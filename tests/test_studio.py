@@ -353,6 +353,16 @@ def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, 
             )
         )
         browser.wait(f"log2sim.chosen === '{name}'")
+        # Its shape is that of the camera's pictures on a phone, too, so that the calibration holds.
+        browser.open(served.address, size=(420, 800))
+        browser.run("log2sim.choose(arguments[0])", name)
+        click(browser, "move")
+        browser.run(
+            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
+        )
+        shape = "const c = document.querySelector('[aria-label=\"Picture of front\"]'); return c.clientWidth / c.clientHeight"
+        camera = log.cameras["front"]
+        assert browser.run(shape) == pytest.approx(camera.width_px / camera.height_px, rel=0.01)
         assert [line for line in browser.log("browser") if line["level"] == "SEVERE"] == []
     finally:
         served.close()
