@@ -284,7 +284,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the steps that are asked for."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] and arguments[0] in PAPERS:
-        importlib.import_module(f"{arguments[0]}.train").main(arguments[1:])
+        importlib.import_module(f"lidar_training.{arguments[0]}").main(arguments[1:])
         return
     parser = parser_of(__doc__)
     parser.add_argument("mount", choices=("vehicle", "roadside"))
