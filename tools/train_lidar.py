@@ -66,23 +66,12 @@ CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
 
 @dataclass(frozen=True)
 class Round:
-    """A part of the training: it starts with the averaged weights of the one before and draws from all scenes so far.
+    """A part of the training: it starts with the averaged weights of the one before and draws from all scenes so far."""
 
-    Attributes
-    ----------
-    seed : int
-        Of its scenes and of its order.
-    scenes : int
-        Generated for it.
-    steps : int
-    rate : float
-        Greatest learning rate; it falls to zero as a cosine.
-    """
-
-    seed: int
-    scenes: int
+    seed: int  # of its scenes and of its order
+    scenes: int  # generated for it
     steps: int
-    rate: float = 2.5e-3
+    rate: float = 2.5e-3  # greatest learning rate; it falls to zero as a cosine
 
 
 # The second round of the vehicle has scenes with a second LiDAR and more clutter, which pictures of misses asked for.

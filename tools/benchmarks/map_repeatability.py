@@ -41,24 +41,12 @@ CORRELATED_CELLS = 9.0
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Offsets of patches between two maps, along the directions that their texture tells.
+    """Offsets of patches between two maps, along the directions that their texture tells."""
 
-    Attributes
-    ----------
-    xy : (N, 2) float64, m
-        Middle of the patches.
-    offset_m : (N,) float64
-        Length of what is told of the offset of the second map.
-    vector_m : (N, 2) float64
-        The offset itself, 0 along directions that the texture does not tell.
-    unlike : int
-        Patches of texture that do not look alike in both maps.
-    """
-
-    xy: Array
-    offset_m: Array
-    vector_m: Array
-    unlike: int
+    xy: Array  # (N, 2), m: middle of the patches
+    offset_m: Array  # (N,): length of what is told of the offset of the second map
+    vector_m: Array  # (N, 2): the offset itself, 0 along directions that the texture does not tell
+    unlike: int  # patches of texture that do not look alike in both maps
 
 
 def on_common_cells(a: GroundMap, b: GroundMap) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:

@@ -29,18 +29,10 @@ ROUNDED_S = 0.06  # a tick is there until its neighbors are
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one way of perceiving made of a log.
+    """What one way of perceiving made of a log."""
 
-    Attributes
-    ----------
-    scenario : Scenario or None
-        None where nothing was found.
-    begin_s : float
-        When it begins, after the begin of the log's scene: at the middle of its first sweep.
-    """
-
-    scenario: Scenario | None
-    begin_s: float = 0.0
+    scenario: Scenario | None  # none where nothing was found
+    begin_s: float = 0.0  # when it begins, after the begin of the log's scene: at the middle of its first sweep
 
     def at(self, agent: Agent, t_s: Array) -> tuple[Array, NDArray[np.bool_]]:
         """x, y, yaw (T, 3) of an agent at times of the scene, and at which of them it was there; between waypoints straight."""

@@ -32,35 +32,16 @@ Parts = tuple[Polytope, ...]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One variant of a test.
+    """One variant of a test."""
 
-    Attributes
-    ----------
-    test : str
-        range, blind_area or overlap.
-    seed : int
-        From which everything is drawn.
-    scene : Scene
-    parts : mapping of str to tuple of Polytope
-        Shape of every agent, and of the "ego".
-    target : str
-        The agent that the test is about.
-    contact_s : float
-        When the front of the ego reaches the target, if nobody brakes; NaN where it does not.
-    things : tuple of Solid
-        Trees, posts, bins and other things beside the road, which are no road users.
-    every : int
-        One in so many sweeps is recorded; the LiDARs turn as fast as they do.
-    """
-
-    test: str
-    seed: int
+    test: str  # range, blind_area or overlap
+    seed: int  # from which everything is drawn
     scene: Scene
-    parts: dict[str, Parts]
-    target: str
-    contact_s: float = float("nan")
-    things: tuple[Solid, ...] = ()
-    every: int = 1
+    parts: dict[str, Parts]  # shape of every agent, and of the "ego"
+    target: str  # the agent that the test is about
+    contact_s: float = np.nan  # when the front of the ego reaches the target, if nobody brakes; NaN where it does not
+    things: tuple[Solid, ...] = ()  # trees, posts, bins and other things beside the road, which are no road users
+    every: int = 1  # one in so many sweeps is recorded; the LiDARs turn as fast as they do
 
     @property
     def period_s(self) -> float:
@@ -178,14 +159,7 @@ MAX_TRIES = 400
 
 @dataclass(eq=False)
 class Builder:
-    """What has been put into a world, in a frame with right-hand traffic.
-
-    Attributes
-    ----------
-    test : str
-    seed : int
-    rng : Generator
-    """
+    """What has been put into a world, in a frame with right-hand traffic."""
 
     test: str
     seed: int
@@ -325,21 +299,11 @@ SINKS_M = 0.1
 
 @dataclass(frozen=True)
 class RoadError:
-    """What is wrong with the road's end.
+    """What is wrong with the road's end."""
 
-    Attributes
-    ----------
-    offset_m : (float, float, float)
-        Of its position in the map.
-    turn_deg : (float, float, float)
-        Roll, pitch and yaw, of its axes in the map.
-    delay_s : float
-        Its stamps are later than its records.
-    """
-
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    delay_s: float = 0.0
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its position in the map
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # roll, pitch and yaw, of its axes in the map
+    delay_s: float = 0.0  # its stamps are later than its records
 
     @property
     def horizontal_m(self) -> float:

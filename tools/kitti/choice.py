@@ -341,24 +341,14 @@ MOVED_ON_FOOT_M, WALKING_MPS, WALKS, RIDES = 1.0, (0.5, 2.0), -2.0, 4.0
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Detections of a sequence, in places with a pedestrian and a rider only one of them first.
+    """Detections of a sequence, in places with a pedestrian and a rider only one of them first."""
 
-    Attributes
-    ----------
-    boxes : Boxes
-        N detections for the tracker, sorted by frame, then the others of their pairs, sorted by frame as well.
-    count : int
-        N.
-    other : (N,) int64
-        Row of the other one of the pair, -1 for none.
-    rider : (N,) float64
-        How much rather it is a rider than a pedestrian, in units of a score.
-    """
-
-    boxes: Boxes
-    count: int
-    other: Index
-    rider: Array
+    boxes: (
+        Boxes  # N detections for the tracker, sorted by frame, then the others of their pairs, sorted by frame as well
+    )
+    count: int  # N
+    other: Index  # (N,): row of the other one of the pair, -1 for none
+    rider: Array  # (N,): how much rather it is a rider than a pedestrian, in units of a score
 
     @property
     def tracked(self) -> Boxes:

@@ -46,31 +46,17 @@ MIN_GROUND_POINTS = 10
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A picture and a cloud; x of the cloud points where the camera looks, its origin is that of the log's cloud.
+    """A picture and a cloud; x of the cloud points where the camera looks, its origin is that of the log's cloud."""
 
-    Attributes
-    ----------
-    image : (H, W, 3) uint8
-    cloud : Cloud
-    pixel_T_cloud : (3, 4) float64
-        Projection of positions in the cloud's frame to homogeneous pixels.
-    ground : (3,) float64
-        a, b, c of the plane z = a x + b y + c of the ground.
-    boxes : (M, 7) float64
-        x, y, height of the center above the ground, length, width, height, heading.
-    truth : SceneBoxes
-        The same, with z in the cloud's frame.
-    views : tuple of LogView
-        The cameras in whose images road users were labeled, for positions in the cloud's frame.
-    """
-
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # (H, W, 3)
     cloud: Cloud
-    pixel_T_cloud: Array
-    ground: Array
-    boxes: Array
-    truth: SceneBoxes
-    views: tuple[LogView, ...]
+    pixel_T_cloud: Array  # (3, 4): projection of positions in the cloud's frame to homogeneous pixels
+    ground: Array  # (3,): a, b, c of the plane z = a x + b y + c of the ground
+    boxes: Array  # (M, 7): x, y, height of the center above the ground, length, width, height, heading
+    truth: SceneBoxes  # the same, with z in the cloud's frame
+    views: tuple[
+        LogView, ...
+    ]  # the cameras in whose images road users were labeled, for positions in the cloud's frame
 
     def labeled(self, xyz: Array) -> NDArray[np.bool_]:
         """Mark positions (N, 3) in the cloud's frame where road users have labels."""

@@ -194,21 +194,11 @@ def _error(context: BenchContext, stage: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """The result of a benchmark.
+    """The result of a benchmark."""
 
-    Attributes
-    ----------
-    context : BenchContext
-        What all runs had in common.
-    panels : tuple of Panel
-        One for each stage.
-    notes : tuple of str
-        What could not be measured, and why.
-    """
-
-    context: BenchContext
-    panels: tuple[Panel, ...]
-    notes: tuple[str, ...]
+    context: BenchContext  # what all runs had in common
+    panels: tuple[Panel, ...]  # one for each stage
+    notes: tuple[str, ...]  # what could not be measured, and why
 
     def __repr__(self) -> str:
         """Return the log and the stages in one line."""
