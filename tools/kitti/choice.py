@@ -343,9 +343,7 @@ MOVED_ON_FOOT_M, WALKING_MPS, WALKS, RIDES = 1.0, (0.5, 2.0), -2.0, 4.0
 class Pairs:
     """Detections of a sequence, in places with a pedestrian and a rider only one of them first."""
 
-    boxes: (
-        Boxes  # N detections for the tracker, sorted by frame, then the others of their pairs, sorted by frame as well
-    )
+    boxes: Boxes  # N detections for the tracker, by frame, then the others of their pairs, by frame as well
     count: int  # N
     other: Index  # (N,): row of the other one of the pair, -1 for none
     rider: Array  # (N,): how much rather it is a rider than a pedestrian, in units of a score

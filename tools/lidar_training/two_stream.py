@@ -54,9 +54,7 @@ class Pair:
     ground: Array  # (3,): a, b, c of the plane z = a x + b y + c of the ground
     boxes: Array  # (M, 7): x, y, height of the center above the ground, length, width, height, heading
     truth: SceneBoxes  # the same, with z in the cloud's frame
-    views: tuple[
-        LogView, ...
-    ]  # the cameras in whose images road users were labeled, for positions in the cloud's frame
+    views: tuple[LogView, ...]  # the cameras in whose images road users were labeled, for the cloud's frame
 
     def labeled(self, xyz: Array) -> NDArray[np.bool_]:
         """Mark positions (N, 3) in the cloud's frame where road users have labels."""
