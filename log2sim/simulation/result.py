@@ -277,12 +277,12 @@ class Replay:
         check(document, "replay-1", ScenarioError)
         plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
         agents = tuple(_agent_from_dict(a) for a in document["agents"])
-        known = {**{k: document[k] for k in plain}, "metrics": _with_owners(document["metrics"])}
+        known = {**{k: document[k] for k in plain}, "metrics": _add_owners(document["metrics"])}
         warned = Warnings.from_dict(document["warnings"]) if "warnings" in document else None
         return cls(agents=agents, left_out=document.get("left_out", {}), warnings=warned, **known)
 
 
-def _with_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
+def _add_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """State whose each collision is where an older file only says whether the scenario has it, as `in_log`."""
 
     def owned(events: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

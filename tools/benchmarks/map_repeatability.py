@@ -180,7 +180,7 @@ def parts_of(log: Log) -> Iterator[tuple[str, Log, Log]]:
         yield "cameras ahead and others", log.changed(cameras=ahead), log.changed(cameras=rest)
 
 
-def say_quantiles(values_m: Array) -> str:
+def quantile_text(values_m: Array) -> str:
     """Median, 95th percentile and share within 5 cm."""
     if not len(values_m):
         return "nothing in common"
@@ -209,14 +209,14 @@ def main(arguments: list[str] | None = None) -> None:
         except LogError as error:
             print(f"{title}: {error}")
             continue
-        print(f"{title}\n  height     {say_quantiles(np.abs(height_differences(a, b)))} cells")
+        print(f"{title}\n  height     {quantile_text(np.abs(height_differences(a, b)))} cells")
         for layer in ("color", "intensity"):
             offsets = measure_offsets(a, b, layer)
             if offsets is None:
                 print(f"  {layer:10} nothing in common")
                 continue
             mean = offsets.vector_m.mean(axis=0) if len(offsets.xy) else np.zeros(2)
-            near = say_quantiles(offsets.offset_m)
+            near = quantile_text(offsets.offset_m)
             print(
                 f"  {layer:10} {near} patches, {offsets.unlike} unlike; mean {100 * mean[0]:.1f} {100 * mean[1]:.1f} cm"
             )

@@ -125,7 +125,7 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[Point
         "measure": [_measure_point(context, r) for r in by_stage["measure"]],
         "homography": homographies,
         "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
-        "whole run": _with_placed_shares(whole, homographies),
+        "whole run": _add_placed_shares(whole, homographies),
     }
     return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
 
@@ -164,7 +164,7 @@ def _measure_point(context: BenchContext, run: BenchRun) -> Point:
     return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
 
 
-def _with_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
+def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
     """Add to whole runs the share of the obstacles that their homographies place."""
     if not homographies:
         return list(whole)
