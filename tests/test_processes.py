@@ -176,7 +176,7 @@ def test_a_script_without_a_guard_may_use_processes(tmp_path: Path) -> None:
     script.write_text(
         "from log2sim import Config, open_log, reconstruct\n"
         f"log = open_log({str(ROOT / 'samples' / 'crossing')!r})\n"
-        "config = Config.load(detect={'name': 'lidar:vehicle'}, stop_s=1.0, map={'lanes': False})\n"
+        "config = Config.load(detect={'name': 'lidar:labels'}, stop_s=1.0, map={'lanes': False})\n"
         "print(len(reconstruct(log, config, jobs=2).scenario.agents))\n"
     )
     ran = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, cwd=ROOT)
