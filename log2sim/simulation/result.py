@@ -106,14 +106,8 @@ class Commands:
 
     `AgentReplay.steer_rad` and `accel_mps2` hold what the actuators did.
 
-    Attributes
-    ----------
-    pedal_mps2 : (S,) float64, m/s2
-        Throttle (positive) or brake (negative).
-    steer_rad : (S,) float64
-        At the road wheels, positive left.
-    gear : (S,) int8
-        1 forward, -1 reverse.
+    `pedal_mps2` (S,), m/s2: throttle (positive) or brake (negative). `steer_rad` (S,): at the road wheels, positive left.
+    `gear` (S,): 1 forward, -1 reverse.
     """
 
     __repr__ = short_repr

@@ -480,10 +480,6 @@ class BrakeWhenWarned:
 
     Its way is clear when no collision would be predicted if it drove on as in the scenario. It then goes on from there, later than
     in the scenario.
-
-    Parameters
-    ----------
-    settings : WarningSettings, optional
     """
 
     def __init__(self, settings: WarningSettings | None = None) -> None:

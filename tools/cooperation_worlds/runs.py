@@ -82,10 +82,7 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
 class Rows:
     """What was measured, by test, seed, way and settings; with a file also across runs.
 
-    Parameters
-    ----------
-    path : Path or None
-        JSON lines; rows of older code are not told apart, so begin a new file after a change.
+    `path`: JSON lines; rows of older code are not told apart, so begin a new file after a change.
     """
 
     def __init__(self, path: Path | None) -> None:

@@ -130,8 +130,6 @@ def _corners(boxes: Boxes) -> Array:
 def _overlap_areas(a: Array, b: Array) -> Array:
     """Area (N,) that convex counter-clockwise quadrilaterals (N, 4, 2) have in common.
 
-    Notes
-    -----
     The corners of the common polygon are corners of one inside the other and crossings of edges; sorted by angle about their
     mean, the shoelace formula gives the area. Edges that lie on each other add no crossing, but their ends are corners.
     """

@@ -35,8 +35,6 @@ def smooth_paths(
 
     Each is carried on at both ends by `beyond` (A,) ticks, as far as there are ticks.
 
-    Notes
-    -----
     Kalman filter and Rauch-Tung-Striebel smoother. All tracks are processed in parallel, each from its own first tick on, so
     the number of steps is the length of the longest track.
     """

@@ -65,10 +65,7 @@ def export_checked(
 ) -> None:
     """Write a network as ONNX, its kernels in 16 bits where `halved`; `axes` may have any length.
 
-    Raises
-    ------
-    RuntimeError
-        When it computes something else of the inputs, by more than that share of the greatest output.
+    Raises `RuntimeError` when it computes something else of the inputs, by more than that share of the greatest output.
     """
     import onnx
     import onnxruntime

@@ -64,10 +64,7 @@ def labeled_by(views: tuple[LogView, ...], xyz: Array) -> NDArray[np.bool_]:
 def read_sweeps(log: Log, every: int = 1) -> list[LogSweep]:
     """Read every n-th sweep of a log that has labels in it.
 
-    Raises
-    ------
-    LogError
-        When there is none.
+    Raises `LogError` when there is none.
     """
     names = list(log.lidars)
     labels = create_lidar_detector("lidar:labels", log, LidarConfig())

@@ -441,8 +441,6 @@ class Batch:
 def loss_of_anchors(logits: Tensor, codes: Tensor, batch: Batch) -> tuple[Tensor, dict[str, float]]:
     """Focal loss of the scores and Smooth L1 of the boxes, not weighted against each other.
 
-    Notes
-    -----
     The paper divides the focal loss by the number of boxes, which makes it vanish beside the other where nearly all anchors
     are empty; both are divided by the number of positive ones, as RetinaNet does (Lin et al., ICCV 2017). Its alpha counts
     for objects, 1 - alpha for the rest, as there.

@@ -169,8 +169,6 @@ def smooth_l1(difference: Tensor) -> Tensor:
 def loss_of_cells(out: Tensor, targets: CellTargets) -> tuple[Tensor, dict[str, float]]:
     """Return the loss of outputs (B, 11, H, W) and its four parts.
 
-    Notes
-    -----
     The class of every cell that is not empty by focal loss; height and heading by Smooth L1, the offset by the logarithm of
     1 + |error| (printed relative to the true offset, which breaks where that is 0), on the cells of road users. The total is
     1/2 sum (l^2 L + log(l^2 + 1)) with l = 1/4, so that all weights are constant.

@@ -207,10 +207,7 @@ class Benchmark:
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame with one row for each stage and setting: time, error and the figures of the stage.
 
-        Raises
-        ------
-        MissingExtra
-            When pandas is not installed.
+        Raises `MissingExtra` when pandas is not installed.
         """
         try:
             import pandas as pd

@@ -72,8 +72,6 @@ def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64],
 def summarize_verdicts(errors: StateErrors) -> dict[str, float | None]:
     """Summarize all rows; a figure without rows is None.
 
-    Notes
-    -----
     Sizes are constant per agent, so their medians run over truth agents, each with its mean over matched ticks;
     `size_median_m` is the median of the mean absolute error over length, width and height. `ade_m` is the mean over
     truth agents of their mean distance.
