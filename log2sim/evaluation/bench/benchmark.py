@@ -311,7 +311,7 @@ def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array
     taken = [
         *(3 * [*np.hstack([at - POINT_PT, at + POINT_PT])]), *np.hstack([ends.min(axis=0) - 1, ends.max(axis=0) + 1]),
     ]  # fmt: skip
-    for k in np.lexsort([-at[:, 1], [not p.present for p in points]]):
+    for k in sorted(range(len(points)), key=lambda k: (not points[k].present, -at[k, 1])):
         name = printable_label(_label(points[k], present), 42)
         size = np.array([len(name) * LETTER_PT, LINE_PT])
         middle = at[k] + np.column_stack([CANDIDATES[:, 0] + CANDIDATES[:, 1] * size[0] / 2, CANDIDATES[:, 2]])
