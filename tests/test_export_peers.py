@@ -204,7 +204,7 @@ def test_asam_s_checker_finds_nothing_in_variations_and_their_distribution(tmp_p
         },
     )
     ids = [a.id for a in base.scenario.agents]
-    write_openscenario(base, [{id: (1.0 + 0.1 * k, 0.5 * k) for id in ids} for k in range(4)], tmp_path / "out")
+    write_openscenario(base, [dict.fromkeys(ids, (1.0 + 0.1 * k, 0.5 * k)) for k in range(4)], tmp_path / "out")
     for name in ("scenario.xosc", "variations.xosc"):
         issues, states = judged("openscenario", tmp_path / "out" / name, tmp_path)
         assert issues == []
