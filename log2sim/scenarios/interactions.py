@@ -294,9 +294,9 @@ def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tupl
 def _crossings(traffic: Traffic) -> Iterator[Tag]:
     """Find whose paths cross, who turns across the path of oncoming traffic, and near misses there."""
     t, on = traffic.table, traffic.continued
-    height = np.where(
-        np.isnan(t.center_m[..., 2]), np.nanmedian(t.center_m[..., 2], axis=1)[:, None], t.center_m[..., 2]
-    )
+    height = t.center_m[..., 2].copy()
+    for k in np.flatnonzero(t.present.any(axis=1)).tolist():
+        height[k, ~t.present[k]] = np.median(height[k, t.present[k]])
     boxes = BoxTracks(
         on.place_m.real.T,
         on.place_m.imag.T,

@@ -7,14 +7,14 @@ drawn anew for each rollout, so that rollouts are samples of what may happen.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, Scenario
+from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, MapLane, Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
@@ -47,6 +47,7 @@ NORMAL_PER_MEDIAN = 1.4826
 
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
+Lane = tuple[MapLane, Polyline]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]
 def recorded(scenario: Scenario, now_s: float, horizon_s: float = 8.0) -> tuple[Motions, int]:
     """Return what the agents that are there at a time did from `HISTORY_S` before, (1, A, T), and the tick of that time."""
     before, after = round(HISTORY_S / TICK_S), round(horizon_s / TICK_S)
-    t_s = now_s + np.arange(-before, after + 1) * TICK_S
+    t_s: Array = now_s + np.arange(-before, after + 1, dtype=np.float64) * TICK_S
     there = [
         a for a in scenario.agents if a.is_permanent or a.waypoints.t_s[0] - 1e-3 <= now_s <= a.waypoints.t_s[-1] + 1e-3
     ]
@@ -126,7 +127,7 @@ def observe(scenario: Scenario, now_s: float) -> Present:
             if a.is_permanent or a.static or not past.any()
             else replace(a, waypoints=a.waypoints.take(np.flatnonzero(past)))
         )
-    t_s = now_s + np.arange(-now, 1) * TICK_S
+    t_s: Array = now_s + np.arange(-now, 1, dtype=np.float64) * TICK_S
     table = tabulate(known, t_s, TICK_S)
     smooth = smooth_motion(table)
     row = np.arange(len(known))
@@ -164,9 +165,9 @@ def observe(scenario: Scenario, now_s: float) -> Present:
     )  # fmt: skip
 
 
-def _jitter(values: Array) -> Array:
+def _jitter(values: Array) -> float:
     """Return the standard deviation of white noise in values at successive ticks, whose second differences have one of sqrt(6) times that."""
-    return np.median(np.abs(values[4:] - 2 * values[2:-2] + values[:-4])) * NORMAL_PER_MEDIAN / np.sqrt(6.0)
+    return float(np.median(np.abs(values[4:] - 2 * values[2:-2] + values[:-4])) * NORMAL_PER_MEDIAN / np.sqrt(6.0))
 
 
 def _shrunk(own: Array, group: NDArray[np.str_]) -> Array:
@@ -204,7 +205,7 @@ def roll_out(
         For an unknown model.
     """
     if model not in MODELS:
-        raise ConfigError(f"model '{model}'{nearest(model, MODELS)}: expected one of {', '.join(MODELS)}")
+        raise ConfigError(f"model '{model}'{nearest(model, list(MODELS))}: expected one of {', '.join(MODELS)}")
     log, now = recorded(scenario, now_s, horizon_s)
     if model == "log":
         return replace(
@@ -216,12 +217,12 @@ def roll_out(
         velocity = present.speed_mps * np.exp(1j * present.course_rad)
         place = present.place_m[:, None] + velocity[:, None] * np.arange(1, ticks + 1) * TICK_S
         yaw = np.repeat(present.yaw_rad[:, None], ticks, axis=1)
-        place, yaw = (np.repeat(c[None], count, axis=0) for c in (place, yaw))
+        place, yaw = np.repeat(place[None], count, axis=0), np.repeat(yaw[None], count, axis=0)
     else:
         crowd = Crowd(scenario, present, horizon_s, count if model == "drivers" else 1, rng, noisy=model == "drivers")
         place, yaw = crowd.run(ticks)
         if model != "drivers":
-            place, yaw = (np.repeat(c, count, axis=0) for c in (place, yaw))
+            place, yaw = np.repeat(place, count, axis=0), np.repeat(yaw, count, axis=0)
     past = [np.repeat(c[:, :, : now + 1], count, axis=0) for c in (log.position_m, log.yaw_rad)]
     return replace(
         log, position_m=np.concatenate([past[0], place], axis=2), yaw_rad=np.concatenate([past[1], yaw], axis=2)
@@ -368,8 +369,8 @@ class Crowd:
             bend[:, m] = np.abs(np.angle(turn)) / ((last - first) * self.step_m[m])
         limit = np.sqrt(LATERAL_MPS2 / np.maximum(bend, 1e-4))
         slower = 2 * self.driver.comfort_mps2 * self.step_m
-        for n in range(POINTS - 2, -1, -1):
-            limit[..., n] = np.minimum(limit[..., n], np.sqrt(limit[..., n + 1] ** 2 + slower))
+        for k in range(POINTS - 2, -1, -1):
+            limit[..., k] = np.minimum(limit[..., k], np.sqrt(limit[..., k + 1] ** 2 + slower))
         return limit
 
     def _spread(self, factor: float, shape: tuple[int, ...]) -> Array:
@@ -434,9 +435,9 @@ class Crowd:
             heading = heading + total * self.step_m
             points[..., n] = points[..., n - 1] + self.step_m * np.exp(1j * heading)
         if tried == 1:
-            return points[0]
+            return np.asarray(points[0])
         best = self._hits(points, horizon_s).argmin(axis=0)
-        return np.take_along_axis(points, best[None, ..., None], axis=0)[0]
+        return np.asarray(np.take_along_axis(points, best[None, ..., None], axis=0)[0])
 
     def _hits(self, points: Complex, horizon_s: float) -> Array:
         """Count the moments (C, R, M) at which who goes on along paths (C, R, M, N) at its speed is where others would be by theirs."""
@@ -458,7 +459,7 @@ class Crowd:
                 count[:, :, m] += ((np.abs(away.real) < room[0]) & (np.abs(away.imag) < room[1])).sum(axis=-1)
         return count
 
-    def _keep_to_lane(self, m: int, lanes: dict, paths: Complex) -> None:
+    def _keep_to_lane(self, m: int, lanes: Mapping[str, Lane], paths: Complex) -> None:
         """Replace the paths (R, N) of a vehicle that is in a lane by ways along it and on, at random where there are several."""
         k = self.rows[m]
         place, heading = self.now.place_m[k], np.array([self.now.course_rad[k]])
@@ -505,13 +506,13 @@ class Crowd:
             direction = _directions(paths[:, m : m + 1], self.step_m[m : m + 1])[:, 0]
             middles = self._middles(lanes)
             for b, side in ((lane.left_lane, 1.0), (lane.right_lane, -1.0)):
-                if b in lanes:
+                if b is not None and b in lanes:
                     aside = float(np.median(lanes[b][0].width_m) + np.median(lane.width_m)) / 2
                     there = paths[:, m] + 1j * side * aside * direction
                     off = middles.query(np.stack([there.real, there.imag], axis=-1))[0] > BESIDE_M
                     self.beside[m, side] = aside, np.cumsum(off, axis=1)
 
-    def _middles(self, lanes: dict) -> Any:
+    def _middles(self, lanes: Mapping[str, Lane]) -> Any:
         """Return a search tree of all middle lines."""
         if self._tree is None:
             from scipy.spatial import cKDTree
@@ -531,7 +532,7 @@ class Crowd:
             out = (smooth[:, window:] - smooth[:, :-window]) / window
         return out
 
-    def _chain(self, name: str, lanes: dict, length_m: float) -> tuple[str, ...]:
+    def _chain(self, name: str, lanes: Mapping[str, Lane], length_m: float) -> tuple[str, ...]:
         """Return a lane and what follows, at random weighed by how straight it leads on, or the straightest."""
         chain, gone = [name], lanes[name][1].length_m
         while gone < length_m and len(chain) < 40:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,9 +118,9 @@ class Road:
         return np.where(known, self._distance_m[i, j], np.nan)
 
 
-def features(motions: Motions, rows: Sequence[int], road: Road | None = None) -> dict[str, Array]:
+def features(motions: Motions, which: Sequence[int], road: Road | None = None) -> dict[str, Array]:
     """Compute the features (R, E, T) of agents at E rows; NaN where they are not known."""
-    rows = np.asarray(rows, dtype=np.intp)
+    rows = np.array(which, dtype=np.intp)
     place, yaw = motions.position_m[:, rows], motions.yaw_rad[:, rows]
     velocity = _central(place) / motions.tick_s
     speed = np.abs(velocity)
@@ -139,7 +139,8 @@ def features(motions: Motions, rows: Sequence[int], road: Road | None = None) ->
         size = motions.size_m[rows]
         corners = box_corners_bev(
             np.stack([place.real, place.imag], axis=-1).reshape(-1, 2),
-            *(np.broadcast_to(size[:, k, None], place.shape).ravel() for k in (0, 1)),
+            np.broadcast_to(size[:, 0, None], place.shape).ravel(),
+            np.broadcast_to(size[:, 1, None], place.shape).ravel(),
             yaw.ravel(),
         )
         edge = road.distance_m(corners[..., 0] + 1j * corners[..., 1]).max(axis=1)
@@ -147,7 +148,7 @@ def features(motions: Motions, rows: Sequence[int], road: Road | None = None) ->
     return found
 
 
-def _central(values: NDArray[np.inexact]) -> NDArray[np.inexact]:
+def _central(values: NDArray[Any]) -> NDArray[Any]:
     """Return half the difference of both neighbors (..., T), NaN at both ends."""
     out = np.full_like(values, np.nan)
     out[..., 1:-1] = (values[..., 2:] - values[..., :-2]) / 2
@@ -243,7 +244,7 @@ def realism(log: Motions, simulated: Motions, rows: Sequence[int], now: int, roa
     """
     kept = [k for k in rows if log.present[0, k, now + 1 :].any()]
     known, drawn = features(log, kept, road), features(simulated, kept, road)
-    there = log.present[0, kept]
+    there: Mask = log.present[0, kept]
     there[:, : now + 1] = False
     out: dict[str, float] = {}
     for name, component in COMPONENTS.items():
@@ -253,8 +254,8 @@ def realism(log: Motions, simulated: Motions, rows: Sequence[int], now: int, roa
         one, many = known[source][0], drawn[source]
         if name in EVENTS:
             sign = -1.0 if name == "collision" else 1.0
-            one, many = (((sign * v > 0) & there).any(axis=-1)[..., None].astype(float) for v in (one, many))
-            valid = there.any(axis=-1)[:, None]
+            one, many = (np.any((sign * v > 0) & there, axis=-1, keepdims=True).astype(np.float64) for v in (one, many))
+            valid: Mask = np.any(there, axis=-1, keepdims=True)
         else:
             many, valid = many[..., now + 1 :], there & np.isfinite(one)
         chance = [_shares(component, many[:, e], one[e])[valid[e]] for e in range(len(kept))]
