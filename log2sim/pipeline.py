@@ -107,12 +107,11 @@ def start(
 
 def observe_log(run: Run) -> Observations:
     """Detect and measure, tick by tick."""
-    config, stage = run.config, "detect and measure"
+    stage = "detect and measure"
     run.progress(stage, 0, len(run.schedule))
     return observe(
-        run.log, run.schedule, run.detectors.images, run.plan, mode=config.measure.mode, max_range_m=config.measure.max_range_m,
-        clock=run.clock, progress=lambda done, total: run.progress(stage, done, total), lidar_detector=run.detectors.sweeps,
-        sweeps=config.lidar.sweeps, cache=run.detectors.cache, jobs=run.jobs,
+        run.log, run.schedule, run.plan, detectors=run.detectors, config=run.config, clock=run.clock,
+        progress=lambda done, total: run.progress(stage, done, total), jobs=run.jobs,
     )  # fmt: skip
 
 

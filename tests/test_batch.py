@@ -19,9 +19,12 @@ from log2sim.batch.discovery import find_logs
 from log2sim.batch.evaluation import pool
 from log2sim.batch.folder import BatchFolder, BatchSettings, Row, html_of, make_jobs, write_parquet
 from log2sim.config import Config
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import check
 from log2sim.files.inputs import following_links
+from log2sim.simulation.result import Replay
+from log2sim.simulation.runner import replay
 
 EVIL = "<script>alert('{{root}}')</script>&\"'"
 
@@ -163,7 +166,7 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     install_reader(tmp_path / "site")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     tell(root / "plugged", "fail-once", tiny_folder)
-    arguments = ("batch", root, "--out", out, *FAST)
+    arguments = ("batch", root, "--out", out, "--replay", *FAST)
 
     ran = run(*arguments)
     assert ran.code == 7, ran.err
@@ -179,7 +182,10 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     good = rows["good"]
     assert good is not None
     assert good.agents == 3
-    assert names(out / "logs" / "good") == ["report.json", "row.json", "scenario.json"]
+    assert names(out / "logs" / "good") == ["replay.json", "report.json", "row.json", "scenario.json"]
+    replayed = replay(Scenario.load(out / "logs" / "good" / "scenario.json"))
+    assert replayed.to_dict() == Replay.load(out / "logs" / "good" / "replay.json").to_dict()
+    assert good.cross_track_max_m == replayed.metrics["cross_track_max_m"] > 0
     (bad,) = (out / "logs").glob("group_bad-*")
     assert names(bad) == ["error.txt", "row.json"]
 
@@ -188,12 +194,12 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     ran = run(*arguments)
     assert ran.code == 0, ran.err
     assert "2 of them done before" in ran.out
-    assert names(bad) == ["report.json", "row.json", "scenario.json"]
+    assert names(bad) == ["replay.json", "report.json", "row.json", "scenario.json"]
     assert (out / "logs" / "good" / "row.json").stat().st_mtime_ns == before
 
     steps: list[tuple[int, int]] = []
     config = Config.load(settings=FAST[3::2], detect={"name": FAST[1]})
-    again = reconstruct_all(root, out, config, progress=lambda done, total: steps.append((done, total)))
+    again = reconstruct_all(root, out, config, replay=True, progress=lambda done, total: steps.append((done, total)))
     assert [row.status for row in again] == ["done"] * 3
     assert steps == []  # nothing was left to do
 

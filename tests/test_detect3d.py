@@ -233,7 +233,7 @@ def test_most_vehicles_with_many_points_are_found_and_few_are_invented(scenes) -
     near = truth.ignoring((truth.points < 50) | (truth.range_m > 25))
     matches = match_detections(sure, near, Criterion("iou_bev", 0.5))
     assert matches.truths > 40
-    assert matches.right.sum() / matches.truths > 0.8
+    assert matches.right.sum() / matches.truths > 0.75
     assert matches.right.sum() / (matches.right | matches.false).sum() > 0.8
 
 

@@ -160,8 +160,17 @@ def agent(name: str, *doubts: Finding, confidence: float = 0.9) -> Agent:
 
 
 def test_the_agents_are_counted_and_named_with_their_reasons() -> None:
-    (line,) = doubt_lines(world(agent("ego"), agent("car-19", confidence=0.2), agent("car-18", PASSES), agent("car-1")))
+    scenario = world(agent("ego"), agent("car-19", confidence=0.2), agent("car-18", PASSES), agent("car-1"))
+    (line,) = doubt_lines(scenario, ())
     assert line == "2 of 3 agents: car-18 (passes through car-22 at 1.2 s), car-19 (confidence 0.20)"
+
+
+def test_doubts_name_the_option_that_corrects_a_sensor_until_it_is_used() -> None:
+    scenario, values = world(agent("ego"), agent("car-1", confidence=0.2)), {"offset_s": 0.1, "offset_sigma_s": 0.01}
+    late, corrected = (Finding("time_offset", "top", treatment, values=values) for treatment in ("kept", "corrected"))
+    assert "--fix-time" in doubt_lines(scenario, [late])[-1]
+    assert doubt_lines(scenario, [corrected]) == doubt_lines(scenario, ())
+    assert doubt_lines(world(agent("ego"), agent("car-1")), [late]) == []
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -22,6 +22,7 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, obstacles_of, sample_rays
 from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.records import RecordSource
+from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan, select_sensors
@@ -115,8 +116,9 @@ def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", lab
     plan = make_plan(log, config, sensors, schedule.t_ns)
     reads.clear()  # synchronization looks into a sweep
     out = observe(
-        log, schedule, detector or Truth(log), plan,
-        mode=mode, max_range_m=max_range_m, clock=StageClock(), progress=lambda done, total: ticks.append((done, total)),
+        log, schedule, plan, detectors=Detectors(detector or Truth(log), None),
+        config=config.changed(measure={"mode": mode, "max_range_m": max_range_m}), clock=StageClock(),
+        progress=lambda done, total: ticks.append((done, total)),
     )  # fmt: skip
     return out, ticks
 

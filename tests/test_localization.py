@@ -11,7 +11,7 @@ from localization_worlds import BEND, HOUSES, STANDING, STRAIGHT, TUNNEL, drive,
 from worlds import tiny_log
 
 from log2sim import Config, reconstruct
-from log2sim.datatypes import ImageLabels, Log, Stream, Sweep
+from log2sim.datatypes import ImageLabels, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform, yaw_of
 from log2sim.localization.camera_motion import follow_camera
@@ -231,6 +231,15 @@ def test_a_scenario_of_a_camera_alone_holds_the_ego() -> None:
 
 def without_poses(log: Log) -> Log:
     return replace(log, ego=None)
+
+
+def test_a_map_that_begins_at_the_ego_has_no_place_on_earth() -> None:
+    """Of a log without poses; one that has them keeps its place, whichever poses are used."""
+    log = replace(bend()[0], map=MapFrame(48.0, 9.0, 400.0, "+proj=tmerc +lat_0=48 +lon_0=9"))
+    found, choice = localize(without_poses(log), Config())
+    assert found.map == MapFrame()
+    assert "not where the log places it" in choice.reason
+    assert localize(log, Config.load(poses={"source": "lidar"}))[0].map == log.map
 
 
 def test_unreadable_sweeps_are_counted_and_bridged() -> None:

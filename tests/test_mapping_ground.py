@@ -15,7 +15,7 @@ from log2sim.geometry import Array, apply
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.road_users import RoadUsers, draw_outlines
-from log2sim.road.surface import PointCollector
+from log2sim.road.surface import MAX_POINTS, take_sweep
 
 SETTINGS = MapConfig(cell_m=0.05)
 
@@ -150,10 +150,11 @@ def test_what_the_lowest_beam_meets_hides_the_ground_from_its_foot_on_and_a_sign
     )
     points = apply(np.linalg.inv(map_T_lidar), np.concatenate([xyz[~left], lowest, highest])).astype(np.float32)
     shown = dataclasses.replace(sweep, xyz_m=points, intensity=None)
-    prepared = PointCollector(log, raster, 1, 0.0).prepare("l0", shown, [])
-    assert prepared is not None
-    above = prepared.hiding[:, 2] - height_at(prepared.hiding[:, :2])
-    beside, over = (np.abs(prepared.hiding[:, 1] - y) < 0.01 for y in (lowest[0, 1], highest[0, 1]))
+    taken = take_sweep(log, "l0", shown, raster, [], most=MAX_POINTS, z0_m=0.0, hides=True)
+    assert taken is not None
+    hiding = taken[1]
+    above = hiding[:, 2] - height_at(hiding[:, :2])
+    beside, over = (np.abs(hiding[:, 1] - y) < 0.01 for y in (lowest[0, 1], highest[0, 1]))
     assert above[beside].min() < 0.1
     assert np.diff(np.unique(above[beside].round(2))).max() < 0.15
     assert above[over].min() > 2.0

@@ -25,6 +25,7 @@ from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.perception import first_pass
 from log2sim.perception.first_pass import Observations, observe
+from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import observe_log, start
 from log2sim.plan import make_plan, select_sensors
@@ -51,10 +52,8 @@ def seen(log: Log, jobs: int) -> Observations:
     sensors = select_sensors(log, config)
     schedule = synchronize(log, sensors.cameras)
     plan = make_plan(log, config, sensors, schedule.t_ns)
-    return observe(
-        log, schedule, Truth(log, looks=True), plan, mode="robust", max_range_m=80.0, clock=StageClock(),
-        progress=lambda *_: None, jobs=jobs,
-    )  # fmt: skip
+    detectors = Detectors(Truth(log, looks=True), None)
+    return observe(log, schedule, plan, detectors=detectors, config=config, clock=StageClock(), jobs=jobs)
 
 
 def damaged() -> Log:

@@ -618,3 +618,10 @@ def test_of_courses_too_different_for_the_way_between_them_the_surer_one_is_know
     assert course_is_known(10 * xy, velocity, covariance, correlated=True)[:3].all()
     assert course_is_known(xy, velocity, 400 * covariance, correlated=True).all()
     assert course_is_known(xy, velocity, covariance, correlated=True, holonomic=True).all()
+
+
+@pytest.mark.parametrize("density", [0.3, 1.0])
+def test_drawn_motions_are_followed_as_well_as_is_possible(maneuvers: ModuleType, density: float) -> None:
+    """No estimator passes the posterior Cramer-Rao bound on average; one that knows neither noise nor motion nears it."""
+    ratio = maneuvers.drawn_error_m(density, 0.1, seeds=8) / maneuvers.cramer_rao_m(density, 0.1)
+    assert 0.85 < ratio < 1.1

@@ -16,7 +16,7 @@ sys.path.insert(0, str(TOOLS))
 
 import torch  # noqa: E402
 import train_lidar  # noqa: E402
-from lidar_training.export import description, export_onnx, import_onnx, quantize  # noqa: E402
+from lidar_training.export import description, export_onnx, import_onnx  # noqa: E402
 from lidar_training.network import BevNetwork  # noqa: E402
 
 
@@ -44,13 +44,11 @@ def test_training_goes_on_from_the_network_in_a_file(tmp_path) -> None:
     torch.save({"mean": network.state_dict()}, tmp_path / "x.pt")
     export_onnx(tmp_path / "x.pt", tmp_path / "x.onnx", description("vehicle", 0.25, 40.0))
     grids = torch.rand(6, 12, 64, 64)
-    quantize(tmp_path / "x.onnx", tmp_path / "small.onnx")
-    assert (tmp_path / "small.onnx").stat().st_size < 0.35 * (tmp_path / "x.onnx").stat().st_size
-    rounded = import_onnx(tmp_path / "small.onnx", grids[:4])
-    exact, off = network.state_dict()["down4.0.0.weight"], rounded.state_dict()["down4.0.0.weight"]
-    assert abs(np.corrcoef(exact[3].ravel(), off[3].ravel())[0, 1]) > 0.999
     again = import_onnx(tmp_path / "x.onnx", grids[:4])
     with torch.no_grad():
-        np.testing.assert_allclose(again(grids[4:]), network.eval()(grids[4:]), atol=1e-3)
+        expected = network.eval()(grids[4:])
+        error = 2e-3 * float(expected.abs().max())  # weights are stored in half floats
+        np.testing.assert_allclose(again(grids[4:]), expected, rtol=0, atol=error)
         # In training a layer is normalized by the batch, whose moments are those that were put in.
-        np.testing.assert_allclose(again.train()(grids[:4]), network.eval()(grids[:4]), atol=1e-3)
+        np.testing.assert_allclose(again.train()(grids[:4]), network.eval()(grids[:4]), rtol=0, atol=error)
+    assert (tmp_path / "x.onnx").stat().st_size < 0.55 * (tmp_path / "x.pt").stat().st_size

@@ -38,7 +38,7 @@ from lidar_training.clouds import (
     window_of,
     write_shard,
 )
-from lidar_training.export import calibrate, describe, description, export_onnx, import_onnx, quantize, report
+from lidar_training.export import calibrate, describe, description, export_onnx, import_onnx, report
 from lidar_training.fitting import FitPlan
 from lidar_training.network import BevNetwork, loss_of, targets_of
 from lidar_training.real_logs import example_of, read_sweeps, sample_of
@@ -49,7 +49,6 @@ from log2sim.config import LidarConfig
 from log2sim.errors import ConfigError, LogError
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.detectors import open_network
-from log2sim.perception.detect3d.network import load_network
 
 PAPERS = ("zou2021", "two_stream")
 PER_SHARD = 100
@@ -92,8 +91,6 @@ ROUNDS = {
 }
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
 RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
-# Integer weights ship where they cost less F1 than this.
-MAX_QUANTIZATION_LOSS = 0.004
 
 
 def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
@@ -234,7 +231,7 @@ def fit(
 
 
 def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = ()) -> None:
-    """Export, calibrate, quantize and report; the files that ship are in `out` afterwards.
+    """Export, calibrate and report; the files that ship are in `out` afterwards.
 
     Without simulated scenes the scores are calibrated and tested on the held-out sweeps; with both, on both.
     """
@@ -245,39 +242,18 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
         test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
     if not calibration or not test:
         raise ConfigError("--data: too few labeled sweeps to hold any out; give more of them, or --scenes")
-    info, exact = description(mount, CELL_M[mount], RANGE_M[mount]), out / f"{mount}-float32.onnx"
-    export_onnx(checkpoint_path(out, len(rounds)), exact, info)
-    info["calibration"] = calibrate(exact, calibration)
-    describe(exact, info)
-    small = out / f"{mount}-int8.onnx"
-    quantize(exact, small)
-    card = {"mount": mount, "rounds": [asdict(r) for r in rounds], "batch": BATCH, "torch": torch.__version__}
-    reports = {}
-    for path in (exact, small):
-        # Eight bits shift the scores a little, so each file has its own calibration.
-        info["calibration"] = calibrate(path, calibration) if path is small else info["calibration"]
-        describe(path, info)
-        detector = open_network(path, LidarConfig(), name=mount)
-        reports[path.name] = report(detector, test, range_m=RANGE_M[mount])
-        line = {
-            k: {m: v[m] and round(v[m], 4) for m in ("precision", "recall", "f1")}
-            for k, v in reports[path.name].items()
-            if isinstance(v, dict)
-        }
-        print(path.name, f"{path.stat().st_size / 1e6:.2f} MB", json.dumps(line), flush=True)
-    loss = (reports[exact.name]["all"]["f1"] or 0.0) - (reports[small.name]["all"]["f1"] or 0.0)
-    chosen = small if loss < MAX_QUANTIZATION_LOSS else exact
-    card |= {
-        "file": "int8" if chosen is small else "float32",
-        "loss_of_f1_by_int8": round(loss, 4),
-        "simulated" if simulated else "own": reports[chosen.name],
-    }
+    path = out / f"{mount}.onnx"
+    info = description(mount, CELL_M[mount], RANGE_M[mount])
+    export_onnx(checkpoint_path(out, len(rounds)), path, info)
+    info["calibration"] = calibrate(path, calibration)
+    info["card"] = {"mount": mount, "rounds": [asdict(r) for r in rounds], "batch": BATCH, "torch": torch.__version__}
+    describe(path, info)
+    detector = open_network(path, LidarConfig(), name=mount)
+    card = info["card"] | {"simulated" if simulated else "own": report(detector, test, range_m=RANGE_M[mount])}
     if simulated and held_out[1::2]:
-        card["own"] = report(open_network(chosen, LidarConfig(), name=mount), held_out[1::2], range_m=RANGE_M[mount])
-    info = json.loads(load_network(chosen).info.model_dump_json()) | {"card": {k: card[k] for k in ("rounds", "file")}}
-    (out / f"{mount}.onnx").write_bytes(chosen.read_bytes())
-    describe(out / f"{mount}.onnx", info)
+        card["own"] = report(detector, held_out[1::2], range_m=RANGE_M[mount])
     (out / f"{mount}.json").write_text(json.dumps(card, indent=1) + "\n")
+    print(f"{path.stat().st_size / 1e6:.2f} MB", json.dumps(card), flush=True)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -106,6 +106,11 @@ class Row(BaseModel):
     seconds: Amount = None
     cpu_s: Amount = None
     peak_memory_mib: Amount = None  # MiB, largest resident memory of the worker so far
+    # Of the replay, where there is one: its time on the processor, the greatest distance of an agent from its path, and
+    # collisions that the scenario does not have.
+    replay_s: Amount = None
+    cross_track_max_m: Amount = None
+    new_collisions: Count = None
 
     @property
     def is_done(self) -> bool:
@@ -175,6 +180,7 @@ def sum_up(rows: Sequence[Row]) -> dict[str, float]:
 SETTINGS_FILE = "batch.json"
 LOGS = "logs"
 SCENARIO_FILE, REPORT_FILE, ROW_FILE, ERROR_FILE = "scenario.json", "report.json", "row.json", "error.txt"
+REPLAY_FILE = "replay.json"
 TOKEN_BYTES = 8
 MAX_LISTED = 5
 
@@ -191,11 +197,15 @@ class BatchSettings(BaseModel):
     format: str  # format that is looked for, or "auto"
     follow_links: bool
     config: dict[str, Any]  # settings of the reconstruction
+    replay: bool = False  # whether each scenario is replayed
 
     @classmethod
-    def create(cls, root: Path, format: str, follow_links: bool, config: Config) -> BatchSettings:
+    def create(
+        cls, root: Path, format: str, follow_links: bool, config: Config, *, replay: bool = False
+    ) -> BatchSettings:
         """Return the settings of a new batch."""
         return cls(
+            replay=replay,
             token=secrets.token_hex(TOKEN_BYTES),
             log2sim_version=__version__,
             root=str(root.resolve()),
@@ -323,6 +333,8 @@ COLUMNS = (
     ("doubtful", "doubtful", "d"),
     ("faults", "faults", "d"),
     ("unreadable", "unreadable", "d"),
+    ("cross_track_max_m", "off path m", ".3f"),
+    ("new_collisions", "collisions", "d"),
     ("seconds", "seconds", ".2f"),
     ("cpu_s", "CPU s", ".2f"),
     ("peak_memory_mib", "peak MiB", ".0f"),

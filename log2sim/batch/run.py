@@ -19,6 +19,7 @@ import cv2
 
 from log2sim.batch.discovery import find_logs
 from log2sim.batch.folder import (
+    REPLAY_FILE,
     REPORT_FILE,
     ROW_FILE,
     SCENARIO_FILE,
@@ -34,6 +35,7 @@ from log2sim.batch.folder import (
     write_parquet,
 )
 from log2sim.config import Config
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, Log2SimError, MissingExtra
 from log2sim.files.documents import write_json
 from log2sim.files.inputs import following_links, follows_links
@@ -42,6 +44,7 @@ from log2sim.files.stages import peak_memory_mib, thread_limits, usable_threads
 from log2sim.logs.opening import open_log
 from log2sim.perception.run_detectors import check_detectors
 from log2sim.pipeline import reconstruct
+from log2sim.simulation.runner import replay
 from log2sim.version import __version__
 
 if TYPE_CHECKING:
@@ -232,7 +235,14 @@ class Finished:
 
 
 def plan_batch(
-    root: Path, out: Path, config: Config, *, format: str = "auto", overwrite: bool = False, cache: bool = True
+    root: Path,
+    out: Path,
+    config: Config,
+    *,
+    format: str = "auto",
+    overwrite: bool = False,
+    cache: bool = True,
+    replay: bool = False,
 ) -> Batch:
     """Find the logs below a folder, and begin their batch in another or go on with it.
 
@@ -246,6 +256,8 @@ def plan_batch(
         Whether to start over, without the results of earlier runs.
     cache : bool
         Whether detections in pictures are taken from the caches of the workers, and kept there.
+    replay : bool
+        Whether each scenario is replayed, too.
 
     Raises
     ------
@@ -262,7 +274,7 @@ def plan_batch(
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ConfigError(f"{out}: holds the logs; choose another folder for the results")
     logs = find_logs(root, format=format, leave_out=out)
-    wanted = BatchSettings.create(root, format, follows_links(), config)
+    wanted = BatchSettings.create(root, format, follows_links(), config, replay=replay)
     folder = BatchFolder.start(out, wanted, overwrite=overwrite)
     jobs = make_jobs(logs, out, folder.settings.token, cache=cache)
     rows = {job.name: folder.read_row(job.name) for job in jobs}
@@ -312,6 +324,7 @@ def reconstruct_all(
     scheduler: str | None = None,
     overwrite: bool = False,
     cache: bool = True,
+    replay: bool = False,
     progress: Progress | None = None,
 ) -> list[Row]:
     """Reconstruct all logs below a folder, several at once, or go on with that; see `plan_batch` and `run_batch`.
@@ -332,6 +345,8 @@ def reconstruct_all(
         Whether to start over, without the results of earlier runs.
     cache : bool
         Whether detections in pictures are taken from the caches of the workers, and kept there.
+    replay : bool
+        Whether each scenario is replayed, too.
     progress : callable, optional
         Called as `progress(done, total)`.
 
@@ -344,7 +359,9 @@ def reconstruct_all(
     -----
     Worker processes import the script that calls this, which needs `if __name__ == "__main__":` around the call.
     """
-    planned = plan_batch(Path(root), Path(out), config or Config(), format=format, overwrite=overwrite, cache=cache)
+    planned = plan_batch(
+        Path(root), Path(out), config or Config(), format=format, overwrite=overwrite, cache=cache, replay=replay
+    )
     return run_batch(planned, lambda: connect(jobs, scheduler), progress=progress or (lambda done, total: None))
 
 
@@ -402,7 +419,8 @@ def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
             result = reconstruct(log, config, cache=job.cache, jobs=1)
             result.scenario.save(unfinished / SCENARIO_FILE)
             write_json(unfinished / REPORT_FILE, result.report)
-            row = done_row(job, result.report, spent())
+            replayed = _replay(result.scenario, unfinished / REPLAY_FILE) if folder.settings.replay else {}
+            row = done_row(job, result.report, spent() | replayed)
             write_json(unfinished / ROW_FILE, row.model_dump())
         return row.model_dump(), False
     except Log2SimError as error:
@@ -412,6 +430,15 @@ def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
         may_repeat, text = True, traceback.format_exc()
     folder.write_failure(row, text)
     return row.model_dump(), may_repeat
+
+
+def _replay(scenario: Scenario, out: Path) -> dict[str, float]:
+    """Replay a scenario into a file, and return the figures of its row."""
+    used = time.process_time()
+    result = replay(scenario)
+    result.save(out)
+    figures = {key: result.metrics[key] for key in ("cross_track_max_m", "new_collisions")}
+    return {"replay_s": round(time.process_time() - used, 4), **figures}
 
 
 def _submit(workers: Workers, job: Job, avoided: Mapping[str, str]) -> Future:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,6 +34,9 @@ def batch(
     config: ConfigFile = None,
     settings: Settings = None,
     seed: Annotated[int | None, option("Seed of all random numbers.")] = None,
+    replay: Annotated[
+        bool, option("Replay each scenario, too: replay.json, and its figures in the tables.", None, "--replay")
+    ] = False,
     no_cache: NoCache = False,
     overwrite: Annotated[
         bool, option("Start over: first remove the results that DIR holds.", None, "--overwrite", "-f")
@@ -41,13 +45,14 @@ def batch(
 ) -> None:
     """Reconstruct all logs below a folder, several at once.
 
-    Each log gets a folder in DIR/logs with scenario.json and report.json, or error.txt where it failed; table.html and
+    Each log gets a folder in DIR/logs with scenario.json and report.json, with --replay also replay.json, or error.txt where it failed; table.html and
     table.parquet list them all. A log that fails by something else than its data is run once more at the end. A second call
     runs what is missing or failed. Exits with 7 when logs failed.
 
     Examples
     --------
     log2sim batch drives/ -o results/
+    log2sim batch drives/ -o results/ --replay
     log2sim batch drives/ -o results/ --scheduler tcp://10.0.0.5:8786
     """
     from log2sim.batch import plan_batch, run_batch
@@ -64,15 +69,18 @@ def batch(
     if poses is not None:
         changes["poses"] = {"source": poses}
     chosen = Config.load(config, settings or (), **changes)
-    planned = plan_batch(root, out, chosen, format=format, overwrite=overwrite, cache=not no_cache)
+    planned = plan_batch(root, out, chosen, format=format, overwrite=overwrite, cache=not no_cache, replay=replay)
     found = f"{counted(len(planned.jobs), 'log')} below {root}"
     say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
 
+    begun = time.perf_counter()
     with progress(quiet=quiet) as report_progress:
         rows = run_batch(planned, lambda: connect(jobs, scheduler), progress=partial(report_progress, "logs"))
     for line in _failure_lines(rows):
         say(line, quiet=quiet)
-    say(f"{out / 'table.html'}: {_summary(rows)}", quiet=quiet)
+    now = sum(row.is_done and row.name not in planned.done for row in rows)
+    rate = f"; {now / (time.perf_counter() - begun) * 3600:,.0f} logs an hour" if now else ""
+    say(f"{out / 'table.html'}: {_summary(rows)}{rate}", quiet=quiet)
     failed = sum(not row.is_done for row in rows)
     if failed:
         raise LogsFailed(f"{failed} of {counted(len(rows), 'log')} failed; {out / 'table.html'} says why")
@@ -82,9 +90,12 @@ def _summary(rows: Sequence[Row]) -> str:
     from log2sim.batch.folder import sum_up
 
     sums = sum_up(rows)
+    off_m = [row.cross_track_max_m for row in rows if row.cross_track_max_m is not None]
+    collisions = counted(sum(row.new_collisions or 0 for row in rows), "new collision")
+    replayed = f"; replayed at most {max(off_m):.3f} m off the paths, {collisions}" if off_m else ""
     return (
         f"{sums['done']:.0f} of {counted(len(rows), 'log')} done, {sums['agents']:.0f} agents ({sums['static']:.0f} static, "
-        f"{sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s"
+        f"{sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s{replayed}"
     )
 
 

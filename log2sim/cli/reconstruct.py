@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,6 +35,7 @@ from log2sim.cli.options import (
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
+    from log2sim.datatypes.findings import Finding
     from log2sim.report import Result
 
 
@@ -57,7 +59,7 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
     speed = f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     rows = [
         ("agents", count_categories(scenario.others) or "none"),
-        *(("doubtful", line) for line in doubt_lines(scenario, verbose=verbose) or ["none"]),
+        *(("doubtful", line) for line in doubt_lines(scenario, result.findings, verbose=verbose) or ["none"]),
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
         *(("used", line) for line in (stage_lines(scenario) if verbose else ())),
@@ -88,10 +90,11 @@ def described(scenario: Scenario) -> list[str]:
     return [counted(count, name) for count, name in counts if count]
 
 
-def doubt_lines(scenario: Scenario, *, verbose: bool = False) -> list[str]:
-    """Say how many agents are doubtful and why the first ones are, or all; no line without any."""
+def doubt_lines(scenario: Scenario, findings: Sequence[Finding], *, verbose: bool = False) -> list[str]:
+    """Say how many agents are doubtful and why the first ones are, or all, and what of the sensors may be the cause; or nothing."""
     from log2sim.datatypes import explain_doubt, list_doubtful
     from log2sim.datatypes.agent import MAX_LISTED
+    from log2sim.datatypes.findings import KINDS
 
     ego, others = scenario.ego, [agent for agent in scenario.others if agent.is_doubtful]
     lines = [f"the ego: {explain_doubt(ego)}"] if ego is not None and ego.is_doubtful else []
@@ -100,10 +103,12 @@ def doubt_lines(scenario: Scenario, *, verbose: bool = False) -> list[str]:
     named = list_doubtful(others, None if verbose else MAX_LISTED)
     gone = [agent for agent in others if agent.quarantined]
     quarantined = f"not in replays and exports: {', '.join(a.id for a in gone)} (quarantined)"
+    options = {KINDS[f.kind].option for f in findings if f.kind in KINDS and f.treatment != "corrected"} - {""}
     return [
         *lines,
         f"{len(others)} of {counted(len(scenario.others), 'agent')}: {named}",
         *([quarantined] if gone else []),
+        *([f"perhaps since sensors are off (see the notes): try {' '.join(sorted(options))}"] if options else []),
     ]
 
 

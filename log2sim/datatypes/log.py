@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
@@ -287,6 +287,13 @@ class Sweep:
     t_ns: NDArray[np.int64] | None = None
     compensated_ns: int | None = None
     intensity: NDArray[np.float32] | None = None
+
+    def thinned(self, most: int) -> Sweep:
+        """Return every second, third ... of the points, at most so many; all as they are where there are no more."""
+        kept = slice(None, None, max(-(-len(self.xyz_m) // most), 1))
+        t_ns = None if self.t_ns is None else self.t_ns[kept]
+        intensity = None if self.intensity is None else self.intensity[kept]
+        return replace(self, xyz_m=self.xyz_m[kept], t_ns=t_ns, intensity=intensity)
 
 
 @dataclass(frozen=True, eq=False)

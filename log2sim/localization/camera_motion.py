@@ -29,6 +29,7 @@ from log2sim.geometry import (
     undistort,
     yaw_of,
 )
+from log2sim.localization.odometry import share_of_motion
 from log2sim.perception.records import RecordSource
 
 MIN_CORNER = 1e-4
@@ -64,8 +65,11 @@ class RoadView:
         valid &= (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width_px) & (uv[:, 1] < camera.height_px)
         uv = np.where(valid[:, None], (uv + 0.5) * scale - 0.5, -1.0).astype(np.float32)
         self.map_uv = uv.reshape(rows, columns, 2)
+        import cv2
+
         margin = np.ones((ROAD_WINDOW_PX, ROAD_WINDOW_PX), dtype=np.uint8)
-        self.shown = _eroded(valid.reshape(rows, columns).astype(np.uint8), margin)
+        shown = valid.reshape(rows, columns).astype(np.uint8)
+        self.shown = np.asarray(cv2.erode(shown, margin, borderType=cv2.BORDER_CONSTANT, borderValue=0), dtype=np.uint8)
 
     def in_ego(self, px: Array) -> Array:
         """Convert pixels (N, 2), column and row, to positions (N, 2), m, ego frame."""
@@ -91,12 +95,6 @@ class RoadView:
         inside = np.clip(np.round(end).astype(int), 0, np.array(self.shown.shape)[::-1] - 1)
         good = self.shown[inside[:, 1], inside[:, 0]] > 0
         return self.in_ego(begin[good]), self.in_ego(end[good])
-
-
-def _eroded(mask: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    import cv2
-
-    return np.asarray(cv2.erode(mask, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -215,7 +213,7 @@ def follow_camera(
                 dt_s = (t_ns[-1] - t_ns[-2]) / NS_PER_S
                 found = follower.motion(last, gray, dt_s)
                 predicted.append(found is None)
-                motion = _scaled(motion, dt_s / motion_s) if found is None else found
+                motion = share_of_motion(motion, np.array([dt_s / motion_s]))[0] if found is None else found
                 motion_s = dt_s
                 poses.append(poses[-1] @ motion)
             last = gray
@@ -244,12 +242,6 @@ def _check(log: Log, name: str, frames: int, read: int, dark: int, predicted: ND
             f"{where}: {int(predicted.sum())} of {read} images show too little of the road to tell how far the ego moves; "
             "give poses"
         )
-
-
-def _scaled(motion: Array, share: float) -> Array:
-    """Return a share of a motion on the plane."""
-    yaw = float(yaw_of(motion)) * share
-    return transform(rotation_from_rpy(0.0, 0.0, yaw), motion[:3, 3] * share)
 
 
 class _Follower:

@@ -244,7 +244,8 @@ def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.start_T_ego, _max_gap_s(found.t_ns)))
     estimate = {**camera_figures(found), **_difference(track, log.ego), "frame": frame}
     findings = (Finding("planar_motion", "ego"), *_predicted("camera motion", found.predicted))
-    reason = "as requested" if request.requested == "camera" else "the log has no poses and no LiDAR on the ego"
+    reason = "the log has no poses and no LiDAR on the ego" + _unplaced(log)
+    reason = "as requested" if request.requested == "camera" else reason
     return replace_poses(log, track), request.answer("camera", reason, estimate=estimate, findings=findings)
 
 
@@ -286,7 +287,7 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
             f"{log.name}: the log has no ego poses, and LiDAR odometry cannot tell how the ego moves: {unsure:.0%} of the "
             "sweeps show too little that holds it, as in a tunnel or on an empty road; give poses"
         )
-    reason = "as requested" if requested == "lidar" else "the log has no poses"
+    reason = "as requested" if requested == "lidar" else "the log has no poses" + _unplaced(log)
     return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, findings=_doubts(log, found))
 
 
@@ -339,6 +340,11 @@ def _in_map(log: Log, estimated: PoseTrack, lidar: str | None = None) -> tuple[P
         frame = "the ego's at the first pose" + ("" if level is None else ", level on the ground")
         map_T_start = np.eye(4) if level is None else level
     return replace(estimated, map_T_ego=map_T_start @ estimated.map_T_ego), frame
+
+
+def _unplaced(log: Log) -> str:
+    """Say that without poses the map of a log is not where the log places it on Earth; nothing where it names no place."""
+    return "" if log.map.projection is None else "; the map begins at the ego, not where the log places it on Earth"
 
 
 def _level(log: Log, lidar: str, t_ns: int) -> Array | None:

@@ -184,11 +184,6 @@ def find_image_edges(gray: NDArray[np.uint8], *, sideways: bool) -> NDArray[np.f
     return np.asarray(np.minimum(upright / around, MAX_STRENGTH), dtype=np.float32)
 
 
-def is_sideways(mount_T_cam: Array) -> bool:
-    """Return whether the rows of a camera's image are closer to upright than its columns."""
-    return bool(abs(mount_T_cam[2, 0]) > abs(mount_T_cam[2, 1]))
-
-
 def score_angles(camera: Camera, view: EdgeView) -> FrameScores:
     """Add up the strength of image edges at the depth edges of a view, for every yaw angle."""
     points, left = _near_image(camera, view)
@@ -198,7 +193,8 @@ def score_angles(camera: Camera, view: EdgeView) -> FrameScores:
     # Turning the camera by an angle turns what it sees by the opposite one.
     moved = np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1).reshape(-1, 3)
     uv, inside = project(camera, moved @ camera.mount_T_cam[:3, :3])
-    image = view.level if is_sideways(camera.mount_T_cam) else view.upright
+    lies_on_side = abs(camera.mount_T_cam[2, 0]) > abs(camera.mount_T_cam[2, 1])
+    image = view.level if lies_on_side else view.upright
     rows = np.flatnonzero(inside)
     u, v = (
         np.clip(np.round((uv[rows, axis] + 0.5) * view.scale - 0.5), 0, image.shape[1 - axis] - 1).astype(np.int64)

@@ -287,7 +287,9 @@ def check_cameras(
     if config.detect.in_images in ("", LABELS):
         return log, ()
     lidar = densest_lidar(sensors.restrict(log)) or ""
-    if any(fault.subject == lidar and _is_wrong(fault) for fault in of_lidars):
+    if any(
+        f.subject == lidar and f.treatment == "kept" and f.kind in ("time_offset", "lidar_rotation") for f in of_lidars
+    ):
         lidar = ""
     check = _look(log, lidar, config, sensors, progress)
     fix = config.calibration.fix_mounts
@@ -308,12 +310,10 @@ def check_cameras(
     mounts |= {name: turn_by(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
     unknown = [name for name, yaw in check.yaws.items() if fix and lidar and yaw is None and name not in mistakes]
     faults += [Finding("unknown_rotation", name, other=lidar, case="edges") for name in unknown]
-    return (with_mounts(log, mounts) if fix and mounts else log), tuple(faults)
-
-
-def _is_wrong(fault: Finding) -> bool:
-    """Return whether a LiDAR is used as it is though its clock or mount is off."""
-    return fault.treatment == "kept" and fault.kind in ("time_offset", "lidar_rotation")
+    if fix and mounts:
+        moved = {name: replace(log.cameras[name], mount_T_cam=mount_T_cam) for name, mount_T_cam in mounts.items()}
+        log = log.changed(cameras={**log.cameras, **moved})
+    return log, tuple(faults)
 
 
 def _treat_mistakes(mistakes: Mapping[str, Mistake], config: Config, sensors: Sensors) -> dict[str, Treatment]:
@@ -338,12 +338,6 @@ def turns_together(yaws: Mapping[str, YawEstimate | None]) -> bool:
         return False
     mean = float(np.average(angles, weights=1 / sigmas**2))
     return bool(np.all(np.abs(angles - mean) < MIN_SIGMAS * sigmas))
-
-
-def with_mounts(log: Log, mounts: Mapping[str, Array]) -> Log:
-    """Return a log whose cameras have other mounts (4, 4), by name."""
-    moved = {name: replace(log.cameras[name], mount_T_cam=mount_T_cam) for name, mount_T_cam in mounts.items()}
-    return log.changed(cameras={**log.cameras, **moved})
 
 
 def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Progress) -> MountCheck:

@@ -25,6 +25,7 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
+from log2sim.perception.lidar.cloud import first_of_voxels
 from log2sim.perception.records import RecordSource
 
 # Transforms are interpolated between knots this far apart, which errs by 3e-6 rad at 1 rad/s: 0.3 mm at 100 m.
@@ -115,7 +116,7 @@ def _coverage(log: Log, lidar: str) -> int:
     for i in range(min(PROBED_SWEEPS, len(stream.t_ns))):
         sweep = read_ego_sweep(log, lidar, i)
         if sweep is not None and len(sweep.xyz_m):
-            return len(np.unique(np.floor(sweep.xyz_m / COVERAGE_VOXEL_M).astype(np.int64), axis=0))
+            return len(first_of_voxels(sweep.xyz_m.T.astype(np.float32), COVERAGE_VOXEL_M))
     return 0
 
 
@@ -131,9 +132,8 @@ def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:
     Of more than `MAX_POINTS` every second, third ... is taken.
     """
     ego_T_lidar = log.lidars[lidar].mount_T_lidar
-    step = max(-(-len(sweep.xyz_m) // MAX_POINTS), 1)
-    stamp_ns, t_ns = int(sweep.stamp_ns), None if sweep.t_ns is None else sweep.t_ns[::step]
-    measured = sweep.xyz_m[::step]
+    sweep = sweep.thinned(MAX_POINTS)
+    stamp_ns, t_ns, measured = int(sweep.stamp_ns), sweep.t_ns, sweep.xyz_m
     if sweep.frame == "map":
         track = log.ego
         if track is None:

@@ -11,9 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log
+from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
-from log2sim.localization.odometry import densest_lidar, read_ego_sweep
+from log2sim.localization.odometry import densest_lidar
 from log2sim.localization.surfaces import (
     Registration,
     Surfaces,
@@ -24,6 +24,7 @@ from log2sim.localization.surfaces import (
     surfaces_of_sweep,
 )
 from log2sim.perception.frames import work_ahead
+from log2sim.perception.records import RecordSource
 
 # Poses between sweeps that are registered are interpolated: so many cover braking and curves of a log, unless they are farther
 # apart than errors of GNSS last.
@@ -63,8 +64,13 @@ def refine_poses(log: Log, during_ns: tuple[int, int] | None = None) -> PoseTrac
     if log.ego is None or lidar is None:
         return None
     chosen = _choose(log, lidar, during_ns)
-    made = work_ahead(lambda index: _keyframe(log, lidar, index), chosen.tolist())
-    keyframes = [keyframe for keyframe in made if keyframe is not None]
+    records = RecordSource(log)
+
+    def surfaces_at(index: int) -> tuple[int, Array, Surfaces] | None:
+        sweep: Sweep | None = records.get(lidar, index)
+        return None if sweep is None else surfaces_of_sweep(log, lidar, sweep)
+
+    keyframes = [Keyframe(*found) for found in work_ahead(surfaces_at, chosen.tolist()) if found is not None]
     if len(keyframes) < MIN_KEYFRAMES:
         return None
     pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
@@ -173,13 +179,3 @@ def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registra
             right[i : i + 6] += of_i.T @ scaled @ measured
         twists = np.asarray(np.linalg.solve(normal, right))
     return twists.reshape(-1, 6)
-
-
-def _keyframe(log: Log, lidar: str, index: int) -> Keyframe | None:
-    """Read a sweep and find its surfaces, in the ego's frame at its stamp; None where it has too few."""
-    sweep = read_ego_sweep(log, lidar, index)
-    if log.ego is None or sweep is None:
-        return None
-    pose, known = log.ego.at(sweep.t_ref_ns)
-    surfaces = surfaces_of_sweep(sweep, log.ego) if known[0] else None
-    return None if surfaces is None else Keyframe(sweep.t_ref_ns, pose[0], surfaces)

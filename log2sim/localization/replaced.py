@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Labels, Log, Stream, Sweep
+from log2sim.datatypes import Labels, Log, MapFrame, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, PoseTrack, apply, inverse, wrap_angle
 from log2sim.localization.odometry import TransformAt, move_points
@@ -19,7 +19,7 @@ def replace_poses(log: Log, new: PoseTrack) -> Log:
     """Return a log with other poses of the ego; labels and sweeps in the map move with it at their own stamps.
 
     Sensors that are fixed in the map stay where they are. Labels and points at whose stamps one of the poses is not known are
-    left out. Without old poses nothing but the ego is in the map.
+    left out. Without old poses nothing but the ego is in the map, whose place on Earth then is not known.
     """
     old = log.ego
 
@@ -53,7 +53,8 @@ def replace_poses(log: Log, new: PoseTrack) -> Log:
         for name, stream in log.streams.items()
     }
     labels = (lambda: log.labels) if old is None else (lambda: _moved_labels(log.labels, new_T_old))
-    return replace(log, ego=new, streams=streams, labels=labels, notes=lambda: log.notes)
+    place = MapFrame() if old is None else log.map
+    return replace(log, ego=new, map=place, streams=streams, labels=labels, notes=lambda: log.notes)
 
 
 def _moved_labels(labels: Labels | None, new_T_old: TransformAt) -> Labels | None:

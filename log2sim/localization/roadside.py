@@ -68,8 +68,9 @@ class Unit:
 def units_of(log: Log, lidars: Sequence[str]) -> list[Unit]:
     """Group LiDARs of the roadside, and the cameras beside them, by their places."""
     groups: list[list[str]] = []
+    place = {name: log.lidars[name].mount_T_lidar[:2, 3] for name in lidars}
     for name in lidars:
-        near = [group for group in groups if any(_apart_m(log, name, other) < MAX_UNIT_M for other in group)]
+        near = [group for group in groups if any(np.hypot(*(place[name] - place[k])) < MAX_UNIT_M for k in group)]
         groups = [group for group in groups if group not in near] + [[*(n for group in near for n in group), name]]
     units = []
     for group in groups:
@@ -81,10 +82,6 @@ def units_of(log: Log, lidars: Sequence[str]) -> list[Unit]:
         ]
         units.append(Unit(tuple(group), tuple(beside), site))
     return units
-
-
-def _apart_m(log: Log, first: str, second: str) -> float:
-    return float(np.hypot(*(log.lidars[first].mount_T_lidar - log.lidars[second].mount_T_lidar)[:2, 3]))
 
 
 def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log:
@@ -207,8 +204,10 @@ def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate
     """
     if sight.view is None:
         return found
-    parts = [_sight_of_part(sight, part) for part in sight.view.parts(PARTS) if len(part.xyz_m)]
-    fits = [_refine(part, np.zeros(7), with_objects=False) for part in parts]
+    road, fits = sight.road.xyz_m, []
+    for part in (part for part in sight.view.parts(PARTS) if len(part.xyz_m)):
+        of_part = replace(sight, view=part, surfaces=surfaces_of(part, road), ground=common_ground(part, road))
+        fits.append(_refine(of_part, np.zeros(7), with_objects=False))
     variance = np.zeros(7)
     if len(fits) == PARTS:
         values = np.array([value for value, _ in fits])
@@ -221,11 +220,6 @@ def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate
     variance[:3] += sigma_m**2
     variance[5] += sigma_rad**2
     return replace(found, covariance=found.covariance + np.diag(variance))
-
-
-def _sight_of_part(sight: Sight, part: VehicleView) -> Sight:
-    road = sight.road.xyz_m
-    return replace(sight, view=part, surfaces=surfaces_of(part, road), ground=common_ground(part, road))
 
 
 def _starts(sight: Sight, by_structure: Array) -> list[Array]:

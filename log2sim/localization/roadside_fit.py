@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Boxes3D, Log, Sweep
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, nearest_index
 from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
 from log2sim.localization.surfaces import (
     CAUCHY,
@@ -176,10 +176,7 @@ def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
     sweep: Sweep | None = RecordSource(log).get(lidar, index)
     if sweep is None:
         return None
-    step = max(-(-len(sweep.xyz_m) // MAX_SWEEP_POINTS), 1)
-    t_ns = None if sweep.t_ns is None else sweep.t_ns[::step]
-    sweep = Sweep(sweep.stamp_ns, sweep.xyz_m[::step], sweep.frame, t_ns, sweep.compensated_ns)
-    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
+    mapped = sweep_to_map(log, lidar, sweep.thinned(MAX_SWEEP_POINTS), compensate=True)
     pose, known = log.map_T_sensor(lidar, sweep.stamp_ns)
     return (mapped[0], pose[0, :3, 3]) if mapped is not None and known[0] and len(mapped[0]) else None
 
@@ -324,7 +321,7 @@ def detect_boxes(
     """
     out, before, records = [], None, RecordSource(log)
     for moment, floor in zip(moments_ns.tolist(), floor_m):
-        index = {name: _nearest_moments(log.streams[name].t_ns, moment) for name in lidars}
+        index = {name: int(nearest_index(log.streams[name].t_ns, moment)[0]) for name in lidars}
         if index == before:
             continue
         before = index
@@ -338,10 +335,6 @@ def detect_boxes(
             boxes = detector.detect(cloud)
             out.append(boxes.take(boxes.score >= MIN_SCORE))
     return out
-
-
-def _nearest_moments(t_ns: NDArray[np.int64], moment: int) -> int:
-    return int(np.argmin(np.abs(t_ns - moment)))
 
 
 def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector]:

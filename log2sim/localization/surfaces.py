@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.datatypes import Log
+from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import (
     NS_PER_S,
     Array,
@@ -21,7 +21,8 @@ from log2sim.geometry import (
     rotation_from_quaternion,
     transform,
 )
-from log2sim.localization.odometry import EgoSweep, ego_sweep_of, move_points
+from log2sim.localization.odometry import MAX_POINTS, MIN_RANGE_M
+from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
 
 # Velocities are those of a second: errors of GNSS and IMU make those of shorter times useless, and vehicles speed up and turn
@@ -290,10 +291,10 @@ def pair_sweeps(
             continue
         if record.frame == "map":
             return None
-        sweep = ego_sweep_of(log, lidar, record)
-        if sweep is not None and (found := surfaces_of_sweep(sweep, track)) is not None:
-            places.append(sweep.t_ref_ns)
-            surfaces.append(found)
+        found = surfaces_of_sweep(log, lidar, record)
+        if found is not None:
+            places.append(found[0])
+            surfaces.append(found[2])
     if len(surfaces) < 2:
         return None
     t_ns = np.array(places, dtype=np.int64)
@@ -312,7 +313,7 @@ def choose_sweeps(
     spaced = _spaced(t_ns, rows)
     velocity, known = velocities_at(track, t_ns[spaced])
     spaced, velocity = spaced[known], velocity[known]
-    if len(spaced) == 0 or _path_m(track, t_ns[spaced]) < MIN_PATH_M:
+    if len(spaced) == 0 or np.linalg.norm(np.ptp(track.at(t_ns[spaced])[0][:, :3, 3], axis=0)) < MIN_PATH_M:
         return rows[:0]
     if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
         return np.sort(np.concatenate(_fastest_changes(spaced, velocity)))
@@ -327,12 +328,6 @@ def _spaced(t_ns: NDArray[np.int64], rows: NDArray[np.intp]) -> NDArray[np.intp]
         return rows
     slot = (t_ns[rows] - t_ns[rows[0]]) // round(SPACING_S * NS_PER_S)
     return np.asarray(rows[np.unique(slot, return_index=True)[1]])
-
-
-def _path_m(track: PoseTrack, t_ns: NDArray[np.int64]) -> float:
-    """Compute how far the ego gets, m, as the diagonal of the box around its places."""
-    places = track.at(t_ns)[0][:, :3, 3]
-    return float(np.linalg.norm(np.ptp(places, axis=0)))
 
 
 def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:
@@ -350,16 +345,21 @@ def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np
     return parts
 
 
-def surfaces_of_sweep(sweep: EgoSweep, track: PoseTrack) -> Surfaces | None:
-    """Find the surfaces of a sweep with the ego's motion taken out."""
-    xyz = sweep.xyz_m
-    if sweep.t_ns is not None:
-        ref_T_map = inverse(track.at(sweep.t_ref_ns)[0][0])
-        moved = move_points(xyz, sweep.t_ns, lambda t: (ref_T_map @ track.at(t)[0], track.at(t)[1]))
-        if moved is None:
-            return None
-        xyz = moved
-    return surfaces_of(xyz)
+def surfaces_of_sweep(log: Log, lidar: str, sweep: Sweep) -> tuple[int, Array, Surfaces] | None:
+    """Find the surfaces of a sweep with the motion of the ego by the log's poses taken out.
+
+    Returns the stamp of the sweep, the pose (4, 4) of the ego at it, and the surfaces in the ego's frame there; None where no pose is
+    known or there are too few.
+    """
+    stamp_ns = int(sweep.stamp_ns if sweep.compensated_ns is None else sweep.compensated_ns)
+    mapped = sweep_to_map(log, lidar, sweep.thinned(MAX_POINTS), compensate=True)
+    if log.ego is None or mapped is None:
+        return None
+    pose, known = log.ego.at(stamp_ns)
+    xyz_m = apply(inverse(pose[0]), mapped[0])
+    away = np.linalg.norm(xyz_m - log.lidars[lidar].mount_T_lidar[:3, 3], axis=1)
+    surfaces = surfaces_of(xyz_m[away > MIN_RANGE_M]) if known[0] else None
+    return None if surfaces is None else (stamp_ns, pose[0], surfaces)
 
 
 def _compare(surfaces: list[Surfaces], map_T_ego: Array) -> list[Pair]:

@@ -28,12 +28,8 @@ NOT_ALLOWED = 1e6
 def align_parts(cloud: Cloud, before: Sequence[Boxes3D]) -> Cloud:
     """Move the points of vehicles and riders, by how these moved between two earlier moments, to the time of most of their points.
 
-    Parameters
-    ----------
-    cloud : Cloud
-        With parts; one without is returned as it is.
-    before : sequence of Boxes3D
-        What was found at the two moments before, the earlier first.
+    `cloud`: with parts; one without is returned as it is. `before`: what was found at the two moments before, the earlier
+    first.
     """
     if not cloud.parts or len(before) < 2:
         return cloud

@@ -34,20 +34,11 @@ MAX_OFFSETS = 1 << 18
 def fit_yaws(xy_m: Array, count: NDArray[np.intp]) -> tuple[Array, Array]:
     """Find the yaw of the rectangle whose sides are nearest to the points of each of M clusters, up to quarter turns.
 
-    Parameters
-    ----------
-    xy_m : (N, 2) float64, m
-        Points of the first cluster, then those of the next.
-    count : (M,) int
-        Number of points of each cluster, at least 1.
+    `xy_m`: (N, 2), m: points of the first cluster, then those of the next. `count`: (M,): number of points of each cluster,
+    at least 1.
 
-    Returns
-    -------
-    yaw_rad : (M,) float64
-        In [0, pi/2).
-    contrast : (M,) float64
-        Score of the best direction over the median score, less 1: 0 for a round or shapeless cluster; below about
-        `MIN_CONTRAST` the yaw carries no information.
+    Returns `yaw_rad`: (M,): in [0, pi/2); `contrast`: (M,): score of the best direction over the median score, less 1: 0
+    for a round or shapeless cluster; below about `MIN_CONTRAST` the yaw carries no information.
 
     Notes
     -----
@@ -166,21 +157,11 @@ TOP_QUANTILE = 0.98
 def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = None) -> tuple[float, Array, Array]:
     """Fit the length axis and the extents of points seen from the origin.
 
-    Parameters
-    ----------
-    points : (n, 2) float64, m
-        Relative to the viewpoint.
-    typical : (3,) float64, m
-        Size of the category, to tell the length from the width.
-    known_yaw_rad : float, optional
-        Rough yaw from elsewhere, used instead.
+    `points`: (n, 2), m: relative to the viewpoint. `typical`: (3,), m: size of the category, to tell the length from the
+    width. `known_yaw_rad`: rough yaw from elsewhere, used instead.
 
-    Returns
-    -------
-    yaw_rad : float
-        Up to half turns at best without a known one.
-    low, high : (2,) float64, m
-        Ends along the length and the width axis, relative to the viewpoint.
+    Returns `yaw_rad`: up to half turns at best without a known one; `low`, `high`: (2,), m: ends along the length and the
+    width axis, relative to the viewpoint.
     """
     known = np.array([np.nan if known_yaw_rad is None else known_yaw_rad])
     yaw, low, high = fit_extents_of_clusters(points, np.array([len(points)]), typical[None], known)
@@ -192,20 +173,10 @@ def fit_extents_of_clusters(
 ) -> tuple[Array, Array, Array]:
     """Fit the length axes and the extents of several clusters, as `fit_extents` does for one.
 
-    Parameters
-    ----------
-    xy_m : (N, 2) float64, m
-        Points of the first cluster, then those of the next, relative to the viewpoint.
-    count : (R,) int
-        Number of points of each cluster, at least 1.
-    typical : (R, 3) float64, m
-    known_yaw_rad : (R,) float64
-        NaN where it is not known.
+    `xy_m`: (N, 2), m: points of the first cluster, then those of the next, relative to the viewpoint. `count`: (R,): number
+    of points of each cluster, at least 1. `typical`: (R, 3), m. `known_yaw_rad`: (R,): NaN where it is not known.
 
-    Returns
-    -------
-    yaw_rad : (R,) float64
-    low, high : (R, 2) float64, m
+    Returns `yaw_rad`: (R,); `low`, `high`: (R, 2), m.
     """
     known = np.isfinite(known_yaw_rad)
     yaw, of_known = known_yaw_rad.copy(), np.repeat(known, count)
@@ -278,12 +249,8 @@ def _median(values: Array) -> float:
 def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:
     """Return the indices of at most so many points of each cluster, evenly spread over its surface.
 
-    Parameters
-    ----------
-    range_m : (N,) float, m
-        Distances from the sensor of the points of the first cluster, then those of the next.
-    count : (R,) int
-        Number of points of each cluster, at least 1.
+    `range_m`: (N,), m: distances from the sensor of the points of the first cluster, then those of the next. `count`: (R,):
+    number of points of each cluster, at least 1.
 
     Notes
     -----
@@ -355,14 +322,8 @@ def rotate(xy: Array, angle_rad: Array | float) -> Array:
 def axes_swapped(extents_m: Array, sensor: Array, typical: Array) -> bool:
     """Decide whether a fitted yaw is along the width of the object instead of its length.
 
-    Parameters
-    ----------
-    extents_m : (2,) float64
-        Along and across the fitted yaw.
-    sensor : (2,) or (K, 2) float64, m
-        Viewpoints along and across the yaw, relative to the middle of the extents.
-    typical : (3,) float64, m
-        Size of the category.
+    `extents_m`: (2,): along and across the fitted yaw. `sensor`: (2,) or (K, 2), m: viewpoints along and across the yaw,
+    relative to the middle of the extents. `typical`: (3,), m: size of the category.
     """
     # A side too long for a width is the length. If both are short, the side that faces the sensor is a front or rear.
     if extents_m.max() > MAX_WIDTH_FACTOR * typical[1]:
@@ -374,14 +335,8 @@ def axes_swapped(extents_m: Array, sensor: Array, typical: Array) -> bool:
 def swapped_log_odds(extents_m: Array, whole: NDArray[np.bool_], sigma_m: Array, category: str) -> float:
     """Return the log-odds that the second of two axes is the length of an object, by the sizes of its category.
 
-    Parameters
-    ----------
-    extents_m : (2,) float64
-        Of what was seen along both axes.
-    whole : (2,) bool
-        Whether that is the whole side; else the side may be longer.
-    sigma_m : (2,) float64
-        Standard deviation of the extents.
+    `extents_m`: (2,): of what was seen along both axes. `whole`: (2,): whether that is the whole side; else the side may be
+    longer. `sigma_m`: (2,): standard deviation of the extents.
 
     Notes
     -----
@@ -434,23 +389,13 @@ def real_ends(
 ) -> NDArray[np.int64]:
     """Decide which ends of the observed extents are ends of the box.
 
-    Parameters
-    ----------
-    low, high : (..., 2) float64, m
-        Ends of the observed points along each axis.
-    sensor : (..., 2) float64, m
-        Viewpoint, in the same axes.
-    ends_visible : (..., 2) bool
-        Whether the right and the left end of the points, as seen from the sensor, are ends of the object.
-    min_sine : float
-        Of the angle at which a side is seen: below it only the near end is taken for one; lower where the distances
-        between rays are taken into account (`end_gaps`).
+    `low`, `high`: (..., 2), m: ends of the observed points along each axis. `sensor`: (..., 2), m: viewpoint, in the same
+    axes. `ends_visible`: (..., 2): whether the right and the left end of the points, as seen from the sensor, are ends of
+    the object. `min_sine`: of the angle at which a side is seen: below it only the near end is taken for one; lower where
+    the distances between rays are taken into account (`end_gaps`).
 
-    Returns
-    -------
-    real : (..., 2, 2) int
-        For each axis, the kind of its lower and upper end: `FACING_END` for a side that faces the sensor, `SIDE_END` for
-        one observed from the side, 0 where the box may extend beyond the points.
+    Returns `real`: (..., 2, 2): for each axis, the kind of its lower and upper end: `FACING_END` for a side that faces the
+    sensor, `SIDE_END` for one observed from the side, 0 where the box may extend beyond the points.
 
     Notes
     -----
@@ -487,14 +432,8 @@ def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.
 
     An end seen from the side is up to one such distance beyond the outermost point. One that faces the sensor is hit.
 
-    Parameters
-    ----------
-    step_rad : (...) float64, rad
-        Angle between neighboring rays, from `box_fitting.azimuth_step_rad`.
-    low, high : (..., 2) float64, m
-        Ends of the extents along the length and the width, relative to the sensor.
-    real : (..., 2, 2) int
-        From `real_ends`.
+    `step_rad`: (...), rad: angle between neighboring rays, from `box_fitting.azimuth_step_rad`. `low`, `high`: (..., 2), m:
+    ends of the extents along the length and the width, relative to the sensor. `real`: (..., 2, 2): from `real_ends`.
 
     Notes
     -----
@@ -519,24 +458,11 @@ def complete_box(
 ) -> tuple[Array, Array]:
     """Place a box of known size over its observed extents.
 
-    Parameters
-    ----------
-    low, high : (..., 2) float64, m
-        Ends of the observed points along each axis.
-    size_m : (2,) or (..., 2) float64, m
-        Length and width of the whole box.
-    real : (..., 2, 2) int
-        Kinds of the ends, see `real_ends`.
-    known : (...) bool
-        Whether a 3D detector gives the size, so that what is added to the points beyond a real end is no guess.
-    gap_m : (..., 2, 2) float64, m
-        From `end_gaps`.
+    `low`, `high`: (..., 2), m: ends of the observed points along each axis. `size_m`: (2,) or (..., 2), m: length and width
+    of the whole box. `real`: (..., 2, 2): kinds of the ends, see `real_ends`. `known`: (...): whether a 3D detector gives
+    the size, so that what is added to the points beyond a real end is no guess. `gap_m`: (..., 2, 2), m: from `end_gaps`.
 
-    Returns
-    -------
-    center : (..., 2) float64, m
-    sigma_m : (..., 2) float64
-        Its standard deviation along each axis.
+    Returns `center`: (..., 2), m; `sigma_m`: (..., 2): its standard deviation along each axis.
 
     Notes
     -----
@@ -590,10 +516,7 @@ def weighted_center(local: Array, sigma_m: Array, box_local: Array, box_sigma_m:
 
     Where one of the two is NaN the other is taken.
 
-    Returns
-    -------
-    center : (..., 2) float64, m
-    sigma_m : (..., 2) float64
+    Returns `center`: (..., 2), m; `sigma_m`: (..., 2).
     """
     missing, unseen = np.isnan(box_local), np.isnan(local)
     share = np.where(missing, 0.0, np.where(unseen, 1.0, sigma_m**2 / (sigma_m**2 + box_sigma_m**2)))

@@ -50,18 +50,10 @@ MIN_SIDE_SIGMA_M, MAX_YAW_SIGMA_RAD = 0.03, np.pi / np.sqrt(12)
 
 @dataclass(frozen=True, eq=False)
 class BoxErrors:
-    """Standard deviations of M boxes.
+    """Standard deviations of M boxes."""
 
-    Attributes
-    ----------
-    side_m : (M, 2, 2) float64
-        Of the lower and the upper end along the length and the width, m.
-    yaw_rad : (M,) float64
-        Up to half turns.
-    """
-
-    side_m: Array
-    yaw_rad: Array
+    side_m: Array  # (M, 2, 2): of the lower and the upper end along the length and the width, m
+    yaw_rad: Array  # (M,): up to half turns
 
     @property
     def center_m(self) -> Array:
@@ -133,18 +125,11 @@ NOT_ALLOWED = 1e6
 
 @dataclass(frozen=True, eq=False)
 class SeenBoxes:
-    """Boxes with their errors.
+    """Boxes with their errors."""
 
-    Attributes
-    ----------
-    boxes : M Boxes3D
-    sensor_m : (3,) float64, optional
-        Where they are all seen from, m, map frame.
-    """
-
-    boxes: Boxes3D
+    boxes: Boxes3D  # M Boxes3D
     errors: BoxErrors
-    sensor_m: Array | None = None
+    sensor_m: Array | None = None  # (3,): where they are all seen from, m, map frame
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -253,12 +238,7 @@ CAUCHY_SIGMAS = 2.0
 def take_off_offset(a: SeenBoxes, b: SeenBoxes, b_all: SeenBoxes) -> SeenBoxes:
     """Move all boxes of the road to where pairs of boxes (P,) that belong together show that they are.
 
-    Parameters
-    ----------
-    a, b : P SeenBoxes
-        Of the vehicle and of the road, row by row the same objects.
-    b_all : N SeenBoxes
-        Of the road.
+    `a`, `b`: of the vehicle and of the road, row by row the same objects. `b_all`: N SeenBoxes: of the road.
 
     Notes
     -----
@@ -322,21 +302,12 @@ Merge = Callable[[SeenBoxes, SeenBoxes], SeenBoxes]
 
 @dataclass(frozen=True)
 class Method:
-    """How boxes of two ends are joined.
+    """How boxes of two ends are joined."""
 
-    Attributes
-    ----------
-    match : callable
-        Of two sets of boxes, which belong together.
-    merge : callable
-        Of two sets of P boxes that belong together row by row, the joined ones.
-    refines : bool
-        Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
-        pose.
-    """
-
-    match: Callable[[SeenBoxes, SeenBoxes], Pairs]
-    merge: Merge
+    match: Callable[[SeenBoxes, SeenBoxes], Pairs]  # of two sets of boxes, which belong together
+    merge: Merge  # of two sets of P boxes that belong together row by row, the joined ones
+    # Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
+    # pose
     refines: bool
 
 
@@ -534,19 +505,11 @@ AUTO = "auto"
 
 @dataclass(frozen=True, eq=False)
 class EndsDetector:
-    """Detector of road users in the clouds of both ends.
+    """Detector of road users in the clouds of both ends."""
 
-    Attributes
-    ----------
-    vehicle, road : LidarDetector
-        For the clouds of each end.
-    method : Method, optional
-        How boxes of the ends are joined; without it each end keeps its own.
-    """
-
-    vehicle: LidarDetector
+    vehicle: LidarDetector  # `vehicle`, `road`: for the clouds of each end
     road: LidarDetector
-    method: Method | None
+    method: Method | None  # how boxes of the ends are joined; without it each end keeps its own
 
     @property
     def name(self) -> str:
@@ -591,15 +554,9 @@ def _is_same_view(one: Cloud, other: Cloud) -> bool:
 def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None) -> LidarDetector:
     """Make the detector in LiDAR sweeps of a log, one for each end where these are searched apart.
 
-    Parameters
-    ----------
-    given : LidarDetector, optional
-        Takes the place of the one that the settings name.
+    `given`: takes the place of the one that the settings name.
 
-    Raises
-    ------
-    ConfigError, MissingExtra
-        See `create_lidar_detector`.
+    Raises `ConfigError`, `MissingExtra`: see `create_lidar_detector`.
     """
     name, level = config.detect.in_sweeps, fusion_level(log, config)[0]
     vehicle = given or create_lidar_detector(name, log, config.lidar)

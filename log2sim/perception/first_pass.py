@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Detections, Finding, Log, Measurements, Obstacles, OtherView, Rays, Sweep
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
@@ -21,14 +22,13 @@ from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Array
 from log2sim.perception.alignment import align_parts
-from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.first_pass_cache import FirstPassCache
 from log2sim.perception.frames import FrameDetector
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, obstacles_of
-from log2sim.perception.observe_tick import Observed, TickObserver
+from log2sim.perception.observe_tick import SeenTick, TickObserver
 from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
+from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
 from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox
 from log2sim.plan import FusionLevel, Plan, Stage
@@ -70,10 +70,7 @@ class ObstacleList(Sequence["Obstacles | None"]):
     What is asked for is new each time: its stamp, its origin and the place of its sensor are at hand, and its points and rays are
     read when they are looked at.
 
-    Parameters
-    ----------
-    file : ArrayFile
-        What keeps points and rays.
+    `file`: what keeps points and rays.
     """
 
     def __init__(self, file: ArrayFile) -> None:
@@ -107,7 +104,7 @@ class ObstacleList(Sequence["Obstacles | None"]):
 
 # Sweeps of each LiDAR that are kept for the next ticks, which may share some.
 SWEEPS_KEPT = 4
-# Ticks that are worked on together; where frames are skipped between some of them, a multiple of these.
+# Ticks that are worked on together, at least.
 PART_TICKS = 5
 
 Key = tuple[int, ...]
@@ -116,35 +113,15 @@ Key = tuple[int, ...]
 class CloudMaker:
     """Make the clouds of successive ticks and search them; ticks share the clouds of the same sweeps, each read once.
 
-    Parameters
-    ----------
-    max_range_m : float
-        Points farther from the origin along an axis are left out.
-    detector : LidarDetector, optional
-        Searches the clouds of the reference sensor.
-    sweeps : int
-        Successive clouds that the detector sees as one.
-
-    Attributes
-    ----------
-    before : list of (Key, Boxes3D)
-        The last two clouds that were searched, and what was found in them.
-    compensated : dict
-        How each sweep was compensated, see `compensation_of`, by LiDAR and index.
+    `config`: `measure.max_range_m`: points farther from the origin along an axis are left out; `lidar.sweeps`: successive
+    clouds that the detector sees as one. `detector`: searches the clouds of the reference sensor.
     """
 
     def __init__(
-        self,
-        log: Log,
-        schedule: Schedule,
-        plan: Plan,
-        *,
-        max_range_m: float,
-        detector: LidarDetector | None = None,
-        sweeps: int = 1,
+        self, log: Log, schedule: Schedule, plan: Plan, config: Config, detector: LidarDetector | None
     ) -> None:
-        self._log, self._schedule, self._plan = log, schedule, plan
-        self._max_range_m, self._detector, self._most_seen = max_range_m, detector, sweeps
+        self._log, self._schedule, self._plan, self._detector = log, schedule, plan, detector
+        self._max_range_m, self._most_seen = config.measure.max_range_m, config.lidar.sweeps
         self.before: list[tuple[Key, Boxes3D]] = []
         self.compensated: dict[tuple[str, int], str] = {}
         self._next = 0
@@ -254,44 +231,26 @@ class CloudMaker:
 
 @dataclass(eq=False)
 class Observations:
-    """Results of the first pass, by tick.
+    """Results of the first pass, by tick."""
 
-    Attributes
-    ----------
-    measurements : T Measurements
-        Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position.
-    obstacles : T Obstacles, None at ticks without LiDAR
-    points : ArrayFile
-        Keeps the points of all measurements and obstacles.
-    feet, ground : dict of str to list of Correspondences
-        Foot points of measured objects and ground points of the LiDAR, by camera.
-    detections : dict of str to int
-        Number of detections by camera and by name of the detector in sweeps.
-    sweeps : Counter of str
-        Number of sweeps by how they were compensated, see `compensation_of`.
-    frames_skipped : mapping of str to int
-        By camera.
-    unseen : mapping of str to list of int
-        Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched.
-    faults : tuple of Finding
-        Of the records.
-    lights : list of LightBox
-        Traffic lights in frames, which are no agents.
-    """
-
+    # T Measurements: of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position
     measurements: list[Measurements] = field(default_factory=list)
-    obstacles: Sequence[Obstacles | None] = field(default_factory=list)
-    points: ArrayFile = field(default_factory=ArrayFile)
+    obstacles: Sequence[Obstacles | None] = field(default_factory=list)  # T Obstacles, None at ticks without LiDAR
+    points: ArrayFile = field(default_factory=ArrayFile)  # keeps the points of all measurements and obstacles
+    # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera
     feet: dict[str, list[Correspondences]] = field(default_factory=dict)
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
+    # Number of detections by camera and by name of the detector in sweeps
     detections: dict[str, int] = field(default_factory=dict)
     records: RecordSource | None = None
+    # Number of sweeps by how they were compensated, see `compensation_of`
     sweeps: Counter[str] = field(default_factory=Counter)
     frames_detected: int = 0
-    frames_skipped: Mapping[str, int] = field(default_factory=dict)
+    frames_skipped: Mapping[str, int] = field(default_factory=dict)  # by camera
+    # Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched
     unseen: dict[str, list[int]] = field(default_factory=dict)
-    faults: tuple[Finding, ...] = ()
-    lights: list[LightBox] = field(default_factory=list)
+    faults: tuple[Finding, ...] = ()  # of the records
+    lights: list[LightBox] = field(default_factory=list)  # traffic lights in frames, which are no agents
 
     @property
     def unreadable(self) -> dict[str, Any]:
@@ -306,103 +265,75 @@ class Observations:
 
 
 @dataclass(eq=False)
-class SeenTick:
-    """What the first pass takes from one tick.
-
-    Attributes
-    ----------
-    found : dict of str to int
-        Number of detections by camera and by name of the detector in sweeps.
-    frames : int
-        How many were searched.
-    skipped, unseen : list of str
-        Cameras whose frame was not searched, and those of which it says nothing.
-    """
-
-    seen: Observed = field(default_factory=Observed)
-    obstacles: Obstacles | None = None
-    lights: list[LightBox] = field(default_factory=list)
-    found: dict[str, int] = field(default_factory=dict)
-    frames: int = 0
-    skipped: list[str] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)
-
-
-@dataclass(eq=False)
 class Part:
-    """What the first pass takes from successive ticks, with what it knew of their records.
-
-    Attributes
-    ----------
-    before : list of (Key, Boxes3D)
-        See `CloudMaker`, after these ticks.
-    """
+    """What the first pass takes from successive ticks, with what it knew of their records."""
 
     ticks: list[SeenTick]
     looks: list[Look]
     read: dict[str, int]
     failed: dict[str, list[str]]
     compensated: dict[tuple[str, int], str]
-    before: list[tuple[Key, Boxes3D]]
+    before: list[tuple[Key, Boxes3D]]  # list of (Key, Boxes3D): see `CloudMaker`, after these ticks
 
 
 PACKED = (
-    Part, SeenTick, Observed, Measurements, OtherView, Correspondences, Obstacles, Rays, LightBox, Look, SweepSketch, Boxes3D,
+    Part, SeenTick, Measurements, OtherView, Correspondences, Obstacles, Rays, LightBox, Look, SweepSketch, Boxes3D,
 )  # fmt: skip
 
 
 @dataclass(eq=False)
 class Task:
-    """Ticks that are to be observed.
-
-    Attributes
-    ----------
-    watch : RecordWatch
-        What is known of the records before them.
-    before : list of (Key, Boxes3D)
-        See `CloudMaker`, before these ticks.
-    judged : bool
-        Whether all that is to be known of the records is known already.
-    """
+    """Ticks that are to be observed."""
 
     ticks: range
-    watch: RecordWatch
-    before: list[tuple[Key, Boxes3D]]
-    judged: bool = False
+    watch: RecordWatch  # what is known of the records before them
+    before: list[tuple[Key, Boxes3D]]  # list of (Key, Boxes3D): see `CloudMaker`, before these ticks
+    judged: bool = False  # whether all that is to be known of the records is known already
 
 
-@dataclass(frozen=True, eq=False)
 class FirstPass:
     """Detection and measurement of parts of a log; what a part holds does not depend on those that this process made before."""
 
-    log: Log
-    schedule: Schedule
-    plan: Plan
-    clouds: CloudMaker
-    observer: TickObserver
-    frames: FrameDetector | None
-    lidar_detector: LidarDetector | None
-    cache: FirstPassCache | None
+    def __init__(self, log: Log, schedule: Schedule, plan: Plan, detectors: Detectors, config: Config) -> None:
+        self.log, self.schedule, self.plan, self.detectors, self.config = log, schedule, plan, detectors, config
+        self.clouds = CloudMaker(log, schedule, plan, config, detectors.sweeps)
+        self.observer = TickObserver(log, schedule, plan, config.measure)
+        self.frames = None if detectors.images is None else FrameDetector(log, schedule, detectors.images, plan)
+        # Ticks of a part: where frames are skipped between some of them, a multiple of these.
+        self.step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
+        if detectors.cache is not None:
+            self.clouds.most_kept = self.step + 1
+            # Of the plan what this pass looks at, so that other later stages leave the key as it is.
+            looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
+            planned = [
+                plan.detector_stride,
+                plan.picture_stride,
+                plan.fusion,
+                [plan.keeps(stage) for stage in looked_at],
+            ]
+            settings = [config.measure.mode, config.measure.max_range_m, config.lidar.sweeps]
+            detectors.cache.begin(log, [list(plan.cameras), planned, *settings, schedule.reference_row])
 
     def observe(self, task: Task) -> tuple[Part, StageClock, tuple[int, int, str | None]]:
         """Detect and measure in some ticks; returns how many were known and how many were kept, and why no more, too."""
         task.watch.attach(self.log)
         records, clock, count = RecordSource(self.log, task.watch), StageClock(), len(task.ticks)
-        if self.cache is not None:
+        cache = self.detectors.cache
+        if cache is not None:
             with clock.stage("recall"):
                 key = self._content(task, records)
-                part: Part | None = self.cache.get(key, PACKED)
+                part: Part | None = cache.get(key, PACKED)
             if part is not None and len(part.ticks) == count:
                 return part, clock, (count, 0, None)
         self.clouds.before, self.clouds.compensated = task.before, {}
         seen = [self._tick(tick, records, clock) for tick in task.ticks]
         looks = list(records.looks.values())
         part = Part(seen, looks, records.read, records.failed, self.clouds.compensated, self.clouds.before)
-        if self.cache is None:
+        if cache is None:
             return part, clock, (0, 0, None)
         with clock.stage("recall"):
-            kept = self.cache.put(key, part)
-        return part, clock, (0, count * kept, self.cache.store_problem)
+            kept = cache.put(key, part)
+        return part, clock, (0, count * kept, cache.store_problem)
 
     def _content(self, task: Task, records: RecordSource) -> bytes:
         """Return a digest of the records of some ticks, and of all else that what is seen there depends on."""
@@ -440,69 +371,54 @@ class FirstPass:
         return hashlib.blake2b(content, digest_size=32).digest()
 
     def _tick(self, tick: int, records: RecordSource, clock: StageClock) -> SeenTick:
-        out, plan, live = SeenTick(), self.plan, dict[str, Detections]()
-        searched = {} if self.frames is None else self.frames.search(tick, records, clock)
-        for camera, findings in searched.items():
-            index = int(self.schedule.frames[camera][tick])
-            if findings is None:
-                out.skipped.append(camera)
+        plan, live, lights, skipped, searched = self.plan, dict[str, Detections](), list[LightBox](), list[str](), 0
+        for camera, found in ({} if self.frames is None else self.frames.search(tick, records, clock)).items():
+            if found is None:
+                skipped.append(camera)
                 if plan.picture_stride > 1:
                     continue
-            boxes = Detections.empty() if findings is None else findings.detections
-            thumbnail = None if findings is None else findings.thumbnail
-            out.frames += findings is not None
-            decodes = plan.keeps(Stage.IMAGE_DECODING)
-            if not decodes or records.is_live(camera, index, thumbnail, found=len(boxes) > 0):
+            boxes, thumbnail, shown = (Detections.empty(), None, ()) if found is None else vars(found).values()
+            searched += found is not None
+            index = int(self.schedule.frames[camera][tick])
+            if not plan.keeps(Stage.IMAGE_DECODING) or records.is_live(camera, index, thumbnail, found=len(boxes) > 0):
                 live[camera] = boxes
-                out.lights += () if findings is None else findings.lights
-        if self.frames is not None:
-            out.unseen = [c for c in plan.cameras if self.schedule.frames[c][tick] >= 0 and c not in live]
+                lights += shown
         with clock.stage("cloud"):
             clouds = self.clouds.clouds(tick, records)
-        boxes_3d = None
-        if self.lidar_detector is not None:
+        detector, boxes_3d = self.detectors.sweeps, None
+        if detector is not None:
             with clock.stage("detect"):
                 boxes_3d = self.clouds.boxes(tick)
-            out.found[self.lidar_detector.name] = len(boxes_3d)
         with clock.stage("measure"):
-            out.seen = self.observer.measure(tick, live, clouds, boxes_3d)
-            out.found |= {camera: len(boxes) for camera, boxes in live.items()}
-            out.lights = self.observer.range_lights(tick, out.lights, clouds)
+            out = self.observer.measure(tick, live, clouds, boxes_3d)
+            out.lights = self.observer.range_lights(tick, lights, clouds)
         with clock.stage("cloud"):
             out.obstacles = None if clouds[0] is None else obstacles_of(clouds[0])
+        out.found = {} if detector is None or boxes_3d is None else {detector.name: len(boxes_3d)}
+        out.found |= {camera: len(boxes) for camera, boxes in live.items()}
+        out.frames, out.skipped = searched, skipped
+        if self.frames is not None:
+            out.unseen = [c for c in plan.cameras if self.schedule.frames[c][tick] >= 0 and c not in live]
         return out
 
 
 def observe(
     log: Log,
     schedule: Schedule,
-    detector: Detector | None,
     plan: Plan,
     *,
-    mode: str,
-    max_range_m: float,
+    detectors: Detectors,
+    config: Config,
     clock: StageClock,
-    progress: Callable[[int, int], None],
-    lidar_detector: LidarDetector | None = None,
-    sweeps: int = 1,
-    cache: FirstPassCache | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     jobs: int = 1,
 ) -> Observations:
     """Run detection and measurement over all ticks.
 
-    Parameters
-    ----------
-    detector : Detector, optional
-        Searches the frames of the plan's cameras; None where it has no cameras.
-    lidar_detector : LidarDetector, optional
-        Searches the clouds of the reference sensor.
-    sweeps : int
-        Successive clouds that it sees as one.
-    cache : FirstPassCache, optional
-        Ticks that it knows are not looked at again.
-    jobs : int
-        Processes that share the ticks. The result is the same for any number; with fusion of points each cloud needs the
-        one before, so that one process does all.
+    `detectors`: those of pictures search the frames of the plan's cameras, those of sweeps the clouds of the reference
+    sensor; ticks that their cache knows are not looked at again. `config`: how to measure, and how many successive clouds
+    are searched as one. `jobs`: processes that share the ticks. The result is the same for any number; with fusion of
+    points each cloud needs the one before, so that one process does all.
 
     Notes
     -----
@@ -511,19 +427,9 @@ def observe(
     """
     out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     obstacles = out.obstacles = ObstacleList(out.points)
-    clouds = CloudMaker(log, schedule, plan, max_range_m=max_range_m, detector=lidar_detector, sweeps=sweeps)
-    frames = None if detector is None else FrameDetector(log, schedule, detector, plan)
-    observer = TickObserver(log, schedule, plan, mode, max_range_m)
-    first_pass = FirstPass(log, schedule, plan, clouds, observer, frames, lidar_detector, cache)
-    step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
-    ranges = [range(k, min(k + step, len(schedule))) for k in range(0, len(schedule), step)]
+    first_pass, cache = FirstPass(log, schedule, plan, detectors, config), detectors.cache
+    ranges = [range(k, min(k + first_pass.step, len(schedule))) for k in range(0, len(schedule), first_pass.step)]
     jobs = 1 if plan.fusion is FusionLevel.POINTS else min(jobs, len(ranges))
-    if cache is not None:
-        clouds.most_kept = step + 1
-        # Of the plan what this pass looks at, so that other later stages leave the key as it is.
-        looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
-        planned = [plan.detector_stride, plan.picture_stride, plan.fusion, [plan.keeps(stage) for stage in looked_at]]
-        cache.begin(log, [list(plan.cameras), planned, mode, max_range_m, sweeps, schedule.reference_row])
     records = out.records = RecordSource(log)
     before: list[tuple[Key, Boxes3D]] = []
     compensated: dict[tuple[str, int], str] = {}
@@ -541,9 +447,9 @@ def observe(
             if cache is not None:
                 cache.count(*known)
             for tick, seen in zip(ticks, part.ticks):
-                out.measurements.append(seen.seen.measurements.stored(out.points))
+                out.measurements.append(seen.measurements.stored(out.points))
                 obstacles.append(seen.obstacles)
-                for kept, new in ((out.feet, seen.seen.feet), (out.ground, seen.seen.ground)):
+                for kept, new in ((out.feet, seen.feet), (out.ground, seen.ground)):
                     for camera, correspondences in new.items():
                         kept[camera].append(correspondences)
                 for name, number in seen.found.items():

@@ -34,20 +34,7 @@ SOURCES = ("datatypes/*.py", "files/packing.py", "geometry/*.py", "logs/records.
 class FirstPassCache:
     """Parts of the first pass of runs with one pair of detectors.
 
-    Parameters
-    ----------
-    store : DiskCache
-    name : str
-        Of the detectors, for people.
-    cache_key : str
-        All that their results depend on besides the records.
-
-    Attributes
-    ----------
-    found, kept : int
-        Ticks that were there, and that were kept for later runs.
-    problem : str or None
-        Why nothing more is kept.
+    `name`: of the detectors, for people. `cache_key`: all that their results depend on besides the records.
     """
 
     def __init__(self, store: DiskCache, name: str, cache_key: str) -> None:

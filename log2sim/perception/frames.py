@@ -53,19 +53,11 @@ def work_ahead(work: Callable[[Item], Out], items: Iterable[Item], ahead: int = 
 
 @dataclass(frozen=True, eq=False)
 class PictureFindings:
-    """What a run takes from a picture.
-
-    Attributes
-    ----------
-    thumbnail : (h, w) float32 or None
-        By which it is compared with other pictures; None where it was not decoded.
-    lights : tuple of LightBox
-        Traffic lights, cut out.
-    """
+    """What a run takes from a picture."""
 
     detections: Detections
-    thumbnail: Thumbnail | None
-    lights: tuple[LightBox, ...] = ()
+    thumbnail: Thumbnail | None  # (h, w): by which it is compared with other pictures; None where it was not decoded
+    lights: tuple[LightBox, ...] = ()  # traffic lights, cut out
 
 
 class FrameDetector:

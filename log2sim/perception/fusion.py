@@ -37,11 +37,7 @@ def fuse_by_end(placed: Sequence[Measurements], plan: Plan) -> list[list[Measure
 def fuse(measurements: Sequence[Measurements], *, across: bool = True) -> list[Measurements]:
     """Fuse the measurements of all cameras at every tick, see `fuse_tick`.
 
-    Parameters
-    ----------
-    measurements : T sets of rows, all with their final position
-    across : bool
-        Whether several cameras may have seen the same object.
+    `across`: whether several cameras may have seen the same object.
     """
     return [fuse_tick(rows, across=across) for rows in measurements]
 

@@ -45,30 +45,14 @@ RAY_HEIGHT_SHARES = (0.2, 0.8)
 
 @dataclass(frozen=True, eq=False)
 class CameraHomography:
-    """A camera's homography to the ground frame of the ego.
-
-    Attributes
-    ----------
-    source : str
-        What it was fitted to, "calibration and flat ground" where a fit was refused, "none" where there is none.
-    refusal : str
-        Why the fit to the log was refused, "" otherwise.
-    rig : RigFit or None
-        What it was fitted together with; None for a camera that was fitted apart.
-    """
+    """A camera's homography to the ground frame of the ego."""
 
     camera: Camera
     fit: HomographyFit
+    # What it was fitted to, "calibration and flat ground" where a fit was refused, "none" where there is none
     source: str
-    refusal: str = ""
-    rig: RigFit | None = None
-
-    def road_at_tick(self, tick: int) -> Array | None:
-        """Return the homography (3, 3) from the image to the ground for the road itself; None where there is none.
-
-        Fitted apart, it is that of the feet of obstacles.
-        """
-        return self.fit.at_tick(tick) if self.rig is None else self.rig.road_at_tick(self.camera.name, tick)
+    refusal: str = ""  # why the fit to the log was refused, "" otherwise
+    rig: RigFit | None = None  # what it was fitted together with; None for a camera that was fitted apart
 
 
 def fit_homographies(
@@ -122,11 +106,7 @@ def _fit_together(
 def list_rigs(log: Log, cameras: Sequence[str]) -> tuple[list[list[str]], dict[str, str]]:
     """List the cameras that see one ground: those of the ego, and those of each place at the road.
 
-    Returns
-    -------
-    rigs : list of list of str
-    left_out : dict of str to str
-        Why a camera belongs to none.
+    Returns `rigs`; `left_out`: why a camera belongs to none.
     """
     left_out: dict[str, str] = {}
     rigs: list[list[str]] = []

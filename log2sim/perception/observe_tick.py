@@ -9,7 +9,8 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ENDS, Boxes3D, Detections, Log, Measurements, end_of
+from log2sim.config import MeasureConfig
+from log2sim.datatypes import ENDS, Boxes3D, Detections, Log, Measurements, Obstacles, end_of
 from log2sim.geometry import Array, inverse
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin, join_parts
@@ -22,21 +23,24 @@ from log2sim.plan import FusionLevel, Plan, Stage
 MAX_GROUND_POINTS_PER_FRAME = 40
 
 
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """What is measured at one tick.
+@dataclass(eq=False)
+class SeenTick:
+    """What the first pass takes from one tick."""
 
-    Attributes
-    ----------
-    measurements : Measurements
-        Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position.
-    feet, ground : dict of str to Correspondences
-        Foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs them.
-    """
-
+    # Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position
     measurements: Measurements = field(default_factory=Measurements.empty)
+    # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs
+    # them
     feet: dict[str, Correspondences] = field(default_factory=dict)
     ground: dict[str, Correspondences] = field(default_factory=dict)
+    obstacles: Obstacles | None = None
+    lights: list[LightBox] = field(default_factory=list)
+    # Number of detections by camera and by name of the detector in sweeps
+    found: dict[str, int] = field(default_factory=dict)
+    frames: int = 0  # how many were searched
+    # `skipped`, `unseen`: cameras whose frame was not searched, and those of which it says nothing
+    skipped: list[str] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +50,11 @@ class TickObserver:
     log: Log
     schedule: Schedule
     plan: Plan
-    mode: str
-    max_range_m: float
+    settings: MeasureConfig
 
     def measure(
         self, tick: int, found: dict[str, Detections], clouds: Sequence[Cloud | None], boxes: Boxes3D | None
-    ) -> Observed:
+    ) -> SeenTick:
         """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
         reference = clouds[self.schedule.reference_row]
         # Where clouds were searched, a camera's objects are sought in what its own end sees.
@@ -67,10 +70,10 @@ class TickObserver:
                 (frames[end], boxes.take(seen), parts[id(reference), end]) for end, seen in zip(ENDS, boxes.seen_by.T)
             ]
         joined = Measurements.join([
-            measure(shown, None if of is None else outside_ego(self.log, of), cloud, mode=self.mode)
+            measure(shown, None if of is None else outside_ego(self.log, of), cloud, mode=self.settings.mode)
             for shown, of, cloud in groups
         ])  # fmt: skip
-        out = Observed(joined.take(self._in_range(tick, joined)))
+        out = SeenTick(joined.take(self._in_range(tick, joined)))
         if self.plan.keeps(Stage.HOMOGRAPHY):
             for view, _, cloud in chain(*frames.values()):
                 ego_T_map, name = inverse(base_pose(self.log, view.t_ns)), view.camera.name
@@ -97,7 +100,7 @@ class TickObserver:
         """Mark the rows within range of the ego, and those without a position, which a homography may still place."""
         origin, _ = cloud_origin(self.log, int(self.schedule.t_ns[tick]))
         with np.errstate(invalid="ignore"):
-            return np.asarray(~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > self.max_range_m))
+            return np.asarray(~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > self.settings.max_range_m))
 
 
 def _of_end(cloud: Cloud | None, end: str) -> Cloud | None:

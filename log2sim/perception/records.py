@@ -56,19 +56,11 @@ MIN_STAMPS = 3
 
 @dataclass(frozen=True)
 class Span:
-    """Records of one stream that are at fault.
+    """Records of one stream that are at fault."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Stamps of the first and the last.
-    count, total : int
-        Records at fault, and all from the first to the last of them.
-    """
-
-    start_ns: int
+    start_ns: int  # `start_ns`, `end_ns`: stamps of the first and the last
     end_ns: int
-    count: int
+    count: int  # `count`, `total`: records at fault, and all from the first to the last of them
     total: int
 
 
@@ -204,16 +196,9 @@ def expect_change(
 ) -> float:
     """Return by how many gray levels a picture changes where nothing but its camera moves: the 95 % quantile over the cells.
 
-    Parameters
-    ----------
-    picture : (h, w) float32
-        The earlier picture.
-    camera : Camera
-        Its lens distortion is left out; it changes where things are in a picture, not how far they move.
-    map_T_before, map_T_after : (4, 4) float64
-        Poses of the camera.
-    ground_z_m : float
-        Height of flat ground in the map.
+    `picture`: (h, w): the earlier picture. `camera`: its lens distortion is left out; it changes where things are in a
+    picture, not how far they move. `map_T_before`, `map_T_after`: (4, 4): poses of the camera. `ground_z_m`: height of flat
+    ground in the map.
 
     Notes
     -----
@@ -244,6 +229,7 @@ def expect_change(
 CELL_M = 0.01
 # Hashes of a sketch; the share of common points errs by 1 / sqrt(this), 3 %.
 SKETCH_SIZE = 1024
+SLICES, MIN_SLICED_POINTS = 8, 4096
 # Rays that hit flat ground do so at the same distance wherever the ego is, and those that hit the ego itself always do.
 MIN_HEIGHT_M, MIN_DISTANCE_M = 0.3, 3.0
 AXIS_BITS = 21
@@ -251,26 +237,26 @@ AXIS_BITS = 21
 
 @dataclass(frozen=True, eq=False)
 class SweepSketch:
-    """What is kept of a sweep to compare it with others.
+    """What is kept of a sweep to compare it with others."""
 
-    Attributes
-    ----------
-    points, obstacles : int
-        How many points it has, and how many of them are above the ground and beyond the ego.
-    hashes : (K,) uint64
-        The smallest hashes of the cells of its obstacle points, sorted, at most `SKETCH_SIZE`.
-    """
-
+    # `points`, `obstacles`: how many points it has, and how many of those that were looked at are above the ground and
+    # beyond the ego
     points: int
     obstacles: int
+    # (K,): the smallest hashes of the cells of its obstacle points, sorted, at most `SKETCH_SIZE`
     hashes: NDArray[np.uint64]
 
 
 def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
-    """Return the sketch of a sweep of a LiDAR."""
+    """Return the sketch of a sweep of a LiDAR.
+
+    Of many points those are looked at whose cells along x are of one slice in `SLICES`, the same in every sweep.
+    """
     xyz = sweep.xyz_m
-    obstacles = xyz[_is_obstacle(log, name, sweep)]
-    return SweepSketch(len(xyz), len(obstacles), _smallest(_hash_cells(obstacles)))
+    if len(xyz) > SLICES * MIN_SLICED_POINTS:
+        xyz = xyz.take(np.flatnonzero(np.floor(xyz[:, 0] / CELL_M).astype(np.int64) % SLICES == 0), axis=0)
+    obstacles = xyz[_is_obstacle(log, name, sweep, xyz)]
+    return SweepSketch(len(sweep.xyz_m), len(obstacles), _smallest(_hash_cells(obstacles)))
 
 
 def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -280,9 +266,9 @@ def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return chosen[:SKETCH_SIZE] if len(chosen) >= SKETCH_SIZE else np.unique(hashes)[:SKETCH_SIZE]
 
 
-def _is_obstacle(log: Log, name: str, sweep: Sweep) -> NDArray[np.bool_]:
-    """Mark the points (N,) well above flat ground under the ego, and not on the ego; all of a LiDAR that stands."""
-    xyz, lidar = sweep.xyz_m, log.lidars[name]
+def _is_obstacle(log: Log, name: str, sweep: Sweep, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Mark points (N, 3) well above flat ground under the ego, and not on the ego; all of a LiDAR that stands."""
+    lidar = log.lidars[name]
     if lidar.mount == "map":
         return np.ones(len(xyz), dtype=bool)
     above_ground_m = float(lidar.mount_T_lidar[2, 3]) - log.ground_z_ego_m
@@ -353,21 +339,11 @@ class _Picture:
 
 @dataclass(eq=False)
 class CameraWatch:
-    """Judge the pictures of one camera in the order of their stamps.
+    """Judge the pictures of one camera in the order of their stamps."""
 
-    Attributes
-    ----------
-    log : Log
-        Its poses tell how the camera moves.
-    name : str
-        Of the camera.
-    states : dict of int to {"live", "black", "frozen"}
-        What was found, by stamp, rising.
-    """
-
-    log: Log
-    name: str
-    states: dict[int, PictureState] = field(default_factory=dict)
+    log: Log  # its poses tell how the camera moves
+    name: str  # of the camera
+    states: dict[int, PictureState] = field(default_factory=dict)  # what was found, by stamp, rising
     _last: _Picture | None = None
     _frozen: bool = False
     _steps_without_change: int = 0
@@ -376,11 +352,7 @@ class CameraWatch:
     def judge(self, t_ns: int, thumbnail: Thumbnail, *, found: bool = False) -> PictureState:
         """Say whether a picture shows what is before the camera at its stamp, and remember it.
 
-        Parameters
-        ----------
-        thumbnail : (h, w) float32
-        found : bool
-            Whether a detector found something in it: then it does show something.
+        `thumbnail`: (h, w). `found`: whether a detector found something in it: then it does show something.
 
         Notes
         -----
@@ -463,24 +435,12 @@ class _Sweep:
 
 @dataclass(eq=False)
 class LidarWatch:
-    """Judge the sweeps of one LiDAR in the order of their stamps.
+    """Judge the sweeps of one LiDAR in the order of their stamps."""
 
-    Attributes
-    ----------
-    log : Log
-        Its poses tell how the LiDAR moves.
-    name : str
-        Of the LiDAR.
-    repeated : dict of int to bool
-        Whether a sweep repeats an earlier one, by stamp, ns.
-    points : dict of int to int
-        Number of points, by stamp.
-    """
-
-    log: Log
-    name: str
-    repeated: dict[int, bool] = field(default_factory=dict)
-    points: dict[int, int] = field(default_factory=dict)
+    log: Log  # its poses tell how the LiDAR moves
+    name: str  # of the LiDAR
+    repeated: dict[int, bool] = field(default_factory=dict)  # whether a sweep repeats an earlier one, by stamp, ns
+    points: dict[int, int] = field(default_factory=dict)  # number of points, by stamp
     _last: _Sweep | None = None
     _shares: dict[Motion, list[float]] = field(default_factory=lambda: {"stands": [], "drives": [], "unclear": []})
 
@@ -532,23 +492,13 @@ MIN_USUAL_POINTS = 100
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What is kept of a record to judge it.
-
-    Attributes
-    ----------
-    shown : Thumbnail, SweepSketch or None
-        None of a picture that was not decoded.
-    found : bool
-        Whether a detector found something in it.
-    state : str
-        "live", "black", "frozen" or, of a sweep, "repeated", as far as it was known then.
-    """
+    """What is kept of a record to judge it."""
 
     sensor: str
     t_ns: int
-    shown: Thumbnail | SweepSketch | None
-    found: bool
-    state: str
+    shown: Thumbnail | SweepSketch | None  # None of a picture that was not decoded
+    found: bool  # whether a detector found something in it
+    state: str  # "live", "black", "frozen" or, of a sweep, "repeated", as far as it was known then
 
 
 # States that a watch takes along to another process: no record of a tick is this many earlier than another.
@@ -560,10 +510,7 @@ class RecordWatch:
 
     Another process gets what it needs to go on, and `attach` gives it the log.
 
-    Attributes
-    ----------
-    cameras : dict of str to CameraWatch
-    lidars : dict of str to LidarWatch
+    `cameras`: . `lidars`: .
     """
 
     def __init__(self, log: Log) -> None:
@@ -665,14 +612,8 @@ class RecordSource:
     `log`: an opened log keeps the sweeps that were read last, so that stages which look at the same ones share them.
     `watch`: which records repeat others or show nothing, also as stages before found it.
 
-    Attributes
-    ----------
-    read : dict of str to int
-        How many records of each stream were read.
-    failed : dict of str to list of str
-        Messages of the records that could not be read, by stream.
-    looks : dict of (str, int) to Look
-        What was judged, by sensor and stamp, in this order.
+    `read`: how many records of each stream were read. `failed`: messages of the records that could not be read, by stream.
+    `looks`: dict of (str, int) to Look: what was judged, by sensor and stamp, in this order.
     """
 
     def __init__(self, log: Log, watch: RecordWatch | None = None) -> None:

@@ -28,19 +28,11 @@ GivenDetector = Callable[..., Any] | Detector | LidarDetector | str
 
 @dataclass(frozen=True, eq=False)
 class GivenDetectors:
-    """Detectors that were handed over, and the settings that name them.
-
-    Attributes
-    ----------
-    images : Detector, optional
-        Searches pictures in place of the one that the settings name.
-    sweeps : LidarDetector, optional
-        Searches clouds in place of the one that the settings name.
-    """
+    """Detectors that were handed over, and the settings that name them."""
 
     config: Config
-    images: Detector | None = None
-    sweeps: LidarDetector | None = None
+    images: Detector | None = None  # searches pictures in place of the one that the settings name
+    sweeps: LidarDetector | None = None  # searches clouds in place of the one that the settings name
 
 
 def sort_detectors(
@@ -48,17 +40,10 @@ def sort_detectors(
 ) -> GivenDetectors:
     """Tell apart what was handed over; it takes the place of `detect.name` in the settings.
 
-    Parameters
-    ----------
-    given : callable, Detector, LidarDetector, str or a list of two of them, optional
-        See `log2sim.reconstruct`.
+    `given`: see `log2sim.reconstruct`.
 
-    Raises
-    ------
-    TypeError
-        When it is none of these, or two are for the same sensors.
-    PluginError
-        When a detector lacks something.
+    Raises `TypeError` when it is none of these, or two are for the same sensors; `PluginError` when a detector lacks
+    something.
     """
     if given is None:
         return GivenDetectors(config)
@@ -109,21 +94,11 @@ def _say(given: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Detectors:
-    """The detectors of a run.
+    """The detectors of a run."""
 
-    Attributes
-    ----------
-    images : Detector, optional
-        Searches the frames of all cameras.
-    sweeps : LidarDetector, optional
-        Searches the clouds.
-    cache : FirstPassCache, optional
-        The first pass of earlier runs with these detectors.
-    """
-
-    images: Detector | None
-    sweeps: LidarDetector | None
-    cache: FirstPassCache | None = None
+    images: Detector | None  # searches the frames of all cameras
+    sweeps: LidarDetector | None  # searches the clouds
+    cache: FirstPassCache | None = None  # the first pass of earlier runs with these detectors
 
     @property
     def own(self) -> bool:
@@ -139,10 +114,7 @@ class Detectors:
 def create_detectors(log: Log, config: Config, given: GivenDetectors, *, cache: bool = True) -> Detectors:
     """Create the detectors that the settings name, but for those that were given.
 
-    Parameters
-    ----------
-    cache : bool
-        Whether what earlier runs of the first pass found is taken from the user's cache, and kept there.
+    `cache`: whether what earlier runs of the first pass found is taken from the user's cache, and kept there.
     """
     images = given.images or create_image_detector(log, config) if config.detect.in_images else None
     sweeps = create_for_ends(log, config, given.sweeps) if config.detect.in_sweeps else None
@@ -166,10 +138,7 @@ def check_detectors(config: Config) -> None:
 
     Those of other packages are imported but not made, since they may look at the log.
 
-    Raises
-    ------
-    ConfigError, MissingExtra, PluginError
-        As the run of a log would.
+    Raises `ConfigError`, `MissingExtra`, `PluginError` as the run of a log would.
     """
     log = _log_without_records()
     images, sweeps = config.detect.in_images, {config.detect.in_sweeps, config.cooperation.road_detector}

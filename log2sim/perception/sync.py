@@ -27,26 +27,16 @@ PROBED_RECORDS = 5
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """Records of every tick.
+    """Records of every tick."""
 
-    Attributes
-    ----------
-    reference : str
-        Camera that sets the ticks, or LiDAR where no camera is used.
-    t_ns : (T,) int64
-        Stamps of the ticks.
-    frames : mapping of camera to (T,) int64
-        Index into its stream, -1 where no frame is near enough.
-    sweeps : mapping of LiDAR to (C, T) int64
-        Index for every camera in the order of `frames`, one row without cameras; -1 where no sweep is near enough.
-    residuals_s : mapping of stream to (T,) float64
-        Time of the record less the requested time, NaN without a record.
-    """
-
-    reference: str
-    t_ns: NDArray[np.int64]
+    reference: str  # camera that sets the ticks, or LiDAR where no camera is used
+    t_ns: NDArray[np.int64]  # (T,): stamps of the ticks
+    # Mapping of camera to (T,) int64: index into its stream, -1 where no frame is near enough
     frames: Mapping[str, NDArray[np.int64]]
+    # Mapping of LiDAR to (C, T) int64: index for every camera in the order of `frames`, one row without cameras; -1 where
+    # no sweep is near enough
     sweeps: Mapping[str, NDArray[np.int64]]
+    # Mapping of stream to (T,) float64: time of the record less the requested time, NaN without a record
     residuals_s: Mapping[str, NDArray[np.float64]]
 
     def __len__(self) -> int:
@@ -94,24 +84,13 @@ def synchronize(
 ) -> Schedule:
     """Find the records of every tick for the chosen cameras.
 
-    Parameters
-    ----------
-    cameras : tuple of str
-        Without any, the sweeps of a LiDAR are the ticks.
-    reference : str
-        Camera that sets the ticks; "" takes the log's own choice, else the first camera. Without cameras the LiDAR; ""
-        takes the one with the most sweeps.
-    max_residual_s : float
-        Largest difference between a record's time and the requested time, s.
-    start_s, stop_s : float, optional
-        Keeps the ticks in [start, stop] seconds after the first one.
+    `cameras`: without any, the sweeps of a LiDAR are the ticks. `reference`: camera that sets the ticks; "" takes the log's
+    own choice, else the first camera. Without cameras the LiDAR; "" takes the one with the most sweeps. `max_residual_s`:
+    largest difference between a record's time and the requested time, s. `start_s`, `stop_s`: keeps the ticks in [start,
+    stop] seconds after the first one.
 
-    Raises
-    ------
-    LogError
-        For a stream without records or with stamps that do not increase.
-    ConfigError
-        When the reference is unknown or no tick is left.
+    Raises `LogError` for a stream without records or with stamps that do not increase; `ConfigError` when the reference is
+    unknown or no tick is left.
     """
     reference = _reference(log, cameras, reference)
     for name in (*cameras, *log.lidars):
@@ -187,12 +166,7 @@ def nearest_records(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Find the record nearest to each requested stamp.
 
-    Returns
-    -------
-    index : (T,) int64
-        -1 beyond the tolerance.
-    residual_s : (T,) float64
-        NaN beyond the tolerance.
+    Returns `index`: (T,): -1 beyond the tolerance; `residual_s`: (T,): NaN beyond the tolerance.
 
     Notes
     -----
@@ -239,12 +213,8 @@ def ticks_of(
 ) -> Ticks:
     """Return the ticks of a log, as `Log.ticks` does; see there.
 
-    Raises
-    ------
-    ConfigError
-        For an unknown camera, and where no tick is left.
-    LogError
-        For a log without cameras and LiDARs, or with stamps that do not increase.
+    Raises `ConfigError` for an unknown camera, and where no tick is left; `LogError` for a log without cameras and LiDARs,
+    or with stamps that do not increase.
     """
     for name in cameras:
         if name not in log.cameras:

@@ -27,26 +27,14 @@ MAX_CROPS = 20_000
 
 @dataclass(frozen=True, eq=False)
 class LightBox:
-    """A traffic light in one frame.
-
-    Attributes
-    ----------
-    t_ns : int
-        Stamp of the frame.
-    box_px : (4,) float64
-        u0, v0, u1, v1.
-    crop : (h, w, 3) uint8
-        The picture there, BGR.
-    range_m : float
-        Distance of LiDAR points in the box from the camera, NaN without any.
-    """
+    """A traffic light in one frame."""
 
     camera: str
-    t_ns: int
-    box_px: Array
+    t_ns: int  # stamp of the frame
+    box_px: Array  # (4,): u0, v0, u1, v1
     score: float
-    crop: NDArray[np.uint8]
-    range_m: float = float("nan")
+    crop: NDArray[np.uint8]  # (h, w, 3): the picture there, BGR
+    range_m: float = float("nan")  # distance of LiDAR points in the box from the camera, NaN without any
 
 
 def crop_lights(camera: str, t_ns: int, image_bgr: NDArray[np.uint8], lights: Array) -> list[LightBox]:

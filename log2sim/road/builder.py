@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 
 import cv2
@@ -23,12 +22,12 @@ from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
 from log2sim.road.pictures import ColorRaster, Image, StandingPictures, View, find_hidden, sample_nearest, warp_onto
 from log2sim.road.road_users import MASK_SHRINK, RoadUsers, covered, draw_footprints, draw_outlines
 from log2sim.road.surface import (
+    MAX_POINTS,
     GroundPoints,
-    PointCollector,
-    PreparedSweep,
     Surface,
     estimate_surface,
     map_intensity,
+    take_sweep,
     upsample,
 )
 
@@ -141,16 +140,6 @@ PROBED_SWEEPS = 3
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True, eq=False)
-class _Ground:
-    """What sweeps show: the points on the ground, its surface, that on which pictures are laid, and by stamp what hides it."""
-
-    points: GroundPoints
-    surface: Surface
-    laid: Surface
-    hiding: Mapping[int, Array]
-
-
 class GroundMapBuilder:
     """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
 
@@ -181,6 +170,7 @@ class GroundMapBuilder:
             size = f"{extent[1] - extent[0]:.0f} x {extent[3] - extent[2]:.0f} m"
             self.notes.append(f"the log covers {size}: cells of {cell_m:g} m instead of {settings.cell_m:g} m")
         self.raster = Raster.covering(extent, cell_m)
+        self._coarse = self.raster.coarser(max(round(HEIGHT_CELL_M / self.raster.resolution_m), 1))
         places = self._path if len(self._path) else roadside
         self._anchors, self._z0_m = places, float(np.median(places[:, 2]))
         self._sweeps = choose_records(log, scenario, {k: self._sweep_step_m(k) for k in log.lidars}, MAX_SWEEPS)
@@ -209,7 +199,7 @@ class GroundMapBuilder:
 
     def _lay(self, colors: ColorRaster, view: View, image: Image, users: NDArray[np.uint8]) -> None:
         """Lay a picture on the ground but where its mask shows road users, or where something stands before the ground."""
-        warp = warp_onto(view, self._ground.laid, self._z0_m, self.raster)
+        warp = warp_onto(view, self._laid, self._z0_m, self.raster)
         if warp is None:
             return
         kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
@@ -236,7 +226,7 @@ class GroundMapBuilder:
         standing = draw_footprints([self._users.standing()], self.raster) > 0
         alpha[standing], color[standing] = 0, 0
         height, intensity = self._measured()
-        for name in ("_ground", "_likely_ground"):
+        for name in ("_swept", "_surface", "_laid", "_likely_ground"):
             self.__dict__.pop(name, None)
         for layer in (height, intensity):
             layer[standing] = np.nan
@@ -260,32 +250,47 @@ class GroundMapBuilder:
         return used or list(self._log.cameras)
 
     @cached_property
-    def _ground(self) -> _Ground:
-        """Read the sweeps, when the first picture comes."""
-        factor = max(round(HEIGHT_CELL_M / self.raster.resolution_m), 1)
-        coarse = self.raster.coarser(factor)
+    def _swept(self) -> tuple[GroundPoints, dict[int, Array]]:
+        """Read the sweeps: points near the ground and, by stamp, points (H, 3), m, map frame, of what stands above it."""
         chosen = [(name, int(i)) for name, indices in self._sweeps.items() for i in indices]
         chosen.sort(key=lambda key: int(self._log.streams[key[0]].t_ns[key[1]]))
-        collector = PointCollector(self._log, coarse, len(chosen), self._z0_m)
+        most = MAX_POINTS // max(len(chosen), 1)
 
-        def prepare(key: tuple[str, int]) -> PreparedSweep | None:
-            name, sweep, t_ns = key[0], self._records.get(*key), int(self._log.streams[key[0]].t_ns[key[1]])
+        def take(key: tuple[str, int]) -> tuple[GroundPoints, Array] | None:
+            name, sweep, t_ns = key[0], self._records.get(*key), self._stamp(key)
             if sweep is None or self._records.watch.lidars[name].repeated.get(t_ns, False):
                 return None
-            return collector.prepare(name, sweep, [self._users.at(t_ns), self._users.ego_at(t_ns)])
+            users, hides = [self._users.at(t_ns), self._users.ego_at(t_ns)], self._colors is not None
+            return take_sweep(self._log, name, sweep, self._coarse, users, most=most, z0_m=self._z0_m, hides=hides)
 
-        for done, prepared in enumerate(work_ahead(prepare, chosen)):
-            collector.take(prepared)
+        parts: list[GroundPoints] = []
+        hiding: dict[int, Array] = {}
+        for done, (key, taken) in enumerate(zip(chosen, work_ahead(take, chosen))):
+            if taken is not None:
+                parts.append(taken[0])
+                before = hiding.get(self._stamp(key), np.zeros((0, 3)))
+                hiding[self._stamp(key)] = np.concatenate([before, taken[1]])
             self._progress(done + 1, len(chosen))
-        points = collector.points()
+        points = GroundPoints.join(parts)
         if not len(points.z):
             self.notes.append(
                 "no height and no intensity: there is no sweep with ground; pictures are laid on flat ground"
             )
         elif not np.isfinite(points.intensity).any():
             self.notes.append("no intensity: the sweeps of this log have none")
-        surface = estimate_surface(points, coarse, self._anchors, self._z0_m)
-        return _Ground(points, surface, surface.smoothed(), collector.hiding)
+        return points, hiding
+
+    @cached_property
+    def _surface(self) -> Surface:
+        return estimate_surface(self._swept[0], self._coarse, self._anchors, self._z0_m)
+
+    @cached_property
+    def _laid(self) -> Surface:
+        """The surface on which pictures are laid."""
+        return self._surface.smoothed()
+
+    def _stamp(self, key: tuple[str, int]) -> int:
+        return int(self._log.streams[key[0]].t_ns[key[1]])
 
     @cached_property
     def _likely_ground(self) -> NDArray[np.uint8]:
@@ -293,7 +298,7 @@ class GroundMapBuilder:
 
         Behind that stand houses, which pictures would smear over the map.
         """
-        surface = self._ground.surface
+        surface = self._surface
         if not surface.known.any():
             return np.ones(self.raster.shape, dtype=np.uint8)
         blind = self._road(surface.raster, BLIND_M)
@@ -304,18 +309,19 @@ class GroundMapBuilder:
 
     def _hiding_at(self, t_ns: int) -> Array | None:
         """Return points (H, 3), m, map frame, of what stood above the ground at a time; None where no sweep is near."""
-        stamps = np.array(sorted(self._ground.hiding), dtype=np.int64)
+        hiding = self._swept[1]
+        stamps = np.array(sorted(hiding), dtype=np.int64)
         near = stamps[np.abs(stamps - t_ns) <= MAX_APART_S * NS_PER_S]
-        return np.concatenate([self._ground.hiding[t] for t in near.tolist()]) if len(near) else None
+        return np.concatenate([hiding[t] for t in near.tolist()]) if len(near) else None
 
     def _measured(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Height, m, and intensity on the cells of the map (R, C), NaN where no sweep tells."""
-        ground, shape = self._ground, self.raster.shape
-        factor = round(ground.surface.raster.resolution_m / self.raster.resolution_m)
-        height = upsample(ground.surface.z_m, factor, shape) + np.float32(self._z0_m)
-        known = np.repeat(np.repeat(ground.surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
+        surface, shape = self._surface, self.raster.shape
+        factor = round(surface.raster.resolution_m / self.raster.resolution_m)
+        height = upsample(surface.z_m, factor, shape) + np.float32(self._z0_m)
+        known = np.repeat(np.repeat(surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
         height[~known] = np.nan
-        intensity = map_intensity(ground.points, ground.surface, self.raster, self._road(ground.surface.raster))
+        intensity = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster))
         return height, intensity
 
     def _road(self, raster: Raster, half_width_m: float = ROAD_HALF_WIDTH_M) -> NDArray[np.bool_]:

@@ -7,9 +7,8 @@ Shafer, 1985), or a dark part (glass, tire, grille, gap), or something else. For
 such pixels in CIELAB is drawn by simulation; a vehicle's pixels are a sample of one of them. So black paint under a bright
 sky differs from gray paint by its many dark pixels, and red paint in the shade from black by the hue of the brighter ones.
 
-Without a box the vehicle is taken to fill most of the photo. What stands out from the border of the box is the vehicle
-(GrabCut, Rother et al. 2004, started from where vehicles are in their boxes); within it the weights of `surface.py`, averaged
-over views from all around, say where paint is to be expected.
+Without a box the vehicle is taken to fill most of the photo. Where in its box a vehicle is, and its paint, is averaged over views
+from all around with the weights of `light.py`.
 """
 
 from __future__ import annotations
@@ -153,12 +152,8 @@ PRIOR_CELLS, PRIOR_VIEWS = 24, 72
 PRIOR_SIZE_M = (4.5, 1.8, 1.5)
 # Eyes and masts that take pictures of vehicles, and from how far.
 HEIGHTS_M, DISTANCE_M = (1.0, 1.6, 2.4), 7.0
-ITERATIONS = 3
-# Shares of views in which a place of the box shows the vehicle, below which it is likelier background, and above which it
-# certainly is the vehicle.
-LIKELY, CERTAIN = 0.5, 0.97
-# A cut that leaves less than this share of the box, or nearly all of it, has failed.
-MIN_CUT, MAX_CUT = 0.15, 0.97
+# Share of views in which a place of the box shows the vehicle, below which it is likelier background.
+LIKELY = 0.5
 FACING = 0.8  # typical cosine of the angle at which a side is seen
 MIN_BACKGROUND_PX = 60
 # What upright white looks like where a photo shows level white as just not clipped.
@@ -188,11 +183,13 @@ def color_of_picture(image_bgr: Image, box_px: ArrayLike | None = None) -> Pictu
     resized = cv2.resize(image_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = np.asarray(resized, np.uint8)
     corners = np.clip(np.round(box * scale).astype(int), 0, [small.shape[1], small.shape[0]] * 2)
-    vehicle = cut_out(small, corners)
     u0, v0, u1, v1 = corners
-    weight = np.zeros(small.shape[:2], np.float32)
-    weight[v0:v1, u0:u1] = _fitted(where_paint_is()[0], (u1 - u0, v1 - v0))
-    weight *= vehicle
+    paint, presence = (
+        cv2.resize(cells, (int(u1 - u0), int(v1 - v0)), interpolation=cv2.INTER_LINEAR) for cells in where_paint_is()
+    )
+    weight, vehicle = np.zeros(small.shape[:2], np.float32), np.zeros(small.shape[:2], bool)
+    vehicle[v0:v1, u0:u1] = presence > LIKELY
+    weight[v0:v1, u0:u1] = np.where(presence > LIKELY, paint, 0)
     if not weight.any():
         return None
     light = _light_around(small, vehicle)
@@ -209,27 +206,6 @@ def _joined(one: Paint, other: Paint) -> Paint:
     return Paint(np.concatenate([one.lab, other.lab]), np.concatenate([one.probability, other.probability]) / 2)
 
 
-def cut_out(image_bgr: Image, corners: NDArray[np.int_]) -> NDArray[np.bool_]:
-    """Mark (H, W) the vehicle in a box u0, v0, u1, v1 of an image."""
-    u0, v0, u1, v1 = corners
-    presence = _fitted(where_paint_is()[1], (u1 - u0, v1 - v0))
-    mask = np.full(image_bgr.shape[:2], cv2.GC_BGD, np.uint8)
-    inside = np.where(presence > LIKELY, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    inside[presence > CERTAIN] = cv2.GC_FGD
-    mask[v0:v1, u0:u1] = inside
-    if not (mask == cv2.GC_BGD).any() and not (mask == cv2.GC_PR_BGD).any():
-        return np.asarray(mask > 0)
-    cv2.setRNGSeed(0)
-    cut = mask.copy()
-    whole = (0, 0, image_bgr.shape[1], image_bgr.shape[0])
-    cv2.grabCut(image_bgr, cut, whole, np.zeros((1, 65)), np.zeros((1, 65)), ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    found = (cut == cv2.GC_FGD) | (cut == cv2.GC_PR_FGD)
-    share = found[v0:v1, u0:u1].mean()
-    likely = np.zeros_like(found)
-    likely[v0:v1, u0:u1] = presence > LIKELY
-    return np.asarray(found if MIN_CUT < share < MAX_CUT else likely)
-
-
 def _light_around(image_bgr: Image, vehicle: NDArray[np.bool_]) -> Light:
     """Estimate the light by what is around the vehicle."""
     half = len(image_bgr) // 2
@@ -240,10 +216,6 @@ def _light_around(image_bgr: Image, vehicle: NDArray[np.bool_]) -> Light:
     # A photo of a vehicle is exposed and balanced for it, whatever it stands before.
     white = np.full(3, PHOTO_WHITE)
     return replace(light, white=white, exposure_sigma=CAMERA_EXPOSURE_SIGMA, tone_sigma=CAMERA_TONE_SIGMA)
-
-
-def _fitted(cells: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    return np.asarray(cv2.resize(cells, (int(size[0]), int(size[1])), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 @lru_cache(maxsize=1)

@@ -309,11 +309,6 @@ def _best_views(scores: list[tuple[str, int, Array]], wanted: list[tuple[int, st
     return views
 
 
-def frames_of(views: Mapping[str, Mapping[int, Sequence[str]]]) -> dict[str, NDArray[np.int64]]:
-    """Return the indices of the frames of views by camera, in order."""
-    return {name: np.array(sorted(frames), np.int64) for name, frames in views.items()}
-
-
 Image = NDArray[np.uint8]
 
 MAX_SAMPLES = 48  # rays along each side of a vehicle's rectangle
@@ -345,7 +340,7 @@ class ColorSampler:
 
     def frames(self) -> Mapping[str, NDArray[np.int64]]:
         """Return the indices of the frames that it wants, by camera."""
-        return frames_of(self._views)
+        return {name: np.array(sorted(frames), np.int64) for name, frames in self._views.items()}
 
     def add(self, camera: str, index: int, image_bgr: Image) -> None:
         """Look at the vehicles for which a frame was chosen."""

@@ -185,7 +185,8 @@ def direct_strips(
         news = {}
         for pair in beside:
             if known[pair.route] and not known[pair.other] and pair.other not in news:
-                alone = not _has_more(beside, pair)
+                both = {pair.route, pair.other}
+                alone = not any(other.route in both and other.other not in both for other in beside)
                 news[pair.other] = _from_neighbor(found[pair.route], found[pair.other], pair, (traffic, alone), sides)
         if not news:
             break
@@ -227,12 +228,6 @@ def _driven(strip: LaneStrip, paths: Sequence[DrivenPath]) -> LaneStrip:
     if along == 0:
         return strip
     return replace(strip if along > 0 else strip.reversed(), directed=DRIVEN)
-
-
-def _has_more(beside: Sequence[Beside], pair: Beside) -> bool:
-    """Whether a road has more lanes than two strips side by side."""
-    both = {pair.route, pair.other}
-    return any(other.route in both and other.other not in both for other in beside)
 
 
 def _from_neighbor(
@@ -334,7 +329,7 @@ def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
     whole = [continued(routes, path, match) for path, match in zip(paths, seen)]
     matches = [match_path(routes, path) for path in whole]
     beside = find_beside([route.line for route in routes])
-    areas = join_conflicts(routes, find_conflicts(routes, whole, matches), beside)
+    areas = join_conflicts(find_conflicts(routes, whole, matches))
     sections = cut_sections(routes, areas, beside, _passed_ends(routes, whole, matches))
     strips = lay_out(routes, sections, beside)
     drivers: list[list[str]] = [[] for _ in strips]

@@ -71,11 +71,8 @@ def linear_values(rgb: NDArray[np.uint8]) -> Array:
     return _TABLE[rgb]
 
 
-def _linear(value: Array) -> Array:
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-_TABLE = _linear(np.arange(256) / 255)
+_VALUES = np.arange(256) / 255
+_TABLE = np.where(_VALUES <= 0.04045, _VALUES / 12.92, ((_VALUES + 0.055) / 1.055) ** 2.4)
 
 
 def reflectances(pixels: Array, light: Light, facing: Array, veil: Array) -> Array:

@@ -143,7 +143,7 @@ def _assemble(chains: list[Chain], partner: dict[int, int]) -> list[Chain]:
 
 
 def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float) -> _Ends:
-    contrasts = contrast_of(pieces)
+    contrasts = np.where(np.isfinite(pieces.color), pieces.color, np.nan_to_num(pieces.reflected))
     if all(len(chain.members) == 1 for chain in chains):
         return _ends_of_single(pieces, chains, contrasts)
     rows = []
@@ -179,11 +179,6 @@ def _ends_of_single(pieces: Pieces, chains: list[Chain], contrasts: Array) -> _E
         )
     )  # fmt: skip
     return _Ends(ends.reshape(-1, 2), outward.ravel(), sigma, width, contrast, length)
-
-
-def contrast_of(pieces: Pieces) -> Array:
-    """Contrast (N,) by camera, or by LiDAR where no camera saw the piece."""
-    return np.where(np.isfinite(pieces.color), pieces.color, np.nan_to_num(pieces.reflected))
 
 
 def _direction(points: Array) -> tuple[float, float]:

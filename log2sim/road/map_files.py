@@ -161,7 +161,9 @@ def write_world_file(ground: GroundMap, path: Path, frame: MapFrame, *, overwrit
     """Write the world file beside a PNG or JPEG of a map."""
     refuse_existing(path, overwrite=overwrite)
     with replaced(path) as temporary:
-        temporary.write_text(world_text(ground, frame), encoding="ascii")
+        d, (x0, _, _, y1) = ground.resolution_m, ground.extent_m
+        place = (x0 + frame.offset_m[0] + d / 2, y1 + frame.offset_m[1] - d / 2)
+        temporary.write_text("".join(f"{float(v)!r}\n" for v in (d, 0, 0, -d, *place)), encoding="ascii")
 
 
 def known_cells(ground: GroundMap, layer: Layer) -> NDArray[np.bool_]:
@@ -178,13 +180,6 @@ def on_white(ground: GroundMap, layer: Layer) -> NDArray[np.uint8]:
         return np.where(np.isfinite(values), np.rint(255 * np.nan_to_num(values)), 255).astype(np.uint8)
     alpha = ground.alpha[..., None].astype(np.float32) / 255
     return np.asarray(np.rint(ground.color_bgr * alpha + 255 * (1 - alpha)).astype(np.uint8))
-
-
-def world_text(ground: GroundMap, frame: MapFrame) -> str:
-    """Six lines of a world file: the cell's edges and the center of the north-west cell in the coordinates of the projection."""
-    d, (x0, _, _, y1) = ground.resolution_m, ground.extent_m
-    x, y = x0 + frame.offset_m[0] + d / 2, y1 + frame.offset_m[1] - d / 2
-    return "".join(f"{value!r}\n" for value in (d, 0.0, 0.0, -d, float(x), float(y)))
 
 
 def read_png_map(path: Path, frame: MapFrame) -> GroundMap:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -157,14 +157,10 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
         fits = wide and STOP_LENGTH_M[0] <= line.length_m <= STOP_LENGTH_M[1] and line.dashes < 3
         angle = _angle_to_lanes(line, [one for one in lanes if one is not line]) if fits else 0.0
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
-            stops.append(_with_odds(line, line.log_odds + (ALONE if angle is None else 0.0)))
+            stops.append(replace(line, log_odds=line.log_odds + (ALONE if angle is None else 0.0)))
         else:
             others.append(line)
     return stops, others
-
-
-def _with_odds(line: PaintedLine, odds: float) -> PaintedLine:
-    return PaintedLine(line.xy, line.kind, line.width_m, line.pieces, line.painted_m, line.dashes, odds)
 
 
 def _angle_to_lanes(line: PaintedLine, lanes: list[PaintedLine]) -> float | None:
@@ -497,7 +493,7 @@ def list_markings(
     long = [line for line in lines if line.kind == "dashed" or line.length_m >= min_line_m]
     found += [_marking_of_line(ground, line, line.kind) for line in long]
     markings = sorted((m for m in found if m.confidence >= min_confidence), key=lambda m: -m.confidence)
-    return tuple(_named(marking, f"marking-{k + 1}") for k, marking in enumerate(markings))
+    return tuple(replace(marking, id=f"marking-{k + 1}") for k, marking in enumerate(markings))
 
 
 def _marking_of_line(ground: GroundMap, line: PaintedLine, kind: str) -> Marking:
@@ -509,12 +505,6 @@ def _marking_of_area(ground: GroundMap, area: PaintedArea) -> Marking:
     points = at_height(ground, area.outline)
     shown_by = (color_of(area.pieces), probability(area.log_odds), sources_of(area.pieces))
     return Marking("", area.kind, points, area.width_m, *shown_by)
-
-
-def _named(marking: Marking, name: str) -> Marking:
-    return Marking(
-        name, *(getattr(marking, k) for k in ("kind", "points_m", "width_m", "color", "confidence", "sources"))
-    )
 
 
 def _notes(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[str, ...]:

@@ -336,7 +336,6 @@ def _median_known(values: Array) -> float:
 HALF_PIECE_M = 1.0
 ACROSS_M = 0.15  # half a coarse cell of error, and the bend of a curve of 6 m radius within a piece
 MAX_TURN_RAD = np.deg2rad(20)  # the directions of ridge points are 15 deg apart
-SHORT_M, MAX_SLANT_RAD = 1.0, np.deg2rad(8)
 MIN_POINTS = 5
 MIN_PIECE_M = 0.4
 MIN_COVERED = 0.6  # share of a piece's length that has ridge points
@@ -351,30 +350,7 @@ def find_pieces(ground: GroundMap, points: RidgePoints) -> Pieces:
         return no_pieces(0)
     parts = [measure_pieces(ground, lines[k : k + PROFILES_AT_ONCE]) for k in range(0, len(lines), PROFILES_AT_ONCE)]
     pieces = Pieces(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pieces)))
-    pieces = pieces.take(np.isfinite(pieces.width_m) & (pieces.width_m > 0))
-    return pieces.take(~_aslant(pieces))
-
-
-def _aslant(pieces: Pieces) -> NDArray[np.bool_]:
-    """Mask (N,) of short pieces that touch longer ones aslant: at the ends of paint, slanting filters respond too."""
-    short = np.flatnonzero(pieces.length_m < SHORT_M)
-    out = np.zeros(len(pieces), bool)
-    if not len(short):
-        return out
-    near = cKDTree(pieces.xy).query_ball_point(pieces.xy[short], 2 * HALF_PIECE_M)
-    for k, others in zip(short.tolist(), near):
-        other = np.array([j for j in others if pieces.length_m[j] > 1.3 * pieces.length_m[k]], int)
-        if not len(other):
-            continue
-        angle = pieces.direction[other]
-        offset = pieces.xy[k] - pieces.xy[other]
-        along = offset[:, 0] * np.cos(angle) + offset[:, 1] * np.sin(angle)
-        across = offset[:, 1] * np.cos(angle) - offset[:, 0] * np.sin(angle)
-        beyond = np.abs(along) - pieces.length_m[other] / 2 - pieces.length_m[k] / 2
-        turn = np.abs((pieces.direction[k] - angle + np.pi / 2) % np.pi - np.pi / 2)
-        reach = (pieces.width_m[other] + pieces.length_m[k]) / 2
-        out[k] = np.any((np.abs(across) < reach) & (beyond < ACROSS_M) & (turn > MAX_SLANT_RAD))
-    return out
+    return pieces.take(np.isfinite(pieces.width_m) & (pieces.width_m > 0))
 
 
 def fit_lines(points: RidgePoints, cell_m: float = CELL_M) -> Array:

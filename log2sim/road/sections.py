@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -180,17 +179,14 @@ class Union:
         self._parent[max(one, two)] = min(one, two)
 
 
-def join_conflicts(routes: Sequence[Route], conflicts: Sequence[Conflict], beside: Sequence[Beside]) -> Areas:
-    """Join conflicts whose stretches overlap, on any route, and let lanes side by side enter a junction together."""
+def join_conflicts(conflicts: Sequence[Conflict]) -> Areas:
+    """Join conflicts whose stretches overlap, on any route."""
     union = Union(len(conflicts))
     stretches: dict[int, list[Stretch]] = {}
     for k, conflict in enumerate(conflicts):
         for interval in conflict.intervals:
             stretches.setdefault(interval.route, []).append((interval.first_m, interval.last_m, k))
-    for _ in range(len(routes) + 1):
-        stretches = {route: _merge(items, union) for route, items in stretches.items()}
-        if not _spread(routes, stretches, beside):
-            break
+    stretches = {route: _merge(items, union) for route, items in stretches.items()}
     crossing = frozenset(union.root(k) for k, conflict in enumerate(conflicts) if conflict.crossing)
     merged = {route: _merge(items, union) for route, items in stretches.items()}
     return Areas({route: [(a, b, union.root(k)) for a, b, k in items] for route, items in merged.items()}, crossing)
@@ -206,37 +202,6 @@ def _merge(items: Iterable[Stretch], union: Union) -> list[Stretch]:
         else:
             out.append((first, last, union.root(k)))
     return out
-
-
-def _spread(routes: Sequence[Route], stretches: dict[int, list[Stretch]], beside: Sequence[Beside]) -> bool:
-    """Add the stretches of each route to those beside it; return whether any was new."""
-    grown = False
-    for pair in beside:
-        if not pair.same_way:
-            continue
-        for first, last, k in list(stretches.get(pair.route, ())):
-            if last < pair.s_m[0] or first > pair.s_m[-1]:
-                continue
-            ends = [
-                np.interp(v, pair.s_m, pair.other_s_m) if pair.s_m[0] <= v <= pair.s_m[-1] else None
-                for v in (first, last)
-            ]
-            a = (
-                ends[0]
-                if ends[0] is not None
-                else ends[1] - (last - first)
-                if ends[1] is not None
-                else pair.other_s_m[0]
-            )
-            b = ends[1] if ends[1] is not None else a + (last - first)
-            held = hold(routes[pair.other], pair.other, float(a), float(b))
-            own = stretches.setdefault(pair.other, [])
-            if held.last_m > held.first_m and not any(
-                low <= held.first_m + 0.1 and high >= held.last_m - 0.1 and j == k for low, high, j in own
-            ):
-                own.append((held.first_m, held.last_m, k))
-                grown = True
-    return grown
 
 
 # What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes.
@@ -362,7 +327,8 @@ def _groups(sections: Sequence[Section], beside: Sequence[Beside]) -> list[list[
         if not pair.same_way or pair.aside_m[0] > 0:
             continue
         for k in by_route.get(pair.route, []):
-            if _overlap(sections[k], pair) < 0.5 * (sections[k].last_m - sections[k].first_m):
+            first, last = sections[k].first_m, sections[k].last_m
+            if min(last, pair.s_m[-1]) - max(first, pair.s_m[0]) < 0.5 * (last - first):
                 continue
             ends = np.interp([sections[k].first_m, sections[k].last_m], pair.s_m, pair.other_s_m)
             ends += np.array([min(sections[k].first_m - pair.s_m[0], 0.0), max(sections[k].last_m - pair.s_m[-1], 0.0)])
@@ -371,18 +337,11 @@ def _groups(sections: Sequence[Section], beside: Sequence[Beside]) -> list[list[
                 if off.max() <= 1.5 * MIN_SECTION_M and k not in right_of and j not in right_of.values():
                     right_of[k] = j
     starts = [k for k in range(len(sections)) if k not in right_of.values()]
-    return [_chain(k, right_of) for k in starts]
-
-
-def _chain(k: int, right_of: Mapping[int, int]) -> list[int]:
-    chain = [k]
-    while chain[-1] in right_of:
-        chain.append(right_of[chain[-1]])
-    return chain
-
-
-def _overlap(section: Section, pair: Beside) -> float:
-    return float(min(section.last_m, pair.s_m[-1]) - max(section.first_m, pair.s_m[0]))
+    chains = [[k] for k in starts]
+    for chain in chains:
+        while chain[-1] in right_of:
+            chain.append(right_of[chain[-1]])
+    return chains
 
 
 def _offsets(
@@ -519,7 +478,7 @@ def _passages(
 ) -> Iterator[tuple[int, int, tuple[float, float]]]:
     """Yield pairs of sections that a path passes in turn, and its stations at the end of one and the start of the other."""
     visits = _visits(strips, match)
-    for (one, _, k), (two, j, _) in itertools.pairwise(visits):
+    for (one, _, k), (two, j, _) in pairwise(visits):
         a, b = strips[one].section, strips[two].section
         if a.end < 0 or a.end != b.start:
             continue
@@ -583,9 +542,5 @@ def _mean(ways: Sequence[Array]) -> Array:
 def continuations(strips: Sequence[Strip]) -> list[tuple[int, int]]:
     """Return pairs of sections of which one goes on as the other."""
     order = sorted(range(len(strips)), key=lambda k: (strips[k].section.route, strips[k].section.first_m))
-    return [(a, b) for a, b in itertools.pairwise(order) if _meets(strips[a], strips[b])]
-
-
-def _meets(one: Strip, two: Strip) -> bool:
-    a, b = one.section, two.section
-    return a.route == b.route and a.end == CUT == b.start and a.end != FREE
+    pairs = [(a, b, strips[a].section, strips[b].section) for a, b in pairwise(order)]
+    return [(a, b) for a, b, one, two in pairs if one.route == two.route and one.end == CUT == two.start]

@@ -47,89 +47,64 @@ class GroundPoints:
     beam: NDArray[np.int16]
     lidar: NDArray[np.int8]  # (N,) int8: number of the LiDAR
 
+    @classmethod
+    def join(cls, parts: Sequence[GroundPoints]) -> GroundPoints:
+        """Concatenate those of several sweeps; none give none."""
+        if not parts:
+            xy, none = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+            return cls(xy, none, none, none, np.zeros(0, np.int16), np.zeros(0, np.int8))
+        return cls(*(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts), strict=True)))
 
-@dataclass(frozen=True, eq=False)
-class PreparedSweep:
-    """What is taken of one sweep."""
 
-    stamp_ns: int
-    hiding: Array  # (H, 3): points above the ground, m, map frame
-    columns: tuple[NDArray[np.generic], ...]  # those of `GroundPoints`
+def take_sweep(
+    log: Log, lidar: str, sweep: Sweep, raster: Raster, users: Sequence[Boxes], *, most: int, z0_m: float, hides: bool
+) -> tuple[GroundPoints, Array] | None:
+    """Find the points of a sweep near the ground on a raster, but for those under road users, and what stands above it.
 
+    `most`: points that are kept near the ground. `z0_m`: height of reference, m, map frame. `hides`: whether what stands is asked for.
 
-class PointCollector:
-    """Gather the points near the ground of chosen sweeps.
-
-    `raster`: points outside of it are dropped. `sweeps`: how many will come, which says how many points of each are
-    kept. `z0_m`: height of reference, m, map frame.
-
-    `hiding`: points above the ground, m, map frame, by stamp of the sweep.
+    Returns what is near the ground and points (H, 3), m, map frame, of what hides it; None where no pose is known.
     """
-
-    def __init__(self, log: Log, raster: Raster, sweeps: int, z0_m: float) -> None:
-        self._log, self._raster, self._z0_m = log, raster, z0_m
-        self._most = MAX_POINTS // max(sweeps, 1)
-        self._lidars = list(log.lidars)
-        self._parts: list[tuple[NDArray[np.generic], ...]] = []
-        self.hiding: dict[int, Array] = {}
-
-    def take(self, prepared: PreparedSweep | None) -> None:
-        """Take what `prepare` made of a sweep."""
-        if prepared is not None:
-            before = self.hiding.get(prepared.stamp_ns, np.zeros((0, 3)))
-            self.hiding[prepared.stamp_ns] = np.concatenate([before, prepared.hiding])
-            self._parts.append(prepared.columns)
-
-    def prepare(self, lidar: str, sweep: Sweep, users: Sequence[Boxes]) -> PreparedSweep | None:
-        """Find the points of a sweep, but for those under road users; several threads may do so at once. None where no pose is known."""
-        mapped = sweep_to_map(self._log, lidar, sweep, compensate=True)
-        if mapped is None or not len(mapped[0]):
-            return None
-        xyz, t_s = mapped
-        middle_ns = sweep.stamp_ns + round(float(t_s.mean(dtype=np.float64)) * 1e9)
-        map_T_lidar, known = self._log.map_T_sensor(lidar, middle_ns)
-        sensor = map_T_lidar[0, :3, 3] if known[0] else np.asarray(xyz.mean(axis=0))
-        origin = np.array([sensor[0], sensor[1], cloud_origin(self._log, sweep.stamp_ns)[1]])
-        local = (xyz - origin).astype(np.float32)
-        ground = estimate_ground(local, np.zeros(2), 0.0)
-        within = np.flatnonzero(np.hypot(local[:, 0], local[:, 1]) < REACH_M)
-        lowest = _lowest(xyz[within] - sensor)
-        local = local[within]
-        height = local[:, 2] - ground.at(local[:, :2])
-        above = within[(height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)]
+    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
+    if mapped is None or not len(mapped[0]):
+        return None
+    xyz, t_s = mapped
+    middle_ns = sweep.stamp_ns + round(float(t_s.mean(dtype=np.float64)) * 1e9)
+    map_T_lidar, known = log.map_T_sensor(lidar, middle_ns)
+    sensor = map_T_lidar[0, :3, 3] if known[0] else np.asarray(xyz.mean(axis=0))
+    origin = np.array([sensor[0], sensor[1], cloud_origin(log, sweep.stamp_ns)[1]])
+    local = (xyz - origin).astype(np.float32)
+    ground = estimate_ground(local, np.zeros(2), 0.0)
+    within = np.flatnonzero(np.hypot(local[:, 0], local[:, 1]) < REACH_M)
+    local = local[within]
+    height = local[:, 2] - ground.at(local[:, :2])
+    hiding: Array = np.zeros((0, 3))
+    if hides:
+        standing = (height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)
+        above = within[standing]
         above = above[:: max(len(above) // MAX_HIDING_POINTS, 1)]
         # Nothing was measured below what the lowest beam meets: the side of a vehicle next to the sensor hides the ground as well.
-        standing = lowest & (height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)
+        standing &= _lowest(xyz[within] - sensor)
         hiding = np.concatenate([xyz[above], _down_to_ground(xyz[within[standing]], height[standing])])
-        near = within[np.abs(height) < NEAR_GROUND_M]
-        near = near[:: -(-len(near) // self._most)] if len(near) > self._most else near
-        cell, inside = self._raster.index_of(xyz[near, :2])
-        near, cell = near[inside], cell[inside]
-        near = near[~covered(users, self._raster, *np.divmod(cell, self._raster.shape[1]))]
-        away = (xyz[near] - sensor) @ (map_T_lidar[0, :3, :3] if known[0] else np.eye(3))
-        range_m = np.linalg.norm(away, axis=1)
-        usable = range_m > 0
-        beam = (np.arcsin(np.clip(away[usable, 2] / range_m[usable], -1, 1)) + np.pi / 2) / ELEVATION_BIN_RAD
-        near, x0, y1 = near[usable], self._raster.extent_m[0], self._raster.extent_m[3]
-        unknown = np.full(len(near), np.nan, np.float32)
-        columns = (
-            np.stack([xyz[near, 0] - x0, y1 - xyz[near, 1]], axis=1).astype(np.float32),
-            (xyz[near, 2] - self._z0_m).astype(np.float32),
-            range_m[usable].astype(np.float32),
-            unknown if sweep.intensity is None else sweep.intensity[near],
-            np.minimum(beam, ELEVATION_BINS - 1).astype(np.int16),
-            np.full(len(near), self._lidars.index(lidar), np.int8),
-        )  # fmt: skip
-        return PreparedSweep(sweep.stamp_ns, hiding, columns)
-
-    def points(self) -> GroundPoints:
-        """Join what was gathered."""
-        empty = (
-            np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32),
-            np.zeros(0, np.int16), np.zeros(0, np.int8),
-        )  # fmt: skip
-        parts, self._parts = [empty, *self._parts], []
-        return GroundPoints(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    near = within[np.abs(height) < NEAR_GROUND_M]
+    near = near[:: -(-len(near) // most)] if len(near) > most else near
+    cell, inside = raster.index_of(xyz[near, :2])
+    near, cell = near[inside], cell[inside]
+    near = near[~covered(users, raster, *np.divmod(cell, raster.shape[1]))]
+    away = (xyz[near] - sensor) @ (map_T_lidar[0, :3, :3] if known[0] else np.eye(3))
+    range_m = np.linalg.norm(away, axis=1)
+    usable = range_m > 0
+    beam = (np.arcsin(np.clip(away[usable, 2] / range_m[usable], -1, 1)) + np.pi / 2) / ELEVATION_BIN_RAD
+    near, x0, y1 = near[usable], raster.extent_m[0], raster.extent_m[3]
+    points = GroundPoints(
+        np.stack([xyz[near, 0] - x0, y1 - xyz[near, 1]], axis=1).astype(np.float32),
+        (xyz[near, 2] - z0_m).astype(np.float32),
+        range_m[usable].astype(np.float32),
+        np.full(len(near), np.nan, np.float32) if sweep.intensity is None else sweep.intensity[near],
+        np.minimum(beam, ELEVATION_BINS - 1).astype(np.int16),
+        np.full(len(near), list(log.lidars).index(lidar), np.int8),
+    )
+    return points, hiding
 
 
 def _lowest(away: Array) -> NDArray[np.bool_]:

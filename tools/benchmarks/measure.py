@@ -22,6 +22,7 @@ from log2sim.files.stages import StageClock
 from log2sim.perception.boxes import provisional_sizes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import observe
+from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import synchronize
 from log2sim.plan import make_plan, select_sensors
 
@@ -58,11 +59,8 @@ def _measured(log: Log, mode: str) -> Sequence[Measurements]:
     schedule = synchronize(log, cameras)
     detector = create_detector(config.detect.name, log)
     plan = make_plan(log, config, select_sensors(log, config), schedule.t_ns)
-    seen = observe(
-        log, schedule, detector, plan, mode=mode, max_range_m=config.measure.max_range_m, clock=StageClock(),
-        progress=lambda done, total: None,
-    )  # fmt: skip
-    return seen.measurements
+    detectors = Detectors(detector, None)
+    return observe(log, schedule, plan, detectors=detectors, config=config, clock=StageClock()).measurements
 
 
 def _errors(measured: Sequence[Measurements], truth: Scenario) -> Iterator[dict[str, Any]]:

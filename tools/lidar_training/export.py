@@ -1,4 +1,4 @@
-"""From a checkpoint to the file that ships: ONNX with its description, calibrated scores, integer weights where they cost nothing."""
+"""From a checkpoint to the file that ships: ONNX with its description, calibrated scores."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ RIGHT = {
     "pedestrian": Criterion("center_m", 1.0),
 }
 MIN_SCORE = 0.1
-MAX_EXPORT_ERROR = 1e-4
+# Of the largest value; half floats have 11 bits.
+MAX_EXPORT_ERROR = 2e-3
 RIDGE = 1e-3
 RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -41,11 +42,16 @@ RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
 def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
     """Write the averaged weights of a checkpoint as ONNX and check that both compute the same.
 
+    Weights are stored in 16 bits, half the bytes, and everything is computed in 32: activations of 8 bits are a sixth faster
+    and lose up to a third of the vehicles where a LiDAR has few lines.
+
     Raises
     ------
     RuntimeError
         When they differ by more than `MAX_EXPORT_ERROR`.
     """
+    import onnx
+
     network = BevNetwork()
     network.load_state_dict(torch.load(checkpoint, weights_only=True)["mean"])
     network.eval()
@@ -57,17 +63,25 @@ def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
             network, (torch.zeros(1, IN_CHANNELS, 128, 96),), str(path), input_names=["grid"], output_names=["maps"],
             opset_version=17, dynamo=False, dynamic_axes={"grid": axes, "maps": axes},
         )  # fmt: skip
+    model = onnx.load(path)
+    for weight in [value for value in model.graph.initializer if len(value.dims) == 4]:
+        half = onnx.numpy_helper.to_array(weight).astype(np.float16)
+        model.graph.initializer.remove(weight)
+        model.graph.initializer.append(onnx.numpy_helper.from_array(half, weight.name + "_half"))
+        cast = onnx.helper.make_node("Cast", [weight.name + "_half"], [weight.name], to=onnx.TensorProto.FLOAT)
+        model.graph.node.insert(0, cast)
+    onnx.save(model, path)
     describe(path, info)
     grid = np.random.default_rng(0).random((IN_CHANNELS, 192, 256), dtype=np.float32)
     with torch.no_grad():
         expected = network(torch.from_numpy(grid[None]))[0].numpy()
     error = float(np.abs(load_network(path).run(grid) - expected).max())
-    if not error < MAX_EXPORT_ERROR:
-        raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
+    if not error < MAX_EXPORT_ERROR * np.abs(expected).max():
+        raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g} of {np.abs(expected).max():.2g}")
 
 
 def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
-    """Read a network back from its ONNX file, with integer weights or without, so that its training can go on.
+    """Read a network back from the ONNX file that `export_onnx` wrote, so that its training can go on.
 
     Normalization was folded into the convolutions. It is put back with the moments of each layer on some grids (B, 12, H, W): the
     network computes what it did, and still trains on normalized layers.
@@ -78,9 +92,8 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
     values = {v.name: onnx.numpy_helper.to_array(v) for v in graph.initializer}
     folded = {}
     for node in graph.node:
-        if node.op_type == "DequantizeLinear" and node.input[0] in values:
-            value, scale = values[node.input[0]].astype(np.float32), values[node.input[1]]
-            values[node.output[0]] = value * scale.reshape(scale.shape + (1,) * (value.ndim - scale.ndim))
+        if node.op_type == "Cast":
+            values[node.output[0]] = values[node.input[0]].astype(np.float32)
         elif node.op_type == "Conv":
             # "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0", "maps" of the head.
             name = node.output[0].split("/")[-2].rsplit(".", 1)[0] if "/" in node.output[0] else "head"
@@ -183,30 +196,6 @@ def logistic(features: np.ndarray, right: np.ndarray) -> np.ndarray:
         if np.abs(step).max() < 1e-8:
             break
     return np.round(weights, 5)
-
-
-def quantize(path: Path, out: Path) -> None:
-    """Write the network with the weights of all but its last layer in 8 bits, scaled by output channel; it computes in float32.
-
-    Activations of 8 bits would save a third of the time of a sweep, and cost up to a third of the vehicles where lines are few.
-    """
-    import onnx
-
-    model = onnx.load(path)
-    graph = model.graph
-    stored = {v.name: v for v in graph.initializer}
-    for conv in [node for node in graph.node if node.op_type == "Conv" and "maps" not in node.output]:
-        weight = onnx.numpy_helper.to_array(stored[conv.input[1]])
-        scale = np.maximum(np.abs(weight).max(axis=(1, 2, 3)), 1e-12) / 127
-        whole = np.rint(weight / scale[:, None, None, None]).astype(np.int8)
-        name = conv.input[1]
-        graph.initializer.remove(stored.pop(name))
-        for suffix, values in (("_int8", whole), ("_scale", scale.astype(np.float32))):
-            graph.initializer.append(onnx.numpy_helper.from_array(values, name + suffix))
-        graph.node.insert(
-            0, onnx.helper.make_node("DequantizeLinear", [name + "_int8", name + "_scale"], [name], axis=0)
-        )
-    onnx.save(model, out)
 
 
 SCORE = 0.5

@@ -1,4 +1,4 @@
-"""The network: space-to-depth stem, four scales, nearest up-sampling with 1x1 laterals, one head at stride 2."""
+"""The network: stem of stride 2, four scales, nearest up-sampling with 1x1 laterals, one head at stride 2."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEAT_PRIOR_LOGIT = -3.5
 
 def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False),
+        nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False),
         nn.BatchNorm2d(outputs),
         nn.ReLU(inplace=True),
     )
@@ -35,7 +35,7 @@ class BevNetwork(nn.Module):
     ) -> None:
         super().__init__()
         a, b, c, d = widths
-        self.stem = nn.Sequential(nn.PixelUnshuffle(2), _conv(IN_CHANNELS * 4, a), _conv(a, a))
+        self.stem = nn.Sequential(_conv(IN_CHANNELS, a, kernel=6, stride=2), _conv(a, a))
         self.down4 = nn.Sequential(_conv(a, b, stride=2), *[_conv(b, b) for _ in range(depths[0])])
         self.down8 = nn.Sequential(_conv(b, c, stride=2), *[_conv(c, c) for _ in range(depths[1])])
         self.down16 = nn.Sequential(_conv(c, d, stride=2), *[_conv(d, d) for _ in range(depths[2])])

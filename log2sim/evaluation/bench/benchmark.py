@@ -563,8 +563,6 @@ TABLE_COLUMNS = (
     ("near_error_m", "<25 m", 2),
     ("far_error_m", ">25 m", 2),
     ("center_error_m", "center m", 2),
-    ("seam_m", "seam m", 3),
-    ("seam_aligned_m", "aligned m", 3),
     ("jitter_m", "jitter m", 4),
 )
 

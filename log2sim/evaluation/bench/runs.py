@@ -37,7 +37,6 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, fit_homographies
 from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import Detectors, create_image_detector
-from log2sim.perception.seams import TICKS, SeamPictures, SeamSurvey, align_seams, ticks_of
 from log2sim.perception.sync import Schedule, schedule_of
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import LABELS, Decision, FusionLevel, HomographyScope, Plan, Stage, make_plan, select_sensors
@@ -110,53 +109,6 @@ def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
             "a detector needs the image, but no image was decoded because all detectors were expected to need none"
         )
     return image
-
-
-@dataclass(frozen=True, eq=False)
-class SeamBench:
-    """Pictures to align mounts by, and registered seams of other ticks to measure homographies by."""
-
-    aligning: SeamPictures
-    measuring: SeamPictures
-    # Which pixels of two cameras show one point of the road 15 m away, registered once for all homographies.
-    survey: SeamSurvey
-    reading_s: float  # time of reading the pictures to align by
-
-    @classmethod
-    def of(
-        cls, log: Log, schedule: Schedule, observed: Observations, homographies: Mapping[str, CameraHomography]
-    ) -> SeamBench:
-        """Read the pictures of a log with several cameras, and register them by homographies of cameras fitted together."""
-        reader, several = RecordSource(log), any(h.rig is not None for h in homographies.values())
-        begin = time.perf_counter()
-        aligning = SeamPictures.read(log, schedule, observed, reader, ticks_of(schedule) if several else [])
-        reading_s = time.perf_counter() - begin
-        ticks = ticks_of(schedule, 2 * TICKS, held_out=True) if several else []
-        measuring = SeamPictures.read(log, schedule, observed, reader, ticks)
-        aligned, _ = align_seams(aligning, homographies)
-        return cls(aligning, measuring, measuring.survey(aligned), reading_s)
-
-    def figures(self, homographies: Mapping[str, CameraHomography]) -> dict[str, Any]:
-        """Compute the median misalignment, m, 15 m from the cameras, as fitted and with mounts aligned; None where none is seen."""
-        if len(homographies) < 2 or not self.survey.places:
-            return {}
-        out: dict[str, Any] = {
-            "seam_m": self._median_m(homographies),
-            "seams": len(self.survey.seams),
-            "seam_places": self.survey.places,
-            "seam_places_covered": self.survey.covered,
-        }
-        if all(h.rig is None for h in homographies.values()):
-            return out
-        begin = time.perf_counter()
-        aligned, _ = align_seams(self.aligning, homographies)
-        spent_s = time.perf_counter() - begin + self.reading_s
-        return out | {"seam_aligned_m": self._median_m(aligned), "aligning_s": spent_s}
-
-    def _median_m(self, homographies: Mapping[str, CameraHomography]) -> float | None:
-        found = self.measuring.misalignments_m(self.survey.seams, homographies)
-        known = found[~np.isnan(found)]
-        return float(np.median(known)) if len(known) else None
 
 
 REPEATS = 3  # repetitions of short stages, taking turns; the least time counts, since other processes only add to it
@@ -232,15 +184,9 @@ def timed_first_pass(
     """Measure what a detector found; returns the observations and the seconds of all stages so far."""
     clock, what = StageClock(), detect.name if measure.present else measure.name
     observations = observe(
-        context.log,
-        context.schedule,
-        context.found[detect.name],
-        context.plan,
-        mode=measure.config.measure.mode,
-        max_range_m=measure.config.measure.max_range_m,
-        clock=clock,
-        progress=lambda done, total: report(f"measure ({what})", done, total),
-    )
+        context.log, context.schedule, context.plan, detectors=Detectors(context.found[detect.name], None),
+        config=measure.config, clock=clock, progress=lambda done, total: report(f"measure ({what})", done, total),
+    )  # fmt: skip
     shared = {k: v for k, v in context.shared_s.items() if k != "decode" or detect.config.detect.name != LABELS}
     return observations, {**clock.seconds, **shared, "detect": context.found[detect.name].seconds}
 
@@ -351,14 +297,9 @@ def homography_points(context: BenchContext, observations: Observations, report:
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
-    # Those fitted together register the pictures best, whatever the settings are.
-    together = [found for found in fits.values() if any(g.rig is not None for g in found.values())]
-    seams = SeamBench.of(context.log, context.schedule, observations, together[0] if together else {})
     for setting in settings:
         score = score_homographies(context.log, holdout, fits[setting.name])
         figures = score.figures | fit_figures(fits[setting.name])
-        if setting in context.grid.homography:
-            figures |= seams.figures(fits[setting.name])
         ms = context.ms_per_tick(min(spent[setting.name]))
         out.append(Point(setting.name, setting.present, ms, figures["error_m"], figures, score.by_object["error_m"]))
     return out

@@ -36,10 +36,7 @@ class SearchedCloud:
 
 def clouds(run: Run, records: RecordSource, detector: LidarDetector | None) -> Iterator[SearchedCloud]:
     """Yield the clouds of all ticks of a run without cameras."""
-    maker = CloudMaker(
-        run.log, run.schedule, run.plan, max_range_m=run.config.measure.max_range_m, detector=detector,
-        sweeps=run.config.lidar.sweeps,
-    )  # fmt: skip
+    maker = CloudMaker(run.log, run.schedule, run.plan, run.config, detector)
     for tick in range(len(run.schedule)):
         (cloud,) = maker.clouds(tick, records)
         yield SearchedCloud(tick, cloud, Boxes3D.empty() if detector is None else maker.boxes(tick))

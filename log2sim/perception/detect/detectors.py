@@ -38,17 +38,10 @@ class _WrongRows(PluginError):
 
 @dataclass(frozen=True, eq=False)
 class CheckedDetector:
-    """A detector of somebody else; what it raises and what it returns is checked.
-
-    Attributes
-    ----------
-    inner : Detector
-    source : str
-        How messages name it.
-    """
+    """A detector of somebody else; what it raises and what it returns is checked."""
 
     inner: Any
-    source: str
+    source: str  # how messages name it
 
     @property
     def name(self) -> str:
@@ -68,10 +61,7 @@ class CheckedDetector:
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame.
 
-        Raises
-        ------
-        PluginError
-            When the detector raises something, or returns no `Detections` of known categories.
+        Raises `PluginError` when the detector raises something, or returns no `Detections` of known categories.
         """
         try:
             found = self.inner.detect(frame)
@@ -94,17 +84,10 @@ class CheckedDetector:
 
 @dataclass(frozen=True, eq=False)
 class FunctionDetector:
-    """A detector made of a function of a picture.
-
-    Attributes
-    ----------
-    function : callable
-    min_score : float
-        Boxes with lower scores are left out.
-    """
+    """A detector made of a function of a picture."""
 
     function: ImageFunction
-    min_score: float = 0.0
+    min_score: float = 0.0  # boxes with lower scores are left out
     name: str = "function"
     default_min_score: float = 0.0
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -118,10 +101,7 @@ class FunctionDetector:
     def detect(self, frame: Frame) -> Detections:
         """Call the function with a copy of the picture, one call at a time.
 
-        Raises
-        ------
-        PluginError
-            When it returns something else than rows of `ROW` or `Detections`.
+        Raises `PluginError` when it returns something else than rows of `ROW` or `Detections`.
         """
         image = frame.image().copy()  # a function may draw on what it gets
         with self._lock:
@@ -138,10 +118,7 @@ class FunctionDetector:
 def checked(detector: Any, source: str) -> CheckedDetector:
     """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
 
-    Raises
-    ------
-    PluginError
-        When it lacks a member of `Detector`, or its `detect` cannot be called.
+    Raises `PluginError` when it lacks a member of `Detector`, or its `detect` cannot be called.
     """
     require_members(detector, MEMBERS, DETECT, source)
     return CheckedDetector(detector, source)
@@ -150,10 +127,7 @@ def checked(detector: Any, source: str) -> CheckedDetector:
 def detections_of(rows: Any) -> Detections:
     """Return rows of x0, y0, x1, y1 in px, score, category as detections.
 
-    Raises
-    ------
-    PluginError
-        For anything else.
+    Raises `PluginError` for anything else.
     """
     if isinstance(rows, (str, bytes)) or not isinstance(rows, (Sequence, np.ndarray)):
         raise _WrongRows(f"returned {type(rows).__name__}, expected a list of rows of {ROW}, or Detections")
@@ -211,23 +185,13 @@ SIZE_WEIGHT = 3.0
 
 @dataclass(frozen=True, eq=False)
 class LabelBoxes:
-    """Labeled boxes in the map frame.
+    """Labeled boxes in the map frame."""
 
-    Attributes
-    ----------
-    t_ns : (L,) int64
-    category : (L,) str
-    center_m : (L, 3) float64
-    size_m : (L, 3) float64
-        Length, width, height.
-    yaw_rad : (L,) float64
-    """
-
-    t_ns: NDArray[np.int64]
-    category: NDArray[np.str_]
-    center_m: Array
-    size_m: Array
-    yaw_rad: Array
+    t_ns: NDArray[np.int64]  # (L,)
+    category: NDArray[np.str_]  # (L,)
+    center_m: Array  # (L, 3)
+    size_m: Array  # (L, 3): length, width, height
+    yaw_rad: Array  # (L,)
 
     def take(self, index: NDArray[np.intp]) -> LabelBoxes:
         """Select the rows at `index`."""
@@ -253,12 +217,7 @@ def window_ns(t_ns: NDArray[np.int64]) -> int:
 def interpolate_boxes(boxes: LabelBoxes, t_ns: int, window: int) -> LabelBoxes:
     """Interpolate boxes to a stamp, between the last one before and the first one after it.
 
-    Parameters
-    ----------
-    boxes
-        Boxes of all stamps in ascending order.
-    window
-        From `window_ns`.
+    `boxes`: boxes of all stamps in ascending order. `window`: from `window_ns`.
 
     Notes
     -----
@@ -343,18 +302,10 @@ STAMP_TOLERANCE_NS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class FrameBoxes:
-    """2D labels of a camera that a detector could find, by frame.
+    """2D labels of a camera that a detector could find, by frame."""
 
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Never decreasing.
-    boxes : Detections
-        (L,), those of one stamp in the order of the labels.
-    """
-
-    t_ns: NDArray[np.int64]
-    boxes: Detections
+    t_ns: NDArray[np.int64]  # (L,): never decreasing
+    boxes: Detections  # (L,), those of one stamp in the order of the labels
 
     @classmethod
     def of(cls, labels: ImageLabels) -> FrameBoxes:
@@ -418,10 +369,7 @@ def create(
 ) -> LabelDetector:
     """Make the detector `labels`; `min_score`, `max_overlap` and `tiles` have no effect on it.
 
-    Raises
-    ------
-    ConfigError
-        When the log has no labels.
+    Raises `ConfigError` when the log has no labels.
     """
     if log.labels is None and not log.image_labels:
         others = ", ".join(name for name in plugins.names("detector") if name != "labels")
@@ -500,29 +448,15 @@ def create_detector(
 ) -> Detector:
     """Make a detector for a log.
 
-    Parameters
-    ----------
-    name_or_path
-        A registered name ("ssd-mobilenet-v2", "labels", plug-ins of others) or the path of an `.onnx` file.
-    log
-        The log whose frames it will see; `labels` takes its boxes from there.
-    min_score
-        Least score in [0, 1] of a box, None for the detector's own default.
-    max_overlap
-        IoU in (0, 1] above which two boxes of one group of categories are the same object.
-    tiles
-        1: the whole image only; N > 1: also N overlapping tiles; "auto": what the image's size asks for.
-    layout
-        Output layout of an ONNX file, where it cannot be recognized.
-    input_px
-        Side of the input of an ONNX file that takes any size, None for what its family takes.
+    `name_or_path`: a registered name ("ssd-mobilenet-v2", "labels", plug-ins of others) or the path of an `.onnx` file.
+    `log`: the log whose frames it will see; `labels` takes its boxes from there. `min_score`: least score in [0, 1] of a
+    box, None for the detector's own default. `max_overlap`: IoU in (0, 1] above which two boxes of one group of categories
+    are the same object. `tiles`: 1: the whole image only; N > 1: also N overlapping tiles; "auto": what the image's size
+    asks for. `layout`: output layout of an ONNX file, where it cannot be recognized. `input_px`: side of the input of an
+    ONNX file that takes any size, None for what its family takes.
 
-    Raises
-    ------
-    ConfigError
-        An unknown name, a file that is no usable model, or a setting out of range.
-    MissingExtra
-        The detector's package is not installed.
+    Raises `ConfigError`: an unknown name, a file that is no usable model, or a setting out of range; `MissingExtra`: the
+    detector's package is not installed.
     """
     check_settings(min_score, max_overlap, tiles)
     if name_or_path.lower().endswith(".onnx"):

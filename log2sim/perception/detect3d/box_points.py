@@ -19,21 +19,11 @@ MARGIN_M = 0.01
 
 @dataclass(frozen=True, eq=False)
 class PointsOfBoxes:
-    """Pairs of a box and a point in it, ordered by box; K pairs.
+    """Pairs of a box and a point in it, ordered by box; K pairs."""
 
-    Attributes
-    ----------
-    box : (K,) int
-        Index of the box.
-    point : (K,) int
-        Index of the point.
-    boxes : int
-        Number of boxes M.
-    """
-
-    box: NDArray[np.intp]
-    point: NDArray[np.intp]
-    boxes: int
+    box: NDArray[np.intp]  # (K,): index of the box
+    point: NDArray[np.intp]  # (K,): index of the point
+    boxes: int  # number of boxes M
 
     def take(self, index: NDArray[np.intp]) -> PointsOfBoxes:
         """Take the pairs of the boxes at `index` (K,), which are numbered anew in that order."""
@@ -70,15 +60,8 @@ def points_of_boxes(
 ) -> PointsOfBoxes:
     """Find the points in each of many upright boxes.
 
-    Parameters
-    ----------
-    xyz : (N, 3) float, m
-        Points that are not finite are in no box.
-    center_m, size_m : (M, 3) float64, m
-        Length, width, height.
-    yaw_rad : (M,) float64
-    usable : (N,) bool, optional
-        The points that count; by default all.
+    `xyz`: (N, 3), m: points that are not finite are in no box. `center_m`, `size_m`: (M, 3), m: length, width, height.
+    `yaw_rad`: (M,). `usable`: (N,): the points that count; by default all.
 
     Notes
     -----
@@ -109,12 +92,7 @@ def points_of_boxes(
 def most_points(counts: NDArray[np.float32], low: Array, cell_m: float, center_m: Array, reach_m: Array) -> Array:
     """Add up counts in cells (H, W) within bounding rectangles (M,): at least as many as there are points in each.
 
-    Parameters
-    ----------
-    low : (2,) float64, m
-        Lower corner of the cells.
-    center_m, reach_m : (M, 2) float64, m
-        Centers and half sides of the rectangles.
+    `low`: (2,), m: lower corner of the cells. `center_m`, `reach_m`: (M, 2), m: centers and half sides of the rectangles.
 
     Notes
     -----
@@ -132,20 +110,11 @@ def most_points(counts: NDArray[np.float32], low: Array, cell_m: float, center_m
 
 @dataclass(frozen=True, eq=False)
 class CoarseGrid:
-    """Cells over all boxes; those of the last row and column are for points outside.
+    """Cells over all boxes; those of the last row and column are for points outside."""
 
-    Attributes
-    ----------
-    corner : (2,) float64, m
-    cell : (2,) float64, m
-        Sides of a cell.
-    shape : (2,) int
-        Rows along x, columns along y.
-    """
-
-    corner: Array
-    cell: Array
-    shape: NDArray[np.intp]
+    corner: Array  # (2,), m
+    cell: Array  # (2,), m: sides of a cell
+    shape: NDArray[np.intp]  # (2,): rows along x, columns along y
 
     @classmethod
     def around(cls, low: Array, high: Array) -> CoarseGrid:
@@ -178,14 +147,8 @@ def candidates(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Pair each box with the usable points in the cells that its bounding rectangle `low` to `high`, (M, 2) each, touches.
 
-    Returns
-    -------
-    box : (K,) int
-        Ascending.
-    place : (K,) int
-        Place of the point in `order`.
-    order : (n,) int
-        Indices of points, ordered by cell.
+    Returns `box`: (K,): ascending; `place`: (K,): place of the point in `order`; `order`: (n,): indices of points, ordered
+    by cell.
     """
     first, last = (np.clip((v - grid.corner) // grid.cell, 0, grid.shape - 2).astype(np.intp) for v in (low, high))
     # One run of cells for each box and each of its rows.

@@ -30,20 +30,11 @@ SHRUNK_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Rectangles:
-    """Oriented rectangles in the ground plane.
+    """Oriented rectangles in the ground plane."""
 
-    Attributes
-    ----------
-    xy_m : (M, 2) float64
-        Centers.
-    size_m : (M, 2) float64
-        Length, width.
-    yaw_rad : (M,) float64
-    """
-
-    xy_m: Array
-    size_m: Array
-    yaw_rad: Array
+    xy_m: Array  # (M, 2): centers
+    size_m: Array  # (M, 2): length, width
+    yaw_rad: Array  # (M,)
 
     def take(self, index: NDArray[Any]) -> Rectangles:
         """Take the rectangles at `index`, integers or a mask."""
@@ -53,20 +44,12 @@ class Rectangles:
 def suppress(boxes: Rectangles, score: Array, group: NDArray[np.intp], *, across: bool = True) -> NDArray[np.intp]:
     """Choose the boxes that no stronger chosen one excludes.
 
-    Parameters
-    ----------
-    boxes : M Rectangles
-    score : (M,) float64
-    group : (M,) int
-        Boxes of one group exclude each other by IoU and by the distance of their centers, others by the part of the
-        smaller one that they share.
-    across : bool
-        Whether boxes of different groups exclude each other at all.
+    `boxes`: M Rectangles. `score`: (M,). `group`: (M,): boxes of one group exclude each other by IoU and by the distance of
+    their centers, others by the part of the smaller one that they share. `across`: whether boxes of different groups
+    exclude each other at all.
 
-    Returns
-    -------
-    (K,) int
-        Indices of the chosen boxes, best score first; ties by place, so that the order of the input does not matter.
+    Returns (K,) int: indices of the chosen boxes, best score first; ties by place, so that the order of the input does not
+    matter.
     """
     order = np.lexsort((boxes.xy_m[:, 1], boxes.xy_m[:, 0], -score))
     first, second = excluding_pairs(boxes.take(order), group[order], across=across)
@@ -163,28 +146,15 @@ MIN_HEAT_SHARE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class LevelBoxes:
-    """M boxes; x and y along the map's axes, z above the ground.
+    """M boxes; x and y along the map's axes, z above the ground."""
 
-    Attributes
-    ----------
-    center_m, size_m : (M, 3) float64
-    yaw_rad : (M,) float64
-    heading_score : (M,) float64
-        Probability in [0.5, 1] that front and back are not swapped.
-    group : (M,) int
-        Index into the network's groups.
-    category : (M,) str
-    heat, quality : (M,) float64
-        Logits of the object being there, and of the expected IoU.
-    """
-
-    center_m: Array
+    center_m: Array  # `center_m`, `size_m`: (M, 3)
     size_m: Array
-    yaw_rad: Array
-    heading_score: Array
-    group: NDArray[np.intp]
-    category: NDArray[np.str_]
-    heat: Array
+    yaw_rad: Array  # (M,)
+    heading_score: Array  # (M,): probability in [0.5, 1] that front and back are not swapped
+    group: NDArray[np.intp]  # (M,): index into the network's groups
+    category: NDArray[np.str_]  # (M,)
+    heat: Array  # `heat`, `quality`: (M,): logits of the object being there, and of the expected IoU
     quality: Array
 
     def __len__(self) -> int:
@@ -203,12 +173,8 @@ class LevelBoxes:
     def terms(self, points: NDArray[Any], range_m: Array) -> Array:
         """Return what the score is computed from: (5, M), the terms of `NetworkInfo.calibration`.
 
-        Parameters
-        ----------
-        points : (M,) int or float
-            Number of points in each box.
-        range_m : (M,) float64
-            Distance of the centers from the sensor in the plane.
+        `points`: (M,) or: number of points in each box. `range_m`: (M,): distance of the centers from the sensor in the
+        plane.
         """
         return np.stack([np.ones(len(self)), self.heat, self.quality, np.log1p(points), range_m / 10.0])
 
@@ -220,18 +186,10 @@ class LevelBoxes:
 
 @dataclass(frozen=True, eq=False)
 class MapCells:
-    """Values of the maps at K cells, or means of several cells each: all channels are such that means make sense.
+    """Values of the maps at K cells, or means of several cells each: all channels are such that means make sense."""
 
-    Attributes
-    ----------
-    middle_m : (K, 2) float64
-        Middles of the cells.
-    values : (C, K) float64
-        All channels.
-    """
-
-    middle_m: Array
-    values: Array
+    middle_m: Array  # (K, 2): middles of the cells
+    values: Array  # (C, K): all channels
 
     @classmethod
     def at(cls, maps: NDArray[np.float32], flat: NDArray[np.intp], info: NetworkInfo, low: Array) -> MapCells:
@@ -278,10 +236,7 @@ def cells_around(
 def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: NetworkInfo) -> LevelBoxes:
     """Decode the box that each cell (K,) regresses for its group (K,); boxes that are not finite are left out.
 
-    Parameters
-    ----------
-    heat : (K,) float64
-        Logit of the object being there.
+    `heat`: (K,): logit of the object being there.
     """
     channels, values = info.channels, cells.values
     box = values[channels.box]
@@ -306,19 +261,11 @@ def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: 
 def headings(axis: Array, direction: Array) -> tuple[Array, Array]:
     """Compute yaw over the full circle from its axis and its direction.
 
-    Parameters
-    ----------
-    axis : (2, K)
-        Sine and cosine of twice the yaw, which do not tell front from back.
-    direction : (2, K)
-        Sine and cosine of the yaw, averaged over what the yaw may be: 2 p - 1 times the unit vector where the front is
-        there with probability p.
+    `axis`: (2, K): sine and cosine of twice the yaw, which do not tell front from back. `direction`: (2, K): sine and
+    cosine of the yaw, averaged over what the yaw may be: 2 p - 1 times the unit vector where the front is there with
+    probability p.
 
-    Returns
-    -------
-    yaw_rad : (K,) float64
-    heading_score : (K,) float64
-        Probability in [0.5, 1] that front and back are not swapped.
+    Returns `yaw_rad`: (K,); `heading_score`: (K,): probability in [0.5, 1] that front and back are not swapped.
     """
     yaw = np.arctan2(axis[0], axis[1]) / 2
     along = direction[0] * np.sin(yaw) + direction[1] * np.cos(yaw)
@@ -355,12 +302,7 @@ MAX_PEAKS = 300
 def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> LevelBoxes:
     """Decode the boxes at the peaks of the heat, strongest first, not yet scored nor suppressed.
 
-    Parameters
-    ----------
-    maps : (C, h, w) float32
-        Output of the network.
-    low : (2,) float64, m
-        Lower corner of the maps.
+    `maps`: (C, h, w): output of the network. `low`: (2,), m: lower corner of the maps.
 
     Notes
     -----
@@ -377,10 +319,7 @@ def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> 
 def peaks(heat: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Find cells that no neighbor exceeds in maps of logits (G, h, w).
 
-    Returns
-    -------
-    group, flat : (K,) int
-        Map and flat index in it, greatest logit first.
+    Returns `group`, `flat`: (K,): map and flat index in it, greatest logit first.
     """
     import cv2
 
@@ -411,14 +350,8 @@ MIN_SCORE = 0.5
 def decode_votes(maps: NDArray[np.float32], grid: NDArray[np.float32], info: NetworkInfo, low: Array) -> LevelBoxes:
     """Decode one box for each cluster of votes; the logit of its mean class probability stands for heat.
 
-    Parameters
-    ----------
-    maps : (C, h, w) float32
-        Output of the network.
-    grid : (12, H, W) float32
-        Its input, by whose greatest heights cells of the ground and empty ones are left out.
-    low : (2,) float64, m
-        Lower corner of both.
+    `maps`: (C, h, w): output of the network. `grid`: (12, H, W): its input, by whose greatest heights cells of the ground
+    and empty ones are left out. `low`: (2,), m: lower corner of both.
 
     Notes
     -----
@@ -468,10 +401,7 @@ def bandwidths_m(info: NetworkInfo) -> Array:
 def cluster(vote: Array, group: NDArray[np.intp], bandwidth_m: Array) -> NDArray[np.intp]:
     """Cluster votes (n, 2), m, by mean shift, each group (n,) with its own bandwidth (G,), then across groups.
 
-    Returns
-    -------
-    (n,) int
-        Clusters, numbered from 0.
+    Returns (n,) int: clusters, numbered from 0.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -500,11 +430,7 @@ def cluster(vote: Array, group: NDArray[np.intp], bandwidth_m: Array) -> NDArray
 def mean_shift(vote: Array, bandwidth_m: float) -> tuple[Array, NDArray[np.intp]]:
     """Let votes (n, 2), m, climb to the modes of their density.
 
-    Returns
-    -------
-    modes : (K, 2) float64, m
-    index : (n,) int
-        The mode of each vote.
+    Returns `modes`: (K, 2), m; `index`: (n,): the mode of each vote.
 
     Notes
     -----
@@ -542,21 +468,11 @@ def mean_shift(vote: Array, bandwidth_m: float) -> tuple[Array, NDArray[np.intp]
 def summarize(vote: Array, probability: Array, label: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
     """Find center, class and class probability of each of K clusters.
 
-    Parameters
-    ----------
-    vote : (n, 2) float64, m
-    probability : (G, n) float64
-    label : (n,) int
-        Cluster of each vote.
+    `vote`: (n, 2), m. `probability`: (G, n). `label`: (n,): cluster of each vote.
 
-    Returns
-    -------
-    center : (K, 2) float64, m
-        Mean vote of the cells of the cluster's class, weighted by its probability.
-    group : (K,) int
-        The class that most cells have, each counted by its probability.
-    mean : (K,) float64
-        Mean probability of that class over all cells.
+    Returns `center`: (K, 2), m: mean vote of the cells of the cluster's class, weighted by its probability; `group`: (K,):
+    the class that most cells have, each counted by its probability; `mean`: (K,): mean probability of that class over all
+    cells.
     """
     count = int(label.max(initial=-1)) + 1
     best = probability.argmax(axis=0)

@@ -36,16 +36,10 @@ from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
 
 @dataclass(frozen=True, eq=False)
 class LabelBoxDetector:
-    """LiDAR detector that returns the labels of a log in which the cloud has points.
-
-    Attributes
-    ----------
-    max_range_m : float
-        Largest distance from the sensor along an axis, m; infinite without a limit.
-    """
+    """LiDAR detector that returns the labels of a log in which the cloud has points."""
 
     log: Log
-    max_range_m: float = np.inf
+    max_range_m: float = np.inf  # largest distance from the sensor along an axis, m; infinite without a limit
     name: str = "lidar:labels"
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
@@ -88,10 +82,7 @@ class LabelBoxDetector:
 def create(log: Log, settings: LidarConfig) -> LabelBoxDetector:
     """Make the detector `lidar:labels`.
 
-    Raises
-    ------
-    ConfigError
-        When the log has no 3D labels.
+    Raises `ConfigError` when the log has no 3D labels.
     """
     if log.labels is None:
         others = ", ".join(f"lidar:{name}" for name in plugins.names("lidar_detector") if name != "labels")
@@ -129,44 +120,23 @@ def describe_weakness(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Boxes of a cloud before the weak ones and those that overlap are left out.
+    """Boxes of a cloud before the weak ones and those that overlap are left out."""
 
-    Attributes
-    ----------
-    boxes : M LevelBoxes
-    inside : PointsOfBoxes
-        Their points above the ground.
-    index : (n,) int
-        Of the points that `inside` numbers in the cloud.
-    terms : (5, M) float64
-        See `LevelBoxes.terms`.
-    """
-
-    boxes: LevelBoxes
-    inside: PointsOfBoxes
-    index: NDArray[np.intp]
-    terms: NDArray[np.float64]
+    boxes: LevelBoxes  # M LevelBoxes
+    inside: PointsOfBoxes  # their points above the ground
+    index: NDArray[np.intp]  # (n,): of the points that `inside` numbers in the cloud
+    terms: NDArray[np.float64]  # (5, M): see `LevelBoxes.terms`
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkDetector:
-    """Detector from a network and settings.
-
-    Attributes
-    ----------
-    decode : "centers" or "votes"
-        See `LidarConfig`.
-    range_m : float
-        Largest distance from the sensor along x and along y, m.
-    min_score : float or None
-        Lowest score of a box; None for the network's own of each group.
-    """
+    """Detector from a network and settings."""
 
     name: str
     network: Network
-    decode: Literal["centers", "votes"]
-    range_m: float
-    min_score: float | None
+    decode: Literal["centers", "votes"]  # "centers" or "votes": see `LidarConfig`
+    range_m: float  # largest distance from the sensor along x and along y, m
+    min_score: float | None  # or None: lowest score of a box; None for the network's own of each group
 
     @property
     def cache_key(self) -> str:
@@ -192,10 +162,7 @@ class NetworkDetector:
     def candidates(self, cloud: Cloud, earlier: Sequence[Cloud] = (), *, weak: bool = True) -> Candidates:
         """Find all boxes that may be road users, of those on one peak or cluster the strongest.
 
-        Parameters
-        ----------
-        weak : bool
-            Whether boxes that cannot reach the least score are among them.
+        `weak`: whether boxes that cannot reach the least score are among them.
 
         Notes
         -----
@@ -262,10 +229,7 @@ def ranges_m(boxes: LevelBoxes, sensors: Array) -> Array:
 def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDetector:
     """Make a detector of a network's file.
 
-    Raises
-    ------
-    ConfigError
-        A file that is no usable network, or a range that its grid cannot cover.
+    Raises `ConfigError`: a file that is no usable network, or a range that its grid cannot cover.
     """
     network = load_network(path)
     limit = network.info.max_range_m
@@ -291,10 +255,7 @@ def create_roadside(log: Log, settings: LidarConfig) -> NetworkDetector:
 def open_shipped(name: str, settings: LidarConfig) -> NetworkDetector:
     """Make a detector of a network that is part of the package.
 
-    Raises
-    ------
-    ConfigError
-        When its file is missing.
+    Raises `ConfigError` when its file is missing.
     """
     path = WEIGHTS / f"{name}.onnx"
     if not path.is_file():
@@ -320,12 +281,8 @@ class LidarDetector(Protocol):
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; deterministic, and may be called from threads.
 
-        Parameters
-        ----------
-        cloud
-            All LiDARs of one moment.
-        earlier
-            Clouds of earlier moments, which make the grid denser; only points of `cloud` count as points of a box.
+        `cloud`: all LiDARs of one moment. `earlier`: clouds of earlier moments, which make the grid denser; only points of
+        `cloud` count as points of a box.
         """
         ...
 
@@ -333,21 +290,12 @@ class LidarDetector(Protocol):
 def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDetector:
     """Make a detector for the clouds of a log.
 
-    Parameters
-    ----------
-    name
-        "lidar:" and a registered name ("vehicle", "roadside", "labels", plug-ins of others) or the path of an `.onnx` file.
-    log
-        The log whose clouds it will see; `labels` takes its boxes from there.
-    settings
-        Decoding, range and lowest score.
+    `name`: "lidar:" and a registered name ("vehicle", "roadside", "labels", plug-ins of others) or the path of an `.onnx`
+    file. `log`: the log whose clouds it will see; `labels` takes its boxes from there. `settings`: decoding, range and
+    lowest score.
 
-    Raises
-    ------
-    ConfigError
-        An unknown name, or a file that is no usable network.
-    MissingExtra
-        The detector's package is not installed.
+    Raises `ConfigError`: an unknown name, or a file that is no usable network; `MissingExtra`: the detector's package is
+    not installed.
     """
     if not name.startswith(PREFIX):
         raise ConfigError(
@@ -372,10 +320,7 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
 def checked(detector: Any, source: str) -> LidarDetector:
     """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
 
-    Raises
-    ------
-    PluginError
-        When it lacks a member of `LidarDetector`, or its `detect` cannot be called.
+    Raises `PluginError` when it lacks a member of `LidarDetector`, or its `detect` cannot be called.
     """
     require_members(detector, MEMBERS, DETECT_IN_CLOUD, source)
     return CheckedLidarDetector(detector, source)

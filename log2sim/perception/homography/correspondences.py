@@ -55,14 +55,9 @@ def fit_frames(data: NormalizedCorrespondences, estimate: FrameEstimator, *, kee
 
 
 class HomographyModel:
-    """Homography from normalized ground to image, as `skimage.measure.ransac` asks for it: `estimate` and `residuals`.
+    """Homography from normalized ground to image, as `skimage.measure.ransac` asks for it: `estimate` and `residuals`."""
 
-    Attributes
-    ----------
-    h : (3, 3) float64
-    """
-
-    h: Array
+    h: Array  # (3, 3)
 
     @classmethod
     def from_estimate(cls, ground: Array, image: Array) -> HomographyModel | None:
@@ -120,20 +115,10 @@ def ransac_skimage(data: NormalizedCorrespondences, rng: np.random.Generator, tr
 def ground_from_sizes(uv_px: Array, height_px: Array, height_m: Array, K: Array, ego_T_cam: Array) -> Array:
     """Estimate ground positions of objects from their heights in the image and average heights.
 
-    Parameters
-    ----------
-    uv_px : (N, 2) float64
-        Undistorted foot points, px.
-    height_px, height_m : (N,) float64
-        Heights of the boxes, px, and of the objects, m.
-    K : (3, 3) float64
-    ego_T_cam : (4, 4) float64
-        Pose of the camera.
+    `uv_px`: (N, 2): undistorted foot points, px. `height_px`, `height_m`: (N,): heights of the boxes, px, and of the
+    objects, m. `K`: (3, 3). `ego_T_cam`: (4, 4): pose of the camera.
 
-    Returns
-    -------
-    (N, 2) float64
-        Positions in the ego frame, m; NaN for boxes without height.
+    Returns (N, 2) float64: positions in the ego frame, m; NaN for boxes without height.
     """
     depth = K[1, 1] * height_m / np.where(height_px > 0, height_px, np.nan)
     rays = np.column_stack([(uv_px - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(uv_px))])
@@ -160,26 +145,13 @@ NEAREST_SIDE_QUANTILE = 0.05
 class Correspondences:
     """Pixels of one camera and the ground positions that they show.
 
-    Attributes
-    ----------
-    uv : (N, 2) float64
-        Pixels, free of lens distortion.
-    xy_ego : (N, 2) float64
-        Ground positions, m, in a frame that moves with the camera: x forward, y left.
-    tick : (N,) int64
-        Tick of each correspondence.
-    xy_by_size : (N, 2) float64 or None
-        Where average sizes put them without a LiDAR, NaN where there is no object; for the baseline "straw-man".
-
-    Raises
-    ------
-    ValueError
-        For arrays of other shapes.
+    Raises `ValueError` for arrays of other shapes.
     """
 
-    uv: Array
-    xy_ego: Array
-    tick: NDArray[np.int64]
+    uv: Array  # (N, 2): pixels, free of lens distortion
+    xy_ego: Array  # (N, 2): ground positions, m, in a frame that moves with the camera: x forward, y left
+    tick: NDArray[np.int64]  # (N,): tick of each correspondence
+    # (N, 2): where average sizes put them without a LiDAR, NaN where there is no object; for the baseline "straw-man"
     xy_by_size: Array | None = None
 
     def __post_init__(self) -> None:

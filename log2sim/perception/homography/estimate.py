@@ -48,30 +48,17 @@ MAX_CONDITION = 1e12
 
 @dataclass(frozen=True, eq=False)
 class EstimationOptions:
-    """How a homography is estimated.
+    """How a homography is estimated."""
 
-    Attributes
-    ----------
-    method : str
-        One of `METHODS`.
-    K : (3, 3) float64 or None
-        Intrinsics, px, which "calibrated" needs.
-    pitch_roll : bool
-        Fit pitch and roll of each tick on top of the stream's homography, with "time-aware" and "calibrated".
-    hypotheses : int or None
-        Samples of four to draw, for the stream or for each frame; None for as many as the data need.
-    together : bool
-        Whether the cameras of a rig are fitted together, see `rig_fit`.
-    sigma_px, sigma_m : float
-        Assumed standard deviations of pixels and of ground positions; they are estimated anew from the inliers, within a
-        factor of 4.
-    """
-
-    method: str = "time-aware"
-    K: Array | None = None
+    method: str = "time-aware"  # one of `METHODS`
+    K: Array | None = None  # (3, 3): intrinsics, px, which "calibrated" needs
+    # Fit pitch and roll of each tick on top of the stream's homography, with "time-aware" and "calibrated"
     pitch_roll: bool = False
+    # Samples of four to draw, for the stream or for each frame; None for as many as the data need
     hypotheses: int | None = None
-    together: bool = False
+    together: bool = False  # whether the cameras of a rig are fitted together, see `rig_fit`
+    # `sigma_px`, `sigma_m`: assumed standard deviations of pixels and of ground positions; they are estimated anew from the
+    # inliers, within a factor of 4
     sigma_px: float = 1.5
     sigma_m: float = 0.1
 
@@ -87,16 +74,10 @@ def estimate_homography(
 ) -> HomographyFit:
     """Estimate the homography of a camera stream.
 
-    Parameters
-    ----------
-    correspondences : Correspondences
-        Rows that are not finite are ignored.
+    `correspondences`: rows that are not finite are ignored.
 
-    Raises
-    ------
-    ValueError
-        For an unknown method, or when the method lacks its input: intrinsics for "calibrated", positions by average
-        sizes for "straw-man".
+    Raises `ValueError` for an unknown method, or when the method lacks its input: intrinsics for "calibrated", positions by
+    average sizes for "straw-man".
 
     Notes
     -----
@@ -210,18 +191,10 @@ def fit_camera(
     Foot points of obstacles are taken alone if they suffice. Where they are too few or do not determine the homography
     (cars of one lane are collinear), LiDAR ground points join them. "straw-man" has no LiDAR and so the obstacles alone.
 
-    Parameters
-    ----------
-    feet, ground : Correspondences
-        Of obstacles and of LiDAR ground points.
-    options : EstimationOptions
-        Its standard deviations are replaced by those of these correspondences; `pitch_roll` is decided by the data.
+    `feet`, `ground`: of obstacles and of LiDAR ground points. `options`: its standard deviations are replaced by those of
+    these correspondences; `pitch_roll` is decided by the data.
 
-    Returns
-    -------
-    fit : HomographyFit
-    source : str
-        What it was fitted to, "none" where nothing was.
+    Returns `fit`; `source`: what it was fitted to, "none" where nothing was.
     """
     options = replace(options, pitch_roll=False)
     fit, source = _fit_fixed(feet, ground, options, rng)
@@ -332,14 +305,8 @@ def place_obstacle(
 ) -> tuple[Array, Array] | None:
     """Place an obstacle by the middle of the lower edge of its box.
 
-    Parameters
-    ----------
-    ground_H_image : (3, 3) float64
-    box_px : (4,) float64
-    category : str
-        Its typical size is used.
-    camera_xy : (2,) float64
-        Position of the camera in the frame of the ground positions, m.
+    `ground_H_image`: (3, 3). `box_px`: (4,). `category`: its typical size is used. `camera_xy`: (2,): position of the
+    camera in the frame of the ground positions, m.
 
     Returns
     -------

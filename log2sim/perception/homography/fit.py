@@ -37,10 +37,7 @@ def predicted_sigma(
 ) -> tuple[float, float]:
     """Predict the standard deviation on the ground one spread of the inliers from their mean.
 
-    Returns
-    -------
-    sigma, spread : float
-        The standard deviation and that spread, normalized units.
+    Returns `sigma`, `spread`: the standard deviation and that spread, normalized units.
     """
     basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
     slope = (linear.slope[0] * use).reshape(9, -1)
@@ -87,28 +84,16 @@ JITTER_PROBES_M = np.array([[10.0, 0.0], [20.0, 0.0], [40.0, 0.0]])
 
 @dataclass(frozen=True)
 class PitchRoll:
-    """Outcome of the decision, with the movement that was estimated.
+    """Outcome of the decision, with the movement that was estimated."""
 
-    Attributes
-    ----------
-    per_tick : bool
-        Whether each tick has its own pitch and roll.
-    source : str
-        Correspondences that the angles were estimated from.
-    pitch_sigma_deg, roll_sigma_deg : float
-        Standard deviations of the angles over the ticks, degrees.
-    held_out_px : (float, float)
-        Median error of held-out correspondences in the image with one homography and with one a tick, px.
-    significance : float
-        Fall of the held-out loss in standard errors.
-    """
-
-    per_tick: bool
-    source: str
+    per_tick: bool  # whether each tick has its own pitch and roll
+    source: str  # correspondences that the angles were estimated from
+    # `pitch_sigma_deg`, `roll_sigma_deg`: standard deviations of the angles over the ticks, degrees
     pitch_sigma_deg: float
     roll_sigma_deg: float
+    # Median error of held-out correspondences in the image with one homography and with one a tick, px
     held_out_px: tuple[float, float]
-    significance: float
+    significance: float  # fall of the held-out loss in standard errors
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a JSON document, as it is written in scenarios and reports."""
@@ -125,42 +110,23 @@ class PitchRoll:
 
 @dataclass(frozen=True, eq=False)
 class HomographyFit:
-    """A homography from the image to the ground, and its health.
+    """A homography from the image to the ground, and its health."""
 
-    Attributes
-    ----------
-    ok : bool
-        Whether it is accepted; False comes with a reason and NaN in `ground_H_image`.
-    reason : str
-        Why it is refused, "" otherwise.
-    ground_H_image : (3, 3) float64
-        Undistorted pixels to ground positions (x forward, y left), m; the third row is a unit vector, positive below the
-        horizon.
-    inliers : (N,) bool
-        Inliers of the final model.
-    error_m : float
-        Median distance of the inliers on the ground, m.
-    condition : float
-        Ratio s1/s8 of the singular values of the inliers' normalized design matrix.
-    ticks : (T,) int64
-        Ticks that had correspondences, ascending.
-    per_tick : (T, 3, 3) float64 or None
-        One homography a tick, where the camera pitches or the method fits single frames; NaN where a tick has none.
-    sigma_m : float
-        Standard deviation of the homography on the ground, m, one spread of the inliers from their mean.
-    pitch_roll : PitchRoll or None
-        Whether each tick has its own pitch and roll, and by how much they vary; None where that was not tested.
-    """
-
-    ok: bool
-    reason: str
+    ok: bool  # whether it is accepted; False comes with a reason and NaN in `ground_H_image`
+    reason: str  # why it is refused, "" otherwise
+    # (3, 3): undistorted pixels to ground positions (x forward, y left), m; the third row is a unit vector, positive below
+    # the horizon
     ground_H_image: Array
-    inliers: NDArray[np.bool_]
-    error_m: float
-    condition: float
+    inliers: NDArray[np.bool_]  # (N,): inliers of the final model
+    error_m: float  # median distance of the inliers on the ground, m
+    condition: float  # ratio s1/s8 of the singular values of the inliers' normalized design matrix
+    # (T,): ticks that had correspondences, ascending
     ticks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # (T, 3, 3): one homography a tick, where the camera pitches or the method fits single frames; NaN where a tick has none
     per_tick: Array | None = None
+    # Standard deviation of the homography on the ground, m, one spread of the inliers from their mean
     sigma_m: float = float("nan")
+    # Whether each tick has its own pitch and roll, and by how much they vary; None where that was not tested
     pitch_roll: PitchRoll | None = None
 
     def at_tick(self, tick: int) -> Array | None:

@@ -22,31 +22,15 @@ CHI2_2DOF_99 = 9.21
 
 @dataclass(frozen=True, eq=False)
 class NormalizedCorrespondences:
-    """Correspondences scaled to mean 0 and spread 1 in the image and on the ground (Hartley, 1997), sorted by tick.
+    """Correspondences scaled to mean 0 and spread 1 in the image and on the ground (Hartley, 1997), sorted by tick."""
 
-    Attributes
-    ----------
-    image : (2, N) float64
-        Normalized pixels.
-    ground : (3, N) float64
-        Normalized ground positions, homogeneous.
-    tick : (N,) int64
-        Tick of each correspondence, numbered from 0, ascending.
-    start : (T,) int64
-        First row of each tick.
-    sigma_image, sigma_ground : float
-        Standard deviations of `image` and `ground`, normalized units.
-    image_N_px, ground_N_m : (3, 3) float64
-        The similarities that normalize pixels and ground positions.
-    """
-
-    image: Array
-    ground: Array
-    tick: NDArray[np.int64]
-    start: NDArray[np.int64]
-    sigma_image: float
+    image: Array  # (2, N): normalized pixels
+    ground: Array  # (3, N): normalized ground positions, homogeneous
+    tick: NDArray[np.int64]  # (N,): tick of each correspondence, numbered from 0, ascending
+    start: NDArray[np.int64]  # (T,): first row of each tick
+    sigma_image: float  # `sigma_image`, `sigma_ground`: standard deviations of `image` and `ground`, normalized units
     sigma_ground: float
-    image_N_px: Array
+    image_N_px: Array  # `image_N_px`, `ground_N_m`: (3, 3): the similarities that normalize pixels and ground positions
     ground_N_m: Array
 
     @classmethod
@@ -231,29 +215,14 @@ MIN_LOSS_DECREASE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Errors of K homographies on N correspondences, linearized, in normalized units.
+    """Errors of K homographies on N correspondences, linearized, in normalized units."""
 
-    Attributes
-    ----------
-    error : (K, 2, N) float64
-        Whitened errors in the image.
-    squared : (K, N) float64
-        Squared norms of `error`; infinite behind the camera.
-    slope : (K, 9, 2, N) float64
-        Derivatives of `error` by the nine elements of the homography.
-    projected : (K, 2, N) float64
-        Ground positions projected into the image.
-    ground : (3, K, N) float64
-        Covariance in the image (uu, uv, vv) of ground noise of standard deviation 1.
-    whiten : (3, K, N) float64
-        Cholesky factors of the inverse covariance: scale of u, scale of v, and the shear of v by u.
-    """
-
-    error: Array
-    squared: Array
-    slope: Array
-    projected: Array
-    ground: Array
+    error: Array  # (K, 2, N): whitened errors in the image
+    squared: Array  # (K, N): squared norms of `error`; infinite behind the camera
+    slope: Array  # (K, 9, 2, N): derivatives of `error` by the nine elements of the homography
+    projected: Array  # (K, 2, N): ground positions projected into the image
+    ground: Array  # (3, K, N): covariance in the image (uu, uv, vv) of ground noise of standard deviation 1
+    # (3, K, N): cholesky factors of the inverse covariance: scale of u, scale of v, and the shear of v by u
     whiten: Array
 
 

@@ -42,24 +42,12 @@ MIN_SIGNIFICANCE_SIGMA = 3.0
 
 @dataclass(frozen=True, eq=False)
 class _Angles:
-    """Angles of all ticks.
+    """Angles of all ticks."""
 
-    Attributes
-    ----------
-    value : (T, 2) float64
-        Pitch, as a shift along v in normalized units or rad, and roll, rad.
-    sigma : (2,) float64
-        Standard deviations of their priors.
-    significant : (2,) bool
-        Whether they are fitted at all.
-    generators : (2, 3, 3) float64
-        Image motions by an angle of 1.
-    """
-
-    value: Array
-    sigma: Array
-    significant: NDArray[np.bool_]
-    generators: Array
+    value: Array  # (T, 2): pitch, as a shift along v in normalized units or rad, and roll, rad
+    sigma: Array  # (2,): standard deviations of their priors
+    significant: NDArray[np.bool_]  # (2,): whether they are fitted at all
+    generators: Array  # (2, 3, 3): image motions by an angle of 1
 
     def warps(self) -> Array:
         """Build the image homographies (T, 3, 3), to second order."""
@@ -69,26 +57,13 @@ class _Angles:
 
 @dataclass(frozen=True, eq=False)
 class PitchRollFit:
-    """A stream's homography with pitch and roll of each tick, in normalized units.
+    """A stream's homography with pitch and roll of each tick, in normalized units."""
 
-    Attributes
-    ----------
-    image_H_ground : (3, 3) float64
-        Homography of the stream.
-    warps : (T, 3, 3) float64
-        Image homography of each tick on top of it.
-    data : NormalizedCorrespondences
-        All correspondences, with the noise as estimated.
-    linear : Linearization
-        Errors of the final homographies.
-    effective_parameters : float
-        Effective number of parameters of the angles: each counts by how little the prior determines it.
-    """
-
-    image_H_ground: Array
-    warps: Array
-    data: NormalizedCorrespondences
-    linear: Linearization
+    image_H_ground: Array  # (3, 3): homography of the stream
+    warps: Array  # (T, 3, 3): image homography of each tick on top of it
+    data: NormalizedCorrespondences  # all correspondences, with the noise as estimated
+    linear: Linearization  # errors of the final homographies
+    # Effective number of parameters of the angles: each counts by how little the prior determines it
     effective_parameters: float
 
 
@@ -229,19 +204,11 @@ ROLL_ARM = 0.2
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Errors of held-out correspondences with one homography and with one a tick.
+    """Errors of held-out correspondences with one homography and with one a tick."""
 
-    Attributes
-    ----------
-    tick : (N,) int64
-    squared : (2, N) float64
-        Squared whitened errors, of the fixed and of the moving camera.
-    distance_px : (2, N) float64
-    """
-
-    tick: NDArray[np.int64]
-    squared: Array
-    distance_px: Array
+    tick: NDArray[np.int64]  # (N,)
+    squared: Array  # (2, N): squared whitened errors, of the fixed and of the moving camera
+    distance_px: Array  # (2, N)
 
     @classmethod
     def join(cls, parts: Sequence[HeldOutErrors]) -> HeldOutErrors:

@@ -104,21 +104,11 @@ def best_hypotheses(
 
 
 class RansacRound(NamedTuple):
-    """One round of drawing, scoring and local optimization.
+    """One round of drawing, scoring and local optimization."""
 
-    Attributes
-    ----------
-    samples : int
-        Samples of four correspondences to draw.
-    scored : int
-        How many of them are solved and scored.
-    min_inlier_share : float
-        Share of inliers below which the next round of a schedule runs.
-    """
-
-    samples: int
-    scored: int
-    min_inlier_share: float
+    samples: int  # samples of four correspondences to draw
+    scored: int  # how many of them are solved and scored
+    min_inlier_share: float  # share of inliers below which the next round of a schedule runs
 
 
 RansacSchedule = tuple[RansacRound, ...]
@@ -137,27 +127,14 @@ NOISE_ROUNDS, FINAL_ROUNDS = 1, 2
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
-    """A homography estimated from correspondences with outliers, in normalized units.
+    """A homography estimated from correspondences with outliers, in normalized units."""
 
-    Attributes
-    ----------
-    h : (3, 3) float64 or None
-        Ground to image; None where no four correspondences determine a homography.
-    data : NormalizedCorrespondences
-        All correspondences, with the noise as estimated.
-    linear : Linearization or None
-        Errors of `h` on them.
-    warps : (N, 3, 3) float64 or None
-        Image homography of each correspondence's tick on top of `h`, see `pitch_roll`.
-    effective_parameters : float
-        Effective number of parameters of `warps`.
-    """
-
-    h: Array | None
-    data: NormalizedCorrespondences
-    linear: Linearization | None = None
+    h: Array | None  # (3, 3): ground to image; None where no four correspondences determine a homography
+    data: NormalizedCorrespondences  # all correspondences, with the noise as estimated
+    linear: Linearization | None = None  # errors of `h` on them
+    # (N, 3, 3): image homography of each correspondence's tick on top of `h`, see `pitch_roll`
     warps: Array | None = None
-    effective_parameters: float = 0.0
+    effective_parameters: float = 0.0  # effective number of parameters of `warps`
 
 
 def ransac(
@@ -170,14 +147,9 @@ def ransac(
 ) -> RobustFit:
     """Estimate the homography of least bounded loss from samples of single ticks and of all ticks.
 
-    Parameters
-    ----------
-    pitch_sigma : float
-        Standard deviation of an image shift along v that differs from tick to tick, normalized units. With it the
-        result is not refined, which is left to the fit of pitch and roll.
-    image_K : (3, 3) float64 or None
-        Normalized intrinsics; with them the result is a pose of that camera.
-    schedule : tuple of RansacRound
+    `pitch_sigma`: standard deviation of an image shift along v that differs from tick to tick, normalized units. With it
+    the result is not refined, which is left to the fit of pitch and roll. `image_K`: (3, 3): normalized intrinsics; with
+    them the result is a pose of that camera.
 
     Notes
     -----

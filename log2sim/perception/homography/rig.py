@@ -26,30 +26,19 @@ PROBE_M = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
-    """A camera of a rig, by its calibration.
-
-    Attributes
-    ----------
-    cam_T_rig : (4, 4) float64
-        The rig frame is the ground frame of the correspondences with its origin on the ground below the cameras' mean.
-    """
+    """A camera of a rig, by its calibration."""
 
     camera: Camera
+    # (4, 4): the rig frame is the ground frame of the correspondences with its origin on the ground below the cameras' mean
     cam_T_rig: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras that see one ground plane.
-
-    Attributes
-    ----------
-    origin_m : (3,) float64
-        Origin of the rig frame in the ground frame of the correspondences.
-    """
+    """Cameras that see one ground plane."""
 
     cameras: Mapping[str, RigCamera]
-    origin_m: Array
+    origin_m: Array  # (3,): origin of the rig frame in the ground frame of the correspondences
 
     @classmethod
     def of(cls, cameras: Mapping[str, Camera], ground_z_m: float) -> Rig:
@@ -66,34 +55,23 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """What is fitted on top of the calibration of a rig.
+    """What is fitted on top of the calibration of a rig."""
 
-    Attributes
-    ----------
-    plane : (3,) float64
-        Height of the ground in the rig frame: its slopes along x and along y, and its height at the origin, m.
-    below_px : float
-        How far below the lower edge of its box an obstacle touches the ground.
-    lift_m : mapping of str to float
-        Height above the road at which the feet of boxes in a camera seem to lie: boxes end at the tires, which stand behind the
-        nearest side of a vehicle, by more where a camera sees its ends than where it sees its sides.
-    mount : mapping of str to (3,) float64
-        Rotation of each camera against its calibration, rad, camera frame.
-    feet : mapping of str to (3,) float64
-        Rotation that the feet of boxes in a camera ask for beyond that of the mount, rad.
-    """
-
+    # (3,): height of the ground in the rig frame: its slopes along x and along y, and its height at the origin, m
     plane: Array
-    below_px: float
+    below_px: float  # how far below the lower edge of its box an obstacle touches the ground
+    # Height above the road at which the feet of boxes in a camera seem to lie: boxes end at the tires, which stand behind
+    # the nearest side of a vehicle, by more where a camera sees its ends than where it sees its sides
     lift_m: Mapping[str, float]
-    mount: Mapping[str, Array]
+    # Mapping of str to (3,) float64: rotation of each camera against its calibration that the feet of boxes ask for, rad,
+    # camera frame
     feet: Mapping[str, Array]
 
     @classmethod
     def calibrated(cls, rig: Rig, plane: Array | None = None) -> RigState:
         """Make the state of a rig that is as its calibration says, over flat ground or a `plane` (3,)."""
         none = {name: np.zeros(3) for name in rig.cameras}
-        return cls(np.zeros(3) if plane is None else plane, 0.0, dict.fromkeys(rig.cameras, 0.0), none, dict(none))
+        return cls(np.zeros(3) if plane is None else plane, 0.0, dict.fromkeys(rig.cameras, 0.0), none)
 
 
 def rotation_of(vector: Array) -> Array:
@@ -110,31 +88,20 @@ def rotation_of(vector: Array) -> Array:
 def cam_of_ground(member: RigCamera, plane: Array, turn: Array) -> Array:
     """Compute the matrices (..., 3, 3) from ground positions (x, y, 1), rig frame, to points in a camera.
 
-    Parameters
-    ----------
-    plane : (..., 3) float64
-    turn : (3, 3) float64
-        Rotation of the camera against its calibration.
+    `plane`: (..., 3). `turn`: (3, 3): rotation of the camera against its calibration.
     """
     r, t = turn @ member.cam_T_rig[:3, :3], turn @ member.cam_T_rig[:3, 3]
     rise = r[:, 2, None] * np.asarray(plane)[..., None, :]
     return np.asarray(np.column_stack([r[:, :2], t]) + rise)
 
 
-def road_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
-    """Compute `ground_H_image` (..., 3, 3) of the road itself, px and m, in the ground frame of the correspondences.
+def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
+    """Compute `ground_H_image` (..., 3, 3) of the feet of boxes at the nearest sides of obstacles.
 
-    `plane` (..., 3) replaces that of the state, as that of a tick does.
+    px and m, in the ground frame of the correspondences; `plane` (..., 3) replaces that of the state, as that of a tick does.
     """
     member = rig.cameras[name]
-    turn = rotation_of(state.mount[name])
-    return _to_ground(rig, member, cam_of_ground(member, state.plane if plane is None else plane, turn))
-
-
-def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
-    """Compute `ground_H_image` (..., 3, 3) from the feet of boxes to the nearest sides of obstacles, like `road_homography`."""
-    member = rig.cameras[name]
-    turn = rotation_of(state.feet[name]) @ rotation_of(state.mount[name])
+    turn = rotation_of(state.feet[name])
     lifted = (state.plane if plane is None else plane) + [0.0, 0.0, state.lift_m[name]]
     below = np.eye(3)
     below[1, 2] = state.below_px
@@ -152,7 +119,7 @@ def foot_sigma_m(rig: Rig, state: RigState, name: str, covariance: Array) -> flo
     if not np.hypot(*axis[:2]) > 0:
         return float("nan")
     at = place + PROBE_M * axis[:2] / np.hypot(*axis[:2])
-    turn = rotation_of(state.feet[name]) @ rotation_of(state.mount[name])
+    turn = rotation_of(state.feet[name])
     matrix = cam_of_ground(member, state.plane, turn)
     point = matrix @ [*at, 1.0]
     if not point[2] > 0:
@@ -178,30 +145,14 @@ SHARED, OF_CAMERA = 1, 4
 
 @dataclass(frozen=True, eq=False)
 class RigRows:
-    """Correspondences of all cameras of a rig, sorted by tick.
+    """Correspondences of all cameras of a rig, sorted by tick."""
 
-    Attributes
-    ----------
-    camera : (N,) int64
-        Number of the camera within the rig.
-    ray : (N, 2) float64
-        Normalized image coordinates.
-    xy : (N, 2) float64
-        Ground positions, m, rig frame.
-    tick : (N,) int64
-        Tick of the log.
-    focal_px : (N,) float64
-        Of the cameras.
-    sigma_px, sigma_m : (N,) float64
-        Standard deviations of pixels and of ground positions.
-    """
-
-    camera: NDArray[np.int64]
-    ray: Array
-    xy: Array
-    tick: NDArray[np.int64]
-    focal_px: Array
-    sigma_px: Array
+    camera: NDArray[np.int64]  # (N,): number of the camera within the rig
+    ray: Array  # (N, 2): normalized image coordinates
+    xy: Array  # (N, 2): ground positions, m, rig frame
+    tick: NDArray[np.int64]  # (N,): tick of the log
+    focal_px: Array  # (N,): of the cameras
+    sigma_px: Array  # `sigma_px`, `sigma_m`: (N,): standard deviations of pixels and of ground positions
     sigma_m: Array
 
     @classmethod
@@ -250,31 +201,18 @@ def heights_of(rig: Rig, rows: RigRows) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class FootErrors:
-    """Errors of the feet of boxes with the state of a rig, linearized.
+    """Errors of the feet of boxes with the state of a rig, linearized."""
 
-    Attributes
-    ----------
-    squared : (N,) float64
-        Squared whitened errors; infinite behind the camera.
-    error : (N, 2) float64
-        Whitened errors.
-    slope : (N, 2, 5) float64
-        Their derivatives by `below_px` and by `lift_m` and rotation of the row's camera.
-    pixels : (N,) float64
-        Distances in the image, px.
-    """
-
-    squared: Array
-    error: Array
-    slope: Array
-    pixels: Array
+    squared: Array  # (N,): squared whitened errors; infinite behind the camera
+    error: Array  # (N, 2): whitened errors
+    slope: Array  # (N, 2, 5): their derivatives by `below_px` and by `lift_m` and rotation of the row's camera
+    pixels: Array  # (N,): distances in the image, px
 
 
 def linearize_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | None = None) -> FootErrors:
     """Linearize the errors of feet; `planes` (N, 3) replaces the plane of the state, as each tick has its own."""
     members = list(rig.cameras.values())
     turns = rotation_of(np.array([state.feet[n] for n in rig.cameras]))
-    turns = turns @ rotation_of(np.array([state.mount[n] for n in rig.cameras]))
     poses = turns @ np.array([m.cam_T_rig[:3] for m in members])
     flat = np.concatenate([poses[:, :, :2], poses[:, :, 3:]], axis=2)[rows.camera]
     up = poses[rows.camera, :, 2]
@@ -325,22 +263,12 @@ TILT_SIGMA = 0.01
 
 @dataclass(frozen=True, eq=False)
 class HeightRows:
-    """Heights of the ground at positions, by all cameras and ticks.
+    """Heights of the ground at positions, by all cameras and ticks."""
 
-    Attributes
-    ----------
-    xy1 : (N, 3) float64
-        Positions, m, rig frame, homogeneous.
-    height, sigma : (N,) float64
-        Heights and their standard deviations, m.
-    tick : (N,) int64
-        Ascending.
-    """
-
-    xy1: Array
-    height: Array
+    xy1: Array  # (N, 3): positions, m, rig frame, homogeneous
+    height: Array  # `height`, `sigma`: (N,): heights and their standard deviations, m
     sigma: Array
-    tick: NDArray[np.int64]
+    tick: NDArray[np.int64]  # (N,): ascending
 
     def losses(self, planes: Array) -> Array:
         """Compute the bounded losses (K,) of planes (K, 3)."""

@@ -39,7 +39,6 @@ from log2sim.perception.homography.rig import (
     foot_sigma_m,
     heights_of,
     linearize_feet,
-    road_homography,
     tilt_of_ticks,
 )
 
@@ -57,22 +56,12 @@ MAX_CANDIDATES = 48
 
 @dataclass(frozen=True, eq=False)
 class FeetFit:
-    """What the feet of boxes say about a rig.
-
-    Attributes
-    ----------
-    errors : FootErrors
-        Of all rows, by the assumed noise.
-    noise : float
-        Factor by which the noise exceeds that.
-    covariance : (P, P) float64
-        Of the shared parameters of feet, m and px, then of the rotation of each camera, rad.
-    """
+    """What the feet of boxes say about a rig."""
 
     state: RigState
-    errors: FootErrors
-    noise: float
-    covariance: Array
+    errors: FootErrors  # of all rows, by the assumed noise
+    noise: float  # factor by which the noise exceeds that
+    covariance: Array  # (P, P): of the shared parameters of feet, m and px, then of the rotation of each camera, rad
 
     def covariance_of(self, camera: int) -> Array:
         """Return the covariance (5, 5) of the parameters of the feet in a camera, given by its number."""
@@ -173,41 +162,16 @@ MIN_ROWS = 30
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
-    """The homographies of the cameras of a rig, fitted together.
+    """The homographies of the cameras of a rig, fitted together."""
 
-    Attributes
-    ----------
-    reason : str
-        Why nothing was fitted, "" otherwise.
-    fits : mapping of str to HomographyFit
-        From the feet of boxes to the ground, by camera; refused ones state why.
-    ticks : (T,) int64
-        Ticks with a plane of their own, ascending.
-    planes : (T, 3) float64
-    """
-
-    reason: str
+    reason: str  # why nothing was fitted, "" otherwise
     rig: Rig
+    # From the feet of boxes to the ground, by camera; refused ones state why
     fits: Mapping[str, HomographyFit] = field(default_factory=dict)
     state: RigState | None = None
+    # (T,): ticks with a plane of their own, ascending
     ticks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    planes: Array = field(default_factory=lambda: np.zeros((0, 3)))
-
-    def road_at_tick(self, camera: str, tick: int) -> Array | None:
-        """Return the homography (3, 3) of the road itself for a camera at a tick; None where nothing was fitted."""
-        plane = self._plane_at_tick(tick)
-        return None if self.state is None or plane is None else road_homography(self.rig, self.state, camera, plane)
-
-    def road_z_m(self, xy: Array, tick: int) -> float | None:
-        """Return the height of the road at a ground position (2,), m; None where nothing was fitted."""
-        plane = self._plane_at_tick(tick)
-        return None if plane is None else float(plane @ [*(xy - self.rig.origin_m[:2]), 1.0] + self.rig.origin_m[2])
-
-    def _plane_at_tick(self, tick: int) -> Array | None:
-        if self.state is None:
-            return None
-        k = int(np.searchsorted(self.ticks, tick))
-        return np.asarray(self.planes[k] if k < len(self.ticks) and self.ticks[k] == tick else self.state.plane)
+    planes: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (T, 3)
 
 
 def fit_rig(
@@ -220,12 +184,8 @@ def fit_rig(
 ) -> RigFit:
     """Fit the homographies of all cameras of a rig.
 
-    Parameters
-    ----------
-    feet, ground : mapping of str to Correspondences
-        Of obstacles and of LiDAR ground points, by camera.
-    samples : int
-        Planes that RANSAC draws for the whole rig.
+    `feet`, `ground`: of obstacles and of LiDAR ground points, by camera. `samples`: planes that RANSAC draws for the whole
+    rig.
     """
     foot_rows = RigRows.of(rig, feet, FOOT_SIGMA_PX, FOOT_SIGMA_M)
     ground_rows = RigRows.of(rig, ground, GROUND_SIGMA_PX, GROUND_SIGMA_M)

@@ -25,18 +25,10 @@ ON_GROUND_M = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Ground heights on a grid.
+    """Ground heights on a grid."""
 
-    Attributes
-    ----------
-    center : (2,) float64
-        m, middle of the grid, in the frame of the points.
-    z : (K, K) float64
-        m, heights at the cell centers, first axis along x.
-    """
-
-    center: Array
-    z: Array
+    center: Array  # (2,): m, middle of the grid, in the frame of the points
+    z: Array  # (K, K): m, heights at the cell centers, first axis along x
 
     def at(self, xy: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """Interpolate the height (N,) under positions (N, 2) bilinearly; constant beyond the grid's edge."""
@@ -63,13 +55,8 @@ class Ground:
 def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float) -> Ground:
     """Estimate the ground under points (N, 3) within `REACH_M` of `center` (2,).
 
-    Parameters
-    ----------
-    xyz : (N, 3) float, m
-    center : (2,) float64, m
-        In the frame of the points.
-    z_hint : float
-        Expected height at the center, m. Without any point the ground is flat at this height.
+    `xyz`: (N, 3), m. `center`: (2,), m: in the frame of the points. `z_hint`: expected height at the center, m. Without any
+    point the ground is flat at this height.
 
     Notes
     -----
@@ -169,29 +156,14 @@ MIN_WINDOW_STEPS = round(MIN_WINDOW_RAD / STEP_RAD)
 
 @dataclass(frozen=True, eq=False)
 class AzimuthIndex:
-    """Points of a cloud around their sensor, sorted by azimuth.
+    """Points of a cloud around their sensor, sorted by azimuth."""
 
-    Attributes
-    ----------
-    azimuth : (N,) uint16
-        In steps of `STEP_RAD` from -pi, map frame, not decreasing.
-    range_m : (N,) float32
-        Horizontal distance from the sensor.
-    slope : (N,) float32
-        Height over horizontal distance, relative to the sensor.
-    obstacle : (N,) bool
-        False for points on the ground.
-    rank : (N,) int32
-        Position of every point of the cloud in the columns above.
-    unsorted : tuple of (N,) uint16, (N,) float32, (N,) float32
-        Azimuth, distance and slope in the order of the cloud.
-    """
-
-    azimuth: NDArray[np.uint16]
-    range_m: NDArray[np.float32]
-    slope: NDArray[np.float32]
-    obstacle: NDArray[np.bool_]
-    rank: NDArray[np.int32]
+    azimuth: NDArray[np.uint16]  # (N,): in steps of `STEP_RAD` from -pi, map frame, not decreasing
+    range_m: NDArray[np.float32]  # (N,): horizontal distance from the sensor
+    slope: NDArray[np.float32]  # (N,): height over horizontal distance, relative to the sensor
+    obstacle: NDArray[np.bool_]  # (N,): false for points on the ground
+    rank: NDArray[np.int32]  # (N,): position of every point of the cloud in the columns above
+    # Azimuth, distance and slope in the order of the cloud
     unsorted: tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]
 
     @classmethod
@@ -211,10 +183,7 @@ class AzimuthIndex:
     def ends_visible(self, members: Sequence[NDArray[np.intp]]) -> NDArray[np.bool_]:
         """Decide which of the right and the left end (R, 2) of clusters are ends of their objects.
 
-        Parameters
-        ----------
-        members : R arrays (n,) of int
-            Rows of each cluster's points in the cloud, at least one.
+        `members`: R arrays (n,): rows of each cluster's points in the cloud, at least one.
 
         Notes
         -----
@@ -296,14 +265,8 @@ def _extended_face_ranges(
 ) -> NDArray[np.float64]:
     """Range (n,) in m, along rays (n, 2), of the face that ends at an end of a cluster, were it to go on; 0 at a corner.
 
-    Parameters
-    ----------
-    corner : (R, 2, 2) float64
-        The points at the right and the left end of each cluster.
-    group, xy : (K,) int, (K, 2) float64
-        Points of the clusters, and which of them they belong to.
-    window : (n,) int
-        Twice the cluster, plus one at its left end.
+    `corner`: (R, 2, 2): the points at the right and the left end of each cluster. `group`, `xy`: (K,), (K, 2): points of
+    the clusters, and which of them they belong to. `window`: (n,): twice the cluster, plus one at its left end.
     """
     near, points = [], []
     for side in range(2):
@@ -360,59 +323,29 @@ MIN_END_POINTS = 3
 
 @dataclass(frozen=True, eq=False)
 class CloudSensor:
-    """One of the LiDARs whose points are in a cloud.
+    """One of the LiDARs whose points are in a cloud."""
 
-    Attributes
-    ----------
-    points : int
-        Number of its points, which follow those of the previous sensor.
-    position : (3,) float64
-        At the stamp of the cloud, relative to the cloud's origin, m.
-    velocity_mps : (3,) float64
-        Mean over its points.
-    end : str
-        One of `ENDS`.
-    """
-
-    points: int
-    position: Array
-    velocity_mps: Array
-    end: str = VEHICLE
+    points: int  # number of its points, which follow those of the previous sensor
+    position: Array  # (3,): at the stamp of the cloud, relative to the cloud's origin, m
+    velocity_mps: Array  # (3,): mean over its points
+    end: str = VEHICLE  # one of `ENDS`
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points of one moment in the map frame.
-
-    Attributes
-    ----------
-    origin : (3,) float64
-        m, map frame. Coordinates are relative to it, so that single precision resolves 1e-5 m.
-    xyz : (N, 3) float32
-        m, map axes, relative to `origin`.
-    t_s : (N,) float32
-        Time of every point relative to `stamp_ns`.
-    sensor : (3,) float32
-        Position of the sensor in the middle of the sweep, mean over several, relative to `origin`; with parts of the first.
-    ground : (N,) bool
-        True for points on the ground.
-    height : (N,) float32
-        m above the ground.
-    sensors : tuple of CloudSensor
-        Empty where the points are all of one sensor at `sensor`.
-    parts : tuple of Cloud
-        The same points by viewpoint, in their order; empty where all are seen from one.
-    """
+    """Points of one moment in the map frame."""
 
     stamp_ns: int
-    origin: Array
-    xyz: NDArray[np.float32]
-    t_s: NDArray[np.float32]
+    origin: Array  # (3,): m, map frame. Coordinates are relative to it, so that single precision resolves 1e-5 m.
+    xyz: NDArray[np.float32]  # (N, 3): m, map axes, relative to `origin`
+    t_s: NDArray[np.float32]  # (N,): time of every point relative to `stamp_ns`
+    # (3,): position of the sensor in the middle of the sweep, mean over several, relative to `origin`; with parts of the
+    # first
     sensor: NDArray[np.float32]
-    ground: NDArray[np.bool_]
-    height: NDArray[np.float32]
-    sensors: tuple[CloudSensor, ...] = ()
-    parts: tuple[Cloud, ...] = ()
+    ground: NDArray[np.bool_]  # (N,): true for points on the ground
+    height: NDArray[np.float32]  # (N,): m above the ground
+    sensors: tuple[CloudSensor, ...] = ()  # empty where the points are all of one sensor at `sensor`
+    parts: tuple[Cloud, ...] = ()  # the same points by viewpoint, in their order; empty where all are seen from one
 
     @property
     def views(self) -> tuple[Cloud, ...]:
@@ -482,17 +415,12 @@ class Cloud:
 def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
     """Transform a sweep to the map frame.
 
-    Parameters
-    ----------
-    compensate : bool
-        Whether every point takes the sensor pose of its own time. Sweeps without point times, or of a sensor at rest, take
-        the pose of their stamp in either case; sweeps that are compensated already take the pose of the stamp to which they are.
+    `compensate`: whether every point takes the sensor pose of its own time. Sweeps without point times, or of a sensor at
+    rest, take the pose of their stamp in either case; sweeps that are compensated already take the pose of the stamp to
+    which they are.
 
-    Returns
-    -------
-    xyz : (N, 3) float64, m, map frame
-    t_s : (N,) float32
-        Times relative to the sweep's stamp. None is returned instead of both where the sensor's pose is not known.
+    Returns `xyz`: (N, 3), m, map frame; `t_s`: (N,): times relative to the sweep's stamp. None is returned instead of both
+    where the sensor's pose is not known.
     """
     t_ns = sweep.t_ns if sweep.t_ns is not None else np.full(len(sweep.xyz_m), sweep.stamp_ns, dtype=np.int64)
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
@@ -668,20 +596,10 @@ def assemble_cloud(
 ) -> Cloud | None:
     """Merge the simultaneous sweeps of all LiDARs into one cloud in the map frame and estimate its ground.
 
-    Parameters
-    ----------
-    sweeps : mapping of LiDAR name to Sweep
-    origin : (3,) float64, m, map frame
-        Position of the ego, or of the sensors; points farther than `max_range_m` along an axis are left out.
-    ground_z : float
-        Expected height of the ground at the origin, m, map frame.
-    compensate : bool
-        See `sweep_to_map`.
+    `origin`: (3,), m, map frame: position of the ego, or of the sensors; points farther than `max_range_m` along an axis
+    are left out. `ground_z`: expected height of the ground at the origin, m, map frame. `compensate`: see `sweep_to_map`.
 
-    Returns
-    -------
-    Cloud or None
-        None when no sweep has a known pose and points.
+    Returns Cloud or None: None when no sweep has a known pose and points.
     """
     parts, sensors, stamp = [], [], 0
     for name, sweep in sweeps.items():
@@ -736,7 +654,7 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     """Take the points above the ground, one a voxel, and a sample of the rays, so that a long log fits in memory."""
     x, y, _ = cloud.obstacle_columns
     near = np.flatnonzero(np.hypot(x, y) < OBSTACLE_REACH_M)
-    index = cloud.obstacles[near[_first_of_voxels(cloud.obstacle_columns.take(near, axis=1), OBSTACLE_VOXEL_M)]]
+    index = cloud.obstacles[near[first_of_voxels(cloud.obstacle_columns.take(near, axis=1), OBSTACLE_VOXEL_M)]]
     kept = cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
     if not cloud.parts:
         return Obstacles(*kept)
@@ -745,7 +663,7 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     return Obstacles(*kept, np.array([part.sensor for part in cloud.parts]), seen_from)
 
 
-def _first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
+def first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
     """Return the indices of the first point of every voxel among points (3, N), in the order of the points.
 
     Notes

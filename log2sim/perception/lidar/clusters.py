@@ -60,22 +60,11 @@ def candidate_clusters(
 ) -> list[tuple[Index, float]]:
     """Find the clusters inside a detection box that could be its object.
 
-    Parameters
-    ----------
-    xyz : (N, 3) float32, m
-        Points in the box and in a margin around it.
-    uv : (N, 2) float32
-        Their pixels.
-    range_m : (N,) float
-        Their distances from the sensor.
-    box_px : (4,) float64
-        The detection box: u0, v0, u1, v1.
+    `xyz`: (N, 3), m: points in the box and in a margin around it. `uv`: (N, 2): their pixels. `range_m`: (N,): their
+    distances from the sensor. `box_px`: (4,): the detection box: u0, v0, u1, v1.
 
-    Returns
-    -------
-    list of (indices (n,), score)
-        The score, in (0, 1], is the IoU of the cluster's image rectangle with the box, times the square root of the ratio
-        of the nearest cluster's range to its own.
+    Returns list of (indices (n,), score): the score, in (0, 1], is the IoU of the cluster's image rectangle with the box,
+    times the square root of the ratio of the nearest cluster's range to its own.
 
     Notes
     -----
@@ -148,17 +137,10 @@ def _extends_beyond_box(
 def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, count: int) -> list[Index]:
     """Assign one cluster to each of K boxes.
 
-    Parameters
-    ----------
-    options : K sequences of (indices, score)
-        Candidate clusters of each box, see `candidate_clusters`.
-    boxes_px : (K, 4) float64
-    count : int
-        Number of points that the indices refer to.
+    `options`: K sequences of (indices, score): candidate clusters of each box, see `candidate_clusters`. `boxes_px`: (K,
+    4). `count`: number of points that the indices refer to.
 
-    Returns
-    -------
-    K arrays (n,) of indices, empty for a box without a cluster.
+    Returns K arrays (n,) of indices, empty for a box without a cluster.
 
     Notes
     -----
@@ -213,12 +195,7 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
 def continued_sides(seed: Array, xy: Array, max_length_m: float) -> Index:
     """Find the points (m, 2) that continue the sides of a cluster (n, 2) where rays are far apart: their indices.
 
-    Parameters
-    ----------
-    seed, xy : (n, 2), (m, 2) float64, m
-        Relative to the sensor.
-    max_length_m : float
-        No side grows beyond it.
+    `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it.
 
     Notes
     -----
@@ -275,34 +252,20 @@ OWNED_MARGIN_M = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Points above the ground that a frame shows and no 3D box owns.
-
-    Attributes
-    ----------
-    points : (n,) int
-        Rows of the cloud that may be image boxes' objects.
-    columns_m : (3, n) float32
-        The same as rows x, y, z, relative to the cloud's origin.
-    visible : ProjectedPoints
-        Which of them are in the image.
-    """
+    """Points above the ground that a frame shows and no 3D box owns."""
 
     view: View
     cloud: Cloud
-    points: Index
-    columns_m: NDArray[np.float32]
-    visible: ProjectedPoints
+    points: Index  # (n,): rows of the cloud that may be image boxes' objects
+    columns_m: NDArray[np.float32]  # (3, n): the same as rows x, y, z, relative to the cloud's origin
+    visible: ProjectedPoints  # which of them are in the image
 
 
 def place_few_points(seen: Shown, columns: dict[str, Any], rows: Index, boxes_px: Array) -> None:
     """Place the people and riders among the rows (R,) of a frame who have no points of their own yet.
 
-    Parameters
-    ----------
-    columns : dict
-        Of `Measurements`, written to.
-    boxes_px : (N, 4) float64
-        All image boxes of the frame, which hide what is behind them.
+    `columns`: of `Measurements`, written to. `boxes_px`: (N, 4): all image boxes of the frame, which hide what is behind
+    them.
 
     Notes
     -----
@@ -334,16 +297,8 @@ def _body_points(
 ) -> NDArray[np.intp]:
     """Choose the points of the body in a box (4,) among the n points of an image; none where nothing fits.
 
-    Parameters
-    ----------
-    boxes_px : (N, 4) float64
-        All boxes of the frame.
-    tall_m : float
-        Typical height of a body.
-    is_free : callable
-        Marks those of some of the points that are no other object's.
-    focal_px : float
-        Vertical.
+    `boxes_px`: (N, 4): all boxes of the frame. `tall_m`: typical height of a body. `is_free`: marks those of some of the
+    points that are no other object's. `focal_px`: vertical.
     """
     u0, v0, u1, v1 = box_px.tolist()
     width, height = u1 - u0, v1 - v0

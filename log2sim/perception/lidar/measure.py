@@ -68,18 +68,10 @@ def measure(
 ) -> Measurements:
     """Measure the image boxes and the 3D boxes of one tick: one row for each object, also where both show it.
 
-    Parameters
-    ----------
-    boxes : Boxes3D, optional
-        What a detector found in `sweep`; None where none searched it.
-    mode : str
-        Of image boxes: "robust" or "paper".
+    `boxes`: what a detector found in `sweep`; None where none searched it. `mode`: of image boxes: "robust" or "paper".
 
-    Returns
-    -------
-    Measurements
-        Rows of the 3D boxes, then those of the image boxes without a partner in the order of the frames; without LiDAR points
-        these have no position.
+    Returns Measurements: rows of the 3D boxes, then those of the image boxes without a partner in the order of the frames;
+    without LiDAR points these have no position.
     """
     searched = boxes is not None and sweep is not None
     boxes = boxes if boxes is not None and sweep is not None else Boxes3D.empty()
@@ -175,16 +167,10 @@ SWEEP_RECALL_POINTS, SWEEP_RANGE_M = 15.0, 40.0
 
 @dataclass(frozen=True)
 class PairWeights:
-    """Weights of the logistic function that scores an object found in an image and in a sweep.
-
-    Attributes
-    ----------
-    image, sweep : float
-        Of the log-odds of the scores.
-    """
+    """Weights of the logistic function that scores an object found in an image and in a sweep."""
 
     bias: float
-    image: float
+    image: float  # `image`, `sweep`: of the log-odds of the scores
     sweep: float
     iou: float
 
@@ -199,20 +185,12 @@ PAIR_WEIGHTS = PairWeights(bias=-1.7, image=1.0, sweep=1.0, iou=4.0)
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Which image boxes show which of M 3D boxes, the best of P pairs first.
+    """Which image boxes show which of M 3D boxes, the best of P pairs first."""
 
-    Attributes
-    ----------
-    box, image : (P,) int
-    iou : (P,) float64
-        Of the projected box with the image box.
-    height_px : (M,) float64
-        Height of the projected box in the image where it is highest; 0 for a box outside all images.
-    """
-
-    box: Index
+    box: Index  # `box`, `image`: (P,)
     image: Index
-    iou: Array
+    iou: Array  # (P,): of the projected box with the image box
+    # (M,): height of the projected box in the image where it is highest; 0 for a box outside all images
     height_px: Array
 
 
@@ -388,13 +366,8 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
 
     Points of several viewpoints are measured from the one that has most of them; a second one is kept beside it.
 
-    Parameters
-    ----------
-    columns : dict
-        Of `Measurements`, written to; those that are no arrays are lists.
-    rows : R ints
-    members : R arrays (n,) of int
-        The points of each row in the cloud.
+    `columns`: of `Measurements`, written to; those that are no arrays are lists. `members`: R arrays (n,): the points of
+    each row in the cloud.
     """
     split = [cloud.split(index) for index in members]
     kept = [i for i, views in enumerate(split) if len(views[0][1]) >= min(MIN_CLUSTER_POINTS, len(members[i]))]

@@ -36,40 +36,23 @@ READOUT_SLACK = 0.25
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera frame: camera, stamp and pose.
-
-    Attributes
-    ----------
-    map_T_cam : (4, 4) float64
-        Pose at the stamp.
-    cam_T_map_at : callable or None
-        Transforms (K, 4, 4) at times (K,), s, relative to the stamp, for an image whose lines are exposed one after the other.
-    """
+    """A camera frame: camera, stamp and pose."""
 
     camera: Camera
     t_ns: int
-    map_T_cam: Array
+    map_T_cam: Array  # (4, 4): pose at the stamp
+    # Transforms (K, 4, 4) at times (K,), s, relative to the stamp, for an image whose lines are exposed one after the other
     cam_T_map_at: Callable[[Array], Array] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedPoints:
-    """Points inside an image.
+    """Points inside an image."""
 
-    Attributes
-    ----------
-    index : (n,) int
-        Rows among the points that were projected.
-    u, v : (n,) float32
-        Pixels, u right, v down.
-    depth : (n,) float32
-        m along the optical axis.
-    """
-
-    index: NDArray[np.intp]
-    u: NDArray[np.float32]
+    index: NDArray[np.intp]  # (n,): rows among the points that were projected
+    u: NDArray[np.float32]  # `u`, `v`: (n,): pixels, u right, v down
     v: NDArray[np.float32]
-    depth: NDArray[np.float32]
+    depth: NDArray[np.float32]  # (n,): m along the optical axis
 
 
 def view_of(log: Log, camera: str, t_ns: int) -> View | None:
@@ -200,10 +183,7 @@ def _frustum(camera: Camera) -> tuple[Array, Array]:
 def points_in_image_boxes(points: ProjectedPoints, box_px: Array, margin: float = 0.0) -> list[NDArray[np.intp]]:
     """Find the rows of projected points inside each box (M, 4), in rising order.
 
-    Parameters
-    ----------
-    margin : float
-        Share of its sides by which a box is widened to the left, right and top.
+    `margin`: share of its sides by which a box is widened to the left, right and top.
 
     Notes
     -----
