@@ -19,7 +19,7 @@ from log2sim.localization.choice import PoseChoice
 from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.frames import PictureConsumer, look_again
+from log2sim.perception.frames import PictureConsumer, give_pictures
 from log2sim.perception.records import RecordSource
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
@@ -55,7 +55,7 @@ def describe(
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
     with clock.stage("pictures", progress):
-        look_again(records, consumers, lambda done, total: progress("pictures", done, total))
+        give_pictures(records, consumers, lambda done, total: progress("pictures", done, total))
     with clock.stage("lanes", progress):
         if builder is not None:
             ground = builder.build()

@@ -22,10 +22,10 @@ from log2sim.road.routes import (
     Beside,
     Route,
     continued,
+    drop_lane_changes,
     find_beside,
     match_path,
     merge_paths,
-    without_lane_changes,
 )
 from log2sim.road.sections import (
     Connection,
@@ -295,11 +295,11 @@ def infer_lanes(
         notes.append("no lanes from paths: no vehicle moves")
     if not driven and not marked:
         return (), tuple(notes)
-    paths = without_lane_changes(driven)
+    paths = drop_lane_changes(driven)
     graph = _graph(merge_paths(paths, marked), paths)
     lanes = _as_lanes(graph, {path.agent: path.confidence for path in driven})
     lanes = [*lanes, *_free_lanes(lanes, driven)]
-    return _with_opposites(name_lines(lanes, markings, borders)), tuple(notes)
+    return _name_opposites(name_lines(lanes, markings, borders)), tuple(notes)
 
 
 def _marked_routes(
@@ -478,7 +478,7 @@ def _free_lanes(lanes: Sequence[MapLane], paths: Sequence[DrivenPath]) -> list[M
     return found
 
 
-def _with_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
+def _name_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
     """Name for each lane the one beside it that leads the other way, along at least half of it."""
     flat = [k for k, lane in enumerate(lanes) if lane.junction is None]
     lines = [Polyline.through(lanes[k].points_m) for k in flat]

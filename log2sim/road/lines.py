@@ -311,7 +311,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             line = _line_of(curve, own, stretch, traced)
             if line is not None:
                 out.append(line)
-    return _in_context(without_repeats(out))
+    return _in_context(drop_repeats(out))
 
 
 def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch, traced: Trace) -> PaintedLine | None:
@@ -329,7 +329,7 @@ def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch, traced: Trace) -> P
     return PaintedLine(xy, stretch.kind, float(np.median(own.width_m)), own, painted_m, stretch.dashes, odds)
 
 
-def without_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
+def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
     """Leave out lines that lie on stronger ones."""
     order = sorted(lines, key=lambda one: (-one.log_odds, -one.length_m))
     dense = [_dense(line.xy) for line in order]

@@ -131,7 +131,7 @@ class _Change:
     known_m: float
 
 
-def without_lane_changes(paths: Sequence[DrivenPath]) -> list[DrivenPath]:
+def drop_lane_changes(paths: Sequence[DrivenPath]) -> list[DrivenPath]:
     """Cut paths where their vehicles change lanes beside others that keep theirs.
 
     Both parts are continued to the end and from the beginning of the change, along the path of the other vehicle. Of two paths
@@ -235,7 +235,7 @@ def _parts(path: DrivenPath, other: DrivenPath, change: _Change) -> tuple[Driven
     after = other.line.offset(s, change.after_m + eased * (now[1] - change.after_m))
     one = np.concatenate([path.line.points_m[: change.first], before])
     two = np.concatenate([after, path.line.points_m[change.last + 1 :]])
-    return path.with_points(one), path.with_points(two)
+    return path.replace_points(one), path.replace_points(two)
 
 
 # Width of a lane where none is measured: 3.5 m on rural roads (RAL 2012), 3.25 to 3.75 m elsewhere.
@@ -472,7 +472,7 @@ def continued(routes: Sequence[Route], path: DrivenPath, match: Match) -> Driven
     after = _along(routes, match, last, last.last, 1)
     if not len(before) and not len(after):
         return path
-    return path.with_points(np.concatenate([before, path.line.points_m, after]))
+    return path.replace_points(np.concatenate([before, path.line.points_m, after]))
 
 
 def _along(routes: Sequence[Route], match: Match, run: Run, k: int, sign: int) -> Array:

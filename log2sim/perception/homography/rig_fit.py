@@ -86,7 +86,7 @@ def fit_feet(
     earlier fit to the same rows, from which fewer steps lead on.
     """
     if is_start:
-        state = _with_consensus(rig, rows, state, planes)
+        state = _turn_by_consensus(rig, rows, state, planes)
     names, scale = list(rig.cameras), 1.0
     covariance = np.zeros((SHARED + OF_CAMERA * len(names),) * 2)
     for gate in GATES if is_start else GATES[-LAST_GATES:]:
@@ -133,7 +133,7 @@ def _noise_factor(squared: Array, gate: float) -> float:
     return float(np.clip(np.sqrt(variance), 1 / MAX_NOISE_FACTOR, MAX_NOISE_FACTOR))
 
 
-def _with_consensus(rig: Rig, rows: RigRows, state: RigState, planes: Array | None) -> RigState:
+def _turn_by_consensus(rig: Rig, rows: RigRows, state: RigState, planes: Array | None) -> RigState:
     """Turn each camera by the shift in the image that most of its feet agree with, among those that single feet ask for."""
     linear = linearize_feet(rig, rows, state, planes)
     feet = dict(state.feet)
@@ -201,7 +201,7 @@ def fit_rig(
     ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
     if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
         ticks, planes = _planes_of_ticks(_heights(rig, ground_rows), plane)
-        own = _of_rows(ticks, planes, plane, foot_rows.tick)
+        own = _planes_at(ticks, planes, plane, foot_rows.tick)
         moving = fit_feet(rig, foot_rows, fit.state, own, is_start=False)
         decision = _decide(foot_rows, fit, moving, planes - plane)
         if decision.per_tick:
@@ -226,7 +226,7 @@ def _planes_of_ticks(heights: HeightRows, plane: Array) -> tuple[NDArray[np.int6
     return ticks, plane + np.column_stack([tilt, np.zeros(len(ticks))])
 
 
-def _of_rows(ticks: NDArray[np.int64], planes: Array, plane: Array, tick: NDArray[np.int64]) -> Array:
+def _planes_at(ticks: NDArray[np.int64], planes: Array, plane: Array, tick: NDArray[np.int64]) -> Array:
     """Look up the planes (N, 3) of ticks (N,); that of all ticks where there is none."""
     index = np.clip(np.searchsorted(ticks, tick), 0, len(ticks) - 1)
     return np.where((ticks[index] == tick)[:, None], planes[index], plane)
