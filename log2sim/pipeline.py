@@ -145,5 +145,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
 
     everyone = agents if ego is None else [ego, *agents]
     scenario = draft_scenario(run, observations, homographies, everyone)
-    described = describe(scenario, log, config, plan, run.poses, observations, clock, run.progress)
+    described = describe(
+        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, clock=clock, progress=run.progress
+    )  # fmt: skip
     return conclude(run, observations, by_end, homographies, described)

@@ -515,7 +515,7 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
         known[skip.first : skip.last] |= ~at_rest[skip.first : skip.last]
     bridged = ~known
     for first, stop in runs_of(bridged):
-        fitted = bridge(t_s, new, known, t_s[first:stop], noise, limits.prior)
+        fitted = bridge(t_s, new, known, t_s[first:stop], noise=noise, prior=limits.prior)
         if fitted is None:
             bridged[first:stop] = False
             continue
@@ -535,7 +535,7 @@ def runs_of(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def bridge(
-    t_s: Array, values: Array, known: NDArray[np.bool_], asked_s: Array, noise: float, prior: PathPrior
+    t_s: Array, values: Array, known: NDArray[np.bool_], asked_s: Array, *, noise: float, prior: PathPrior
 ) -> FittedPath | None:
     """Interpolate or extrapolate a path at asked times by the known samples around them; None without any."""
     rows = np.flatnonzero(known)
