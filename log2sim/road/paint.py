@@ -58,6 +58,7 @@ class Pieces:
     # where no camera saw it
     color: Array
     color_sigma: Array
+    edge_m: Array  # (N,): length in which the edges rise from a quarter to three quarters of the contrast
     uneven: Array  # (N,): difference of both sides
     # (N,): logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side
     outshines: Array
@@ -104,7 +105,7 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     color, reflected = (_quiet(np.nanmean, a) for a in (samples.paint, samples.intensity))
     by_camera = np.isfinite(color[:, np.abs(across) <= 0.5]).mean(1) > MIN_SEEN
     # Of values, not of their logarithms, in which edges that are blurred lie farther out.
-    left, right = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
+    left, right, edge = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
     shift, width = (left + right) / 2, right - left
     inside = np.abs(across - shift[:, None]) <= np.maximum(width / 2 - 0.02, 0.03)[:, None]
     sides = [_side(across, shift, width, side) for side in (-1, 1)]
@@ -128,6 +129,7 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
         width,
         contrast,
         sigma,
+        edge,
         uneven,
         outshines,
         yellow,
@@ -143,18 +145,26 @@ def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
         return np.asarray(function(values, axis=1, **options), np.float64)
 
 
-def _edges(profile: Array, across: Array) -> list[Array]:
-    """Positions (N,) left and right of the middle where profiles (N, P) fall to half of their contrast on that side."""
+def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
+    """Positions (N,) left and right of the middle where profiles (N, P) fall to half of their contrast on that side.
+
+    The third result is the length in which they fall from three quarters to one.
+    """
     filled, soft = _fill_gaps(profile)
     near = np.abs(across) <= MAX_SHIFT_M
     peak = np.argmax(np.where(near, soft, -np.inf), axis=1)
     index = np.arange(len(profile))
     top = soft[index, peak]
     # Lines wider than the blur have a flat top: its mean is nearer to the paint than its largest value.
+    edges, falls = [], []
     distance = across - across[peak][:, None]
     roads = [_darkest(soft, (side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1])) for side in (-1, 1)]
-    filled_in = [np.where(np.isfinite(road), road, other) for road, other in zip(roads, roads[::-1])]
-    return [_crossing(filled, peak, (road + top) / 2, side, across) for side, road in zip((-1, 1), filled_in)]
+    for side, road, other in zip((-1, 1), roads, roads[::-1]):
+        road = np.where(np.isfinite(road), road, other)
+        high, half, low = (_crossing(filled, peak, road + q * (top - road), side, across) for q in (0.75, 0.5, 0.25))
+        edges.append(half)
+        falls.append(side * (low - high))
+    return edges[0], edges[1], np.fmax(falls[0], falls[1])
 
 
 def _darkest(soft: Array, where: NDArray[np.bool_]) -> Array:
@@ -239,10 +249,15 @@ DASHES = 1.5  # three or more dashes of one length at one distance
 MAX_BY_CAMERA = 3.0
 UNEVEN = -1.5  # a step beside which a little stands out
 NOT_BRIGHTEST, MIN_OUTSHINING = -2.5, 0.4  # no brighter than much of the ground around; share of its contrast
+# Glare fades to its sides; paint ends. Lines of 0.3 m or less look alike to a camera.
+FADING, FADING_FROM_M, FADING_WIDTH_M = -5.0, 0.1, 0.3
+FADING_SHARE = 0.25  # of the width; 0.39 of a Gaussian's
 WIDTH_VARIES = -2.0
 WIDTH_UNUSUAL = -4.0
 # Contrast of logarithms of LiDAR intensity of paint and of other ridges: mean, sigma.
 PAINT_REFLECTS, OTHER_REFLECTS = (0.8, 0.35), (0.0, 0.12)
+# Dashes along lanes are up to 0.3 m wide (VwV-StVO: broad lines of 0.25 m and 0.3 m).
+MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
 MAX_BY_LIDAR, MAX_BY_LIDAR_ALONE = 6.0, 3.0
 ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
 MIN_REFLECTING = 2  # pieces
@@ -257,6 +272,8 @@ def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bo
     if np.isfinite(by_camera):
         odds += _by_shape(pieces, alone=alone)
     odds += _by_width(pieces)
+    if alone and dashes > 1 and np.median(pieces.width_m) > MAX_DASH_WIDTH_M:
+        odds += WIDE_DASHES
     odds = min(odds, MAX_BY_CAMERA)
     lidar = by_lidar(pieces)
     if np.isfinite(by_camera):
@@ -274,6 +291,9 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
     if len(bright) and alone:
         share = float(np.mean(bright > MIN_OUTSHINING * contrast[np.isfinite(pieces.outshines)]))
         odds += NOT_BRIGHTEST * float(np.clip((0.5 - share) / 0.4, 0, 1))
+    width, edge = float(np.median(pieces.width_m)), _median_known(pieces.edge_m)
+    if width > FADING_WIDTH_M and edge > max(FADING_FROM_M, FADING_SHARE * width):
+        odds += FADING
     typical = _median_known(pieces.color)
     return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
 
