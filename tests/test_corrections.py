@@ -70,6 +70,29 @@ def test_a_pose_far_beyond_the_sigmas_is_followed() -> None:
     assert w.y_m[k] == pytest.approx(3.0, abs=0.01)
 
 
+def test_moves_one_after_the_other_are_one_with_all_their_poses() -> None:
+    poses = [at(1.0, 10.0, 0.1), at(1.6, 16.0, -0.05), at(3.0, 30.1, 0.0)]
+    agent = at(2.5, 25.0, 0.0)
+    both = after(scenario(straight("car-1")), {"kind": "move", "agent": agent, "poses": poses})["car-1"].waypoints
+    parts = [{"kind": "move", "agent": agent, "poses": [pose]} for pose in poses]
+    apart = after(scenario(straight("car-1")), *parts)["car-1"].waypoints
+    for column in ("t_s", "x_m", "y_m", "yaw_rad", "sigma_xy_m"):
+        np.testing.assert_allclose(getattr(apart, column), getattr(both, column), atol=1e-12)
+
+
+def test_a_static_agent_that_is_put_at_different_places_moves_through_them_for_all_its_life() -> None:
+    source = parked()  # at (30, -3) from 0 to 4 s
+    poses = [at(1.0, 30.0, -3.0), at(2.0, 32.0, -3.0)]
+    steps = [{"kind": "move", "agent": at(1.0, 30.0, -3.0), "poses": [pose]} for pose in poses]
+    found = after(scenario(source), *steps)["parked"]
+    assert not found.static
+    assert found.waypoints.t_s[[0, -1]].tolist() == source.waypoints.t_s[[0, -1]].tolist()
+    np.testing.assert_allclose(found.waypoints.x_m, 28.0 + 2.0 * found.waypoints.t_s, atol=1e-9)
+    np.testing.assert_allclose(found.waypoints.speed_mps, 2.0, atol=1e-9)
+    k = np.searchsorted(found.waypoints.t_s, [1.0, 4.0 - 1e-6])
+    assert found.waypoints.sigma_xy_m[k[0]] < 0.06 < 2.0 < found.waypoints.sigma_xy_m[k[1]]
+
+
 @pytest.mark.parametrize("source", [straight("car-1"), circling(40.0, 8.0)])
 def test_merging_the_parts_of_a_trajectory_gives_it_back(source: Any) -> None:
     w = source.waypoints

@@ -152,6 +152,8 @@ BASE_ONLY: dict[str, str | None] = {
     "find s.json standing": "find",
     "vary s.json cut_in --out varied": "find",
     "test EGO s.json cut_in --out tested": "find",
+    "export s.json --to openlabel --out openlabel": None,
+    "export s.json --to lanelet2 --out lanelet2": None,
     "export s.json --to carla --out carla": None,
     "export s.json --to csv --out csv": None,
     "export s.json --to scenarionet --out scenarionet": None,

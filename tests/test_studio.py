@@ -13,15 +13,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from browser import Browser
 from command_line import run
 from test_edit import parked, scenario, straight
 
-from log2sim.datatypes import Finding, Scenario
+from log2sim import open_log
+from log2sim.datatypes import Agent, Finding, Log, Scenario
 from log2sim.edit.corrections import load_corrections
 from log2sim.errors import ScenarioError
+from log2sim.geometry import apply, inverse, project
+from log2sim.visualization.recording import Recorded
 from log2sim.visualization.studio import Studio
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def world() -> Scenario:
@@ -234,3 +240,136 @@ def test_on_a_phone_and_by_touch(chromium: Browser, studio: Studio) -> None:
     click(browser, "confirm")
     shown(browser, studio, 1)
     assert not studio.result.scenario["car-3"].is_doubtful
+
+
+def test_lines_are_drawn_and_erased_on_the_page(chromium: Browser, studio: Studio) -> None:
+    browser = chromium
+    browser.open(studio.address)
+    browser.run("document.getElementById('studio-feature').value = 'curb'")
+
+    def window(x_m: float, y_m: float) -> tuple[float, float]:
+        x, y = browser.run(
+            "const r = document.getElementById('map').getBoundingClientRect(), p = log2sim.pixelOf(...arguments); return [p[0] + r.left, p[1] + r.top]",
+            x_m,
+            y_m,
+        )
+        return float(x), float(y)
+
+    click(browser, "line")
+    for place_m in ((5.0, -8.0), (15.0, -8.0), (25.0, -7.0)):
+        browser.mouse(window(*place_m))
+    browser.press("\ue007")
+    shown(browser, studio, 1)
+    features = studio.result.scenario.map_features
+    assert features is not None
+    (border,) = features.borders
+    assert border.kind == "curb"
+    np.testing.assert_allclose(border.points_m[:, :2], [[5, -8], [15, -8], [25, -7]], atol=0.2)
+    np.testing.assert_allclose(border.points_m[:, 2], 0.0, atol=1e-3)  # on the ground below the boxes
+    click(browser, "erase")
+    browser.mouse(window(10.0, -8.0))
+    shown(browser, studio, 2)
+    assert not studio.result.scenario.map_features
+
+
+def test_a_box_is_sized_in_the_map_and_the_other_end_stays(chromium: Browser, studio: Studio) -> None:
+    browser = chromium
+    browser.open(studio.address)
+    before = studio.result.scenario["car-3"]
+    browser.run("log2sim.choose('car-3')")
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    while scale < 25:
+        browser.wheel(*place(browser, "car-3"), -400)
+        scale = browser.run("return log2sim.pixelsPerMeter")
+    browser.press("E")
+    x, y = place(browser, "car-3")
+    w, (length, width, _) = before.waypoints, before.size_m
+    ahead = np.array([np.cos(w.yaw_rad[0]), -np.sin(w.yaw_rad[0])]) * scale
+    front = np.array([x, y]) + ahead * length / 2
+    browser.mouse(tuple(front), tuple(front + ahead))  # type: ignore[arg-type]
+    browser.press("\ue007")
+    browser.wait("log2sim.corrections().length === 2")
+    after = studio.result.scenario["car-3"]
+    assert after.size_m[:2] == pytest.approx((length + 1.0, width), abs=1.5 / scale)
+    rear = [
+        np.array([a.waypoints.x_m[0], a.waypoints.y_m[0]]) - ahead * [1, -1] / scale * a.size_m[0] / 2
+        for a in (before, after)
+    ]
+    np.testing.assert_allclose(rear[1], rear[0], atol=0.1)
+
+
+def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, tmp_path: Path) -> None:
+    """The picture's pixels are those of log2sim's own projection, and a drag there moves the box on the ground."""
+    log = open_log(ROOT / "samples/crossing")
+    scenario = Scenario.load(ROOT / "samples/crossing/truth.json")
+    served = Studio(scenario, tmp_path / "c.json", recorded=Recorded(log, max_bytes=3_000_000))
+    thread = threading.Thread(target=served.serve, daemon=True)
+    thread.start()
+    browser = chromium
+    try:
+        browser.open(served.address)
+        name = "car_parked"
+        browser.run(
+            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
+        )
+        browser.run("log2sim.time = 1.0; log2sim.choose(arguments[0])", name)
+        browser.wait("log2sim.pictures.front !== null")
+        browser.press("E")
+        browser.wait("log2sim.pictures.front === log2sim.time")
+        t_s = browser.run("return log2sim.time")
+        expected = in_view(log, scenario, scenario[name], t_s)
+        at = scenario[name].at(t_s)
+        pixel = browser.run("return log2sim.inPicture('front', ...arguments)", float(at.x_m[0]), float(at.y_m[0]))
+        box = browser.run(
+            "const r = document.querySelector('[aria-label=\"Picture of front\"]').getBoundingClientRect(); return [r.left, r.top, r.width]"
+        )
+        assert expected is not None
+        np.testing.assert_allclose(
+            (np.array(pixel) - box[:2]) * log.cameras["front"].width_px / box[2], expected, atol=0.5
+        )
+        goal = browser.run(
+            "return log2sim.inPicture('front', ...arguments)", float(at.x_m[0]) - 2.0, float(at.y_m[0]) + 2.0
+        )
+        browser.mouse(tuple(pixel), tuple(goal))
+        browser.press("\ue007")
+        browser.wait("log2sim.corrections().length === 1")
+        (entry,) = served.document["corrections"]
+        # A pixel of the picture is up to a meter of the ground there.
+        moved = np.array([entry["poses"][0]["x_m"] - at.x_m[0], entry["poses"][0]["y_m"] - at.y_m[0]])
+        np.testing.assert_allclose(moved, [-2.0, 2.0], atol=0.8)
+        # Loaded again, its box is in the picture where it is now.
+        browser.open(served.address)
+        browser.run(
+            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
+        )
+        browser.run("log2sim.time = arguments[0]", t_s)
+        browser.wait("log2sim.pictures.front !== null")
+        now = served.result.scenario[name].at(t_s)
+        browser.mouse(
+            tuple(
+                browser.run(
+                    "return log2sim.inPicture('front', ...arguments)", float(now.x_m[0]), float(now.y_m[0]), 0.7
+                )
+            )
+        )
+        browser.wait(f"log2sim.chosen === '{name}'")
+        assert [line for line in browser.log("browser") if line["level"] == "SEVERE"] == []
+    finally:
+        served.close()
+        thread.join(10)
+
+
+def in_view(log: Log, scenario: Scenario, agent: Agent, t_s: float) -> np.ndarray | None:
+    """Pixel of the ground below an agent in the front camera; None where it is not in the picture."""
+    stamps = log.streams["front"].t_ns
+    t_ns = int(stamps[np.argmin(np.abs(stamps - scenario.t0_ns - t_s * 1e9))])
+    at = agent.at(t_s)
+    if not at.valid[0]:
+        return None
+    map_T_cam, _ = log.map_T_sensor("front", t_ns)
+    camera = log.cameras["front"]
+    uv, seen = project(
+        camera, apply(inverse(map_T_cam[0]), np.array([[at.x_m[0], at.y_m[0], at.z_m[0] - agent.size_m[2] / 2]]))
+    )
+    inside = seen[0] and 0 < uv[0, 0] < camera.width_px and 0 < uv[0, 1] < camera.height_px
+    return uv[0] if inside else None

@@ -15,6 +15,8 @@ environments=(
     "metadrive metadrive-simulator==0.4.3"
     "commonroad commonroad-io==2024.3 commonroad-drivability-checker==2025.4.0" # which needs modules that later releases moved
     "omega_prime omega-prime==0.3.7"
+    "lanelet2 lanelet2==1.2.3"
+    "openlabel vcd==6.0.3 jsonschema" # whose schema of OpenLABEL 1.0.0 is that of ASAM
     "rerun --editable .[rerun]"
 )
 # MetaDrive needs its models and textures for rendering only; without these two files it would download all at the start.

@@ -9,6 +9,7 @@ from typing import Annotated
 from log2sim.cli.options import (
     Cameras,
     Format,
+    LabelFile,
     LogPath,
     Overwrite,
     Quiet,
@@ -31,6 +32,7 @@ def convert(
     start: Start = None,
     stop: Stop = None,
     cameras: Cameras = None,
+    labels: LabelFile = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -39,6 +41,7 @@ def convert(
     Examples
     --------
     log2sim convert samples/crossing --start 1 --stop 3 --cameras front -o part/
+    log2sim convert drive.bag --labels openlabel.json -o labeled/
     """
     from log2sim.cli.progress import progress
     from log2sim.files.documents import check_folder
@@ -51,7 +54,9 @@ def convert(
     check_folder(out, overwrite=overwrite)
     if out.resolve() in (log.resolve(), *log.resolve().parents):
         raise ConfigError(f"{out}: holds the log that is converted; choose another folder")
-    part = cut_log(open_log(log, format=format, sequence=sequence), cameras=names, start_s=start, stop_s=stop)
+    part = cut_log(
+        open_log(log, format=format, sequence=sequence, labels=labels), cameras=names, start_s=start, stop_s=stop
+    )
     for note in part.notes:
         say(f"note: {note}", quiet=quiet)
     problems: list[str] = []

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from log2sim.cli.options import (
     ConfigFile,
     Format,
+    LabelFile,
     LogPath,
     Overwrite,
     Poses,
@@ -42,6 +43,7 @@ def detect(
     start: Start = None,
     stop: Stop = None,
     poses: Poses = None,
+    labels: LabelFile = None,
     config: ConfigFile = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
@@ -53,6 +55,7 @@ def detect(
     --------
     log2sim detect samples/crossing -o boxes.json
     log2sim detect kitti_object/ --detector lidar:MODEL.onnx -o boxes.json
+    log2sim detect LOG --detector lidar:labels --labels openlabel.json -o boxes.json
     """
     from log2sim.cli.progress import progress
     from log2sim.cli.reconstruct import pose_lines
@@ -67,7 +70,7 @@ def detect(
     if poses is not None:
         changes["poses"] = {"source": poses}
     chosen = Config.load(config, settings or (), **changes)
-    opened = open_log(log, format=format, sequence=sequence)
+    opened = open_log(log, format=format, sequence=sequence, labels=labels)
     for note in opened.notes:
         say(f"note: {note}", quiet=quiet)
     if weakness := describe_weakness(detector):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from log2sim.cli.options import (
+    LabelFile,
     Overwrite,
     Poses,
     Quiet,
@@ -44,13 +45,7 @@ def evaluate(
             "TRUTH",
         ),
     ],
-    labels: Annotated[
-        Path | None,
-        option(
-            "True boxes for the log of --truth: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
-            "FILE",
-        ),
-    ] = None,
+    labels: LabelFile = None,
     sequence: SequenceName = None,
     poses: Poses = None,
     range: Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated
 from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, choose, complete_plugins, option, say, write_to
 
 MAX_NOTES = 5
-FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
+FORMATS = "openscenario, carla, csv, scenarionet, commonroad, lanelet2, openlabel, osi, mcap, rerun"  # written out: --help imports nothing
 
 
 def export(
@@ -24,7 +24,10 @@ def export(
     mode: Annotated[
         str | None, choose("--mode", "exact", "pid", help="carla: how agents move.", default="exact")
     ] = None,
-    log: Annotated[Path | None, option("mcap, rerun: log whose images and points are included.", "LOG")] = None,
+    log: Annotated[
+        Path | None,
+        option("mcap, rerun: log whose images and points are included; openlabel: whose pictures have boxes.", "LOG"),
+    ] = None,
     ego: Annotated[
         str | None,
         option(

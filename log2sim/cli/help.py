@@ -42,4 +42,5 @@ def help_(
         return
     if topic not in known:
         raise ConfigError(f"no page '{topic}'{nearest(topic, list(known))}; log2sim help lists them")
-    say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", known[topic].rstrip()))
+    text = re.sub(r"^!\[.*\n\n?", "", known[topic].rstrip(), flags=re.MULTILINE)
+    say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", text))

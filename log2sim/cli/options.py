@@ -90,6 +90,14 @@ Categories = Annotated[
     str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B", default="all")
 ]
 Truth = Annotated[Path | None, option("Ground truth: a scenario file or a log with labels.", "TRUTH")]
+LabelFile = Annotated[
+    Path | None,
+    option(
+        "True boxes in place of those of the log: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
+        "FILE",
+        "--labels",
+    ),
+]
 Poses = Annotated[
     str | None,
     choose(

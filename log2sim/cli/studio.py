@@ -60,10 +60,11 @@ def studio(
             layers["recorded"] = recorded
             if shows_ground(recorded.log):
                 layers["background"] = map_of(recorded.log, loaded, report_progress)
-    try:
-        served = Studio(loaded, path, port=port, **layers)
-    except OSError as error:
-        raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
+        try:
+            served = Studio(loaded, path, port=port, **layers)
+        except OSError as error:
+            raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
+        served.page()  # its pictures take long to gather: not while a browser waits
     for line in served.result.unmatched:
         say(f"warning: {line}", quiet=quiet)
     try:
@@ -73,6 +74,5 @@ def studio(
         served.serve()
     except KeyboardInterrupt:
         count = len(served.document["corrections"])
-        say(
-            f"{path}: {count} correction{'s' * (count != 1)}; log2sim correct {scenario} {path} --out corrected.json applies them"
-        )
+        words = f"{path}: {count} correction{'s' * (count != 1)}"
+        say(f"{words}; log2sim correct {scenario} {path} --out corrected.json applies them" if count else words)

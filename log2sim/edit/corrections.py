@@ -119,6 +119,8 @@ class _Draft:
         self.deleted: dict[str, Agent] = {}
         self.features = scenario.map_features or MapFeatures()
         self.given: dict[tuple[str, str], tuple[int, Any]] = {}
+        # By id: an agent as its last move left it, as it was before its moves, and their poses.
+        self.moves: dict[str, tuple[Agent | None, Agent, list[dict[str, float]]]] = {}
         self.shift = np.zeros(3) if offset_m is None else np.array(offset_m) - np.array(scenario.map.offset_m)
 
     def result(self, history: list[Any]) -> Scenario:
@@ -171,8 +173,13 @@ class _Draft:
         elif kind == "confirm":
             self.agents[agent_id] = replace(agent, confidence=1.0, doubts=(), quarantined=False)
         elif kind == "move":
-            poses = self._poses(entry)
-            self.agents[agent_id] = settled(moved(agent, poses, float(entry.get("over_s", CORRELATION_S))), kind)
+            # Moves one after the other are measurements of one trajectory, as if they were one.
+            last, before, known = self.moves.get(agent_id, (None, agent, []))
+            before, known = (before, known) if last is agent else (agent, [])
+            poses = list({p["t_s"]: p for p in (*known, *self._poses(entry))}.values())
+            poses.sort(key=lambda p: p["t_s"])
+            self.agents[agent_id] = settled(moved(before, poses, float(entry.get("over_s", CORRELATION_S))), kind)
+            self.moves[agent_id] = self.agents[agent_id], before, poses
         else:
             self.agents[agent_id] = settled(_changed(agent, kind, entry), kind)
         return ""
@@ -296,10 +303,23 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
     correlation time `over_s`; of a static agent it is the same at all times. A single pose of sigma s moves the place at its
     time by the Kalman gain sigma^2 / (sigma^2 + s^2) of its distance (Rasmussen and Williams, "Gaussian Processes for Machine
     Learning", 2006, section 2.2), and less before and after. Where the poses contradict the stated sigmas, these are too small
-    and grow until the distance is as expected.
+    and grow until the distance is as expected. A static agent that they put at different places moves through them.
     """
     key_s = np.array([p["t_s"] for p in poses])
     w = agent.waypoints
+    apart_m = np.ptp([[p["x_m"], p["y_m"]] for p in poses], axis=0).max()
+    if agent.static and apart_m > 3 * POSE_SIGMA_M:
+        path = [{"z_m": float(w.z_m[0]), **p} for p in poses]
+        for at, t_s, step in ((0, float(w.t_s[0]), 1), (-1, float(w.t_s[-1]), -1)):
+            if (key_s[at] - t_s) * step > 1e-6:  # straight on to the end of its life
+                f = (t_s - key_s[at]) / (key_s[at + step] - key_s[at])
+                x, y = (path[at][k] + f * (path[at + step][k] - path[at][k]) for k in ("x_m", "y_m"))
+                far = POSE_SIGMA_M + float(np.hypot(x - path[at]["x_m"], y - path[at]["y_m"]))
+                end = {"t_s": t_s, "x_m": x, "y_m": y, "z_m": path[at]["z_m"], "sigma_m": far}
+                path.insert(0 if at == 0 else len(path), end)
+                key_s = np.array([p["t_s"] for p in path])
+        through = added(agent.category, agent.size_m, path, agent.id)
+        return replace(agent, static=False, waypoints=through.waypoints)
     if not agent.static:
         inside = key_s[(key_s > w.t_s[0]) & (key_s < w.t_s[-1])]
         steps = np.unique(np.concatenate([insert_steps(w, float(w.t_s[0]), float(w.t_s[-1])), inside]))

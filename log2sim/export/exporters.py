@@ -93,6 +93,18 @@ def on_map(frame: MapFrame, projection: str | None, offset_m: tuple[float, float
     return ExportPlacement(offset_m, frame.offset_m, frame.projection, projection)
 
 
+def project_points(frame: MapFrame, points_m: Array) -> tuple[Array, Array]:
+    """Return longitude and latitude (N,), degrees, of points (N, 3) of a map; around its origin, or 0, 0, where it has no projection."""
+    if frame.projection is not None:
+        source, offset = frame.projection, np.array(frame.offset_m)
+    else:
+        source = f"+proj=tmerc +lat_0={frame.latitude_deg or 0} +lon_0={frame.longitude_deg or 0} +ellps=WGS84"
+        offset = np.zeros(3)
+    x, y = (points_m + offset)[:, :2].T
+    longitude, latitude = _transformer(source, "+proj=longlat +ellps=WGS84").transform(x, y)
+    return np.asarray(longitude), np.asarray(latitude)
+
+
 def geo_reference(projection: str) -> str:
     """Return a PROJ string with the same coordinates in the words that esmini reads, too; others stay as they are.
 

@@ -31,8 +31,16 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from log2sim.datatypes import Agent, explain_doubt
-from log2sim.export.viewers import AgentSteps, CameraFrame, ThinnedSweep, UnreadableRecord, ViewerRecord, rgb_of
-from log2sim.geometry import NS_PER_S, Array, quaternion_from_rotation, rotation_from_rpy, transform
+from log2sim.export.viewers import (
+    AgentSteps,
+    CameraFrame,
+    ThinnedSweep,
+    UnreadableRecord,
+    ViewerRecord,
+    ego_pose,
+    rgb_of,
+)
+from log2sim.geometry import NS_PER_S, Array, quaternion_from_rotation, transform
 
 MAP = "map"
 BOX_ALPHA, PATH_ALPHA = 0.6, 0.9
@@ -52,7 +60,7 @@ def scene_messages(steps: AgentSteps, origin: Array) -> Iterator[Message]:
         yield t_ns, "/agents", SceneUpdate(deletions=[gone], entities=[_box(t_ns, *at) for at in here])
         for agent, position, yaw in here:
             if agent.id == "ego":
-                yield t_ns, "/tf", _frame(t_ns, "ego", _rear_axle(agent, position, yaw))
+                yield t_ns, "/tf", _frame(t_ns, "ego", ego_pose(agent, position, yaw))
 
 
 def record_messages(record: ViewerRecord, origin: Array) -> Iterable[Message]:
@@ -116,12 +124,6 @@ def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntit
     )
     metadata = [KeyValuePair(key=key, value=value) for key, value in about.items()]
     return SceneEntity(timestamp=_stamp(t_ns), frame_id=MAP, id=agent.id, cubes=[cube], texts=[name], metadata=metadata)
-
-
-def _rear_axle(agent: Agent, position: Array, yaw_rad: float) -> Array:
-    """Return the ego frame: at the rear axle, on the ground."""
-    map_T_box = transform(rotation_from_rpy(0.0, 0.0, yaw_rad), position)
-    return map_T_box @ transform(np.eye(3), [-agent.rear_axle_offset_m, 0.0, -agent.size_m[2] / 2])
 
 
 def _frame(t_ns: int, child: str, map_T_child: Array) -> FrameTransform:

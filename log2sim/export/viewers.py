@@ -19,6 +19,8 @@ from log2sim.geometry import (
     box_corners,
     box_lines,
     inverse,
+    rotation_from_rpy,
+    transform,
 )
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
@@ -87,6 +89,12 @@ def agent_steps(scenario: Scenario) -> AgentSteps:
     t_s = step_times(min(first for first, _ in ends), max(last for _, last in ends), STEP_S, len(ends))
     t_ns = scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)
     return AgentSteps(t_ns, tuple((agent, sample_steps(agent, t_s, STEP_S)) for agent in scenario.agents))
+
+
+def ego_pose(agent: Agent, position_m: Array, yaw_rad: float) -> Array:
+    """Return the ego frame (4, 4) of a box: at the rear axle, on the ground."""
+    map_T_box = transform(rotation_from_rpy(0.0, 0.0, yaw_rad), position_m)
+    return map_T_box @ transform(np.eye(3), [-agent.rear_axle_offset_m, 0.0, -agent.size_m[2] / 2])
 
 
 def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:

@@ -130,6 +130,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "csv": "log2sim.export.csv_table:EXPORTER",
         "scenarionet": "log2sim.export.scenarionet:EXPORTER",
         "commonroad": "log2sim.export.commonroad:EXPORTER",
+        "lanelet2": "log2sim.export.lanelet2:EXPORTER",
+        "openlabel": "log2sim.export.openlabel:EXPORTER",
         "osi": "log2sim.export.osi:EXPORTER",
         "mcap": "log2sim.export.mcap:EXPORTER",
         "rerun": "log2sim.export.rerun:EXPORTER",

@@ -157,14 +157,18 @@ def track_forward(
     measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float, whole_boxes: bool = False
 ) -> list[Tracklet]:
     """Assign the measurements of T ticks (stamps (T,)) to tracklets, which come in the order of their births."""
-    tracker = ForwardTracker(birth_score=birth_score, period_s=period_of(t_ns), whole_boxes=whole_boxes)
-    log: list[tuple[Index, NDArray[np.int64], Index]] = []
-    for tick, found in enumerate(measurements):
-        rows, number = tracker.step(found, int(t_ns[tick]))
-        log.append((number, np.full(len(rows), tick, dtype=np.int64), rows))
-    if not log:
+    if not len(measurements):
         return []
-    number, ticks, rows = (np.concatenate(column) for column in zip(*log))
+    tracker = ForwardTracker(birth_score=birth_score, period_s=period_of(t_ns), whole_boxes=whole_boxes)
+    count = [len(found) for found in measurements]
+    everything = _Columns.of(Measurements.join(measurements), np.repeat(t_ns, count), whole_boxes=whole_boxes)
+    first = np.searchsorted(everything.row, np.cumsum([0, *count]))
+    log = [
+        tracker.advance(everything.take(slice(first[k], first[k + 1])), int(now_ns)) for k, now_ns in enumerate(t_ns)
+    ]
+    rows, number = (np.concatenate(column) for column in zip(*log))
+    ticks = np.repeat(np.arange(len(log)), [len(taken) for taken, _ in log])
+    rows = rows - np.concatenate([[0], np.cumsum(count)])[ticks]
     order = np.argsort(number, kind="stable")
     cuts = np.flatnonzero(np.diff(number[order])) + 1
     means = tracker.last_states()
@@ -218,12 +222,14 @@ class ForwardTracker:
         Those with a score of at least the birth score may start a track; weaker ones only continue one (Zhang et al.,
         "ByteTrack", ECCV 2022), after the strong ones are assigned.
         """
-        self._advance(now_ns)
-        rows = np.flatnonzero(found.source != "")
-        if len(rows) == 0:
-            return rows, np.zeros(0, dtype=np.intp)
-        columns = _Columns(found, rows, now_ns, whole_boxes=self.whole_boxes)
-        strong = found.score[rows] >= self.birth_score
+        return self.advance(_Columns.of(found, np.full(len(found), now_ns), whole_boxes=self.whole_boxes), now_ns)
+
+    def advance(self, columns: _Columns, now_ns: int) -> tuple[Index, Index]:
+        """Do what `step` does, with the columns of a tick."""
+        self._predict(now_ns)
+        if len(columns.row) == 0:
+            return columns.row, np.zeros(0, dtype=np.intp)
+        strong = columns.score >= self.birth_score
         costs = self._costs(columns)
         tracks, taken = self._choose(columns, strong, costs)
         self._update(tracks, columns, taken, costs)
@@ -238,7 +244,7 @@ class ForwardTracker:
             self._start(columns, born, now_ns)
             numbers = np.concatenate([numbers, self.number[len(self.number) - len(born) :]])
             taken = np.concatenate([taken, born])
-        return rows[taken], numbers
+        return columns.row[taken], numbers
 
     def last_states(self) -> Array:
         """Return the last states (N, 4) of all tracks, ended ones included, by number."""
@@ -246,7 +252,7 @@ class ForwardTracker:
         number = np.concatenate([n for n, _ in ended])
         return np.concatenate([m for _, m in ended])[np.argsort(number)]
 
-    def _advance(self, now_ns: int) -> None:
+    def _predict(self, now_ns: int) -> None:
         """End the tracks without a recent measurement and predict the others to `now_ns`."""
         age_s = (now_ns - self.seen_ns) / NS_PER_S
         alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, self._confirmed_age_s, self._tentative_age_s)
@@ -323,7 +329,7 @@ class ForwardTracker:
         count, group = len(born), columns.group[born]
         mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
         mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
-        covariance[:, 2:, 2:] = first_velocity(columns.axis_rad[born], columns.start[born])
+        covariance[:, 2:, 2:] = columns.velocity[born]
         prior = np.where(columns.riderless[born] > 0, RIDERLESS_STANDING_PRIOR, STANDING_PRIOR)
         self.standing = np.concatenate([self.standing, prior])
         self.place_m = np.concatenate([self.place_m, columns.xy[born]])
@@ -337,20 +343,36 @@ class ForwardTracker:
         self._born += count
 
 
+@dataclass(frozen=True, eq=False)
 class _Columns:
-    """The placed measurements of one tick as arrays for the filter."""
+    """Placed measurements as arrays (M, ...) for the filter; `row` is that of each among all, `age_s` relative to its tick."""
 
-    def __init__(self, found: Measurements, rows: Index, now_ns: int, *, whole_boxes: bool) -> None:
-        self.xy = found.center_m[rows, :2]
-        self.axis_rad = (found.yaw_rad if whole_boxes else found.box_yaw_rad)[rows]
-        category = found.category[rows]
-        self.group = np.array([_INDEX[c] for c in category.tolist()])
-        self.riderless = (category == "bicycle").astype(np.float64)
-        self.two_wheeler = self.group == _NAMES.index("two_wheeler")
-        self.name = _NAME_ARRAY[self.group]
-        self.start = np.where(category == "bicycle", "bicycle", self.name)
-        self.r = measurement_noise(found.covariance[rows], self.name, whole_boxes=whole_boxes)
-        self.age_s = (found.t_ns[rows] - now_ns) / NS_PER_S
+    row: Index
+    score: Array
+    xy: Array
+    r: Array
+    velocity: Array
+    age_s: Array
+    group: Index
+    riderless: Array
+    two_wheeler: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, found: Measurements, now_ns: NDArray[np.int64], *, whole_boxes: bool) -> _Columns:
+        row = np.flatnonzero(found.source != "")
+        category = found.category[row]
+        group = np.array([_INDEX[c] for c in category.tolist()], dtype=np.intp)
+        start = np.where(category == "bicycle", "bicycle", _NAME_ARRAY[group])
+        axis_rad = (found.yaw_rad if whole_boxes else found.box_yaw_rad)[row]
+        return cls(
+            row, found.score[row], found.center_m[row, :2],
+            measurement_noise(found.covariance[row], _NAME_ARRAY[group], whole_boxes=whole_boxes), first_velocity(axis_rad, start),
+            (found.t_ns[row] - now_ns[row]) / NS_PER_S, group, (category == "bicycle").astype(np.float64),
+            group == _NAMES.index("two_wheeler"),
+        )  # fmt: skip
+
+    def take(self, rows: slice) -> _Columns:
+        return _Columns(*(column[rows] for column in vars(self).values()))
 
 
 def _joined(moving: Array, standing: Array, probability: Array) -> Array:

@@ -60,7 +60,10 @@ def voted_category(m: Measurements) -> str:
     A motorcycle, a bicycle and their riders have much the same points but look different: within two-wheelers the
     measurements with an image decide, if there are any.
     """
-    groups = np.array([GROUP_OF[c] for c in m.category.tolist()])
+    categories = m.category.tolist()
+    if len(set(categories)) == 1:
+        return str(categories[0])
+    groups = np.array([GROUP_OF[c] for c in categories])
     group = _most_scored(groups, m.score)
     voters = groups == group
     with_image = voters & (m.camera != "")
@@ -116,18 +119,25 @@ class _Ends:
     ----------
     first_ns : (A,) int64
     last_ns : (A,) int64
-    first : tuple of (A, 4) and (A, 4, 4) float64
-        States and covariances.
-    last : tuple of (A, 4) and (A, 4, 4) float64
-        States and covariances.
+    first, last : (A, 4) float64
+        States.
+    first_covariance, last_covariance : (A, 4, 4) float64
     group : (A,) str
     """
 
     first_ns: NDArray[np.int64]
     last_ns: NDArray[np.int64]
-    first: tuple[Array, Array]
-    last: tuple[Array, Array]
+    first: Array
+    first_covariance: Array
+    last: Array
+    last_covariance: Array
     group: NDArray[np.str_]
+
+    def join(self, other: _Ends) -> _Ends:
+        return _Ends(*(np.concatenate(columns) for columns in zip(vars(self).values(), vars(other).values())))
+
+    def take(self, rows: list[int]) -> _Ends:
+        return _Ends(*(column[rows] for column in vars(self).values()))
 
 
 def stitch(
@@ -139,19 +149,23 @@ def stitch(
     uncertainty.
     """
     current = list(tracks)
-    while len(current) > 1:
-        i, j = _choose_joins(_joining_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s))
+    ends = _ends(current, whole_boxes=whole_boxes) if len(current) > 1 else None
+    while ends is not None:
+        i, j = _choose_joins(_joining_costs(ends, max_gap_s))
         if not len(i):
             break
         following = dict(zip(i.tolist(), j.tolist()))
-        heads = sorted(set(range(len(current))) - set(following.values()))
-        joined = []
-        for head in heads:
-            chain = [head]
+        chains = [[head] for head in sorted(set(range(len(current))) - set(following.values()))]
+        for chain in chains:
             while chain[-1] in following:
                 chain.append(following[chain[-1]])
-            joined.append(_concatenate([current[k] for k in chain], whole_boxes=whole_boxes))
-        current = joined
+        joined = [_concatenate([current[k] for k in c], whole_boxes=whole_boxes) for c in chains if len(c) > 1]
+        # Only what was joined is filtered again.
+        number = iter(range(len(current), len(current) + len(joined)))
+        rows = [next(number) if len(c) > 1 else c[0] for c in chains]
+        everyone = [*current, *joined]
+        ends = ends.join(_ends(joined, whole_boxes=whole_boxes)).take(rows)
+        current = [everyone[k] for k in rows]
     return current
 
 
@@ -199,11 +213,11 @@ def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], ND
     a = np.repeat(np.arange(len(starts)), count)
     b = order[np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(after, count)]
     slow_end, slow_start = (
-        np.flatnonzero(np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS) for state in (ends.last[0], ends.first[0])
+        np.flatnonzero(np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS) for state in (ends.last, ends.first)
     )
     if len(slow_end) and len(slow_start):
-        near = cKDTree(ends.first[0][slow_start, :2])
-        found = near.query_ball_point(ends.last[0][slow_end, :2], MAX_STATIONARY_OFFSET_M)
+        near = cKDTree(ends.first[slow_start, :2])
+        found = near.query_ball_point(ends.last[slow_end, :2], MAX_STATIONARY_OFFSET_M)
         a = np.concatenate([a, np.repeat(slow_end, [len(k) for k in found])])
         b = np.concatenate([b, slow_start[np.concatenate([*found, []]).astype(np.intp)]])
     pairs = np.unique(a * len(starts) + b)
@@ -217,10 +231,10 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> _Costs:
     a, b = _possible_pairs(ends, max_gap_s)
     gap_s = (ends.first_ns[b] - ends.last_ns[a]) / NS_PER_S
     ends_stationary, starts_stationary = (
-        np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last[0], ends.first[0])
+        np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last, ends.first)
     )
     stationary = ends_stationary[a] & starts_stationary[b]
-    last, first = ends.last[0][a], ends.first[0][b]
+    last, first = ends.last[a], ends.first[b]
     offset_m = np.hypot(*(last - first)[:, :2].T)
     same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M)
     cost = np.where(same_place, offset_m, FORBIDDEN)
@@ -232,8 +246,8 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> _Costs:
     )
     one, other, half_gap_s = a[near], b[near], gap_s[near] / 2
     noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[one].tolist()])
-    forward = predict(ends.last[0][one], ends.last[1][one], half_gap_s, noise)
-    backward = predict(ends.first[0][other], ends.first[1][other], -half_gap_s, noise)
+    forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise)
+    backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise)
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
     squared = np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
     position_covariance = covariance[:, :2, :2]
@@ -251,8 +265,8 @@ def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
     return _Ends(
         np.array([m.t_ns[0] for m in parts]),
         np.array([m.t_ns[-1] for m in parts]),
-        _filtered([np.arange(len(m))[:END_MEASUREMENTS][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
-        _filtered([np.arange(len(m))[-END_MEASUREMENTS:] for m in parts], parts, group, whole_boxes=whole_boxes),
+        *_filtered([np.arange(len(m))[:END_MEASUREMENTS][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
+        *_filtered([np.arange(len(m))[-END_MEASUREMENTS:] for m in parts], parts, group, whole_boxes=whole_boxes),
         group,
     )
 

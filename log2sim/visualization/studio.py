@@ -9,14 +9,17 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from log2sim.datatypes import CATEGORIES, Scenario
+import numpy as np
+
+from log2sim.datatypes import CATEGORIES, Log, Scenario
 from log2sim.edit.corrections import Corrected, correct, load_corrections
 from log2sim.errors import Log2SimError, ScenarioError
 from log2sim.files.documents import check, write_json
-from log2sim.visualization.page.document import SCALES, page_document
-from log2sim.visualization.page.writer import make_page
+from log2sim.geometry import NS_PER_S, fold_radius, inverse
+from log2sim.visualization.page.document import SCALES, feature_columns, page_document, second_differences
+from log2sim.visualization.page.writer import make_page, page_html
 from log2sim.visualization.plot.drawing import Background
-from log2sim.visualization.recording import Recorded
+from log2sim.visualization.recording import Recorded, records_within
 
 # A hundred thousand corrections have some 20 MB.
 MAX_BODY_BYTES = 32_000_000
@@ -58,7 +61,8 @@ class Studio:
         self.result: Corrected = correct(scenario, self.document)
         self._token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
-        self._page: tuple[Corrected, bytes] | None = None  # pictures take seconds to gather
+        # Pictures and points take long to gather: once, with the corrections of then.
+        self._recording: tuple[Corrected, dict[str, Any] | None] | None = None
         studio = self
 
         class Handler(_Handler):
@@ -83,9 +87,8 @@ class Studio:
     def page(self) -> bytes:
         """Return the page with the scenario as it is corrected now."""
         with self._lock:
-            if self._page is not None and self._page[0] is self.result:
-                return self._page[1]
             document = page_document(self.result.scenario, background=self.background)
+            document["layers"]["scenario"] = _agents(self.result.scenario)
             document["studio"] = {
                 "address": f"/{self._token}/corrections",
                 "t0_ns": self.scenario.t0_ns,
@@ -93,9 +96,17 @@ class Studio:
                 "log": self.scenario.name,
                 "categories": list(CATEGORIES),
                 "corrections": self.document["corrections"],
+                "before": [{**entry, "doubts": [], "doubted": []} for entry in _agents(self.scenario)],
+                "scales": SCALES,
+                "cameras": [] if self.recorded is None else _calibrations(self.recorded.log, self.scenario),
+                "corrected": self._recording is not None and self._recording[0] is not self.result,
             }
-            self._page = self.result, make_page(document, self.result.scenario, self.recorded)
-            return self._page[1]
+            if self._recording is None:
+                page = make_page(document, self.result.scenario, self.recorded)
+                self._recording = self.result, document["recording"]
+                return page
+            document |= {"scales": SCALES, "recording": self._recording[1]}
+            return page_html(document).encode()
 
     def keep(self, body: bytes) -> dict[str, Any]:
         """Apply a document of corrections, write it to the file, and return what the page shows of the scenario then.
@@ -111,13 +122,40 @@ class Studio:
             result = correct(self.scenario, document)
             write_json(self.path, document)
             self.document, self.result = document, result
-            agents = page_document(result.scenario)["layers"]["scenario"]
-        return {"agents": agents, "scales": SCALES, "unmatched": list(result.unmatched)}
+        shown = {"agents": _agents(result.scenario), "features": feature_columns(result.scenario), "scales": SCALES}
+        return {**shown, "unmatched": list(result.unmatched)}
 
     def allows(self, path: str, host: str | None, origin: str | None) -> bool:
         """Whether a request is for this run, asked of this computer by its own page."""
         named = path.startswith(f"/{self._token}/") and host == self.origin.removeprefix("http://")
         return named and origin in (None, self.origin)
+
+
+def _agents(scenario: Scenario) -> list[dict[str, Any]]:
+    """Return the agents as a page has them, with their heights."""
+    entries: list[dict[str, Any]] = page_document(scenario)["layers"]["scenario"]
+    return [{**e, "z_m": second_differences(scenario[e["id"]].waypoints.z_m, SCALES["x_m"])} for e in entries]
+
+
+def _calibrations(log: Log, scenario: Scenario) -> list[dict[str, Any]]:
+    """Return the cameras of a log with their poses at the stamps of their pictures; rolling shutters are left out."""
+    out = []
+    for name, camera in log.cameras.items():
+        t_ns = log.streams[name].t_ns if name in log.streams else np.zeros(0, dtype=np.int64)
+        t_ns = t_ns[records_within(t_ns, scenario)]
+        map_T_cam, known = log.map_T_sensor(name, t_ns)
+        reach = fold_radius(camera)
+        entry = {
+            "name": name,
+            "K": [float(camera.K[0, 0]), float(camera.K[1, 1]), float(camera.K[0, 2]), float(camera.K[1, 2])],
+            "model": camera.distortion_model,
+            "distortion": list(map(float, camera.distortion)),
+            "reach": reach if np.isfinite(reach) else 1e6,
+            "t_s": np.round((t_ns[known] - scenario.t0_ns) / NS_PER_S, 4).tolist(),
+            "cam_T_map": [np.round(inverse(pose)[:3].ravel(), 7).tolist() for pose in map_T_cam[known]],
+        }
+        out += [entry] if known.any() else []
+    return out
 
 
 def _refuse(word: str) -> float:

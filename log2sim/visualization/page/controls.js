@@ -3,7 +3,7 @@
 const CLICK_PX = 5;
 
 // Drag, pinch, wheel and click on the map. act: drag(dx, dy), zoom(factor, sx, sy), click(sx, sy, margin), hover(sx, sy),
-// grab(sx, sy): whether what is pressed there is pulled instead of the map, by pull(dx, dy, sx, sy)
+// grab(sx, sy): whether what is pressed there is pulled instead of the map, by pull(sx, sy)
 const listenToPointers = (canvas, act) => {
   const down = new Map();
   let travelled = 0, grabbed = false;
@@ -29,7 +29,7 @@ const listenToPointers = (canvas, act) => {
       act.drag(after.x - before.x, after.y - before.y);
       act.zoom(after.distance / before.distance, after.x, after.y);
       travelled = Infinity;
-    } else if (grabbed) act.pull(dx, dy, pointer.x, pointer.y);
+    } else if (grabbed) act.pull(pointer.x, pointer.y);
     else if (travelled > CLICK_PX) act.drag(dx, dy);
   });
   const release = (event) => {

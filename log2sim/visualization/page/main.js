@@ -163,7 +163,7 @@ const listen = () => {
     zoom,
     click: (sx, sy, margin) => editor?.click(sx, sy, margin) || choose(agentAt(sx, sy, margin)),
     grab: (sx, sy) => editor?.grab(sx, sy) ?? false,
-    pull: (dx, dy, sx, sy) => editor.drag(dx, dy, sx, sy),
+    pull: (sx, sy) => editor.drag(sx, sy),
     hover: (sx, sy) => hover(sx === null ? null : agentAt(sx, sy, 3)),
   });
   window.addEventListener("hashchange", readAddress);

@@ -7,7 +7,7 @@ class CameraTile {
     Object.assign(this, { name: entry.name, t: entry.t_s, width: entry.size_px[0], height: entry.size_px[1], act, shown: -1 });
     this.reach = reachOf(this.t);
     this.outlines = entry.outlines.map(() => null);
-    this.read = (k) => (this.outlines[k] ??= entry.outlines[k].map((values) => new Outline(values, agents)).filter(({ track }) => track));
+    this.read = (k) => editor?.outlines(this, k) ?? (this.outlines[k] ??= entry.outlines[k].map((values) => new Outline(values, agents)).filter(({ track }) => track));
     const decode = (k) => createImageBitmap(new Blob([bytesOf(entry.jpeg[k])], { type: "image/jpeg" }));
     this.decoded = new Decoded(decode, (picture) => picture.close(), act.ready);
     this.element = element("div", { class: "tile" });
@@ -39,7 +39,7 @@ class CameraTile {
     if (k >= 0) this.decoded.ask(Array.from({ length: AHEAD }, (_, i) => k + i).filter((i) => i < this.t.length));
     if (k < 0 || this.decoded.get(k) !== undefined) this.shown = k;
     const names = state.shown.names && state.shown.scenario;
-    const key = [this.shown, chosen, hovered, this.canvas.clientWidth, this.canvas.clientHeight, names, state.shown.scenario, theme.ink];
+    const key = [this.shown, chosen, hovered, this.canvas.clientWidth, this.canvas.clientHeight, names, state.shown.scenario, theme.ink, editor?.changes];
     if (this.key?.every((value, i) => value === key[i])) return;
     this.key = key;
     const ctx = scaledContext(this.canvas), { clientWidth: width, clientHeight: height } = this.canvas;
@@ -59,6 +59,7 @@ class CameraTile {
     for (const outline of outlines) if (outline.track === chosen) outline.draw(ctx, scale, chosen, hovered);
     ctx.restore();
     nameOutlines(ctx, outlines, scale, width, chosen, hovered);
+    editor?.paintPicture(this, ctx);
   }
 }
 

@@ -13,6 +13,16 @@ window.log2sim = {
     track?.moveTo(state.t);
     return track?.present ? [view.sx(track.px), view.sy(track.py)] : null;
   },
+  // Position of a place of the map on the canvas, CSS pixels.
+  pixelOf: (x, y) => [view.sx(x), view.sy(y)],
+  // Where the box that is moved stands in the map.
+  poseOf: () => (editor?.pose ? [editor.pose.x, editor.pose.y] : null),
+  // Position of a place of the ground in the picture of a camera, CSS pixels of the window; null where it is not in it.
+  inPicture: (name, x, y, up = 0) => {
+    const tile = pictures?.tiles.find((other) => other.name === name), surface = editor?.cameras.get(name)?.surface(tile);
+    const pixel = surface?.to(x, y, editor.groundAt(x, y) + up), box = tile?.canvas.getBoundingClientRect();
+    return pixel ? [pixel[0] + box.left, pixel[1] + box.top] : null;
+  },
   // Its heading in rad, counter-clockwise from east; null when it is absent.
   headingOf: (id) => {
     const track = tracks.find((other) => other.id === id);

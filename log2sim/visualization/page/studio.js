@@ -1,6 +1,11 @@
 // Corrections by hand, sent to the program that serves this page, which answers with the corrected scenario.
 
-const HANDLE_M = 2.5, NUDGE_M = 0.05, TURN_RAD = Math.PI / 180;
+const HANDLE_M = 2.5, NUDGE_M = 0.05, TURN_RAD = Math.PI / 180, SIZE_M = [0.05, 100], CIRCLE_95 = 2.448;
+// What can be pulled: places on the box in half lengths, half widths and heights, and in m ahead.
+const HANDLES = [
+  { name: "turn", along: 1, across: 0, up: 0, ahead: HANDLE_M }, { name: "length", along: 1, across: 0, up: 0 }, { name: "length", along: -1, across: 0, up: 0 },
+  { name: "width", along: 0, across: 1, up: 0 }, { name: "width", along: 0, across: -1, up: 0 }, { name: "height", along: 0, across: 0, up: 1 },
+];
 
 class Editor {
   // entry: address, t0_ns, map_offset_m, log, categories, corrections
@@ -9,8 +14,13 @@ class Editor {
     this.made = [...entry.corrections];
     this.undone = [];
     this.visited = new Set();
-    this.mode = null;  // null, "move", "merge" or "add"
-    this.pose = null;  // of the box that is moved: x, y, yaw, turned
+    this.mode = null;  // null, "move", "merge", "add", "line" or "erase"
+    this.pose = null;  // of the box that is moved: x, y, z of the ground below it, yaw, size, and what of it was changed
+    this.line = [];  // points of the line that is drawn
+    this.cameras = new Map((entry.cameras ?? []).map((camera) => [camera.name, new Calibrated(camera)]));
+    this.before = new Map(entry.before.map((agent) => [agent.id, new Track(agent, entry.scales)]));
+    this.corrected = entry.corrected;  // since the boxes in the pictures were projected
+    this.changes = 0;  // so that pictures know when to draw again
     this.busy = false;
     byId("studio").hidden = false;
     byId("studio-category").append(...entry.categories.map((name) => element("option", {}, name)));
@@ -19,6 +29,7 @@ class Editor {
       "studio-add": () => this.toggle("add"), "studio-confirm": () => this.put("confirm"), "studio-delete": () => this.put("delete"),
       "studio-flip": () => this.put("flip"), "studio-split": () => this.put("split", { t_ns: this.stamp() }), "studio-merge": () => this.toggle("merge"),
       "studio-move": () => (this.mode === "move" ? this.place() : this.toggle("move")), "studio-size": () => this.resize(),
+      "studio-line": () => (this.mode === "line" ? this.finish() : this.toggle("line")), "studio-erase": () => this.toggle("erase"),
     };
     for (const [id, run] of Object.entries(actions)) byId(id).addEventListener("click", run);
     byId("studio-category").addEventListener("change", (event) => this.put("category", { category: event.target.value }));
@@ -27,7 +38,30 @@ class Editor {
       E: actions["studio-move"], Z: () => this.undo(), Y: () => this.redo(), Delete: actions["studio-delete"],
     };
     window.addEventListener("keydown", (event) => this.key(event), { capture: true });
+    for (const tile of pictures?.tiles ?? []) this.listenTo(tile);
     this.show();
+  }
+
+  // In a picture a mode takes presses and clicks, as it does in the map.
+  listenTo(tile) {
+    const camera = this.cameras.get(tile.name);
+    if (!camera) return;
+    let pulled = false;
+    tile.canvas.addEventListener("pointerdown", (event) => {
+      const surface = camera.surface(tile);
+      pulled = surface !== null && event.button <= 0 && this.grab(event.offsetX, event.offsetY, surface);
+      if (pulled) tile.canvas.setPointerCapture(event.pointerId);
+    });
+    tile.canvas.addEventListener("pointermove", (event) => {
+      const surface = pulled && event.buttons ? camera.surface(tile) : null;
+      if (surface) this.drag(event.offsetX, event.offsetY, surface);
+    });
+    tile.canvas.addEventListener("click", (event) => {
+      const surface = camera.surface(tile), margin = event.pointerType === "touch" ? 10 : 2;
+      if (!pulled && !(surface && this.click(event.offsetX, event.offsetY, margin, surface, tile.trackAt(event.offsetX, event.offsetY, margin)))) return;
+      event.stopImmediatePropagation();
+      pulled = false;
+    }, { capture: true });
   }
 
   key(event) {
@@ -38,7 +72,8 @@ class Editor {
       if (nudge) this.pull(nudge[0] * NUDGE_M, nudge[1] * NUDGE_M);
       else if (event.key === "Enter") this.place();
       else this.turn(this.pose.yaw + (event.key === "[" ? TURN_RAD : -TURN_RAD));
-    } else if (event.key === "Escape" && this.mode) this.toggle(null);
+    } else if (this.mode === "line" && event.key === "Enter") this.finish();
+    else if (event.key === "Escape" && this.mode) this.toggle(null);
     else if (this.keys[event.key]) this.keys[event.key]();
     else return;
     event.preventDefault();
@@ -54,79 +89,188 @@ class Editor {
     return { t_ns: Math.round(this.entry.t0_ns + t * 1e9), x_m: track.px, y_m: track.py };
   }
 
+  // The corrections so far but those of a kind of an agent, which has one category and one size: the last.
+  without(kind, track) {
+    const same = ({ agent }) => {
+      track.moveTo((agent.t_ns - this.entry.t0_ns) / 1e9);
+      return track.present && track.contains(agent.x_m, agent.y_m, 0);
+    };
+    const kept = this.made.filter((entry) => entry.kind !== kind || !same(entry));
+    track.moveTo(state.t);
+    return kept;
+  }
+
   // Make a correction of the chosen agent.
   put(kind, more = {}) {
     const track = state.chosen;
     if (!track || track.ego) return this.say("Choose an agent first; the ego is that of the log.");
-    this.send([...this.made, { kind, agent: this.reference(track), ...more, time: new Date().toISOString() }], track.id);
+    const kept = kind === "category" || kind === "size" ? this.without(kind, track) : this.made;
+    this.send([...kept, { kind, agent: this.reference(track), ...more, time: new Date().toISOString() }], track.id);
   }
 
   toggle(mode) {
-    const track = state.chosen;
-    if (mode && mode !== "add" && (!track || track.ego)) return this.say("Choose an agent first; the ego is that of the log.");
+    const track = state.chosen, ofAgent = mode === "move" || mode === "merge";
+    if (ofAgent && (!track || track.ego)) return this.say("Choose an agent first; the ego is that of the log.");
     this.mode = this.mode === mode ? null : mode;
+    this.line = [];
     if (this.mode === "move") {
-      track.moveTo(state.t);
-      if (!track.present) [this.mode] = [null];
-      else this.pose = { x: track.px, y: track.py, yaw: track.pyaw, turned: false };
+      // The picture that shows it is of its own time: it is moved at that.
+      const shows = (tile) => !tile.element.hidden && tile.shown >= 0 && this.cameras.has(tile.name) && tile.read(tile.shown).some((outline) => outline.track === track);
+      const tile = pictures?.tiles.find(shows);
+      if (tile) seek(tile.t[tile.shown]);
+      chooseVisible(track);
+      if (!track.present) this.mode = null;
+      else this.pose = { ...this.boxOf(track), moved: false, turned: false, sized: false };
     }
-    const words = { move: "Drag the box or its handle; arrows, [ and ] by steps; Enter when it is right.", merge: "Click the agent that is the same object.", add: "Click where it stands." };
+    const words = {
+      move: "Drag the box, or its handles to turn and size it, in the map or a picture; arrows, [ and ] by steps; Enter when it is right.",
+      merge: "Click the agent that is the same object.", add: "Click where it stands.",
+      line: "Click along the line; Enter when it is done.", erase: "Click a line or border.",
+    };
     this.say(words[this.mode] ?? "");
     this.show();
+    this.redraw();
+  }
+
+  redraw() {
+    this.changes++;
     requestDraw();
   }
 
-  // A click on the map in a mode; returns whether it was taken.
-  click(sx, sy, margin) {
+  // A track as it is at the present time, with the ground below it.
+  boxOf(track) {
+    return { x: track.px, y: track.py, z: track.pz - track.height / 2, yaw: track.pyaw, length: track.length, width: track.width, height: track.height };
+  }
+
+  // The ground at a place: that below the nearest waypoint.
+  groundAt(x, y) {
+    let best = 0, closest = Infinity;
+    for (const track of tracks) {
+      for (let k = 0; track.z !== null && k < track.t.length; k++) {
+        const far = Math.hypot(track.x[k] - x, track.y[k] - y);
+        if (far < closest) [best, closest] = [track.z[k] - track.height / 2, far];
+      }
+    }
+    return best;
+  }
+
+  // The place of the ground under a pixel; null above the horizon.
+  under(sx, sy, surface) {
+    let place = surface.from(sx, sy, state.chosen?.present ? this.boxOf(state.chosen).z : this.groundAt(view.x, view.y));
+    if (place && !surface.flat) place = surface.from(sx, sy, this.groundAt(...place));
+    return place && [...place, this.groundAt(...place)];
+  }
+
+  // A click in a mode; returns whether it was taken.
+  click(sx, sy, margin, surface = mapSurface, other = agentAt(sx, sy, margin)) {
+    if (this.mode === null) return false;
+    if (this.mode === "move") return true;
     if (this.mode === "merge") {
-      const other = agentAt(sx, sy, margin), track = state.chosen;
+      const track = state.chosen;
       this.toggle(null);
       if (other && other !== track && !other.ego) this.put("merge", { other: this.reference(other) });
       return true;
     }
-    if (this.mode !== "add") return this.mode === "move";
+    const place = this.under(sx, sy, surface), time = new Date().toISOString();
+    if (!place) return true;
+    if (this.mode === "line") {
+      this.line.push(place);
+      this.redraw();
+      return true;
+    }
+    const kind = this.mode, pose = { t_ns: this.stamp(), x_m: place[0], y_m: place[1], yaw_rad: 0 };
     this.toggle(null);
-    const pose = { t_ns: this.stamp(), x_m: view.mx(sx), y_m: view.my(sy), yaw_rad: 0 };
-    this.send([...this.made, { kind: "add", category: byId("studio-category").value || "car", poses: [pose], time: new Date().toISOString() }], null);
+    const entry = kind === "erase" ? { at: place } : { category: byId("studio-category").value || "car", poses: [pose] };
+    this.send([...this.made, { kind, ...entry, time }], state.chosen?.id);
     return true;
   }
 
-  // Whether a drag that begins here moves or turns the box.
-  grab(sx, sy) {
-    if (this.mode !== "move") return false;
-    const x = view.mx(sx) - this.pose.x, y = view.my(sy) - this.pose.y, c = Math.cos(this.pose.yaw), s = Math.sin(this.pose.yaw);
-    const track = state.chosen, reach = track.length / 2 + HANDLE_M, slack = 12 / view.scale;
-    this.turning = Math.hypot(x - reach * c, y - reach * s) < slack;
-    return this.turning || (Math.abs(x * c + y * s) <= track.length / 2 + slack && Math.abs(y * c - x * s) <= track.width / 2 + slack);
+  // The line is whole.
+  finish() {
+    const points_m = this.line, feature = byId("studio-feature").value;
+    if (points_m.length < 2) return this.say("A line has two points or more.");
+    this.toggle(null);
+    this.send([...this.made, { kind: "draw", feature, points_m, time: new Date().toISOString() }], state.chosen?.id);
   }
 
-  drag(dx, dy, sx, sy) {
-    if (this.turning) this.turn(Math.atan2(view.my(sy) - this.pose.y, view.mx(sx) - this.pose.x));
-    else this.pull(dx / view.scale, -dy / view.scale);
+  // Pixel of a handle of the box that is moved.
+  handle({ along, across, up, ahead = 0 }, surface) {
+    const { x, y, z, yaw, length, width, height } = this.pose, a = (along * length) / 2 + ahead, b = (across * width) / 2;
+    return surface.to(x + a * Math.cos(yaw) - b * Math.sin(yaw), y + a * Math.sin(yaw) + b * Math.cos(yaw), z + up * height);
+  }
+
+  // Whether a drag that begins here moves, turns or sizes the box.
+  grab(sx, sy, surface = mapSurface) {
+    if (this.mode !== "move") return false;
+    const slack = matchMedia("(pointer: coarse)").matches ? 22 : 10, body = { name: "body", along: 0, across: 0, up: 0 };
+    const far = (handle) => { const at = this.handle(handle, surface); return at ? Math.hypot(at[0] - sx, at[1] - sy) : Infinity; };
+    const usable = HANDLES.filter(({ name }) => name !== "height" || !surface.flat);
+    const best = usable.reduce((found, handle) => (far(handle) < far(found) ? handle : found), usable[0]);
+    const pixels = cornersOf(this.pose).map((corner) => surface.to(...corner)).filter(Boolean);
+    const inside = pixels.length > 0 && [0, 1].every((axis) => {
+      const values = pixels.map((pixel) => pixel[axis]), at = [sx, sy][axis];
+      return at >= Math.min(...values) - slack && at <= Math.max(...values) + slack;
+    });
+    // Small boxes are all handles: then the box itself is held unless the pointer is outside it.
+    const small = pixels.length > 0 && Math.max(...[0, 1].map((axis) => Math.max(...pixels.map((p) => p[axis])) - Math.min(...pixels.map((p) => p[axis])))) < 4 * slack;
+    const handled = far(best) < slack && far(best) < far(body) && (!small || best.name === "turn");
+    this.held = handled ? best : inside ? body : null;
+    if (!this.held) return false;
+    const at = this.handle(this.held, surface);
+    this.offset = at ? [sx - at[0], sy - at[1]] : [0, 0];
+    return true;
+  }
+
+  drag(sx, sy, surface = mapSurface) {
+    const pose = this.pose, { name, along, across } = this.held, target = [sx - this.offset[0], sy - this.offset[1]];
+    const limited = (value) => Math.min(Math.max(value, SIZE_M[0]), SIZE_M[1]);
+    if (name === "height") {
+      const low = this.handle(this.held, surface), high = this.handle({ ...this.held, up: 1.1 }, surface);
+      if (!low || !high || Math.abs(high[1] - low[1]) < 1e-3) return;
+      pose.height = limited(pose.height * (1 + (0.1 * (target[1] - low[1])) / (high[1] - low[1])));
+      pose.sized = true;
+      return this.redraw();
+    }
+    const place = surface.from(...target, pose.z);
+    if (!place) return;
+    const dx = place[0] - pose.x, dy = place[1] - pose.y, c = Math.cos(pose.yaw), s = Math.sin(pose.yaw);
+    if (name === "body") return this.pull(dx, dy);
+    if (name === "turn") return this.turn(Math.atan2(dy, dx));
+    // The other end stays where it is.
+    const sign = along + across, out = sign * (name === "length" ? dx * c + dy * s : dy * c - dx * s);
+    const size = limited(out + pose[name] / 2), shift = (sign * (size - pose[name])) / 2;
+    pose[name] = size;
+    pose.sized = true;
+    this.pull(...(name === "length" ? [shift * c, shift * s] : [-shift * s, shift * c]));
   }
 
   pull(dx, dy) {
     this.pose.x += dx;
     this.pose.y += dy;
-    requestDraw();
+    this.pose.moved = true;
+    this.redraw();
   }
 
   turn(yaw) {
     this.pose.yaw = yaw;
     this.pose.turned = true;
-    requestDraw();
+    this.redraw();
   }
 
-  // The box is right: a key pose at this time.
+  // The box is right: its size, and a key pose at this time.
   place() {
-    const { x, y, yaw, turned } = this.pose, pose = { t_ns: this.stamp(), x_m: x, y_m: y, ...(turned ? { yaw_rad: yaw } : {}) };
+    const { x, y, yaw, length, width, height, moved, turned, sized } = this.pose, track = state.chosen, time = new Date().toISOString();
+    const pose = { t_ns: this.stamp(), x_m: x, y_m: y, ...(turned ? { yaw_rad: yaw } : {}) }, agent = this.reference(track);
     this.toggle(null);
-    this.put("move", { poses: [pose] });
+    const made = [], kept = sized ? this.without("size", track) : this.made;
+    if (sized) made.push({ kind: "size", agent, size_m: [length, width, height].map((value) => Math.round(value * 100) / 100), time });
+    if (moved || turned || !sized) made.push({ kind: "move", agent, poses: [pose], time });
+    this.send([...kept, ...made], track.id);
   }
 
   resize() {
     const size = ["length", "width", "height"].map((name) => byId(`studio-${name}`).valueAsNumber);
-    if (size.every((value) => value >= 0.05 && value <= 100)) this.put("size", { size_m: size });
+    if (size.every((value) => value >= SIZE_M[0] && value <= SIZE_M[1])) this.put("size", { size_m: size });
     else this.say("Sizes are from 0.05 to 100 m.");
   }
 
@@ -171,6 +315,9 @@ class Editor {
       done();
       this.made = made;
       this.say(reply.unmatched.length ? reply.unmatched.join("; ") : `${made.length} correction${made.length === 1 ? "" : "s"} kept.`);
+      this.corrected = true;
+      this.changes++;
+      data.features = loadFeatures(reply);
       replaceTracks(reply.agents, reply.scales, id);
     } catch (error) {
       this.say(error instanceof TypeError ? "The program that serves this page does not answer; download the corrections." : error.message);
@@ -185,8 +332,10 @@ class Editor {
   show() {
     const track = state.chosen, none = !track || track.ego;
     for (const name of ["confirm", "delete", "flip", "split", "merge", "move", "size"]) byId(`studio-${name}`).disabled = none;
-    for (const name of ["move", "merge", "add"]) byId(`studio-${name}`).setAttribute("aria-pressed", this.mode === name);
+    for (const name of ["move", "merge", "add", "line", "erase"]) byId(`studio-${name}`).setAttribute("aria-pressed", this.mode === name);
     byId("studio-move").textContent = this.mode === "move" ? "Place" : "Move";
+    byId("studio-line").textContent = this.mode === "line" ? "Finish" : "Draw";
+    document.body.classList.toggle("editing", this.mode !== null);
     byId("studio-undo").disabled = this.made.length === 0;
     byId("studio-redo").disabled = this.undone.length === 0;
     if (none) return;
@@ -194,25 +343,78 @@ class Editor {
     for (const name of ["length", "width", "height"]) byId(`studio-${name}`).value = track[name].toFixed(2);
   }
 
-  // The box that is moved, with its handle.
-  paint({ ctx }) {
-    if (this.mode !== "move") return;
-    const { x, y, yaw } = this.pose, track = state.chosen, c = Math.cos(yaw), s = Math.sin(yaw);
-    const at = (along, across) => [view.sx(x + along * c - across * s), view.sy(y + along * s + across * c)];
-    const l = track.length / 2, w = track.width / 2;
+  // What is edited, on the map.
+  paint({ ctx }) { this.draw(ctx, mapSurface); }
+
+  // The same in the picture of a tile.
+  paintPicture(tile, ctx) {
+    const surface = this.cameras.get(tile.name)?.surface(tile);
+    if (surface) this.draw(ctx, surface);
+  }
+
+  draw(ctx, surface) {
+    const ghost = this.before.get(state.chosen?.id), present = state.chosen?.present;
+    if (ghost && present && (this.mode === "move" || this.made.length)) {
+      ghost.moveTo(state.t);
+      if (ghost.present) this.drawGhost(ctx, surface, ghost);
+    }
     ctx.setLineDash(TRUTH_DASHES);
-    ctx.strokeStyle = theme.alert;
+    ctx.strokeStyle = ctx.fillStyle = theme.alert;
     ctx.lineWidth = 2;
-    ctx.beginPath();
-    [[l, w], [-l, w], [-l, -w], [l, -w], [l, w]].forEach(([a, b], k) => ctx[k ? "lineTo" : "moveTo"](...at(a, b)));
-    ctx.moveTo(...at(l, 0));
-    ctx.lineTo(...at(l + HANDLE_M, 0));
-    ctx.stroke();
+    if (this.mode === "line") this.stroke(ctx, this.line.map((point) => surface.to(...point)), true);
+    if (this.mode === "move") {
+      this.drawBox(ctx, surface, this.pose);
+      const [front, tip] = [HANDLES[1], HANDLES[0]].map((handle) => this.handle(handle, surface));
+      if (front && tip) this.stroke(ctx, [front, tip], false);
+      ctx.setLineDash(SOLID);
+      for (const handle of HANDLES) if (handle.name !== "height" || !surface.flat) this.dot(ctx, this.handle(handle, surface), handle.name === "turn" ? 6 : 4);
+    }
     ctx.setLineDash(SOLID);
+  }
+
+  // Where the agent was before the corrections, with the circle that the measurements put it into with 95 %.
+  drawGhost(ctx, surface, ghost) {
+    const box = this.boxOf(ghost), radius = CIRCLE_95 * (ghost.sigma(0) ?? 0);
+    ctx.setLineDash(DOTTED);
+    ctx.strokeStyle = surface.flat ? theme.ink : "#FFFFFF";
+    ctx.lineWidth = 1.6;
+    this.drawBox(ctx, surface, box);
+    const circle = Array.from({ length: 33 }, (_, k) => surface.to(box.x + radius * Math.cos((k * Math.PI) / 16), box.y + radius * Math.sin((k * Math.PI) / 16), box.z));
+    if (radius > 0) this.stroke(ctx, circle, false);
+  }
+
+  drawBox(ctx, surface, box) {
+    const pixels = cornersOf(box).map((corner) => surface.to(...corner));
+    for (const [a, b] of surface.flat ? BOX_EDGES.slice(0, 4) : BOX_EDGES) if (pixels[a] && pixels[b]) this.stroke(ctx, [pixels[a], pixels[b]], false);
+  }
+
+  stroke(ctx, pixels, dots) {
     ctx.beginPath();
-    ctx.arc(...at(l + HANDLE_M, 0), 6, 0, 2 * Math.PI);
-    ctx.fillStyle = theme.alert;
+    pixels.filter(Boolean).forEach((pixel, k) => ctx[k ? "lineTo" : "moveTo"](...pixel));
+    ctx.stroke();
+    if (dots) for (const pixel of pixels) this.dot(ctx, pixel, 3);
+  }
+
+  dot(ctx, pixel, radius) {
+    if (!pixel) return;
+    ctx.beginPath();
+    ctx.arc(...pixel, radius, 0, 2 * Math.PI);
     ctx.fill();
+  }
+
+  // Boxes in a picture by the present tracks, the farthest first; null where the page's own still hold.
+  outlines(tile, k) {
+    const camera = this.cameras.get(tile.name);
+    if (!camera || !this.corrected) return null;
+    const out = [];
+    tracks.forEach((track, i) => {
+      track.moveTo(tile.t[k]);
+      if (!track.present || track.ego) return;
+      const box = this.boxOf(track), segments = camera.segments(tile.t[k], cornersOf(box), tile.width, tile.height);
+      if (segments.length) out.push({ far: camera.toCamera(camera.poseAt(tile.t[k]), box.x, box.y, box.z)[2], outline: new Outline([i, 0, ...segments], tracks) });
+    });
+    for (const track of tracks) track.moveTo(state.t);
+    return out.sort((a, b) => b.far - a.far).map(({ outline }) => outline);
   }
 }
 

@@ -33,6 +33,7 @@ class Track {
     });
     this.vx = entry.vx_mps ? sums(entry.vx_mps, scales.vx_mps) : null;  // only agents of scenarios follow a spline
     this.vy = entry.vy_mps ? sums(entry.vy_mps, scales.vy_mps) : null;
+    this.z = entry.z_m ? sums(entry.z_m, scales.x_m) : null;  // of the middle of the box, on a page of the studio
     this.jumps = new Uint8Array(this.t.length);
     for (const k of entry.jumps ?? []) this.jumps[k] = 1;
     this.filled = new Uint8Array(Math.max(this.t.length - 1, 0));
@@ -104,6 +105,8 @@ class Track {
     this.pv = v;
     this.interpolated = interpolated;
   }
+
+  get pz() { return this.z === null ? this.height / 2 : this.z[this.k] + (this.share > 0 ? this.share * (this.z[this.k + 1] - this.z[this.k]) : 0); }
 
   // The present standard deviation of position (0), yaw (1) or speed (2); null where it is not known.
   sigma(which) {

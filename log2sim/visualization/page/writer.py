@@ -132,7 +132,7 @@ def page_html(document: dict[str, Any]) -> str:
     Only a page of the studio (`document["studio"]`) talks to anybody: the program that serves it.
     """
     edits = "studio" in document
-    files = (*SCRIPT_FILES[:-1], *(("studio.js",) if edits else ()), SCRIPT_FILES[-1])
+    files = (*SCRIPT_FILES[:-1], *(("surface.js", "studio.js") if edits else ()), SCRIPT_FILES[-1])
     script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in files) + "})();\n"
     style = _file("style.css")
     policy = (

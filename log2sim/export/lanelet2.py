@@ -1,0 +1,240 @@
+"""Export of the road to Lanelet2 (OSM XML): lanelets, their borders, stop lines, crosswalks and traffic lights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from log2sim.datatypes import MapFeatures, MapFrame, MapLane, Marking, RoadBorder, Scenario, Signal
+from log2sim.export import xml_text
+from log2sim.export.exporters import Options, project_points
+from log2sim.export.roads.network import MarkFinder
+from log2sim.export.roads.opendrive import LIGHT_HEIGHT_M, LIGHT_WIDTH_M, edges_of, lanes, signal_lanes
+from log2sim.export.xml_text import element
+from log2sim.geometry import Array, wrap_angle
+from log2sim.road.polyline import Polyline
+
+SHARED_M = 0.5  # edges whose ends are nearer than this are one way: lanes of log2sim are measured to some decimeters
+STOP_M = 8.0  # from a stop line to where its lane ends: across a crosswalk
+TURN_RAD = float(np.deg2rad(30.0))  # less is straight on
+TYPE_OF_MARK = {
+    "solid": ("line_thin", "solid"), "broken": ("line_thin", "dashed"), "curb": ("curbstone", "high"), "none": ("virtual", None),
+}  # fmt: skip
+Way = tuple[str, str]  # of a lane, "left" or "right"
+
+
+class Lanelet2:
+    """`lanelet2_map.osm`, and `map_projector_info.yaml`, with which Autoware takes `local_x` and `local_y` of its nodes.
+
+    Lanes beside each other share a way and those behind each other its ends, as routing needs it. Nodes have latitude and
+    longitude; where the place of the map is not known, they are around 0, 0.
+    """
+
+    options: tuple[str, ...] = ()
+    loses = (
+        "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; stop lines without a light are "
+        "ways that no lanelet names; `location` is always urban, and speed limits are not known"
+    )
+
+    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the map."""
+        draft = _Draft(scenario.map)
+        roads, marks = lanes(scenario), MarkFinder.of(scenario)
+        way_of = _add_borders(draft, roads, marks)
+        features = scenario.map_features or MapFeatures()
+        stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
+        rules: dict[str, list[int]] = {lane.id: [] for lane in roads}
+        for signal in scenario.signals:
+            ahead = signal_lanes(signal, roads)
+            members = [("way", _add_light(draft, signal), "refers")]
+            if not ahead:
+                continue
+            members += [
+                ("way", number, "ref_line") for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)
+            ][:1]
+            rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
+            for lane in ahead:
+                rules[lane.id].append(rule)
+        for lane in roads:
+            members = [("way", way_of[lane.id, side], side) for side in ("left", "right")]
+            members += [("relation", rule, "regulatory_element") for rule in rules[lane.id]]
+            tags = {"subtype": "road", "location": "urban", "one_way": "yes", "participant:vehicle": "yes"}
+            draft.relation(members, type="lanelet", **tags, **_turn(lane), log2sim_id=xml_text.escaped(lane.id))
+        for marking in features.markings:
+            if marking.kind == "crosswalk":
+                edges = [draft.way(edge, type="pedestrian_marking") for edge in _walk_edges(marking)]
+                members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
+                draft.relation(
+                    members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
+                )
+        xml_text.write(draft.document(), folder / "lanelet2_map.osm")
+        (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
+
+
+class _Draft:
+    """Nodes, ways and relations, numbered in one row as Lanelet2 asks for it."""
+
+    def __init__(self, frame: MapFrame) -> None:
+        self.frame = frame
+        self.places: dict[int, Array] = {}  # nodes, map frame
+        self.parts: dict[str, list[Element]] = {"way": [], "relation": []}
+        self.next_id = 1
+
+    def _number(self) -> int:
+        self.next_id += 1
+        return self.next_id - 1
+
+    def nodes(self, points_m: Array) -> list[int]:
+        """Add a node at each point (N, 3); return their numbers."""
+        numbers = [self._number() for _ in points_m]
+        self.places |= dict(zip(numbers, points_m))
+        return numbers
+
+    def way(self, points: Array | Sequence[int], **tags: str) -> int:
+        """Add a way along points (N, 3), or along nodes; return its number."""
+        numbers = self.nodes(points) if isinstance(points, np.ndarray) else points
+        way = element("way", id=str(self._number()))
+        for number in numbers:
+            element("nd", way, ref=str(number))
+        return self._tagged("way", way, tags)
+
+    def relation(self, members: Sequence[tuple[str, int, str]], **tags: str) -> int:
+        """Add a relation of members, each with its kind, number and role; return its number."""
+        relation = element("relation", id=str(self._number()))
+        for kind, number, role in members:
+            element("member", relation, type=kind, ref=str(number), role=role)
+        return self._tagged("relation", relation, tags)
+
+    def _tagged(self, kind: str, item: Element, tags: dict[str, str]) -> int:
+        _tag(item, tags)
+        self.parts[kind].append(item)
+        return int(item.attrib["id"])
+
+    def document(self) -> Element:
+        """Return all of it, nodes first, with latitude, longitude and height."""
+        root = element("osm", version="0.6", generator="log2sim")
+        points = np.array(list(self.places.values())).reshape(-1, 3)
+        longitude, latitude = project_points(self.frame, points)
+        height = points[:, 2] + self.frame.offset_m[2]
+        for number, (x, y, _), lat, lon, ele in zip(self.places, points.tolist(), latitude, longitude, height):
+            node = element("node", root, id=str(number), lat=f"{lat:.11f}", lon=f"{lon:.11f}")
+            _tag(node, {"ele": f"{ele:.4f}", "local_x": f"{x:.4f}", "local_y": f"{y:.4f}"})
+        for item in (*self.parts["way"], *self.parts["relation"]):
+            root.append(item)
+        for item in root:
+            item.attrib |= {"version": "1", "visible": "true"}
+        return root
+
+
+def _tag(item: Element, tags: dict[str, str]) -> None:
+    for key, value in tags.items():
+        element("tag", item, k=key, v=value)
+
+
+def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> dict[Way, int]:
+    """Add the edges of all lanes; return the number of the way at each side of each."""
+    edges = {(lane.id, side): edge for lane in roads for side, edge in zip(("left", "right"), edges_of(lane))}
+    same: dict[Way, Way] = {}
+    for lane in roads:
+        for beside, theirs, step in ((lane.left_lane, "right", 1), (lane.opposite, "left", -1)):
+            if beside is None or (beside, theirs) not in edges or (beside, theirs) in same:
+                continue
+            gap = edges[lane.id, "left"][[0, -1]] - edges[beside, theirs][::step][[0, -1]]
+            if np.hypot(gap[:, 0], gap[:, 1]).max() <= SHARED_M:
+                same[lane.id, "left"] = (beside, theirs)
+    number_of: dict[Way, list[int]] = {}
+    for key, edge in edges.items():
+        if key not in same:
+            number_of[key] = draft.nodes(edge)
+    # One node where ways meet: which node stands for each, and the middle of all of them.
+    stands: dict[int, int] = {}
+
+    def root(number: int) -> int:
+        while number in stands:
+            number = stands[number]
+        return number
+
+    def end(lane: MapLane, side: str, at: int) -> int:
+        own = (lane.id, side)
+        other = same.get(own, own)
+        reversed_ = own != other and other[1] == side
+        return number_of[other][-1 - at if reversed_ else at]
+
+    by_id = {lane.id: lane for lane in roads}
+    for lane in roads:
+        for name in lane.successors:
+            for side in ("left", "right"):
+                a, b = root(end(lane, side, -1)), root(end(by_id[name], side, 0))
+                if a != b:
+                    stands[b] = a
+    met: dict[int, list[Array]] = {}
+    for number in {*stands, *stands.values()}:
+        met.setdefault(root(number), []).append(draft.places[number])
+    for number, points in met.items():
+        draft.places[number] = np.mean(points, axis=0)
+    for number in stands:
+        del draft.places[number]
+    way_of = {}
+    by_key = {(lane.id, side): (lane, side) for lane in roads for side in ("left", "right")}
+    for key, numbers in number_of.items():
+        lane, side = by_key[key]
+        way_of[key] = draft.way([root(n) for n in numbers], **_border_tags(lane, side, marks))
+    return way_of | {key: way_of[other] for key, other in same.items()}
+
+
+def _border_tags(lane: MapLane, side: str, marks: MarkFinder) -> dict[str, str]:
+    name = lane.left if side == "left" else lane.right
+    item = marks.sides.get(name) if name is not None else None
+    if isinstance(item, RoadBorder) and item.kind == "edge":
+        return {"type": "road_border"}
+    mark = marks.left_of(lane) if side == "left" else marks.right_of(lane)
+    kind, subtype = TYPE_OF_MARK[mark.kind]
+    color = {"color": mark.color} if mark.color in ("white", "yellow") else {}
+    return {"type": kind, **({"subtype": subtype} if subtype else {}), **color}
+
+
+def _add_light(draft: _Draft, signal: Signal) -> int:
+    """Add a traffic light as the lower edge of its housing, from the left to the right of who looks at it."""
+    x, y, z = signal.position_m
+    across = 0.0 if signal.heading_rad is None else signal.heading_rad + np.pi / 2
+    side = np.array([np.cos(across), np.sin(across)]) * LIGHT_WIDTH_M / 2
+    bottom = z - LIGHT_HEIGHT_M / 2
+    points = np.array([[x - side[0], y - side[1], bottom], [x + side[0], y + side[1], bottom]])
+    tags = {"subtype": "red_yellow_green", "height": f"{LIGHT_HEIGHT_M:g}", "log2sim_id": xml_text.escaped(signal.id)}
+    return draft.way(points, type="traffic_light", **tags)
+
+
+def _ends_at(lane: MapLane, stop: Marking) -> bool:
+    """Whether a lane ends at a stop line: near it and within its ends."""
+    x, y = lane.points_m[-1, :2]
+    ends = stop.points_m[[0, -1], :2]
+    heading = float(Polyline(lane.points_m).heading_rad[-1])
+    along = (ends[:, 0] - x) * np.cos(heading) + (ends[:, 1] - y) * np.sin(heading)
+    aside = (ends[:, 1] - y) * np.cos(heading) - (ends[:, 0] - x) * np.sin(heading)
+    return bool(np.abs(along.mean()) <= STOP_M and aside.min() <= 0 <= aside.max())
+
+
+def _turn(lane: MapLane) -> dict[str, str]:
+    """Return where a lane in a junction leads, as Autoware's signals need it."""
+    if lane.junction is None:
+        return {}
+    heading = Polyline(lane.points_m).heading_rad
+    turn = float(wrap_angle(heading[-1] - heading[0]))
+    return {"turn_direction": "straight" if abs(turn) < TURN_RAD else "left" if turn > 0 else "right"}
+
+
+def _walk_edges(marking: Marking) -> tuple[Array, Array]:
+    """Return the long sides (2, 3) of the rectangle around a crosswalk, both in the direction of people."""
+    import shapely
+
+    ring = np.array(shapely.MultiPoint(marking.points_m[:, :2]).minimum_rotated_rectangle.exterior.coords)[:4]
+    if np.hypot(*(ring[1] - ring[0])) < np.hypot(*(ring[2] - ring[1])):
+        ring = np.roll(ring, -1, axis=0)
+    z = np.full(2, marking.points_m[:, 2].mean())
+    return np.column_stack([ring[[3, 2]], z]), np.column_stack([ring[[0, 1]], z])
+
+
+EXPORTER = Lanelet2()

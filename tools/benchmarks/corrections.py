@@ -1,0 +1,266 @@
+"""What corrections by hand are worth: the doubtful and the wrong agents corrected as a person would who sees the truth.
+
+    python tools/bench.py corrections SCENARIO TRUTH [--browser] [--range M] [--out FILE.json]
+
+TRUTH is a log with labels, or a scenario. Each agent that the scenario doubts, or that is wrong at more than a fifth of its ticks, gets what a person would
+give it: confirmed, deleted, merged, turned round, of another category or size (to 0.1 m), moved by key poses with errors of 5 cm, one a second.
+Agents that were missed are not added. Figures are those of `log2sim evaluate` before and after.
+
+With --browser the same is done on the page of the studio in a headless Chromium, by keys and clicks. Seconds an agent are those of the
+keystroke-level model (Card, Moran, Newell, Communications of the ACM 23, 1980: 0.28 s a key, 1.1 s to point, 0.1 s a button) for
+carrying it out, without the looking and thinking, and what the page takes to answer.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from entry import parser_of
+
+from benchmarks.table import markdown
+from log2sim.datatypes import GROUP_OF, Agent, Scenario
+from log2sim.edit.corrections import correct
+from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE
+from log2sim.evaluation.metrics.evaluator import evaluate, place_truth
+from log2sim.evaluation.metrics.truth import load_truth
+from log2sim.geometry import NS_PER_S, wrap_angle
+from log2sim.visualization.studio import Studio
+
+HAND_M, HAND_RAD = 0.05, 0.02
+MOVED_M = 0.5  # a person moves what is farther off, a quarter of a car's width
+KEY_S, POINT_S, BUTTON_S = 0.28, 1.1, 0.1
+FIGURES = ("recall", "precision", "hota", "position_rmse_m", "speed_rmse_mps")
+MEASURES = ("wrong", "invented", "duplicate", "backwards", "wrong_size", "wrong_speed", "wrong_motion", "wrong_class")
+Step = tuple[str, dict[str, Any]]  # id of the agent and the correction
+
+
+def steps_of(
+    scenario: Scenario, truth: Scenario, max_range_m: float | None, rng: np.random.Generator
+) -> list[list[Step]]:
+    """The corrections of a person, by agent."""
+    found = evaluate(scenario, truth, max_range_m=max_range_m)
+    placed, _ = place_truth(load_truth(truth, scenario), scenario)
+    shift, later_s = placed.shift_to(scenario), (scenario.t0_ns - placed.t0_ns) / NS_PER_S
+    true = {agent.id: agent for agent in placed.others}
+    rows = {row["id"]: row for row in found["correctness"]["judged_agents"]}
+    owner = {
+        name: max(row["matched_ids"], key=row["matched_ids"].get)
+        for name, row in ((r["id"], r) for r in found["agents"])
+        if row["matched_ids"]
+    }
+    out, gone = [], set()
+    for agent in sorted(scenario.others, key=lambda a: not a.is_doubtful):
+        row = rows.get(agent.id)
+        if (
+            row is None
+            or agent.id in gone
+            or agent.quarantined
+            or not (agent.is_doubtful or row["wrong_ticks"] > MAX_WRONG_SHARE * row["ticks"])
+        ):
+            continue
+        name = max(row["taken_for"], key=row["taken_for"].get)
+        same = true.get(name)
+        if same is None:
+            out.append([_step(scenario, agent, "delete")])
+        elif owner.get(name, agent.id) != agent.id:
+            other = scenario[owner[name]]
+            alike = GROUP_OF.get(agent.category) == GROUP_OF.get(other.category) and other.id not in gone
+            more = {"other": _reference(scenario, other)} if alike else {}
+            out.append([_step(scenario, agent, "merge" if alike else "delete", **more)])
+            gone |= {other.id} if alike else set()
+        else:
+            sure = [_step(scenario, agent, "confirm")] if agent.is_doubtful else []
+            out.append([*sure, *_of_known(scenario, agent, same, row, (shift, later_s), rng)])
+        gone.add(agent.id)
+    return out
+
+
+def _of_known(
+    scenario: Scenario,
+    agent: Agent,
+    true: Agent,
+    row: dict[str, Any],
+    place: tuple[Any, float],
+    rng: np.random.Generator,
+) -> Iterator[Step]:
+    """Corrections of an agent whose object is known."""
+    much = MAX_WRONG_SHARE * row["ticks"]
+    if row["wrong_class_ticks"] > much:
+        yield _step(scenario, agent, "category", category=true.category)
+    if row["wrong_size_ticks"] > much or GROUP_OF.get(agent.category) != GROUP_OF.get(true.category):
+        yield _step(scenario, agent, "size", size_m=[max(round(float(v), 1), 0.1) for v in true.size_m])
+    if row["backwards_ticks"] > much:
+        yield _step(scenario, agent, "flip")
+    shift, later_s = place
+    w = agent.waypoints
+    t_s = np.linspace(w.t_s[0], w.t_s[-1], int(np.ceil(np.ptp(w.t_s))) + 1)
+    t_s = t_s[true.at(t_s + later_s).valid]
+    if agent.static and true.static:
+        t_s = t_s[len(t_s) // 2 :][:1]
+    at, ours = true.at(t_s + later_s), agent.at(t_s)
+    off = np.hypot(at.x_m + shift[0] - ours.x_m, at.y_m + shift[1] - ours.y_m)
+    there = at.valid & ours.valid
+    if there.any() and (off[there].mean() > MOVED_M or row["wrong_speed_ticks"] + row["wrong_motion_ticks"] > much):
+        poses = [
+            {
+                "t_ns": scenario.t0_ns + round(float(t_s[k]) * NS_PER_S),
+                "x_m": float(at.x_m[k] + shift[0] + rng.normal(0, HAND_M)),
+                "y_m": float(at.y_m[k] + shift[1] + rng.normal(0, HAND_M)),
+                "yaw_rad": float(wrap_angle(at.yaw_rad[k] + rng.normal(0, HAND_RAD))),
+            }
+            for k in np.flatnonzero(there)
+        ]
+        yield _step(scenario, agent, "move", poses=poses)
+
+
+def _reference(scenario: Scenario, agent: Agent) -> dict[str, Any]:
+    """The place of an agent in the middle of its life, as the studio names it."""
+    t_s = float(np.mean(agent.waypoints.t_s[[0, -1]]))
+    at = agent.at(t_s)
+    return {"t_ns": scenario.t0_ns + round(t_s * NS_PER_S), "x_m": float(at.x_m[0]), "y_m": float(at.y_m[0])}
+
+
+def _step(scenario: Scenario, agent: Agent, kind: str, **more: Any) -> Step:
+    return agent.id, {"kind": kind, "agent": _reference(scenario, agent), **more}
+
+
+def on_the_page(scenario: Scenario, steps: list[list[Step]], folder: Path) -> tuple[Scenario, dict[str, float]]:
+    """Carry the steps out on the page of the studio; return what came of it, and actions and seconds an agent."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+    from browser import browsing
+
+    studio = Studio(scenario, folder / "corrections.json")
+    threading.Thread(target=studio.serve, daemon=True).start()
+    counts: Counter[str] = Counter()
+    with browsing(folder / "profile") as browser:
+        browser.open(studio.address, size=(1280, 800))
+
+        def key(name: str) -> None:
+            browser.press(name)
+            counts["keys"] += len(name)
+
+        def click(name: str) -> None:
+            browser.run("document.getElementById(arguments[0]).click()", f"studio-{name}")
+            counts["clicks"] += 1
+
+        def fill(name: str, value: Any, keys: int) -> None:
+            script = "const e = document.getElementById(arguments[0]); e.value = arguments[1]; e.dispatchEvent(new Event('change'))"
+            browser.run(script, f"studio-{name}", value)
+            counts["clicks"] += 1
+            counts["keys"] += keys
+
+        def seek(t_ns: int) -> None:
+            browser.run("log2sim.time = arguments[0]", (t_ns - scenario.t0_ns) / NS_PER_S)
+            counts["clicks"] += 1
+
+        def window(x_m: float, y_m: float) -> tuple[float, float]:
+            script = "const r = document.getElementById('map').getBoundingClientRect(), p = log2sim.pixelOf(...arguments); return [p[0] + r.left, p[1] + r.top]"
+            x, y = browser.run(script, x_m, y_m)
+            return float(x), float(y)
+
+        begin, made = time.monotonic(), 0
+        for own in steps:
+            for k, (name, entry) in enumerate(own):
+                if k == 0:
+                    seek(entry["agent"]["t_ns"])
+                    browser.run("log2sim.choose(arguments[0])", name)  # a click in the list, or on it in the map
+                    counts["clicks"] += 1
+                kind = entry["kind"]
+                if kind == "merge":
+                    key("M")
+                    browser.mouse(window(entry["other"]["x_m"], entry["other"]["y_m"]))
+                    counts["clicks"] += 1
+                elif kind == "size":
+                    for side, value in zip(("length", "width", "height"), entry["size_m"]):
+                        fill(side, value, 3)
+                    click("size")
+                elif kind == "category":
+                    fill("category", entry["category"], 1)
+                elif kind == "move":
+                    for pose in entry["poses"]:
+                        seek(pose["t_ns"])
+                        key("E")
+                        here = browser.run("return log2sim.poseOf()")
+                        browser.mouse(window(*here), window(pose["x_m"], pose["y_m"]))
+                        counts["drags"] += 1
+                        key("\ue007")
+                        made += 1
+                        browser.wait(f"log2sim.corrections().length === {made}")
+                    continue
+                else:
+                    key({"confirm": "K", "delete": "\ue017", "flip": "B"}[kind])
+                made += 1
+                browser.wait(f"log2sim.corrections().length === {made}")
+        took_s = time.monotonic() - begin
+    studio.close()
+    actions = counts["keys"] + counts["clicks"] + counts["drags"]
+    by_hand_s = (
+        KEY_S * counts["keys"] + (POINT_S + BUTTON_S) * counts["clicks"] + 2 * (POINT_S + BUTTON_S) * counts["drags"]
+    )
+    agents = max(len(steps), 1)
+    per = {"actions": actions / agents, "by_hand_s": by_hand_s / agents, "page_s": took_s / agents}
+    return studio.result.scenario, per
+
+
+def figures(scenario: Scenario, truth: Any, max_range_m: float | None) -> dict[str, Any]:
+    found = evaluate(scenario, truth, max_range_m=max_range_m)
+    judged = found["correctness"]
+    agents = {name: judged[name]["agents"] for name in MEASURES}
+    return {
+        **{k: found[k] for k in FIGURES},
+        "wrong_share": judged["wrong"]["share"],
+        **agents,
+        "doubtful": len(scenario.doubtful),
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("scenario", type=Path)
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("--browser", action="store_true", help="also on the page of the studio")
+    parser.add_argument("--range", type=float, metavar="M", help="agents up to this distance from the ego")
+    parser.add_argument("--out", type=Path, help="JSON file with the figures and the corrections")
+    options = parser.parse_args(arguments)
+    scenario = Scenario.load(options.scenario)
+    truth = load_truth(options.truth, scenario, points=True)
+    steps = steps_of(scenario, truth, options.range, np.random.default_rng(0))
+    made = [entry for own in steps for _, entry in own]
+    document = {"format": "log2sim-corrections", "version": 1, "log": scenario.name, "corrections": made}
+    document["map_offset_m"] = list(scenario.map.offset_m)
+    after = correct(scenario, document)
+    columns = {
+        "before": figures(scenario, truth, options.range),
+        "corrected": figures(after.scenario, truth, options.range),
+    }
+    per: dict[str, float] = {}
+    if options.browser:
+        with tempfile.TemporaryDirectory() as folder:
+            by_page, per = on_the_page(scenario, steps, Path(folder))
+        columns["on the page"] = figures(by_page, truth, options.range)
+    print(
+        markdown(
+            ["figure", *columns],
+            [[k, *("-" if c[k] is None else f"{c[k]:.3g}" for c in columns.values())] for k in columns["before"]],
+        )
+    )
+    kinds = Counter(entry["kind"] for entry in made)
+    print(
+        f"\n{len(steps)} of {len(scenario.others)} agents, {dict(kinds)}, {len(after.unmatched)} without their agent; an agent: ",
+        end="",
+    )
+    print(", ".join(f"{name} {value:.1f}" for name, value in per.items()) or "not asked for")
+    if options.out is not None:
+        options.out.write_text(
+            json.dumps({**columns, "per_agent": per, "corrections": document}, indent=1) + "\n", encoding="utf-8"
+        )
+    return 0
