@@ -11,7 +11,7 @@ from test_size import measured
 from worlds import measured_row, scan, standing
 
 from log2sim.agents import hypotheses
-from log2sim.agents.hypotheses import explain_track
+from log2sim.agents.hypotheses import explain_track, main_place
 from log2sim.agents.smooth.fixed_interval import (
     PLACE_SIGMA_M,
     REPEATED_SHARE,
@@ -130,6 +130,10 @@ def test_what_is_shown_in_between_is_no_object_of_its_own():
     (part,) = explain_track(track_of(t, along(np.where(other, 5.0, 0.0)) + view_noise(t, 1)))
     assert part.static
     assert len(part.track) == 40
+    main = main_place(part.track)
+    assert main is not None
+    assert np.abs(main.measurements.center_m[:, 0]).max() < 2.0
+    assert 20 <= len(main) <= 33
 
 
 @pytest.mark.parametrize(("off_m", "kept"), [(0.8, 38), (3.5, 30)])

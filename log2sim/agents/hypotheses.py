@@ -193,6 +193,14 @@ def explain_track(track: Track) -> list[Part]:
     return [Part(track, static=False)]
 
 
+def main_place(track: Track) -> Track | None:
+    """Return the measurements of a track at the place of most of them; None if there is no such place."""
+    positions = _positions_of(track, np.arange(len(track)))
+    places = _places(positions)
+    rows = _labels(positions, places[:1], np.zeros(1, dtype=np.intp)) == 0 if len(places) else np.zeros(0, dtype=bool)
+    return _taken(track, rows) if rows.sum() > len(track) / 2 else None
+
+
 def _taken(track: Track, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Track:
     return replace(track, tick=track.tick[rows], measurements=track.measurements.take(rows))
 
@@ -294,14 +302,16 @@ def _objects_at(places: Array) -> NDArray[np.intp]:
     return np.unique(index, return_inverse=True)[1]
 
 
-def _labels(p: Positions, places: Array, objects: NDArray[np.intp], body: Array) -> NDArray[np.intp]:
+def _labels(p: Positions, places: Array, objects: NDArray[np.intp], body: Array | None = None) -> NDArray[np.intp]:
     """Return the index (n,) of the object at whose place each position is, -1 for none.
 
     In its `body` are the centers of what shows while the rest of it is hidden.
     """
     offset = p.xy_m[:, None] - places[None]
     squared = (offset**2 / p.variance[:, None]).sum(axis=2)
-    at_place = (squared < PLACE_GATE) | np.all(np.abs(offset @ body) < 1, axis=2)
+    at_place = squared < PLACE_GATE
+    if body is not None:
+        at_place |= np.all(np.abs(offset @ body) < 1, axis=2)
     nearest = np.argmin(np.where(at_place, squared, np.inf), axis=1)
     return np.where(at_place.any(axis=1), objects[nearest], -1)
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
-from log2sim.agents.hypotheses import Part
+from log2sim.agents.hypotheses import Part, main_place
 from log2sim.agents.rays import Ending, classify_rays
 from log2sim.agents.size import TrackGeometry, independent, static_geometry
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
-from log2sim.datatypes import GROUP_OF, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import (
     FACING_END,
@@ -375,8 +375,16 @@ def _candidate(track: Track, geometry: TrackGeometry, matched: Sequence[int], ti
 
 
 def _geometry_of(part: Part) -> TrackGeometry:
-    """Estimate the geometry of a track that stands by the measurements that agree on its place."""
+    """Estimate the geometry of a track that stands by the measurements that agree on its place.
+
+    If all make it too large for one object, some show a part of a neighbor.
+    """
     geometry = static_geometry(part.at_place or part.track)
+    if part.at_place is None and _is_too_large(geometry, part.track.category):
+        main = main_place(part.track)
+        smaller = None if main is None else static_geometry(main)
+        if smaller is not None and not _is_too_large(smaller, part.track.category):
+            geometry = smaller
     n = len(part.track)
     return replace(
         geometry,
@@ -384,6 +392,10 @@ def _geometry_of(part: Part) -> TrackGeometry:
         covariance=np.tile(np.median(geometry.covariance, axis=0), (n, 1, 1)),
         z_m=np.full(n, np.median(geometry.z_m)),
     )
+
+
+def _is_too_large(geometry: TrackGeometry, category: str) -> bool:
+    return bool(np.any(geometry.size_m[:2] >= MAX_SIZE_M[category][:2]))
 
 
 def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:
