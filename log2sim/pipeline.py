@@ -133,7 +133,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         candidates = decide_headings(candidates, ego_path(log, schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with clock.stage("judge", run.progress):
-        searched = schedule.without_frames(observations.unseen)
+        searched = schedule.drop_frames(observations.unseen)
         judged = judge(candidates, ego, Recording(log, searched, observations.obstacles, timeline))
         rated = rate_agents(judged, timeline, lidar=bool(log.lidars))
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
@@ -145,5 +145,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
 
     everyone = agents if ego is None else [ego, *agents]
     scenario = draft_scenario(run, observations, homographies, everyone)
-    described = describe(scenario, log, config, plan, run.poses, observations, clock, run.progress)
+    described = describe(
+        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, clock=clock, progress=run.progress
+    )  # fmt: skip
     return conclude(run, observations, by_end, homographies, described)

@@ -30,7 +30,7 @@ from log2sim.localization.roadside_fit import (
     ObjectTrack,
     RoadView,
     VehicleView,
-    look_through,
+    compare_visibility,
     surfaces_of,
     track_of,
     upright_points,
@@ -191,11 +191,11 @@ def test_errors_of_the_poses_of_the_ego_add_to_the_sigma() -> None:
 def test_what_the_vehicle_saw_through_contradicts_a_pose() -> None:
     points, sensors = walls(0.25)
     upright = points[points[:, 2] > -3.0]
-    healthy = look_through(view_of(points, sensors), upright_points(points))
+    healthy = compare_visibility(view_of(points, sensors), upright_points(points))
     assert healthy.contradicting < 0.05
     assert healthy.seen > 0.8 * len(upright)
     nearer = apply(transform(np.eye(3), np.array([-8.0, -8.0, 0.0])), upright_points(points))
-    assert look_through(view_of(points, sensors), nearer).contradicting > 0.8
+    assert compare_visibility(view_of(points, sensors), nearer).contradicting > 0.8
 
 
 # --- units

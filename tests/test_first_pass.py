@@ -17,7 +17,7 @@ from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import observe
-from log2sim.perception.frames import AHEAD, look_again, work_ahead
+from log2sim.perception.frames import AHEAD, give_pictures, work_ahead
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, obstacles_of, sample_rays
 from log2sim.perception.observe_tick import base_pose
@@ -315,7 +315,7 @@ def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
     log = log_of(reads)
     first, second = Wants(left=[3, 1, 1], right2=[1]), Wants(left=[3, 4])
     steps: list[tuple[int, int]] = []
-    assert look_again(RecordSource(log), [first, second], lambda *step: steps.append(step)) == 4
+    assert give_pictures(RecordSource(log), [first, second], lambda *step: steps.append(step)) == 4
     assert first.got == [("left", 1, 1), ("right2", 1, 1), ("left", 3, 3)]
     assert second.got == [("left", 3, 3), ("left", 4, 4)]
     assert sorted(reads) == [("left", 1), ("left", 3), ("left", 4), ("right2", 1)]

@@ -288,7 +288,7 @@ def test_noise_is_found_from_the_errors(pixel: float, place: float) -> None:
     stream = NormalizedCorrespondences.of(world.uv, world.xy, world.tick, 1.0 / pixel, 0.05 / place)
     h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
     for _ in range(6):
-        stream = stream.with_noise(*noise_factors(stream, linearize(stream, h[None]), 0))
+        stream = stream.scale_noise(*noise_factors(stream, linearize(stream, h[None]), 0))
     believed = stream.sigma_image / stream.image_N_px[0, 0], stream.sigma_ground / stream.ground_N_m[0, 0]
     assert believed == pytest.approx((1.0, 0.05), rel=0.12)
 

@@ -10,7 +10,7 @@ import pytest
 
 from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import box_corners, inverse, project
-from log2sim.perception.traffic_light_boxes import LightBox, crop_lights, with_ranges
+from log2sim.perception.traffic_light_boxes import LightBox, add_ranges, crop_lights
 from log2sim.road.signals import (
     STATES,
     find_signals,
@@ -147,6 +147,6 @@ def test_points_in_the_middle_of_a_box_give_its_range() -> None:
     assert view is not None
     expected = np.linalg.norm(signal.position_m - view.map_T_cam[:3, 3])
     aside = LightBox("front", box.t_ns, box.box_px + 150, 0.5, box.crop)
-    near, none = with_ranges([box, aside], view, cloud)
+    near, none = add_ranges([box, aside], view, cloud)
     assert near.range_m == pytest.approx(expected, abs=0.05)
     assert np.isnan(none.range_m)

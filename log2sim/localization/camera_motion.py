@@ -219,7 +219,7 @@ def follow_camera(
             last = gray
         if progress is not None:
             progress(done, len(index))
-    _check(log, name, len(index), len(t_ns), dark, np.array(predicted))
+    _check(log, name, np.array(predicted), frames=len(index), read=len(t_ns), dark=dark)
     return CameraPath(
         name,
         np.array(t_ns, dtype=np.int64),
@@ -230,7 +230,7 @@ def follow_camera(
     )
 
 
-def _check(log: Log, name: str, frames: int, read: int, dark: int, predicted: NDArray[np.bool_]) -> None:
+def _check(log: Log, name: str, predicted: NDArray[np.bool_], *, frames: int, read: int, dark: int) -> None:
     """Raise `LogError` for a path that is mostly a guess."""
     where = f"{log.name}: camera motion by '{name}'"
     if read < 2:

@@ -265,7 +265,7 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         )
     stamps = log.streams[lidar].t_ns
     if log.ego is None and len(stamps) == 1:
-        return _of_one_sweep(request, lidar, stamps)
+        return _pose_of_single_sweep(request, lidar, stamps)
     try:
         found = run_odometry(
             log,
@@ -304,7 +304,7 @@ def _better_of(
     return (log if verdict.keep else replace_poses(log, track)), choice
 
 
-def _of_one_sweep(request: _Request, lidar: str, t_ns: NDArray[np.int64]) -> tuple[Log, PoseChoice]:
+def _pose_of_single_sweep(request: _Request, lidar: str, t_ns: NDArray[np.int64]) -> tuple[Log, PoseChoice]:
     """Take the ego's frame at the only sweep of a log as its map."""
     track, frame = _in_map(request.log, PoseTrack(t_ns, np.eye(4)[None]), lidar)
     estimate = {"lidar": lidar, "sweeps": 1, "poses": 1, "frame": frame}

@@ -130,12 +130,12 @@ class PoseNoise:
 
     def _eliminate(self, noise: Array, tau: float) -> tuple[Array, float]:
         """Return the information (V + 1, V + 1) about values and residual, and the logarithm of the determinant of their covariance."""
-        matrix, log_det = self._with_noise(noise, tau)
+        matrix, log_det = self._add_pose_noise(noise, tau)
         lower = np.linalg.cholesky(matrix)
         white = solve_triangular(lower, self._mixed, lower=True, check_finite=False)
         return self._of_both - white.T @ white, log_det + 2 * float(np.log(np.diag(lower)).sum())
 
-    def _with_noise(self, noise: Array, tau: float) -> tuple[Array, float]:
+    def _add_pose_noise(self, noise: Array, tau: float) -> tuple[Array, float]:
         """Return the information (6 K, 6 K) about errors of poses, and the logarithm of the determinant of their prior covariance."""
         (unlike, shape_log_det, _), matrix, log_det = self._shapes[tau], self._of_poses.copy(), 0.0
         k = len(unlike)
@@ -169,7 +169,7 @@ class PoseNoise:
 
     def _information_of_noise(self, noise: Array, tau: float) -> float:
         """Compute what the errors of the velocities alone would tell about a time offset, 1/s2."""
-        matrix, _ = self._with_noise(noise, tau)
+        matrix, _ = self._add_pose_noise(noise, tau)
         left = self._of_poses - self._of_poses @ np.linalg.solve(matrix, self._of_poses)
         velocity = self._shapes[tau][2]
         k = len(velocity)

@@ -165,8 +165,8 @@ def check_poses(given: PoseTrack) -> CheckedPoses:
         track = replace(track, map_T_ego=poses, sigma_m=sigmas[:, 0], sigma_yaw_rad=sigmas[:, 1])
 
     def bridge_gap(at_s: Array) -> tuple[FittedPath, FittedPath] | None:
-        position = bridge(t_s, new_xyz, measured, at_s, level.noise, POSITION_PRIOR)
-        turned = bridge(t_s, yaw.values, measured, at_s, yaw.noise, YAW_PRIOR)
+        position = bridge(t_s, new_xyz, measured, at_s, noise=level.noise, prior=POSITION_PRIOR)
+        turned = bridge(t_s, yaw.values, measured, at_s, noise=yaw.noise, prior=YAW_PRIOR)
         return None if position is None or turned is None else (position, turned)
 
     track, gaps = _filled(track, kept, bridge_gap)

@@ -349,13 +349,13 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Prog
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
-    looks = {name: _look_through(log.cameras[name], seen) for name in names}
+    looks = {name: _estimate_by_few_or_all(log.cameras[name], seen) for name in names}
     progress("check cameras", len(moments.sweeps), len(moments.sweeps))
     views = {name: views for name, (views, _) in looks.items()}
     return MountCheck(log, lidar, views, unknown | {name: yaw for name, (_, yaw) in looks.items()})
 
 
-def _look_through(camera: Camera, seen: EdgeViews) -> tuple[list[EdgeView], YawEstimate | None]:
+def _estimate_by_few_or_all(camera: Camera, seen: EdgeViews) -> tuple[list[EdgeView], YawEstimate | None]:
     """Return views of a camera and its yaw: by every second moment, and by all where those do not show that it is sound."""
     few = seen.of_camera(camera.name, every=2)
     yaw = estimate_mount_yaw(camera, few)

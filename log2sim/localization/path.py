@@ -270,7 +270,7 @@ def find_parts(samples: Samples) -> list[Part]:
     if not cores:
         return []
     grown = _grown(samples, cores)
-    rows = [r for part in grown[:-1] for r in _without_rest(samples, part)] + grown[-1:]
+    rows = [r for part in grown[:-1] for r in _split_at_rest(samples, part)] + grown[-1:]
     parts = [Part(r) for r in rows]
     return _choose(samples, _marked_at_rest(samples, parts))
 
@@ -340,7 +340,7 @@ def _end(samples: Samples, rows: NDArray[np.intp], *, first: bool) -> _End:
     return _End(t_end, solution[0], solution[1], change, float(spread[0]), float(spread[1]), slack)
 
 
-def _without_rest(samples: Samples, rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def _split_at_rest(samples: Samples, rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Divide a part that ends in one place, at which the path goes on with a break, unless the vehicle stopped there by itself."""
     same = (samples.values[rows] == samples.values[rows[-1]]).all(axis=1)
     moving = len(rows) - int(np.argmin(same[::-1])) if not same.all() else 0
@@ -515,7 +515,7 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
         known[skip.first : skip.last] |= ~at_rest[skip.first : skip.last]
     bridged = ~known
     for first, stop in runs_of(bridged):
-        fitted = bridge(t_s, new, known, t_s[first:stop], noise, limits.prior)
+        fitted = bridge(t_s, new, known, t_s[first:stop], noise=noise, prior=limits.prior)
         if fitted is None:
             bridged[first:stop] = False
             continue
@@ -535,7 +535,7 @@ def runs_of(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def bridge(
-    t_s: Array, values: Array, known: NDArray[np.bool_], asked_s: Array, noise: float, prior: PathPrior
+    t_s: Array, values: Array, known: NDArray[np.bool_], asked_s: Array, *, noise: float, prior: PathPrior
 ) -> FittedPath | None:
     """Interpolate or extrapolate a path at asked times by the known samples around them; None without any."""
     rows = np.flatnonzero(known)

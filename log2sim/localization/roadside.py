@@ -29,11 +29,11 @@ from log2sim.localization.roadside_fit import (
     Visibility,
     choose_moments,
     common_ground,
+    compare_visibility,
     detect_boxes,
     detectors_of,
     ground_below,
     link_boxes,
-    look_through,
     match_ground,
     match_objects,
     match_structure,
@@ -142,7 +142,7 @@ class Estimate:
         return exp_of(self.values[:DELAY])
 
 
-def look_around(log: Log, config: Config, unit: Unit, report: Callable[[int, int], None]) -> Sight:
+def collect_sight(log: Log, config: Config, unit: Unit, report: Callable[[int, int], None]) -> Sight:
     """Collect what both ends see around a unit."""
     during = during_ns(log, config)
     report(0, 3)
@@ -470,10 +470,10 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
     faults: list[Finding] = []
     for unit in units_of(used, at_road):
         stage = f"register {unit.lidars[0]}"
-        sight = look_around(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]
+        sight = collect_sight(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]
         found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
         before, after = (
-            None if sight.view is None else look_through(sight.view, apply(correction, upright))
+            None if sight.view is None else compare_visibility(sight.view, apply(correction, upright))
             for correction in (np.eye(4), found.correction)
         )
         findings = Findings(unit, found, (before, after))

@@ -247,7 +247,7 @@ class Visibility:
         return self.seen_through / looked_at if looked_at else 0.0
 
 
-def look_through(view: VehicleView, upright_m: Array) -> Visibility:
+def compare_visibility(view: VehicleView, upright_m: Array) -> Visibility:
     """Compare upright things of a unit, points (N, 3), m, with the ranges of the vehicle's sweeps."""
     upright = upright_m[:: max(len(upright_m) // MAX_POINTS, 1)]
     if len(upright) == 0:

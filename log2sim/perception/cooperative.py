@@ -370,7 +370,7 @@ def merge_by_covariance(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
         np.where(contradict[:, None, None], whole.errors.side_m, np.sqrt(variance)),
         np.where(contradict, whole.errors.yaw_rad, axes.errors.yaw_rad),
     )
-    return SeenBoxes(_with_both(_choose(contradict, whole.boxes, merged), a.boxes, b.boxes), errors)
+    return SeenBoxes(_join_evidence(_choose(contradict, whole.boxes, merged), a.boxes, b.boxes), errors)
 
 
 def merge_by_points(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
@@ -384,7 +384,7 @@ def merge_by_points(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
         np.where(more[:, 0], b.errors.yaw_rad, a.errors.yaw_rad),
     )
     merged = replace(chosen, center_m=center, t_ns=_mean_time(a.boxes, b.boxes))
-    return SeenBoxes(_with_both(merged, a.boxes, b.boxes), errors)
+    return SeenBoxes(_join_evidence(merged, a.boxes, b.boxes), errors)
 
 
 METHODS = {
@@ -425,7 +425,7 @@ def _choose(mask: NDArray[np.bool_], one: Boxes3D, other: Boxes3D) -> Boxes3D:
     return Boxes3D.join([one, other]).take(np.where(mask, 0, len(one)) + np.arange(len(one)))
 
 
-def _with_both(boxes: Boxes3D, a: Boxes3D, b: Boxes3D) -> Boxes3D:
+def _join_evidence(boxes: Boxes3D, a: Boxes3D, b: Boxes3D) -> Boxes3D:
     """Return joined boxes (P,) with the points of both, scores as independent evidence, and the category of the surer one."""
     score = np.minimum(1 - (1 - a.score) * (1 - b.score), MAX_SCORE)
     category = np.where(b.score > a.score, b.category, a.category)

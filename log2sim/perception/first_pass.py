@@ -259,7 +259,7 @@ class Observations:
 
     def recorded(self, schedule: Schedule) -> dict[str, NDArray[np.bool_]]:
         """Return (T,) for each camera, and for "" any LiDAR, whether it recorded at each tick something that shows what is there."""
-        frames = schedule.without_frames(self.unseen).frames
+        frames = schedule.drop_frames(self.unseen).frames
         sweeps = np.array([cloud is not None for cloud in self.obstacles], dtype=bool)
         return {"": sweeps} | {camera: index >= 0 for camera, index in frames.items()}
 

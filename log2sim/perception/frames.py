@@ -154,7 +154,7 @@ class PictureConsumer(Protocol):
         ...
 
 
-def look_again(
+def give_pictures(
     records: RecordSource,
     consumers: Sequence[PictureConsumer],
     progress: Callable[[int, int], None] = lambda done, total: None,

@@ -17,7 +17,7 @@ from log2sim.perception.lidar.cloud import Cloud, cloud_origin, join_parts
 from log2sim.perception.lidar.measure import Frame, measure, outside_ego, project_cloud
 from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.sync import Schedule
-from log2sim.perception.traffic_light_boxes import LightBox, with_ranges
+from log2sim.perception.traffic_light_boxes import LightBox, add_ranges
 from log2sim.plan import FusionLevel, Plan, Stage
 
 MAX_GROUND_POINTS_PER_FRAME = 40
@@ -58,7 +58,7 @@ class TickObserver:
         """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
         reference = clouds[self.schedule.reference_row]
         # Where clouds were searched, a camera's objects are sought in what its own end sees.
-        parts = {(id(c), end): c if boxes is None else _of_end(c, end) for c in clouds for end in ENDS}
+        parts = {(id(c), end): c if boxes is None else _seen_from_end(c, end) for c in clouds for end in ENDS}
         frames: dict[str, list[Frame]] = {end: [] for end in ENDS}
         for camera, cloud in zip(self.schedule.frames, clouds):
             if camera in found and (view := self._view(camera, tick)) is not None:
@@ -88,7 +88,7 @@ class TickObserver:
         for camera, cloud in zip(self.schedule.frames, clouds):
             of_camera = [light for light in lights if light.camera == camera]
             view = self._view(camera, tick) if of_camera else None
-            out += of_camera if view is None or cloud is None else with_ranges(of_camera, view, cloud)
+            out += of_camera if view is None or cloud is None else add_ranges(of_camera, view, cloud)
         return out
 
     def _view(self, camera: str, tick: int) -> View | None:
@@ -103,7 +103,7 @@ class TickObserver:
             return np.asarray(~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > self.settings.max_range_m))
 
 
-def _of_end(cloud: Cloud | None, end: str) -> Cloud | None:
+def _seen_from_end(cloud: Cloud | None, end: str) -> Cloud | None:
     """Return the parts of a cloud that an end sees; the whole cloud where it has no parts or the end sees none of them."""
     if cloud is None or not cloud.parts:
         return cloud

@@ -53,7 +53,7 @@ class Schedule:
         """Row of `sweeps` that belongs to the reference."""
         return list(self.frames).index(self.reference) if self.frames else 0
 
-    def without_frames(self, ticks: Mapping[str, Sequence[int]]) -> Schedule:
+    def drop_frames(self, ticks: Mapping[str, Sequence[int]]) -> Schedule:
         """Return the schedule without the frames of some ticks by camera, as if they had not been recorded."""
         frames = dict(self.frames)
         for camera, left_out in ticks.items():

@@ -66,18 +66,16 @@ def _share_within(a: Array, b: Array) -> float:
     return float(common / min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])))
 
 
-def with_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[LightBox]:
+def add_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[LightBox]:
     """Return the traffic lights of a frame with the distance of the points in the middle of each, if there are some of a housing."""
     if not lights:
         return []
     high = np.flatnonzero(cloud.height > MIN_HEIGHT_M)
     visible = project_points(view, cloud.origin, cloud.columns.take(high, axis=1))
-    return [_with_range(light, view, cloud, high, visible) for light in lights]
+    return [_add_range(light, view, cloud, high, visible) for light in lights]
 
 
-def _with_range(
-    light: LightBox, view: View, cloud: Cloud, high: NDArray[np.intp], visible: ProjectedPoints
-) -> LightBox:
+def _add_range(light: LightBox, view: View, cloud: Cloud, high: NDArray[np.intp], visible: ProjectedPoints) -> LightBox:
     """Return a traffic light with its distance by the points of a cloud at `high` (n,), which are projected."""
     (u0, v0, u1, v1), reach = light.box_px, (light.box_px[2:] - light.box_px[:2]) * MIDDLE / 2
     inside = (np.abs(visible.u - (u0 + u1) / 2) <= reach[0]) & (np.abs(visible.v - (v0 + v1) / 2) <= reach[1])

@@ -15,7 +15,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.frames import look_again, work_ahead
+from log2sim.perception.frames import give_pictures, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.records import RecordSource
 from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
@@ -368,6 +368,6 @@ def map_ground(
         log = log if refined is None else replace_poses(log, refined)
     records = records.of(log)
     builder = GroundMapBuilder(log, scenario, settings, records, partial(progress, "map: sweeps"))
-    look_again(records, [builder], partial(progress, "map: pictures"))
+    give_pictures(records, [builder], partial(progress, "map: pictures"))
     records.require_some()
     return builder.build()

@@ -325,7 +325,7 @@ ROUNDING_RAD = 1e-6
 class ColorSampler:
     """Looks at the vehicles of a scenario in chosen pictures and names their colors.
 
-    A consumer of `log2sim.perception.frames.look_again`.
+    A consumer of `log2sim.perception.frames.give_pictures`.
 
     `gray`: cameras whose pictures have no color.
     """
@@ -362,7 +362,7 @@ class ColorSampler:
         scene = _Scene(view, boxes, place, image_bgr, *halves)
         for agent in agents:
             row = next(k for k, other in enumerate(boxes.agents) if other.id == agent)
-            look = scene.look_at(row)
+            look = scene.observe_agent(row)
             if look is not None:
                 self._looks.setdefault(agent, []).append(look)
 
@@ -412,7 +412,7 @@ class _Scene:
     def _linear_below(self) -> Array:
         return linear_values(self.below)
 
-    def look_at(self, row: int) -> Look | None:
+    def observe_agent(self, row: int) -> Look | None:
         """Look at an agent; None where too little of its paint is seen."""
         center, yaw, size = self._center_m[row], self.boxes.yaw_rad[row, self.place], self.boxes.size_m[row]
         if not np.isfinite(center).all():

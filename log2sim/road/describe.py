@@ -11,15 +11,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from log2sim.config import Config
+from log2sim.config import MapConfig
 from log2sim.datatypes import Log, MapFeatures, Scenario
 from log2sim.errors import LogError
 from log2sim.files.stages import StageClock
-from log2sim.localization.choice import PoseChoice
+from log2sim.geometry import PoseTrack
 from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.frames import PictureConsumer, look_again
+from log2sim.perception.frames import PictureConsumer, give_pictures
 from log2sim.perception.records import RecordSource
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
@@ -32,30 +32,31 @@ from log2sim.road.signals import find_signals
 def describe(
     scenario: Scenario,
     log: Log,
-    config: Config,
     plan: Plan,
-    poses: PoseChoice,
     observations: Observations,
+    *,
+    settings: MapConfig,
+    for_map: PoseTrack | None,
     clock: StageClock,
     progress: Callable[[str, int, int], None],
 ) -> tuple[Scenario, list[Decision], dict[str, Any]]:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario; with what the stages did, and figures of the report.
 
-    `poses`: with those by which the ground is drawn. `observations`: what the first pass found of the records.
+    `observations`: what the first pass found of the records. `for_map`: poses by which the ground is drawn, None for those of the log.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
-    drawn = log if poses.for_map is None else replace_poses(log, poses.for_map)
+    drawn = log if for_map is None else replace_poses(log, for_map)
     records = (observations.records or RecordSource(log)).of(drawn)
     builder, features = None, MapFeatures() if plan.keeps(Stage.LANES) else None
     if features is not None:
         try:
-            builder = GroundMapBuilder(drawn, scenario, config.map, records)
+            builder = GroundMapBuilder(drawn, scenario, settings, records)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
     with clock.stage("pictures", progress):
-        look_again(records, consumers, lambda done, total: progress("pictures", done, total))
+        give_pictures(records, consumers, lambda done, total: progress("pictures", done, total))
     with clock.stage("lanes", progress):
         if builder is not None:
             ground = builder.build()

@@ -25,7 +25,6 @@ from log2sim.road.routes import (
     find_beside,
     match_path,
     merge_paths,
-    without_lane_changes,
 )
 from log2sim.road.sections import (
     Connection,
@@ -156,8 +155,6 @@ ONCOMING_M = 15.0
 # Probabilities of a direction: somebody drives that way; the lane beside it, away from oncoming traffic, must lead the same
 # way; the one towards oncoming traffic may lead either way; nothing is known. Not measured, but for the order.
 DRIVEN, OUTER, INNER, UNKNOWN = 0.98, 0.9, 0.7, 0.5
-# Directions of lanes that somebody drives or that lie next to such a one, not those told across two lines.
-SURE = 0.65
 
 
 def find_side_of_traffic(paths: Sequence[DrivenPath]) -> int:
@@ -194,25 +191,6 @@ def direct_strips(
         found = [news.get(k, strip) for k, strip in enumerate(found)]
         if any(turned.values()):
             beside = find_beside([strip.line for strip in found])
-    medians = _find_medians(found, beside, sides)
-    return [strip for k, strip in enumerate(found) if k not in medians]
-
-
-def _find_medians(
-    strips: Sequence[LaneStrip], beside: Sequence[Beside], sides: Mapping[str, Marking | RoadBorder]
-) -> set[int]:
-    """Return strips that nobody drives, behind solid lines, between lanes that surely lead opposite ways."""
-    ways: dict[int, set[tuple[bool, bool]]] = {}
-    for pair in beside:
-        if strips[pair.other].directed >= SURE:
-            ways.setdefault(pair.route, set()).add((bool(pair.aside_m[0] > 0), pair.same_way))
-    found = set()
-    for k, strip in enumerate(strips):
-        lines = [sides.get(name) for name in (strip.left, strip.right)]
-        closed = all(isinstance(line, RoadBorder) or (line is not None and line.kind == "solid") for line in lines)
-        apart = {(True, True), (False, False)}, {(True, False), (False, True)}
-        if closed and strip.directed < DRIVEN and ways.get(k, set()) in apart:
-            found.add(k)
     return found
 
 
@@ -295,11 +273,10 @@ def infer_lanes(
         notes.append("no lanes from paths: no vehicle moves")
     if not driven and not marked:
         return (), tuple(notes)
-    paths = without_lane_changes(driven)
-    graph = _graph(merge_paths(paths, marked), paths)
+    graph = _graph(merge_paths(driven, marked), driven)
     lanes = _as_lanes(graph, {path.agent: path.confidence for path in driven})
     lanes = [*lanes, *_free_lanes(lanes, driven)]
-    return _with_opposites(name_lines(lanes, markings, borders)), tuple(notes)
+    return _name_opposites(name_lines(lanes, markings, borders)), tuple(notes)
 
 
 def _marked_routes(
@@ -478,7 +455,7 @@ def _free_lanes(lanes: Sequence[MapLane], paths: Sequence[DrivenPath]) -> list[M
     return found
 
 
-def _with_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
+def _name_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
     """Name for each lane the one beside it that leads the other way, along at least half of it."""
     flat = [k for k, lane in enumerate(lanes) if lane.junction is None]
     lines = [Polyline.through(lanes[k].points_m) for k in flat]

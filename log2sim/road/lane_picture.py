@@ -139,7 +139,7 @@ AROUND_M = 0.3
 def keep_road(ground: GroundMap, camera_x_m: float, camera_y_m: float) -> GroundMap:
     """Hide what has not the color of the ground in front of the camera; all is kept where that is no wide surface."""
     seen = ground.alpha > 0
-    bright, yellow = (_without_narrow(a, ground.resolution_m) for a in log_color(ground.color_bgr))
+    bright, yellow = (_remove_narrow(a, ground.resolution_m) for a in log_color(ground.color_bgr))
     near = np.zeros(seen.shape, bool)
     x0, _, _, y1 = ground.extent_m
     rows = slice(*(max(round((y1 - camera_y_m + side * BESIDE_M) / ground.resolution_m), 0) for side in (-1, 1)))
@@ -158,7 +158,7 @@ def keep_road(ground: GroundMap, camera_x_m: float, camera_y_m: float) -> Ground
     return replace(ground, alpha=np.where(wider > 0, ground.alpha, 0).astype(np.uint8))
 
 
-def _without_narrow(values: NDArray[np.float32], cell_m: float) -> NDArray[np.float32]:
+def _remove_narrow(values: NDArray[np.float32], cell_m: float) -> NDArray[np.float32]:
     """Remove what is narrow across the road, which runs along the rows: bright lines first, then dark ones."""
     across = np.ones((2 * round(NARROW_M / cell_m / 2) + 1, 1), np.uint8)
     soft = cv2.blur(values, (5, 5))

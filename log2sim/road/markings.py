@@ -255,7 +255,6 @@ ROAD_TOLERANCE = 1.5  # sigmas that a road may differ from where lane lines are
 # Log-odds: a meter of seam, patch or wear is much more frequent than that of a border, long ones are not.
 PRIOR, PER_METER, MAX_BY_LENGTH, PER_SIGMA = -3.0, 0.15, 4.5, 0.7
 MIN_BORDER_M, MIN_BORDER_CONFIDENCE = 5.0, 0.5
-AT_CROSSWALK_M = 1.0
 NEAR_LINE_M = 12.0  # borders farther from all lane lines are those of something else
 
 
@@ -284,9 +283,8 @@ def find_borders(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[tupl
     points = _steps(coarse, ground, road)
     fitted = fit_lines(points, coarse.cell_m)
     pieces = no_pieces(len(fitted), xy=fitted[:, :2], direction=fitted[:, 2], length_m=fitted[:, 3])
-    areas = [m.points_m[:, :2].astype(np.float32) for m in markings if m.kind == "crosswalk"]
     found = [_border_of(coarse, ground, chain.corners(pieces), lines) for chain in touching_chains(pieces)]
-    kept = sorted((b for b in found if b is not None and not _is_paint(b, areas)), key=lambda b: -b.confidence)
+    kept = sorted((b for b in found if b is not None), key=lambda b: -b.confidence)
     named = tuple(
         RoadBorder(f"border-{k + 1}", b.kind, b.points_m, b.confidence, b.sources) for k, b in enumerate(kept)
     )
@@ -431,13 +429,6 @@ def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[A
     shown = (("camera", by_color > 1), ("lidar", by_lidar > 1 or curb))
     sources = tuple(name for name, shows in shown if shows)
     return RoadBorder("", "curb" if curb else "edge", at_height(ground, thin(curve.xy)), probability(odds), sources)
-
-
-def _is_paint(border: RoadBorder, areas: list[NDArray[np.float32]]) -> bool:
-    """Whether most of a border is at a crosswalk, whose paint is another surface, too."""
-    xy = border.points_m[:, :2].tolist()
-    at = [max((cv2.pointPolygonTest(area, p, True) for area in areas), default=-np.inf) > -AT_CROSSWALK_M for p in xy]
-    return bool(np.mean(at) > 0.5)
 
 
 def _steps_along(coarse: _Coarse, ground: GroundMap, xy: Array, normal: Array) -> list[Array]:

@@ -150,7 +150,7 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
 
     The third result is the length in which they fall from three quarters to one.
     """
-    filled, soft = _without_gaps(profile)
+    filled, soft = _fill_gaps(profile)
     near = np.abs(across) <= MAX_SHIFT_M
     peak = np.argmax(np.where(near, soft, -np.inf), axis=1)
     index = np.arange(len(profile))
@@ -173,7 +173,7 @@ def _darkest(soft: Array, where: NDArray[np.bool_]) -> Array:
     return np.where(np.isfinite(least), least, np.nan)
 
 
-def _without_gaps(profile: Array) -> tuple[Array, Array]:
+def _fill_gaps(profile: Array) -> tuple[Array, Array]:
     """Fill gaps of profiles (N, P), where LiDAR hit no cell, from their neighbors; also blur them, without gaps."""
     known = np.isfinite(profile).astype(np.float64)
     total, count = cv2.blur(np.nan_to_num(profile), (3, 1)), cv2.blur(known, (3, 1))

@@ -219,7 +219,7 @@ class DrivenPath:
     rank: int  # 0 for the ego, 1 for vehicles, 2 for two-wheelers: in this order paths make lanes
     confidence: float  # of the agent
 
-    def with_points(self, points_m: Array) -> DrivenPath:
+    def replace_points(self, points_m: Array) -> DrivenPath:
         """Return the same path along other points (N, 3)."""
         return replace(self, line=Polyline.through(points_m))
 

@@ -249,7 +249,7 @@ def cut_sections(
         length = route.line.length_m
         first, start = 0.0, FREE
         for low, high, area in areas.stretches.get(k, []):
-            low, high = _with_ends(low, high, length, ((k, True) in ends, (k, False) in ends))
+            low, high = _leave_ends(low, high, length, ((k, True) in ends, (k, False) in ends))
             if low - first > 1e-6:
                 found += _pieces(k, (first, low), (start, area), cuts.get(k, []))
             first, start = high, area
@@ -258,7 +258,7 @@ def cut_sections(
     return found
 
 
-def _with_ends(low: float, high: float, length: float, entered: tuple[bool, bool]) -> tuple[float, float]:
+def _leave_ends(low: float, high: float, length: float, entered: tuple[bool, bool]) -> tuple[float, float]:
     """Leave a section before and after a stretch of a junction where the route itself begins or ends in it."""
     room = min(FIRST_M, (high - low) / 3)
     if low < room and not entered[0]:

@@ -244,13 +244,13 @@ def stretches_of(strokes: Array) -> list[Stretch]:
         if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
             out += _solid_parts(solid)
             solid = []
-            out += [Stretch(float(p[0, 0]), float(p[-1, 1]), "dashed", len(p)) for p in _without_long_gaps(part)]
+            out += [Stretch(float(p[0, 0]), float(p[-1, 1]), "dashed", len(p)) for p in _split_long_gaps(part)]
         else:
             solid += list(part)
     return out + _solid_parts(solid)
 
 
-def _without_long_gaps(strokes: Array) -> list[Array]:
+def _split_long_gaps(strokes: Array) -> list[Array]:
     """Part dashes (K, 2) where several are missing in a row, as lines end before a junction and begin again behind it."""
     gaps = strokes[1:, 0] - strokes[:-1, 1]
     usual = float(np.median(gaps) if len(gaps) > FEW_GAPS else gaps.min(initial=np.inf))

@@ -28,7 +28,7 @@ from log2sim.geometry import (
     project,
 )
 from log2sim.geometry.boxes import EDGES, NEAR_M
-from log2sim.perception.frames import look_again
+from log2sim.perception.frames import give_pictures
 from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
@@ -256,7 +256,7 @@ def picture_document(
     probes = _probe(log, within, projector, reader)
     size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
     pictures = ShrunkPictures(chosen, size.width_px)
-    look_again(reader, [pictures], progress, least_px=size.width_px)
+    give_pictures(reader, [pictures], progress, least_px=size.width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     _thin_out(entries, budget_bytes)

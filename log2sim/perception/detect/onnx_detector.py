@@ -394,7 +394,7 @@ def open_onnx(
             f"{path}: outputs {describe_outputs(outputs)} do not fit the layout '{layout.name}' ({error})"
         ) from None
     if input_px is not None:
-        layout = with_input_size(layout, model, input_px)
+        layout = resize_input(layout, model, input_px)
     score = layout.default_min_score if min_score is None else min_score
     weak = WEAK_SHARE * score if min_score is None else score
     return OnnxDetector(
@@ -431,7 +431,7 @@ def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, O
     )
 
 
-def with_input_size(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
+def resize_input(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
     """Return the layout with another side of the input, which the model is tried on."""
     if model.spec.width_px is not None or model.spec.height_px is not None:
         raise ConfigError(

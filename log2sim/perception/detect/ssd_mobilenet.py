@@ -222,13 +222,13 @@ class Converter:
         if value is None:
             return self.translate(node.inputs[i])
         if CLASS_HEAD in node.name:
-            value = of_known_classes(value)
+            value = select_classes(value)
         return self.store(f"{node.name}/{i}", value.reshape(1, -1, 1, 1) if value.ndim == 1 else value)
 
     def _convolution(self, node: Node) -> str:
         weights = self.required(node.inputs[1])  # height, width, channels in, channels out or multiplier
         if CLASS_HEAD in node.name:
-            weights = of_known_classes(weights)
+            weights = select_classes(weights)
         if node.op == "Conv2D":
             kernel, groups = weights.transpose(3, 2, 0, 1), 1
         else:
@@ -275,7 +275,7 @@ def convert(graph: bytes) -> onnx.ModelProto:
     return model
 
 
-def of_known_classes(constant: NDArray[Any]) -> NDArray[Any]:
+def select_classes(constant: NDArray[Any]) -> NDArray[Any]:
     """Leave only the columns of `CLASS_NAMES` of a constant (..., K * 91) of the classes of K shapes of boxes."""
     by_class = constant.reshape(*constant.shape[:-1], -1, GRAPH_CLASSES)
     return by_class[..., list(CLASS_NAMES)].reshape(*constant.shape[:-1], -1)

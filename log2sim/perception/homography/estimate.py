@@ -106,7 +106,7 @@ def estimate_homography(
         if options.method == "per-frame-skimage":
             estimate = partial(ransac_skimage, rng=rng, trials=options.hypotheses)
         fit = fit_frames(data, estimate, keep_all=options.method != "min-frame")
-    fit = _of_all_rows(fit, correspondences.tick, rows, of_stream=options.method in STREAM_METHODS)
+    fit = _spread_to_all(fit, correspondences.tick, rows, of_stream=options.method in STREAM_METHODS)
     if options.method == "straw-man" and fit.ok:
         offset = apply_homography(fit.ground_H_image, uv)[0] - correspondences.xy_ego
         distance = np.hypot(*offset[fit.inliers].T)
@@ -149,7 +149,7 @@ def _fit_stream(data: NormalizedCorrespondences, options: EstimationOptions, rng
     return replace(fit, per_tick=data.to_ground_H_image(moving.warps @ moving.image_H_ground))
 
 
-def _of_all_rows(
+def _spread_to_all(
     fit: HomographyFit, tick: NDArray[np.int64], rows: NDArray[np.int64], *, of_stream: bool
 ) -> HomographyFit:
     """Convert a fit of `rows` into one of all correspondences, whose ticks are `tick` (N,).

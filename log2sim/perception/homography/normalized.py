@@ -74,7 +74,7 @@ class NormalizedCorrespondences:
             self.image[:, rows], self.ground[:, rows], tick, start, *sigmas, *normalizations
         )
 
-    def with_noise(self, image: float, ground: float) -> NormalizedCorrespondences:
+    def scale_noise(self, image: float, ground: float) -> NormalizedCorrespondences:
         """Scale the standard deviations of pixels and ground positions by these factors."""
         return replace(self, sigma_image=self.sigma_image * image, sigma_ground=self.sigma_ground * ground)
 

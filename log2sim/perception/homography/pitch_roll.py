@@ -86,7 +86,7 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
         linear = linearize(noisy, h[None], angles.warps()[noisy.tick])
         h, angles, information = _step(noisy, h, linear, angles, image_K)
         if k >= 1:
-            noisy = noisy.with_noise(*noise_factors(noisy, linear, 8 + 2 * len(angles.value)))
+            noisy = noisy.scale_noise(*noise_factors(noisy, linear, 8 + 2 * len(angles.value)))
         variance = 1.0 / (information + 1.0 / angles.sigma**2)
         if k == ROUNDS - 2:
             significant = _is_significant(angles, information)
@@ -240,12 +240,12 @@ def stabilizing_warps(moving: HomographyFit) -> Array:
 
 def stabilized(correspondences: Correspondences, moving: HomographyFit) -> Correspondences:
     """Undo the pitch and roll of each tick in the pixels; ticks that `moving` does not have are left as they are."""
-    warps = _of_ticks(stabilizing_warps(moving), moving.ticks, correspondences.tick)
+    warps = _warps_at(stabilizing_warps(moving), moving.ticks, correspondences.tick)
     q = np.einsum("nij,nj->ni", warps, np.column_stack([correspondences.uv, np.ones(len(correspondences))]))
     return replace(correspondences, uv=q[:, :2] / q[:, 2:])
 
 
-def _of_ticks(values: Array, ticks: NDArray[np.int64], tick: NDArray[np.int64]) -> Array:
+def _warps_at(values: Array, ticks: NDArray[np.int64], tick: NDArray[np.int64]) -> Array:
     """Look up the matrices (N, 3, 3) of ticks (N,); the identity where there is none."""
     index = np.clip(np.searchsorted(ticks, tick), 0, len(ticks) - 1)
     return np.where((ticks[index] == tick)[:, None, None], values[index], np.eye(3))

@@ -204,7 +204,7 @@ def refine_with_noise(data: NormalizedCorrespondences, h: Array, image_K: Array 
     for _ in range(NOISE_ROUNDS):
         linear = linearize(part, h[None])
         h = newton_step(linear, h, image_K)
-        part = part.with_noise(*noise_factors(part, linear, parameters))
+        part = part.scale_noise(*noise_factors(part, linear, parameters))
     h = refine(part, h, FINAL_ROUNDS, image_K)
     data = replace(data, sigma_image=part.sigma_image, sigma_ground=part.sigma_ground)
     return RobustFit(h, data, linearize(data, h[None]))

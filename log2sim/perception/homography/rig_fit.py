@@ -86,12 +86,12 @@ def fit_feet(
     earlier fit to the same rows, from which fewer steps lead on.
     """
     if is_start:
-        state = _with_consensus(rig, rows, state, planes)
+        state = _turn_by_consensus(rig, rows, state, planes)
     names, scale = list(rig.cameras), 1.0
     covariance = np.zeros((SHARED + OF_CAMERA * len(names),) * 2)
     for gate in GATES if is_start else GATES[-LAST_GATES:]:
         linear = linearize_feet(rig, rows, state, planes)
-        step, covariance = _step(rig, rows, linear, state, gate * scale**2, scale)
+        step, covariance = _step(rig, rows, linear, state, gate=gate * scale**2, scale=scale)
         of_camera = step[SHARED:].reshape(-1, OF_CAMERA)
         lift = {name: state.lift_m[name] + float(s[0]) for name, s in zip(names, of_camera)}
         turned = {name: state.feet[name] + s[1:] for name, s in zip(names, of_camera)}
@@ -103,7 +103,7 @@ def fit_feet(
 
 
 def _step(
-    rig: Rig, rows: RigRows, linear: FootErrors, state: RigState, gate: float, scale: float
+    rig: Rig, rows: RigRows, linear: FootErrors, state: RigState, *, gate: float, scale: float
 ) -> tuple[Array, Array]:
     """Compute a Gauss-Newton step (P,) and the covariance (P, P)."""
     use = linear.squared < gate
@@ -133,7 +133,7 @@ def _noise_factor(squared: Array, gate: float) -> float:
     return float(np.clip(np.sqrt(variance), 1 / MAX_NOISE_FACTOR, MAX_NOISE_FACTOR))
 
 
-def _with_consensus(rig: Rig, rows: RigRows, state: RigState, planes: Array | None) -> RigState:
+def _turn_by_consensus(rig: Rig, rows: RigRows, state: RigState, planes: Array | None) -> RigState:
     """Turn each camera by the shift in the image that most of its feet agree with, among those that single feet ask for."""
     linear = linearize_feet(rig, rows, state, planes)
     feet = dict(state.feet)
@@ -201,7 +201,7 @@ def fit_rig(
     ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
     if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
         ticks, planes = _planes_of_ticks(_heights(rig, ground_rows), plane)
-        own = _of_rows(ticks, planes, plane, foot_rows.tick)
+        own = _planes_at(ticks, planes, plane, foot_rows.tick)
         moving = fit_feet(rig, foot_rows, fit.state, own, is_start=False)
         decision = _decide(foot_rows, fit, moving, planes - plane)
         if decision.per_tick:
@@ -210,7 +210,8 @@ def fit_rig(
             ticks, planes = ticks[:0], planes[:0]
     result = RigFit("", rig, {}, fit.state, ticks, planes)
     found = {name: feet.get(name) or Correspondences.join([]) for name in rig.cameras}
-    fits = {name: _fit_of_camera(result, fit, foot_rows, name, data, decision) for name, data in found.items()}
+    fits = {name: _fit_of_camera(result, fit, foot_rows, name, data) for name, data in found.items()}
+    fits = {name: replace(f, pitch_roll=decision) if f.ok else f for name, f in fits.items()}
     return replace(result, fits=fits)
 
 
@@ -226,7 +227,7 @@ def _planes_of_ticks(heights: HeightRows, plane: Array) -> tuple[NDArray[np.int6
     return ticks, plane + np.column_stack([tilt, np.zeros(len(ticks))])
 
 
-def _of_rows(ticks: NDArray[np.int64], planes: Array, plane: Array, tick: NDArray[np.int64]) -> Array:
+def _planes_at(ticks: NDArray[np.int64], planes: Array, plane: Array, tick: NDArray[np.int64]) -> Array:
     """Look up the planes (N, 3) of ticks (N,); that of all ticks where there is none."""
     index = np.clip(np.searchsorted(ticks, tick), 0, len(ticks) - 1)
     return np.where((ticks[index] == tick)[:, None], planes[index], plane)
@@ -242,9 +243,7 @@ def _decide(rows: RigRows, fixed: FeetFit, moving: FeetFit, tilt: Array) -> Pitc
     return PitchRoll(significance > MIN_SIGNIFICANCE_SIGMA, "ground points", pitch, roll, (before, after), significance)
 
 
-def _fit_of_camera(
-    result: RigFit, fit: FeetFit, rows: RigRows, name: str, data: Correspondences, decision: PitchRoll | None
-) -> HomographyFit:
+def _fit_of_camera(result: RigFit, fit: FeetFit, rows: RigRows, name: str, data: Correspondences) -> HomographyFit:
     """Make the result of one camera of a rig, refused where its feet contradict the rig; `rows` are all feet."""
     number = list(result.rig.cameras).index(name)
     own = rows.camera == number
@@ -265,4 +264,4 @@ def _fit_of_camera(
     error_m, s = float(np.median(known)) if len(known) else float("nan"), np.linalg.svd(h, compute_uv=False)
     per_tick = foot_homography(result.rig, fit.state, name, result.planes) if len(result.ticks) else None
     sigma_m = foot_sigma_m(result.rig, fit.state, name, fit.covariance_of(number))
-    return HomographyFit(True, "", h, inliers, error_m, float(s[0] / s[-1]), result.ticks, per_tick, sigma_m, decision)
+    return HomographyFit(True, "", h, inliers, error_m, float(s[0] / s[-1]), result.ticks, per_tick, sigma_m)

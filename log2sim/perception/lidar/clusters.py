@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,16 @@ def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp
     return _cluster(xy, cell_m)[0]
 
 
-def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[Any]]:
-    """Label points on a grid: labels (N,), lower corner (2,) of the grid, and the grid with labels plus one, 0 where empty."""
+class _Grid(NamedTuple):
+    """Cells in which points were labeled."""
+
+    corner: Array  # (2,), m: lower one
+    cell_m: float
+    owner: NDArray[Any]  # labels plus one, 0 where empty
+
+
+def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], _Grid]:
+    """Label points (N, 2) by the connected cells of a grid that they are in."""
     import cv2
 
     x, y = xy.T
@@ -52,7 +60,7 @@ def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.i
     grid[i, j] = 1
     _, labels = cv2.connectedComponents(grid, connectivity=8, ltype=cv2.CV_16U)
     grid = np.asarray(labels)
-    return grid[i, j].astype(np.intp) - 1, corner, grid
+    return grid[i, j].astype(np.intp) - 1, _Grid(corner, cell_m, grid)
 
 
 def candidate_clusters(
@@ -77,8 +85,8 @@ def candidate_clusters(
     if len(inside) < MIN_CLUSTER_POINTS:
         return []
     cell_m = CELL_M[GROUP_OF[category]]
-    labels, corner, grid = _cluster(xyz[inside, :2], cell_m)
-    is_structure = _extends_beyond_box(xyz, uv, box_px, labels, corner, grid, cell_m)
+    labels, grid = _cluster(xyz[inside, :2], cell_m)
+    is_structure = _extends_beyond_box(xyz, uv, box_px, np.bincount(labels), grid)
     # NumPy sorts 16-bit integers by radix.
     order, count = np.argsort(labels.astype(np.uint16), kind="stable"), np.bincount(labels)
     first = np.cumsum(count) - count
@@ -110,21 +118,18 @@ def _extends_beyond_box(
     xyz: NDArray[np.float32],
     uv: NDArray[np.floating[Any]],
     box_px: Array,
-    labels: NDArray[np.intp],
-    corner: Array,
-    grid: NDArray[Any],
-    cell_m: float,
+    count: NDArray[np.intp],
+    grid: _Grid,
 ) -> NDArray[np.bool_]:
-    """Mark the clusters (L,) that extend into the margin beyond two of the left, right and upper side of the box."""
+    """Mark the clusters of so many points (L,) that extend into the margin beyond two of the left, right and upper side of the box."""
     import cv2
 
-    count = np.bincount(labels)
     u, v = uv.T
     outside = np.flatnonzero(((u < box_px[0]) | (u > box_px[2]) | (v < box_px[1])) & (v <= box_px[3]))
-    i, j = ((xyz[outside, axis] - corner[axis]) / cell_m for axis in (0, 1))
-    on_grid = (i >= 0) & (i < grid.shape[0]) & (j >= 0) & (j < grid.shape[1])
+    i, j = ((xyz[outside, axis] - grid.corner[axis]) / grid.cell_m for axis in (0, 1))
+    on_grid = (i >= 0) & (i < grid.owner.shape[0]) & (j >= 0) & (j < grid.owner.shape[1])
     outside, i, j = outside[on_grid], i[on_grid].astype(np.intp), j[on_grid].astype(np.intp)
-    owner = cv2.dilate(grid, np.ones((3, 3)))[i, j].astype(np.intp) - 1
+    owner = cv2.dilate(grid.owner, np.ones((3, 3)))[i, j].astype(np.intp) - 1
     sides = np.zeros(len(count), dtype=np.int64)
     u, v = u[outside], v[outside]
     within = (u >= box_px[0]) & (u <= box_px[2])
@@ -281,31 +286,30 @@ def place_few_points(seen: Shown, columns: dict[str, Any], rows: Index, boxes_px
         return ~_owned(seen.cloud.xyz[index[chosen], :2] + seen.cloud.origin[:2], columns, extended)
 
     for k in wanted.tolist():
-        tall_m = TYPICAL_SIZE_M[str(columns["category"][k])][2]
-        chosen = _body_points(visible, columns["box_px"][k], boxes_px, tall_m, is_free, float(seen.view.camera.K[1, 1]))
+        box_px, tall_m = columns["box_px"][k], TYPICAL_SIZE_M[str(columns["category"][k])][2]
+        usual_m = float(seen.view.camera.K[1, 1] * tall_m / (box_px[3] - box_px[1]))
+        chosen = _body_points(visible, box_px, boxes_px, usual_m, is_free)
         if len(chosen):
-            _write(columns, k, seen.view, seen.cloud, index[chosen], visible.depth[chosen])
+            _write(columns, k, seen, chosen)
 
 
 def _body_points(
     visible: ProjectedPoints,
     box_px: Array,
     boxes_px: Array,
-    tall_m: float,
+    usual_m: float,
     is_free: Callable[[NDArray[np.intp]], NDArray[np.bool_]],
-    focal_px: float,
 ) -> NDArray[np.intp]:
     """Choose the points of the body in a box (4,) among the n points of an image; none where nothing fits.
 
-    `boxes_px`: (N, 4): all boxes of the frame. `tall_m`: typical height of a body. `is_free`: marks those of some of the
-    points that are no other object's. `focal_px`: vertical.
+    `boxes_px`: (N, 4): all boxes of the frame. `usual_m`: depth at which a body of typical height fills the box. `is_free`: marks
+    those of some of the points that are no other object's.
     """
     u0, v0, u1, v1 = box_px.tolist()
-    width, height = u1 - u0, v1 - v0
     u, v, depth = visible.u, visible.v, visible.depth
-    inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * width
+    inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * (u1 - u0)
     inside = np.flatnonzero(inner & (v >= v0) & (v <= v1))
-    inside = inside[np.abs(_off_height(depth[inside], height, focal_px, tall_m)) <= MAX_HEIGHT_SIGMAS]
+    inside = inside[np.abs(_off_height(depth[inside], usual_m)) <= MAX_HEIGHT_SIGMAS]
     inside = inside[is_free(inside)] if len(inside) >= MIN_POINTS else inside
     if len(inside) < MIN_POINTS:
         return inside[:0]
@@ -315,15 +319,15 @@ def _body_points(
     bodies = [b for b in bodies if len(b) >= MIN_POINTS and not _goes_on(visible, b, around, box_px)]
 
     def likelihood(body: NDArray[np.intp]) -> float:
-        off = _off_height(depth[body], height, focal_px, tall_m)
+        off = _off_height(depth[body], usual_m)
         return float(np.log(len(body)) - off.mean() ** 2 / 2)
 
     return max(bodies, key=likelihood, default=inside[:0])
 
 
-def _off_height(depth_m: NDArray[np.float32], height_px: float, focal_px: float, tall_m: float) -> NDArray[np.float32]:
-    """Return by how many sigma a body of some height in px would be off a person's at depths (n,)."""
-    return np.asarray((height_px * depth_m / focal_px / tall_m - 1) / HEIGHT_SIGMA_SHARE)
+def _off_height(depth_m: NDArray[np.float32], usual_m: float) -> NDArray[np.float32]:
+    """Return by how many sigma the heights of people at depths (n,) are off, whose usual height fills the box at `usual_m`."""
+    return np.asarray((depth_m / np.float32(usual_m) - 1) / HEIGHT_SIGMA_SHARE)
 
 
 def _owned(xy: Array, columns: dict[str, Any], rows: Index) -> NDArray[np.bool_]:
@@ -360,13 +364,11 @@ def _goes_on(visible: ProjectedPoints, body: NDArray[np.intp], around: NDArray[n
     return bool(((u < box_px[0]).any() and (u > box_px[2]).any()) or (within & (v < box_px[1])).any())
 
 
-def _write(
-    columns: dict[str, Any], k: int, view: View, cloud: Cloud, members: NDArray[np.intp], depth: NDArray[np.float32]
-) -> None:
-    """Write the place of a body into row `k`: along the middle of its image box, as deep as its points."""
-    box, camera = columns["box_px"][k], view.camera
-    category = str(columns["category"][k])
-    front_m = float(depth.mean())
+def _write(columns: dict[str, Any], k: int, seen: Shown, chosen: Index) -> None:
+    """Write the place of a body into row `k`: along the middle of its image box, as deep as its points in the image."""
+    view, cloud, members = seen.view, seen.cloud, seen.points[seen.visible.index[chosen]]
+    box, camera, category = columns["box_px"][k], view.camera, str(columns["category"][k])
+    front_m = float(seen.visible.depth[chosen].mean())
     middle = undistort(camera, np.array([[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]]))[0]
     if not np.isfinite(middle).all():
         return
