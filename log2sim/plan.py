@@ -16,7 +16,7 @@ from log2sim.datatypes import ENDS, VEHICLE, Lidar, Log, end_of
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Camera, PoseTrack, period_of
-from log2sim.logs.checks import Span, problems_of, say_apart
+from log2sim.logs.checks import Span, describe_gap, problems_of
 from log2sim.tracking.tracker import min_hits
 
 # Largest departure of R R^T from 1: calibration files round to five digits or more.
@@ -171,7 +171,7 @@ def _check_pose_times(log: Log, cameras: tuple[str, ...]) -> None:
     records = Span.of("frames" if cameras else "sweeps", np.concatenate(stamps))
     poses = Span.of("ego poses", log.ego.t_ns)
     if poses.is_apart(records, round(log.ego.extrapolate_s * NS_PER_S)):
-        raise LogError(f"{log.name}: {say_apart(poses, records)}; correct the stamps, or choose --poses lidar")
+        raise LogError(f"{log.name}: {describe_gap(poses, records)}; correct the stamps, or choose --poses lidar")
 
 
 def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:

@@ -44,18 +44,14 @@ def assert_same(ours: Scenario, theirs: Scenario, atol_m: float) -> None:
             np.testing.assert_allclose(getattr(a.waypoints, column) + offset, getattr(b.waypoints, column), atol=atol_m)
 
 
-QUICK = {"log2sim": native.encode, "kitti": kitti.encode_raw, "pandaset": pandaset.encode}
-SLOW = {
-    "waymo": waymo.encode, "waymo-parquet": waymo_parquet.encode, "nuscenes": nuscenes.encode_world,
-    "argoverse2": argoverse.encode,
+ENCODERS = {
+    "log2sim": native.encode, "kitti": kitti.encode_raw, "pandaset": pandaset.encode, "waymo": waymo.encode,
+    "waymo-parquet": waymo_parquet.encode, "nuscenes": nuscenes.encode_world, "argoverse2": argoverse.encode,
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "encode",
-    [*QUICK.values(), *(pytest.param(encode, marks=pytest.mark.slow) for encode in SLOW.values())],
-    ids=[*QUICK, *SLOW],
-)
+@pytest.mark.matrix
+@pytest.mark.parametrize("encode", ENCODERS.values(), ids=ENCODERS)
 def test_a_converted_log_gives_the_same_scenario(tmp_path: Path, encode: Callable[[Log, Path], Path]) -> None:
     path = encode(world_log(), tmp_path / "from")
     ran = run("convert", path, "--out", tmp_path / "to")
@@ -65,7 +61,7 @@ def test_a_converted_log_gives_the_same_scenario(tmp_path: Path, encode: Callabl
     before, after = scenario_of(path), scenario_of(tmp_path / "to")
     assert len(before.agents) >= 3
     # Points that were not whole millimeters are rounded to them, which decides what is still part of an object.
-    assert_same(after, before, atol_m=0.005 if encode in QUICK.values() else 0.03)
+    assert_same(after, before, atol_m=0.005 if encode in (native.encode, kitti.encode_raw, pandaset.encode) else 0.03)
     log, back = open_log(path), open_log(tmp_path / "to")
     assert {n: s.t_ns.tolist() for n, s in back.streams.items()} == {n: s.t_ns.tolist() for n, s in log.streams.items()}
     for name in log.cameras:

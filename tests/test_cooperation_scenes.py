@@ -15,12 +15,12 @@ from log2sim.synth.traffic_data import START_NS
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tools"))
 
-from cooperation_worlds.draw_blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S, draw_blind_area  # noqa: E402
-from cooperation_worlds.draw_overlap import draw_overlap  # noqa: E402
-from cooperation_worlds.draw_range import draw_range  # noqa: E402
+from cooperation_worlds.blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S, draw_blind_area  # noqa: E402
+from cooperation_worlds.curve import draw_range  # noqa: E402
 from cooperation_worlds.hidden_traffic import HiddenTraffic, row, seen  # noqa: E402
 from cooperation_worlds.hidden_traffic import _drawn as draw_traffic  # noqa: E402
 from cooperation_worlds.hidden_traffic import figures as traffic_figures  # noqa: E402
+from cooperation_worlds.overlap import draw_overlap  # noqa: E402
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast  # noqa: E402
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}

@@ -183,3 +183,37 @@ def esmini_states(file: Path) -> dict[str, np.ndarray]:
                 at = [next(j for j, c in enumerate(header) if c.startswith(group + " ") and key in c) for key in keys]
                 found.setdefault(row[k], []).append([t, *(float(row[j]) for j in at)])
     return {name: np.array(values) for name, values in found.items()}
+
+
+def test_asam_s_checker_finds_nothing_in_variations_and_their_distribution(tmp_path: Path) -> None:
+    from benchmarks.tags import traffic
+
+    from log2sim.scenarios import Base, find_tags, write_openscenario
+
+    world = next(w.scenario for w in map(traffic, range(20)) if any(g.tag == "cut_in" for g in find_tags(w.scenario)))
+    tag = next(g for g in find_tags(world) if g.tag == "cut_in")
+    base = Base.of(
+        world,
+        {
+            "agent": tag.agent,
+            "other": tag.other,
+            "t_s": tag.t_s,
+            "start_s": tag.start_s,
+            "end_s": tag.end_s,
+            "tag": tag.tag,
+        },
+    )
+    ids = [a.id for a in base.scenario.agents]
+    write_openscenario(base, [dict.fromkeys(ids, (1.0 + 0.1 * k, 0.5 * k)) for k in range(4)], tmp_path / "out")
+    for name in ("scenario.xosc", "variations.xosc"):
+        issues, states = judged("openscenario", tmp_path / "out" / name, tmp_path)
+        assert issues == []
+        assert states["check_asam_xosc_xml_valid_schema"] == "completed"
+    # Every parameter that is given values is declared and used.
+    roots = [ElementTree.parse(tmp_path / "out" / name).getroot() for name in ("scenario.xosc", "variations.xosc")]
+    declared = {p.attrib["name"] for p in roots[0].iter("ParameterDeclaration")}
+    used = {v[1:] for e in roots[0].iter() for v in e.attrib.values() if v.startswith("$")}
+    given = {p.attrib["parameterRef"] for p in roots[1].iter("ParameterAssignment")}
+    assert len(given) == 2 * len(ids)
+    assert given == used <= declared
+    assert len(list(roots[1].iter("ParameterValueSet"))) == 4

@@ -18,7 +18,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
 from log2sim.export.xml_text import require_number
 from log2sim.files.documents import parse_float, parse_int
-from log2sim.logs.checks import problems_of, without_impossible_labels
+from log2sim.logs.checks import drop_impossible_labels, problems_of
 from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.opening import open_log
 
@@ -114,12 +114,12 @@ def test_only_ascii_digits_make_a_number(tmp_path: Path, text: str) -> None:
 def test_labels_of_no_object_are_left_out_and_told(column: str, value: float, row_is_kept: bool) -> None:
     log = short_world()
     assert log.labels is not None
-    assert without_impossible_labels(log).notes == log.notes
-    assert without_impossible_labels(log).labels is log.labels
+    assert drop_impossible_labels(log).notes == log.notes
+    assert drop_impossible_labels(log).labels is log.labels
     changed = getattr(log.labels, column).copy()
     changed[2, 0] = value
     labels = replace(log.labels, **{column: changed})
-    checked = without_impossible_labels(log.changed(labels=labels))
+    checked = drop_impossible_labels(log.changed(labels=labels))
     words = "1 label left out: no object is so large or so far away, or it has no size"
     assert (words in checked.notes) == (not row_is_kept)
     assert checked.labels is not None

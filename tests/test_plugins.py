@@ -65,7 +65,7 @@ def test_there_is_an_example_of_every_kind(examples: Path) -> None:
     for kind in groups:
         (name,) = set(plugins.names(kind)) - set(plugins.BUILT_IN[kind])
         assert plugins.load(kind, name) is not None
-        assert "package 'my-plugins 1.0'" in plugins.say_plugin(kind, name)
+        assert "package 'my-plugins 1.0'" in plugins.plugin_label(kind, name)
 
 
 def test_the_log_reader_opens_a_folder(examples: Path, tmp_path: Path) -> None:

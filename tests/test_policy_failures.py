@@ -162,3 +162,61 @@ def test_the_command(folder, tmp_path) -> None:
     )
     assert "raises in every run" in broken.line
     assert "mine" in broken.line
+
+
+def test_a_policy_sees_others_as_late_and_as_far_off_as_its_sensors_are(folder) -> None:
+    from dataclasses import replace as changed
+
+    from log2sim.simulation.runner import replay
+    from log2sim.simulation.sensing import LateEyes, Sensing
+
+    index = open_index(folder, jobs=1)
+    world = Scenario.load(index.folder / ask(index, "cut_in").rows[0]["file"])
+    exact: dict[float, dict[str, complex]] = {}
+    seen: list[tuple[float, dict[str, complex]]] = []
+
+    def places(o):
+        return dict(zip(o.others.id.tolist(), (o.others.x_m + 1j * o.others.y_m).tolist()))
+
+    def looks(o):
+        seen.append((o.t_s, places(o)))
+        return Controls(0.0, 0.0)
+
+    class Spy(LateEyes):
+        def __call__(self, o):
+            exact[round(o.t_s, 3)] = places(o)
+            return super().__call__(o)
+
+    def drive(sensing):
+        exact.clear()
+        seen.clear()
+        replay(world, mode="exact", dt_s=0.05, ego=Spy(looks, sensing), agents="scenario")
+        return list(seen)
+
+    late = drive(Sensing(latency_s=0.3))
+    assert not any(p for t, p in late if t < late[0][0] + 0.29)
+    for t, p in late:
+        if p:
+            assert p == exact[round(t - 0.3, 3)]
+    noisy = drive(Sensing(noise_m=0.5))
+    off = np.array([p[id] - exact[round(t, 3)][id] for t, p in noisy for id in p])
+    assert np.std(off.real) == pytest.approx(0.5, rel=0.25)
+    assert drive(Sensing(noise_m=0.5)) == noisy
+    moved = changed(
+        world, agents=tuple(changed(a, waypoints=changed(a.waypoints, x_m=a.waypoints.x_m + 1.0)) for a in world.agents)
+    )
+    world = moved
+    other = drive(Sensing(noise_m=0.5))
+    assert other[5] != noisy[5]
+    spread = drive(Sensing(latency_s=0.3, latency_sigma_s=0.1))
+    stamps = [(t, max(e for e, q in exact.items() if q == p)) for t, p in spread if p]
+    assert np.ptp([t - e for t, e in stamps]) > 0.1  # not all are as old
+    assert (np.diff([e for _, e in stamps]) >= 0).all()  # and nothing older follows
+
+
+@pytest.mark.parametrize("text", ["x", "0.1:0.2:0.3", "-1", "", "nan"])
+def test_latencies_that_are_none_are_refused(text) -> None:
+    from log2sim.simulation.sensing import parse_sensing
+
+    with pytest.raises(ConfigError, match="MEAN"):
+        parse_sensing(text, 0.0)

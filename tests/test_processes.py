@@ -72,8 +72,7 @@ def damaged() -> Log:
     )
 
 
-@pytest.mark.parametrize("jobs", [2, 3])
-@pytest.mark.parametrize("ticks", [1, 2, 3])
+@pytest.mark.parametrize(("jobs", "ticks"), [(2, 1), (3, 2), (3, 3)])
 def test_records_that_repeat_are_told_alike_by_any_number_of_processes(
     jobs: int, ticks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,18 +84,19 @@ def test_records_that_repeat_are_told_alike_by_any_number_of_processes(
     assert shared.unreadable == alone.unreadable == {"left": {"count": 1, "first": "left 2: torn"}}
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("detector", ["labels+lidar:vehicle", "lidar:vehicle"])
 def test_scenarios_of_any_number_of_processes_are_the_same(detector: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_pass, "PART_TICKS", 2)
     config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector})
-    made = [reconstruct(tiny_log()[0], config, jobs=jobs) for jobs in (1, 2, 3)]
+    made = [reconstruct(tiny_log()[0], config, jobs=jobs) for jobs in (1, 3)]
     assert len({json.dumps(result.scenario.to_dict(), sort_keys=True) for result in made}) == 1
     assert len({str(result.report["detections"]) for result in made}) == 1
-    assert all(stage["seconds"] > 0 for stage in made[2].report["stages"] if stage["stage"] in ("cloud", "measure"))
+    assert all(stage["seconds"] > 0 for stage in made[1].report["stages"] if stage["stage"] in ("cloud", "measure"))
 
 
 def test_frames_are_skipped_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, _ = tiny_log(duration_s=2.0)
+    log, _ = tiny_log(duration_s=1.2)
 
     def find(image: Any) -> list[Any]:
         return [(10.0, 10.0, 60.0, 50.0, 0.9, "car")] if image[::7].mean() % 1 < 0.3 else []
@@ -175,7 +175,7 @@ def test_a_script_without_a_guard_may_use_processes(tmp_path: Path) -> None:
     script.write_text(
         "from log2sim import Config, open_log, reconstruct\n"
         f"log = open_log({str(ROOT / 'samples' / 'crossing')!r})\n"
-        "config = Config.load(detect={'name': 'lidar:vehicle'}, stop_s=1.0, map={'lanes': False})\n"
+        "config = Config.load(detect={'name': 'lidar:labels'}, stop_s=1.0, map={'lanes': False})\n"
         "print(len(reconstruct(log, config, jobs=2).scenario.agents))\n"
     )
     ran = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, cwd=ROOT)
@@ -188,6 +188,7 @@ def sample() -> Log:
     return open_log(ROOT / "samples" / "crossing")
 
 
+@pytest.mark.slow
 def test_the_sample_is_the_same_by_one_two_and_three_processes(sample: Log) -> None:
     config = Config.load(detect={"name": "lidar:vehicle"}, stop_s=1.0)
     found = [content(observe_log(start(sample, config, jobs=jobs, cache=False))) for jobs in (1, 2, 3)]

@@ -203,3 +203,28 @@ def test_lanes_inferred_from_paths_alone_are_no_edges() -> None:
     world = traffic(3, lanes=True)
     guessed = tuple(replace(lane, inferred_from="paths") for lane in world.scenario.map_features.lanes)
     assert Traffic(replace(world.scenario, map_features=MapFeatures(lanes=guessed))).lanes == []
+
+
+def test_who_is_lost_from_sight_before_a_crossing_still_crosses_with_a_time_that_is_less_certain() -> None:
+    rng = np.random.default_rng(3)
+    stage = Stage(rng, 10.0, False, 0.1)
+    stage.add("ego", route([(-200, 0), (300, 0)], 5.0), 10.0, start_m=150.0)  # at the crossing at 5 s
+    stage.add("car-1", route([(0, -200), (0, 300)], 5.0), 8.0, start_m=200 - 8.0 * 6.6)  # at 6.6 s
+    whole = stage.world("crossing", [], ()).scenario
+
+    def cut(seconds: float) -> Scenario:
+        w = whole["car-1"].waypoints
+        return replace(
+            whole, agents=(whole["ego"], replace(whole["car-1"], waypoints=w.take(np.flatnonzero(w.t_s < seconds))))
+        )
+
+    def of(name: str, world: Scenario) -> list:
+        return [g for g in find_tags(world) if g.tag == name]
+
+    (seen,), (lost,) = of("crossing_path", whole), of("crossing_path", cut(5.0))
+    assert lost.quantities["pet_s"] == pytest.approx(seen.quantities["pet_s"], abs=0.15)
+    assert (lost.agent, lost.other) == (seen.agent, seen.other) == ("ego", "car-1")
+    near, unsure = of("near_miss", whole), of("near_miss", cut(5.0))
+    assert near[0].probability > 0.9
+    assert 0.5 < unsure[0].probability < near[0].probability
+    assert not of("crossing_path", cut(3.5))  # too long ago

@@ -48,8 +48,6 @@ def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFix
     from entry import commands_in, run_named
 
     for name in commands_in(folder):
-        if name == "zou2021":
-            pytest.importorskip("torch")
         with pytest.raises(SystemExit, match="0"):
             run_named(folder, [name, "--help"])
         assert "usage" in capsys.readouterr().out

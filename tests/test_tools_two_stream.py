@@ -14,11 +14,8 @@ pytest.importorskip("onnx")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 import torch
-from lidar_training import fitting, real_logs
-from two_stream import network as boxes_of
-from two_stream import network as inputs
-from two_stream import network as two_stream
-from two_stream.network import Pair, pair_of
+from lidar_training import fitting, real_logs, two_stream
+from lidar_training.two_stream import Pair, pair_of
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.geometry import Camera, project_boxes, rotation_from_rpy, transform
@@ -79,7 +76,7 @@ def pair() -> Pair:
 def test_a_toy_learns_one_pair_is_exported_and_finds_its_objects(pair: Pair, tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = two_stream.TwoStream(((8, 1), (16, 1)))
-    batch = two_stream.Batch.of(inputs.inputs_of(pair))
+    batch = two_stream.Batch.of(two_stream.inputs_of(pair))
     losses: list[float] = []
 
     def step(n: Any, rng: np.random.Generator, _: int) -> Any:
@@ -89,11 +86,11 @@ def test_a_toy_learns_one_pair_is_exported_and_finds_its_objects(pair: Pair, tmp
 
     fitting.fit(network, step, fitting.FitPlan(70, peak_rate=5e-3))
     assert losses[-1] < 0.1 * losses[0]
-    boxes_of.export_two_stream(network, tmp_path / "two.onnx")
-    search = boxes_of.TwoStreamDetector.open(tmp_path / "two.onnx")
+    two_stream.export_two_stream(network, tmp_path / "two.onnx")
+    search = two_stream.TwoStreamDetector.open(tmp_path / "two.onnx")
     found = search(pair)
     best = found.take(np.argsort(-found.score)[: len(NAMES)])
     assert sorted(best.category.tolist()) == sorted(NAMES)
-    row = boxes_of.compare({"toy": search}, [pair])["toy"]
+    row = two_stream.compare({"toy": search}, [pair])["toy"]
     assert row["car"]["IoU BEV > 0.5"] == 1.0
     assert row["car"]["truths"] == 2

@@ -45,11 +45,11 @@ def sample() -> Sample:
 
 @pytest.mark.slow
 def test_one_command_trains_from_shards_and_exports(sample: Sample, tmp_path: Path) -> None:
-    from zou2021 import train as train_zou2021
+    from lidar_training import zou2021
 
     (tmp_path / "data").mkdir()
     write_shard(tmp_path / "data" / "roadside-1-0000.npz", [sample, sample])
-    path = train_zou2021.train([tmp_path / "data"], tmp_path / "out", steps=2, seed=1, start=None, share=0.1)
+    path = zou2021.train([tmp_path / "data"], tmp_path / "out", steps=2, seed=1, start=None, share=0.1)
     info = load_network(path).info
     assert info.card == {"steps": 2, "seed": 1, "share": 0.1, "samples": 2}
     assert info.stride == 1

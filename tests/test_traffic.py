@@ -293,6 +293,7 @@ def kitti(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return out
 
 
+@pytest.mark.matrix
 def test_boxes_in_space_project_into_boxes_in_the_picture(kitti: Path) -> None:
     checked = 0
     for index in range(3):

@@ -15,23 +15,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cooperation_worlds import (
-    blind_area_measures,
-    hidden_traffic,
-    overlap_measures,
-    range_measures,
-    registration_measures,
+from cooperation_worlds import blind_area, curve, hidden_traffic, overlap
+from cooperation_worlds.runs import (
+    ALONE,
+    TABLE,
+    WAYS,
+    Found,
+    Rows,
+    detect,
+    perceive,
+    prepared,
+    registration_figures,
+    registration_row,
 )
-from cooperation_worlds.draw_blind_area import draw_blind_area
-from cooperation_worlds.draw_overlap import draw_overlap
-from cooperation_worlds.draw_range import draw_range
-from cooperation_worlds.runs import ALONE, TABLE, WAYS, Found, Rows, detect, perceive, prepared
 from cooperation_worlds.world import RoadError, World, disturb, draw_error, log_of
 from entry import parser_of
 
 from log2sim.datatypes import Log
 
-DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
+DRAW = {"range": curve.draw_range, "blind_area": blind_area.draw_blind_area, "overlap": overlap.draw_overlap}
 TESTS = (*DRAW, "ap", "registration")
 
 
@@ -106,32 +108,28 @@ def say(test: str, done: int, total: int) -> None:
 
 def run_range(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     """Test A."""
-    rows = [
-        r for _, r in measured("range", choices, seeds, lambda w, _, __, f: range_measures.perceived(w, f).tolist())
-    ]
-    return {way: range_measures.figures([np.array(r[way]) for r in rows]) for way in choices.ways}
+    rows = [r for _, r in measured("range", choices, seeds, lambda w, _, __, f: curve.perceived(w, f).tolist())]
+    return {way: curve.figures([np.array(r[way]) for r in rows]) for way in choices.ways}
 
 
 def run_blind_area(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     """Test B."""
-    results = list(measured("blind_area", choices, seeds, lambda w, _, __, f: blind_area_measures.row(w, f)))
+    results = list(measured("blind_area", choices, seeds, lambda w, _, __, f: blind_area.row(w, f)))
     rows = {way: [r[way] for _, r in results] for way in choices.ways}
-    return blind_area_measures.figures([world for world, _ in results], rows)
+    return blind_area.figures([world for world, _ in results], rows)
 
 
 def run_overlap(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     """Test C, box by box and as a scenario."""
 
     def measure(world: World, log: Log, way: str, found: Found) -> dict[str, Any]:
-        row = {"scenario": overlap_measures.of_scenario(world, found).tolist()}
+        row = {"scenario": overlap.of_scenario(world, found).tolist()}
         # Tracks join after detection: their boxes are those of each end.
-        return (
-            row if way == "tracks" else {**row, "boxes": overlap_measures.from_boxes(world, *detect(log, way)).tolist()}
-        )
+        return row if way == "tracks" else {**row, "boxes": overlap.from_boxes(world, *detect(log, way)).tolist()}
 
     rows = [r for _, r in measured("overlap", choices, seeds, measure)]
     return {
-        of: overlap_measures.figures([{way: r[way][of] for way in choices.ways if of in r[way]} for r in rows])
+        of: overlap.figures([{way: r[way][of] for way in choices.ways if of in r[way]} for r in rows])
         for of in ("boxes", "scenario")
     }
 
@@ -159,11 +157,11 @@ def run_registration(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
         if key not in choices.rows:
             world = replace(list(DRAW.values())[seed % len(DRAW)](seed), every=choices.every)
             error = draw_error(seed, choices.noise or 1.0, delayed=choices.delayed)
-            row = registration_measures.row(log_of(world)[0], error)
+            row = registration_row(log_of(world)[0], error)
             choices.rows[key] = {"test": world.test, "seed": seed, **row}
         say("registration", count, len(seeds))
     rows = [choices.rows[choices.key("registration", seed, "")] for seed in seeds]
-    return {"rows": rows, **registration_measures.figures(rows)}
+    return {"rows": rows, **registration_figures(rows)}
 
 
 RUN: dict[str, Callable[[Choices, Sequence[int]], dict[str, Any]]] = {

@@ -65,23 +65,12 @@ CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
 
 @dataclass(frozen=True)
 class Round:
-    """A part of the training: it starts with the averaged weights of the one before and draws from all scenes so far.
+    """A part of the training: it starts with the averaged weights of the one before and draws from all scenes so far."""
 
-    Attributes
-    ----------
-    seed : int
-        Of its scenes and of its order.
-    scenes : int
-        Generated for it.
-    steps : int
-    rate : float
-        Greatest learning rate; it falls to zero as a cosine.
-    """
-
-    seed: int
-    scenes: int
+    seed: int  # of its scenes and of its order
+    scenes: int  # generated for it
     steps: int
-    rate: float = 2.5e-3
+    rate: float = 2.5e-3  # greatest learning rate; it falls to zero as a cosine
 
 
 # The second round of the vehicle has scenes with a second LiDAR and more clutter, which pictures of misses asked for.
@@ -260,7 +249,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the steps that are asked for."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] and arguments[0] in PAPERS:
-        importlib.import_module(f"{arguments[0]}.train").main(arguments[1:])
+        importlib.import_module(f"lidar_training.{arguments[0]}").main(arguments[1:])
         return
     parser = parser_of(__doc__)
     parser.add_argument("mount", choices=("vehicle", "roadside"))

@@ -44,7 +44,7 @@ def find_logs(
     names = plugins.names("log") if format == "auto" else [format]
     readers: dict[str, Reader] = {name: plugins.load("log", name) for name in names}
     if root.is_file():
-        found = _of_file(root, format)
+        found = _logs_of_file(root, format)
     else:
         left_out = None if leave_out is None else leave_out.resolve()
         found = _Search(root, readers, left_out, max_folders).below(root, MAX_LEVELS)
@@ -54,7 +54,7 @@ def find_logs(
     return sorted(found, key=lambda log: (log.id, log.format))
 
 
-def _of_file(root: Path, format: str) -> list[FoundLog]:
+def _logs_of_file(root: Path, format: str) -> list[FoundLog]:
     name = find_reader(root) if format == "auto" else format
     reader: Reader = plugins.load("log", name)
     return [FoundLog(_text(sequence), root, name, sequence) for sequence in reader.sequences(root)]

@@ -57,24 +57,9 @@ def evaluate_batch(
 ) -> Figures:
     """Measure each scenario of a batch against the truth of its log.
 
-    Parameters
-    ----------
-    truth : Path
-        Folder in which the logs have the same places as in the batch's own.
-    load_truth : callable
-        Returns the truth of a log for a scenario.
-    progress : callable
-        Called as `progress(done, total)`.
-
-    Returns
-    -------
-    dict
-        The document of `schemas/batch-metrics-1.json`.
-
-    Raises
-    ------
-    LogError
-        When no log below `truth` is one of the batch.
+    `truth`: folder in which the logs have the same places as in the batch's own. `load_truth`: returns the truth of a log for
+    a scenario. `progress`: called as `progress(done, total)`. Returns the document of `schemas/batch-metrics-1.json`. Raises
+    `LogError` when no log below `truth` is one of the batch.
     """
     names = sorted(path.parent.name for path in (folder.path / LOGS).glob(f"*/{SCENARIO_FILE}"))
     rows = [row for name in names if (row := folder.read_row(name)) is not None and row.is_done]

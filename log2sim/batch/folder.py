@@ -232,10 +232,7 @@ class BatchFolder:
     def load(cls, path: Path) -> BatchFolder:
         """Open the folder of an earlier run.
 
-        Raises
-        ------
-        LogError
-            When it is none.
+        Raises `LogError` when it is none.
         """
         document = read_json(path / SETTINGS_FILE)
         try:

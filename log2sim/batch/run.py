@@ -246,28 +246,11 @@ def plan_batch(
 ) -> Batch:
     """Find the logs below a folder, and begin their batch in another or go on with it.
 
-    Parameters
-    ----------
-    config : Config
-        Settings of all runs.
-    format : str
-        Format of the logs, or "auto".
-    overwrite : bool
-        Whether to start over, without the results of earlier runs.
-    cache : bool
-        Whether detections in pictures are taken from the caches of the workers, and kept there.
-    replay : bool
-        Whether each scenario is replayed, too.
-
-    Raises
-    ------
-    LogError
-        Where there is no log.
-    ConfigError
-        For an output folder that holds the logs, something else, or a batch of other settings, and for detectors that could
-        search no log.
-    MissingExtra
-        Where a detector, or the batch itself, needs what is not installed.
+    `config`: settings of all runs. `format`: format of the logs, or "auto". `overwrite`: whether to start over, without the
+    results of earlier runs. `cache`: whether detections in pictures are taken from the caches of the workers, and kept there.
+    `replay`: whether each scenario is replayed, too. Raises `LogError` where there is no log, and `ConfigError` for an output
+    folder that holds the logs, something else, or a batch of other settings, and for detectors that could search no log, and
+    `MissingExtra` where a detector, or the batch itself, needs what is not installed.
     """
     import_dask()
     check_detectors(config)

@@ -135,7 +135,7 @@ def read_requirements() -> list[Requirement]:
         table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
         lines = list(table["dependencies"])
         for extra, wanted in table["optional-dependencies"].items():
-            lines += [_with_extra(line, extra) for line in wanted]
+            lines += [_requirement_of_extra(line, extra) for line in wanted]
     else:
         lines = metadata.requires("log2sim") or []
     found = []
@@ -147,7 +147,7 @@ def read_requirements() -> list[Requirement]:
     return found
 
 
-def _with_extra(line: str, extra: str) -> str:
+def _requirement_of_extra(line: str, extra: str) -> str:
     """Return a requirement of an extra as the metadata of packages state it."""
     package, _, marker = line.partition(";")
     condition = f"({marker.strip()}) and " if marker else ""

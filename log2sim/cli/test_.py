@@ -27,6 +27,12 @@ def run_test(
     agents: Annotated[
         str, choose("--agents", "scenario", "reactive", help="Behavior of the other agent.")
     ] = "scenario",
+    latency: Annotated[
+        str, option("How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")
+    ] = "0",
+    noise: Annotated[
+        float, option("Standard deviation of where it sees them, m, on each axis.", "M", min=0.0, max=10.0)
+    ] = 0.0,
     worst: Annotated[int, option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
     seed: Annotated[int, option("Seed of all draws.", min=0)] = 0,
     jobs: Annotated[int | None, option("Processes.", "N", min=1, default="one for each core")] = None,
@@ -41,7 +47,10 @@ def run_test(
     Examples
     --------
     log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o test/ --limit min_ttc_s=0.5
+    log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o late/ --latency 0.3:0.05 --noise 0.2
     """
+    from dataclasses import asdict
+
     import numpy as np
 
     from log2sim.cli.progress import progress
@@ -64,10 +73,14 @@ def run_test(
     from log2sim.scenarios.logical import Base, choose_base, fit
     from log2sim.scenarios.query import ask
     from log2sim.simulation.policy import load_policy
+    from log2sim.simulation.sensing import LateEyes, parse_sensing
     from log2sim.visualization.page.writer import write_page
 
     refuse_folder(out, overwrite=overwrite, holding="test.json", kind="folder of a test")
     limits, driver = parse_limits(limit or ()), load_policy(policy)
+    sensing = parse_sensing(latency, noise)
+    if sensing:
+        driver = LateEyes(driver, sensing)
     index = open_index(path)
     rows = ask(index, condition).rows
     logical = fit(rows)
@@ -103,7 +116,9 @@ def run_test(
         (folder / "report.html").write_text(
             report_page(title, logical, table, outcomes, found.estimate, links), encoding="utf-8"
         )
-        write_json(folder / "test.json", describe(policy, condition, logical, found, outcomes))
+        write_json(
+            folder / "test.json", {**describe(policy, condition, logical, found, outcomes), "sensing": asdict(sensing)}
+        )
         figures = sorted({key for o in outcomes for key in o.values})
         write_rows(
             folder / "runs.parquet",

@@ -55,10 +55,7 @@ def pack(value: Any) -> bytes:
 def unpack(content: bytes, classes: Collection[type]) -> Any:
     """Return what `pack` made bytes of; all dataclasses in it are among `classes`.
 
-    Raises
-    ------
-    ValueError
-        For whatever `pack` did not write; no number in it is believed before the length agrees with it.
+    Raises `ValueError` for whatever `pack` did not write; no number in it is believed before the length agrees with it.
     """
     try:
         magic, digest, length = _HEAD.unpack_from(content)

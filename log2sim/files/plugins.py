@@ -186,7 +186,7 @@ def load(kind: str, name: str) -> Any:
         found = entries[0].load()
     defect = find_defect(kind, found)
     if defect is not None:
-        raise PluginError(f"{say_plugin(kind, name)}: {defect}")
+        raise PluginError(f"{plugin_label(kind, name)}: {defect}")
     return found
 
 
@@ -195,7 +195,7 @@ def is_built_in(kind: str, name: str) -> bool:
     return name in BUILT_IN[kind]
 
 
-def say_plugin(kind: str, name: str) -> str:
+def plugin_label(kind: str, name: str) -> str:
     """Name a plug-in for messages: its kind, its name and, of another package, that package and the place in it."""
     places = [f" of {package_of(e)} ({e.value})" for e in installed(kind) if e.name == name]
     return f"{_label(kind)} '{name}'{places[0] if places and not is_built_in(kind, name) else ''}"
@@ -214,16 +214,16 @@ def blaming(kind: str, name: str) -> Iterator[None]:
     except Exception as error:
         if is_built_in(kind, name):
             raise
-        raise PluginError(f"{say_plugin(kind, name)}: {say_exception(error)}") from error
+        raise PluginError(f"{plugin_label(kind, name)}: {exception_line(error)}") from error
 
 
 def require_type(kind: str, name: str, value: Any, expected: type) -> None:
     """Raise `PluginError` when a plug-in returned something of another type."""
     if not isinstance(value, expected):
-        raise PluginError(f"{say_plugin(kind, name)}: returned {type(value).__name__}, expected {expected.__name__}")
+        raise PluginError(f"{plugin_label(kind, name)}: returned {type(value).__name__}, expected {expected.__name__}")
 
 
-def say_exception(error: Exception) -> str:
+def exception_line(error: Exception) -> str:
     """Say in one line what was raised, and in which line of which file."""
     trace, place = error.__traceback__, ""
     while trace is not None:

@@ -27,8 +27,6 @@ AHEAD = 4
 def default_jobs() -> int:
     """Return how many processes a run uses that is told nothing: the usable cores, and one where it cannot be forked.
 
-    Notes
-    -----
     Forked processes have the log, its readers and the networks at once; others would need a second to import all that, and would
     run scripts again that do not ask for `__name__`. A fork has the thread alone that calls it, so that it must not come
     from another than the first; the libraries of macOS do not survive it, and daemons, such as workers of Dask, must have no children.
@@ -40,18 +38,9 @@ def default_jobs() -> int:
 def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: int) -> Generator[Out, None, None]:
     """Yield what `work` makes of each task, in their order.
 
-    Parameters
-    ----------
-    tasks : iterable
-        Each is asked for when a process has nothing to do, so that it may depend on the results so far.
-    jobs : int
-        Processes; with 1 all is done in this one.
-
-    Raises
-    ------
-    Log2SimError
-        When a process ended before it had a result, and whatever `work` raises. No process is left then, nor when this one is
-        interrupted; should it be killed, they end with what they do.
+    `tasks`: each is asked for when a process has nothing to do, so that it may depend on the results so far. `jobs`:
+    processes; with 1 all is done in this one. Raises `Log2SimError` when a process ended before it had a result, and whatever
+    `work` raises. No process is left then, nor when this one is interrupted; should it be killed, they end with what they do.
     """
     if jobs == 1:
         yield from map(work, tasks)

@@ -16,11 +16,7 @@ def box_corners_bev(xy_m: ArrayLike, length_m: ArrayLike, width_m: ArrayLike, ya
 
     Counter-clockwise from the front left: front left, rear left, rear right, front right.
 
-    Parameters
-    ----------
-    xy_m : (2,) or (M, 2), m
-        Centers.
-    length_m, width_m, yaw_rad : scalar or (M,)
+    `xy_m` (2,) or (M, 2), m: centers. `length_m`, `width_m`, `yaw_rad` scalar or (M,).
     """
     xy, length, width, yaw = (np.asarray(a, dtype=np.float64) for a in (xy_m, length_m, width_m, yaw_rad))
     xy = np.atleast_2d(xy)
@@ -44,11 +40,7 @@ def box_corners_bev(xy_m: ArrayLike, length_m: ArrayLike, width_m: ArrayLike, ya
 def box_corners(center_m: ArrayLike, size_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
     """Compute the corners (M, 8, 3), m, of upright boxes: the bottom four, then the top four, in `box_corners_bev`'s order.
 
-    Parameters
-    ----------
-    center_m, size_m : (3,) or (M, 3), m
-        Size is length, width, height.
-    yaw_rad : scalar or (M,)
+    `center_m`, `size_m` (3,) or (M, 3), m: size is length, width, height. `yaw_rad` scalar or (M,).
     """
     center, size = np.atleast_2d(np.asarray(center_m, float)), np.atleast_2d(np.asarray(size_m, float))
     bev = box_corners_bev(center[:, :2], size[:, 0], size[:, 1], yaw_rad)
@@ -110,14 +102,8 @@ VIEW_MARGIN = 1.3
 class ProjectedBoxes:
     """Boxes in one image; rows that are not valid hold NaN.
 
-    Attributes
-    ----------
-    valid : (L,) bool
-        Whether the image shows a part of the box.
-    box_px : (L, 4) float64
-        u0, v0, u1, v1, clipped to the image.
-    range_m : (L,) float64
-        Distance of the nearest corner from the camera.
+    `valid` (L,): whether the image shows a part of the box. `box_px` (L, 4): u0, v0, u1, v1, clipped to the image. `range_m`
+    (L,): distance of the nearest corner from the camera.
     """
 
     valid: NDArray[np.bool_]
@@ -128,16 +114,11 @@ class ProjectedBoxes:
 def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera, cam_T_map: Array) -> ProjectedBoxes:
     """Project upright boxes into an image.
 
-    Parameters
-    ----------
-    center_m, size_m, yaw_rad : (L, 3), (L, 3), (L,)
-        Boxes in the map frame; size is length, width, height.
-    cam_T_map : (4, 4)
-
-    Notes
-    -----
     A box is clipped to the view before projection, so that one that extends behind the camera keeps its visible part. A box
     that contains the camera is the vehicle that carries it and is not valid.
+
+    `center_m`, `size_m`, `yaw_rad` (L, 3), (L, 3), (L,): boxes in the map frame; size is length, width, height. `cam_T_map`
+    (4, 4).
     """
     count = len(center_m)
     box = np.full((count, 4), np.nan)
@@ -185,8 +166,6 @@ def view_planes(camera: Camera) -> Array:
 def clip_box(corners_cam: Array, planes: Array) -> Array:
     """Clip a box, corners (8, 3), to the inside of planes (K, 4): vertices (V, 3), which may repeat.
 
-    Notes
-    -----
     Sutherland and Hodgman (1974) on each face.
     """
     inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0
@@ -222,8 +201,6 @@ def box_lines(camera: Camera, corners_cam: Array) -> Array:
 
     Edges are clipped at the near plane; segments outside the image are left out. The front is crossed out.
 
-    Notes
-    -----
     With lens distortion each edge is approximated by eight segments.
     """
     ends = np.array([[corners_cam[a], corners_cam[b]] for a, b in EDGES])
@@ -247,10 +224,7 @@ def box_lines(camera: Camera, corners_cam: Array) -> Array:
 def outline(corners_cam: Array) -> Array:
     """Project the part of a box, corners (8, 3), m, cam frame, in front of the camera onto the plane at depth 1.
 
-    Returns
-    -------
-    (V, 2) float64
-        Points whose convex hull is the outline; none for a box behind the camera.
+    Returns (V, 2) float64: points whose convex hull is the outline; none for a box behind the camera.
     """
     vertices = clip_box(corners_cam, NEAR_PLANE)
     return np.asarray(vertices[:, :2] / vertices[:, 2:])

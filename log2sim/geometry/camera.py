@@ -133,8 +133,6 @@ def _before_fold(camera: Camera, x: Array, y: Array) -> NDArray[np.bool_]:
 def fold_radius(camera: Camera) -> float:
     """Compute the radius of rays, at depth 1, up to which the radius in the image increases; infinite when it always does.
 
-    Notes
-    -----
     Beyond it a point far outside the view would be projected into the image. It is the first zero of the derivative of the
     radial part, or the pole of the rational model.
     """
@@ -158,8 +156,6 @@ def _fold_radius(model: str, distortion: tuple[float, ...]) -> float:
 def _first_positive_root(polynomial: Polynomial) -> float:
     """Find the smallest positive root of a polynomial that is 1 at 0; infinite without one, 0 where coefficients are not finite.
 
-    Notes
-    -----
     Its inverse is a root of the polynomial of the reversed coefficients, whose leading one is 1: however small the last ones are,
     nothing is divided by them.
     """
@@ -203,8 +199,6 @@ def undistort(camera: Camera, uv_px: Array) -> Array:
 
     NaN for pixels outside the invertible range of the lens model.
 
-    Notes
-    -----
     Newton's method on the whole model, from the radial part inverted by a table. The usual fixed-point iteration diverges
     under strong distortion and converges slowly near the fold.
     """
@@ -342,24 +336,10 @@ MIN_CAMERA_HEIGHT_M = 1e-3
 def ground_homography(camera: Camera, dst_T_cam: Array, ground_z_m: float = 0.0) -> Array:
     """Compute `ground_H_image` (3, 3) of the plane z = `ground_z_m` from a camera's calibration.
 
-    Parameters
-    ----------
-    camera : Camera
-        Its lens distortion does not enter: pixels are to be undistorted.
-    dst_T_cam : (4, 4) float64
-        Pose of the camera in the frame of the ground positions.
-    ground_z_m : float
-        Height of the ground in that frame, m.
-
-    Returns
-    -------
-    (3, 3) float64
-        Its third row, applied to a pixel, is the inverse depth of the ground seen there: positive below the horizon.
-
-    Raises
-    ------
-    ValueError
-        When the camera lies in the plane, which it then sees edge-on.
+    `camera`: its lens distortion does not enter: pixels are to be undistorted. `dst_T_cam` (4, 4): pose of the camera in the
+    frame of the ground positions. `ground_z_m`: height of the ground in that frame, m. Returns (3, 3) float64: its third row,
+    applied to a pixel, is the inverse depth of the ground seen there: positive below the horizon. Raises `ValueError` when
+    the camera lies in the plane, which it then sees edge-on.
     """
     if abs(dst_T_cam[2, 3] - ground_z_m) < MIN_CAMERA_HEIGHT_M:
         raise ValueError(

@@ -26,17 +26,10 @@ MIN_EXTRAPOLATION_BASE_NS = 10_000_000
 class PoseTrack:
     """Poses of the ego over time.
 
-    Attributes
-    ----------
-    t_ns : (P,) int64
-        Strictly increasing absolute stamps.
-    map_T_ego : (P, 4, 4) float64
-    max_gap_s : float, s
-        Poses are not interpolated between stamps farther apart than this.
-    extrapolate_s : float, s
-        Poses are extrapolated up to this far outside the track.
-    sigma_m, sigma_yaw_rad : (P,) float64, optional
-        Standard deviations of the position along each axis, m, and of the yaw, rad; None where they are not known.
+    `t_ns` (P,): strictly increasing absolute stamps. `map_T_ego` (P, 4, 4). `max_gap_s`, s: poses are not interpolated
+    between stamps farther apart than this. `extrapolate_s`, s: poses are extrapolated up to this far outside the track.
+    `sigma_m`, `sigma_yaw_rad` (P,), optional: standard deviations of the position along each axis, m, and of the yaw, rad;
+    None where they are not known.
     """
 
     __repr__ = short_repr
@@ -91,11 +84,7 @@ class PoseTrack:
     def sigmas_at(self, t_ns: ArrayLike, usual: tuple[float, float]) -> Array:
         """Interpolate the standard deviations (N, 2) of position, m, and yaw, rad, at stamps (N,) int64 ns.
 
-        Parameters
-        ----------
-        t_ns : int or (N,) int64
-        usual : (float, float)
-            What they are where the track does not know them.
+        `usual`: what they are where the track does not know them.
         """
         t_s = (np.atleast_1d(np.asarray(t_ns, dtype=np.int64)) - self.t_ns[0]) / NS_PER_S
         known_s = (self.t_ns - self.t_ns[0]) / NS_PER_S

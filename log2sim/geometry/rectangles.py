@@ -18,14 +18,10 @@ with collinear edges, which boxes of one road user have."""
 def overlap_area(a_m: ArrayLike, b_m: ArrayLike) -> Array:
     """Compute the area (...), m^2, that convex polygons share in pairs.
 
-    Parameters
-    ----------
-    a_m, b_m : (..., K, 2), m
-        Corners of convex polygons in order; leading dimensions broadcast. A polygon with a NaN or without area shares 0.
-
-    Notes
-    -----
     Corners are taken relative to the first one of `a_m`, so that map coordinates of millions of meters cost no digits.
+
+    `a_m`, `b_m` (..., K, 2), m: corners of convex polygons in order; leading dimensions broadcast. A polygon with a NaN or
+    without area shares 0.
     """
     import shapely
 
@@ -61,17 +57,10 @@ def rectangles_overlap(
 ) -> NDArray[np.bool_]:
     """Tell whether rectangles overlap in pairs (N,); those that only touch do not.
 
-    Parameters
-    ----------
-    dx_m, dy_m : (N,)
-        From the center of a to the center of b.
-    yaw_a_rad, yaw_b_rad : (N,)
-    size_a_m, size_b_m : (N, 2 or more)
-        Length and width first.
-
-    Notes
-    -----
     A hundred times faster than intersecting the polygons, which is why simulation loops ask this way.
+
+    `dx_m`, `dy_m` (N,): from the center of a to the center of b. `yaw_a_rad`, `yaw_b_rad` (N,). `size_a_m`, `size_b_m` (N, 2
+    or more): length and width first.
     """
     apart = np.zeros(len(dx_m), dtype=bool)
     for nx, ny, reach, _ in separating_axes(yaw_a_rad, yaw_b_rad, size_a_m, size_b_m):
@@ -109,16 +98,11 @@ def separating_axes(
 def rectangle_overlap(a: ArrayLike, b: ArrayLike) -> Array:
     """Compute the area (N,), m^2, that oriented rectangles share in pairs.
 
-    Parameters
-    ----------
-    a, b : (N, 5), m and rad
-        Center x, y, length, width, yaw. A rectangle with a NaN or without area shares 0.
-
-    Notes
-    -----
     In the axes of a, the shared area is the integral of y, limited to a, over x, limited to a, along the border of b. Every
     edge contributes at most three trapezoids, and edges that lie on each other are no special case. A pair takes 1.5
     microseconds, a fiftieth of the intersection of two polygon objects.
+
+    `a`, `b` (N, 5), m and rad: center x, y, length, width, yaw. A rectangle with a NaN or without area shares 0.
     """
     a, b = (np.asarray(r, dtype=np.float64).reshape(-1, 5) for r in (a, b))
     usable = (a[:, 2:4] > 0).all(axis=1) & (b[:, 2:4] > 0).all(axis=1) & np.isfinite(a + b).all(axis=1)
@@ -153,10 +137,7 @@ def overlap_of_smaller(a: ArrayLike, b: ArrayLike) -> Array:
 def upright_box_iou(a: ArrayLike, b: ArrayLike) -> Array:
     """Compute the IoU (N,) of upright boxes in pairs.
 
-    Parameters
-    ----------
-    a, b : (N, 7), m and rad
-        Center x, y, z, length, width, height, yaw. A box with a NaN or without volume has the IoU 0.
+    `a`, `b` (N, 7), m and rad: center x, y, z, length, width, height, yaw. A box with a NaN or without volume has the IoU 0.
     """
     a, b = (np.asarray(r, dtype=np.float64).reshape(-1, 7) for r in (a, b))
     flat = [0, 1, 3, 4, 6]

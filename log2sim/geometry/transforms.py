@@ -23,17 +23,8 @@ def period_of(t_ns: NDArray[np.int64]) -> float:
 def nearest_index(stamps: NDArray[Any], t: ArrayLike) -> NDArray[np.int64]:
     """Find the nearest stamp to each time.
 
-    Parameters
-    ----------
-    stamps : (F,) int64 ns or float64 s
-        In ascending order, at least one.
-    t : scalar or (T,)
-        In the unit of `stamps`.
-
-    Returns
-    -------
-    (T,) int64
-        Index into `stamps`; of two equally near ones the earlier.
+    `stamps` (F,) ns or s: in ascending order, at least one. `t` scalar or (T,): in the unit of `stamps`. Returns (T,) int64:
+    index into `stamps`; of two equally near ones the earlier.
     """
     t = np.atleast_1d(np.asarray(t))
     after = np.minimum(np.searchsorted(stamps, t), len(stamps) - 1)
@@ -78,8 +69,6 @@ def shift_poses(map_T_x: Array, offset_m: Array) -> Array:
 def nearest_rotation(matrix: Array) -> Array:
     """Compute the rotation (3, 3) that is nearest to a matrix (3, 3), by the Frobenius norm.
 
-    Notes
-    -----
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991, lemma.
     """
     u, _, vt = np.linalg.svd(matrix)
@@ -90,8 +79,6 @@ def nearest_rotation(matrix: Array) -> Array:
 def wrap_angle(angle_rad: ArrayLike) -> Array:
     """Wrap angles to [-pi, pi).
 
-    Notes
-    -----
     Rounding can carry `mod` to its modulus, which would return +pi; that value is folded back.
     """
     wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
@@ -101,8 +88,6 @@ def wrap_angle(angle_rad: ArrayLike) -> Array:
 def cos_sin(angle_rad: Array) -> tuple[Array, Array]:
     """Compute cosine and sine (N,), (N,) of angles (N,), to the last bits.
 
-    Notes
-    -----
     By the tangent of the half angle, which numpy vectorizes in double precision where it does not vectorize the other
     two: a quarter to two thirds of their time. At odd multiples of pi the tangent is large but finite.
     """
@@ -126,8 +111,6 @@ def rotation_from_quaternion(q_wxyz: ArrayLike) -> Array:
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     """Turn rotation matrices (..., 3, 3) into scalar-first unit quaternions (..., 4) with w >= 0.
 
-    Notes
-    -----
     Takes the largest of the four squared components as pivot (Shepperd, 1978), so no division is ill-conditioned.
     """
     r = np.asarray(rotation, dtype=np.float64)

@@ -25,7 +25,7 @@ def find_possible(labels: Labels) -> NDArray[np.bool_]:
     return np.asarray(sized & (np.abs(labels.center_m) <= MAX_POSITION_M).all(axis=1) & np.isfinite(labels.yaw_rad))
 
 
-def without_impossible_labels(log: Log) -> Log:
+def drop_impossible_labels(log: Log) -> Log:
     """Return the log without labels that no object can have, and with a note of how many there were; labels stay unread until they are asked for."""
 
     @cache
@@ -208,11 +208,11 @@ def explain_missing_poses(log: Log, t_ns: NDArray[np.int64]) -> str:
         return "no ego poses"
     poses, ticks = Span.of("ego poses", log.ego.t_ns), Span.of("ticks", t_ns)
     if poses.is_apart(ticks, 0):
-        return say_apart(poses, ticks)
+        return describe_gap(poses, ticks)
     return f"no ego pose within {log.ego.max_gap_s:g} s of any tick"
 
 
-def say_apart(one: Span, other: Span) -> str:
+def describe_gap(one: Span, other: Span) -> str:
     """Say that two spans do not overlap, by how much, and which clocks would explain it."""
     difference_s = (one.first_ns - other.first_ns) / NS_PER_S
     hint = _explain(one, other)
@@ -266,7 +266,7 @@ def _other_clocks(log: Log) -> list[str]:
         return []
     spans = [Span(_listed(words), span.first_ns, span.last_ns) for words, span in groups]
     most = max(range(len(groups)), key=lambda k: len(groups[k][0]))
-    return [say_apart(span, spans[most]) for k, span in enumerate(spans) if k != most]
+    return [describe_gap(span, spans[most]) for k, span in enumerate(spans) if k != most]
 
 
 def _spans(log: Log) -> list[Span]:
@@ -333,7 +333,7 @@ def _image_label_problems(log: Log) -> list[str]:
                 continue
             line = f"{int(lost.sum())} of {len(lost)} {what} in images of '{name}' are at stamps of no frame, first {rows.t_ns[lost].min()}"
             spans = Span.of(f"{what}", rows.t_ns), Span.of("frames", frames)
-            apart = f": {say_apart(*spans)}" if spans[0].is_apart(spans[1]) else ""
+            apart = f": {describe_gap(*spans)}" if spans[0].is_apart(spans[1]) else ""
             nearest = "" if apart or not lost.all() else f"; the nearest is {off_ns.min() / 1e6:.3g} ms off"
             problems.append(f"{line}{nearest}{apart}")
     return problems
@@ -354,4 +354,4 @@ def _label_problems(log: Log) -> list[str]:
         f"poses, first at stamp {t_ns[far].min()}"
     )
     spans = Span.of("labels", t_ns), Span.of("records", np.concatenate(records))
-    return [f"{line}: {say_apart(*spans)}" if spans[0].is_apart(spans[1]) else line]
+    return [f"{line}: {describe_gap(*spans)}" if spans[0].is_apart(spans[1]) else line]

@@ -122,10 +122,10 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
         return replace(labels, cameras=labeled_cameras)
     keep = np.zeros(len(labels.t_ns), dtype=bool)
     for track in np.unique(labels.track_id):
-        keep |= _with_neighbors(labels.t_ns, np.flatnonzero(labels.track_id == track), span)
+        keep |= _mark_rows(labels.t_ns, np.flatnonzero(labels.track_id == track), span)
     labeled = labels.labeled_ns
     if labeled is not None:
-        labeled = labeled[_with_neighbors(labeled, np.arange(len(labeled)), span)]
+        labeled = labeled[_mark_rows(labeled, np.arange(len(labeled)), span)]
     return replace(take_labels(labels, keep), cameras=labeled_cameras, labeled_ns=labeled)
 
 
@@ -138,7 +138,7 @@ def take_labels(labels: Labels, rows: NDArray[Any]) -> Labels:
     return replace(labels, **columns)
 
 
-def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:
+def _mark_rows(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:
     """Mark (N,) those of `rows` in the span, and of the others the last before and the first after it, unless far from it."""
     mark = np.zeros(len(t_ns), dtype=bool)
     mark[rows[span.contains(t_ns[rows], 0)]] = True

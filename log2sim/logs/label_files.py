@@ -39,7 +39,7 @@ CATEGORY_OF: Mapping[str, str] = {
 }  # fmt: skip
 
 
-def with_label_file(log: Log, path: Path) -> Log:
+def replace_labels(log: Log, path: Path) -> Log:
     """Return a log with the boxes of a file as its labels, in place of its own.
 
     Raises `LogError` when the file cannot be read, is of none of the formats, or has no box at a time at which the log

@@ -10,7 +10,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, Log2SimError, LogError, PluginError
 from log2sim.files import plugins
 from log2sim.files.inputs import following_links
-from log2sim.logs.checks import list_calibration_problems, list_time_problems, without_impossible_labels
+from log2sim.logs.checks import drop_impossible_labels, list_calibration_problems, list_time_problems
 from log2sim.logs.records import guard_log, translate_parser_errors
 
 __all__ = ["Reader", "find_reader", "open_log"]
@@ -124,9 +124,9 @@ def open_log(
         log = _open(Path(path), format, sequence)
         if labels is None:
             return log
-        from log2sim.logs.label_files import with_label_file  # reads formats that the log is not of
+        from log2sim.logs.label_files import replace_labels  # reads formats that the log is not of
 
-        return with_label_file(log, Path(labels))
+        return replace_labels(log, Path(labels))
 
 
 def _open(root: Path, format: str, sequence: str | None) -> Log:
@@ -145,7 +145,7 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
         with plugins.blaming("log", name):
             opened = reader.open(root, chosen)
         plugins.require_type("log", name, opened, Log)
-        log = without_impossible_labels(guard_log(opened, str(root)))
+        log = drop_impossible_labels(guard_log(opened, str(root)))
     notes = list(defects)
     if format == "auto" and root.is_dir():  # of downloads, perhaps
         others = [other for other, some in readers.items() if other != name and _seems_to_match(other, some, root)]

@@ -19,7 +19,7 @@ from log2sim.prediction.motion_table import TICK_S
 from log2sim.scenarios.tagging import find_tags
 
 INDEX_FILE = "tags.parquet"
-INDEX_VERSION = 1
+INDEX_VERSION = 2
 KEY = b"log2sim.tags"
 
 TEXTS = ("file", "scenario", "tag", "agent", "other", "lane")

@@ -293,9 +293,17 @@ def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tupl
 
 def _crossings(traffic: Traffic) -> Iterator[Tag]:
     """Find whose paths cross, who turns across the path of oncoming traffic, and near misses there."""
-    t = traffic.table
+    t, on = traffic.table, traffic.continued
+    height = t.center_m[..., 2].copy()
+    for k in np.flatnonzero(t.present.any(axis=1)).tolist():
+        height[k, ~t.present[k]] = np.median(height[k, t.present[k]])
     boxes = BoxTracks(
-        t.center_m[..., 0].T, t.center_m[..., 1].T, t.center_m[..., 2].T, t.yaw_rad.T, t.speed_mps.T, t.size_m
+        on.place_m.real.T,
+        on.place_m.imag.T,
+        height.T,
+        on.yaw_rad.T,
+        np.where(t.present, t.speed_mps, on.speed_mps).T,
+        t.size_m,
     )
     found = post_encroachment_times(boxes, TICK_S)
     last = len(t.t_s) - 1
@@ -304,14 +312,14 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
     ):
         pet = (came - left) * TICK_S
         i, j = min(int(left), last), min(int(np.ceil(came)), last)
-        speed_a, speed_c = traffic.speed_mps[a, i], traffic.speed_mps[c, j]
+        speed_a, speed_c = on.speed_mps[a, i], on.speed_mps[c, j]
         if pet > CROSSING_S or min(speed_a, speed_c) < 0.5 or not (traffic.wheeled[a] or traffic.wheeled[c]):
             continue
-        angle = float(abs(wrap_angle(traffic.course_rad[a, i] - traffic.course_rad[c, j])))
+        angle = float(abs(wrap_angle(on.course_rad[a, i] - on.course_rad[c, j])))
         if not SAME_WAY_RAD <= angle <= ONCOMING_RAD + CROSSING_RAD:
             continue
         begin, ttc, touch = _planar_ttc(traffic, a, c, j)
-        sigma_s = float(np.hypot(traffic.sigma_m[a, i] / speed_a, traffic.sigma_m[c, j] / speed_c))
+        sigma_s = float(np.hypot(on.sigma_m[a, i] / speed_a, on.sigma_m[c, j] / speed_c))
         sure = probability_above(CROSSING_S - pet, 0.0, sigma_s)
         way_m = t.size_m[a, 0] + t.size_m[c, 1]
         measures = {

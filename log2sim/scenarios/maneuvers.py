@@ -40,6 +40,12 @@ TURN_RAD, BACK_RAD = np.radians(60.0), np.radians(150.0)
 TURN_WITHIN_M = 40.0
 """Within which a vehicle turns at a junction: a quarter of a circle of 25 m."""
 
+LEAST_RADIUS_M = 1.5
+"""No rider turns on a smaller circle; boxes of who stands do, and headings that flip."""
+
+LEAST_SHIFT_M = 1.0
+"""Who changes between lanes moves that far to the side; where lanes of a map overlap, who goes straight on leaves one for another."""
+
 BREAK = round(0.5 / TICK_S)
 """Ticks that an activity may be interrupted for."""
 
@@ -124,6 +130,8 @@ def _change_between(traffic: Traffic, k: int, one: int, two: int, edge: tuple[in
     certain = min(probability_above(np.max(half - np.abs(off)), 0.0, sigma) for off, half in (before, after))
     lane = traffic.lanes[two][0]
     certain *= lane.confidence * traffic.lanes[one][0].confidence
+    if abs(aside[end] - aside[begin]) < LEAST_SHIFT_M:
+        return
     span = (first + begin, crossing, first + end)
     yield replace(
         tag_of(
@@ -229,6 +237,7 @@ def _turns(traffic: Traffic, k: int) -> Iterator[Tag]:
             radius_m = way_m / abs(angle) if angle else np.inf
             if (
                 not np.isfinite(angle)
+                or radius_m < LEAST_RADIUS_M
                 or abs(angle) < TURN_RAD
                 or way_m > TURN_WITHIN_M * max(1.0, abs(angle) / (np.pi / 2))
             ):
@@ -244,7 +253,11 @@ def _hard_braking(traffic: Traffic, k: int) -> Iterator[Tag]:
     hard: Mask = (accel < -COMFORTABLE_MPS2) & np.isfinite(accel)
     for i, j in runs(hard, round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(accel[i : j + 1]))
-        if -accel[n] > MAX_BRAKING_MPS2:  # it is the log that jumps
+        after = speed[j + 1 : j + 1 + BREAK]
+        after = after[np.isfinite(after)]
+        # It is the log that jumps where no brakes are as hard, and where the speed is soon what it was.
+        back = len(after) > 0 and float(np.median(after)) > (speed[i] + speed[j]) / 2
+        if -accel[n] > MAX_BRAKING_MPS2 or back or speed[i] < MOVING_MPS:
             continue
         # Two speeds half a second apart, whose errors are independent, tell the deceleration.
         sigma = np.sqrt(2.0) * traffic.sigma_speed_mps[k, n] / max((j - i) * TICK_S, 0.5)

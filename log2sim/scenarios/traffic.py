@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import STANDSTILL_MPS, MapLane, Scenario
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
+from log2sim.prediction.prediction import MOVING, drift_variance
 from log2sim.road.polyline import Polyline
 
 Mask = NDArray[np.bool_]
@@ -35,6 +36,9 @@ HALF_TRACK_M = 1.0
 
 SIDE_M = 0.3
 """Beyond a lane's edge, on either side, until which an agent has not crossed it: drivers keep their lane to this standard deviation."""
+
+UNSEEN_S = 2.0
+"""For how long agents are supposed to go on before and after they were seen: a reconstruction loses them at the edge of what sensors show."""
 
 EXTENSION_M = 40.0
 """How far a path is continued: beside a lane or the path of another vehicle, else on the circle that it ends on."""
@@ -105,6 +109,16 @@ class Driven(NamedTuple):
 
     ticks: Index
     line: Polyline
+
+
+class Continued(NamedTuple):
+    """Agents (A, T) also while they are not seen: places x + iy, headings of boxes, courses, speeds, sigmas of places."""
+
+    place_m: Complex
+    yaw_rad: Array
+    course_rad: Array
+    speed_mps: Array
+    sigma_m: Array
 
 
 class Path(NamedTuple):
@@ -213,6 +227,27 @@ class Traffic:
         length = self.table.size_m[:, 0]
         gap = np.abs(ahead) - ((length + length[r]) / 2)[:, None]
         return Beside(ahead, aside, turn, gap, sigma, self.half_lane_m(r))
+
+    @cached_property
+    def continued(self) -> Continued:
+        """Return where agents are, for `UNSEEN_S` before and after they were seen straight on at their speeds, but at no time without others."""
+        t, ticks = self.table, round(UNSEEN_S / TICK_S)
+        place, course, speed = t.position_m.copy(), self.course_rad.copy(), self.speed_mps.copy()
+        yaw, sigma = t.yaw_rad.copy(), self.sigma_m.copy()
+        for k in np.flatnonzero(
+            t.present.any(axis=1) & np.array([not a.static for a in t.agents], dtype=bool)
+        ).tolist():
+            there = np.flatnonzero(t.present[k])
+            along = MOVING[str(t.group[k])].along_mps2
+            for end, rows in (
+                (there[0], np.arange(max(there[0] - ticks, 0), there[0])),
+                (there[-1], np.arange(there[-1] + 1, min(there[-1] + 1 + ticks, len(t.t_s)))),
+            ):
+                lead_s = (rows - end) * TICK_S
+                place[k, rows] = place[k, end] + speed[k, end] * np.exp(1j * course[k, end]) * lead_s
+                yaw[k, rows], course[k, rows], speed[k, rows] = yaw[k, end], course[k, end], speed[k, end]
+                sigma[k, rows] = np.hypot(sigma[k, end], along * np.sqrt(drift_variance(np.abs(lead_s))))
+        return Continued(place, yaw, course, speed, sigma)
 
     @cached_property
     def drift_mps(self) -> Array:

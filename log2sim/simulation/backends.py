@@ -14,10 +14,7 @@ SIMULATORS = ("own", "carla")
 def external_simulator(name: str, address: str | None, port: int | None, map: str | None) -> ExternalSimulator | None:
     """Return the simulator of a name, with an address, port and world (town or OpenDRIVE file); None for the embedded one.
 
-    Raises
-    ------
-    ConfigError
-        For an unknown name, options that it does not use, or a missing file.
+    Raises `ConfigError` for an unknown name, options that it does not use, or a missing file.
     """
     if name not in SIMULATORS:
         raise ConfigError(

@@ -44,23 +44,6 @@ ObservationArrays = dict[str, Any]
 class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
     """Drive the ego of a scenario among its other agents.
 
-    Parameters
-    ----------
-    scenario : Scenario or path
-    dt_s : float
-        Simulation step.
-    hold_s : float
-        How long each action holds, a multiple of `dt_s`.
-    agents : {"reactive", "scenario"} or collection of str
-        Behavior of the other agents; see `log2sim.simulation.runner.replay`.
-    sight_m : float
-        Range within which others are observed.
-    max_others : int
-        Rows for the nearest others.
-    render_mode : {"rgb_array"}, optional
-
-    Notes
-    -----
     Action, `Box(-1, 1, (2,))` float32: the pedal (full brake to full throttle) and the steering (full lock right to full
     lock left), as shares of the vehicle's limits `accel_limits_mps2` and `max_steer_rad`.
 
@@ -78,6 +61,10 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
     less 100 for a collision; `info["reward"]` holds the terms. The episode terminates with a collision or at the end of
     the path of the scenario, and is truncated when the scenario's time is over, or when the ego is more than 15 m off
     the path. The environment is deterministic; the seed has no effect.
+
+    `dt_s`: simulation step. `hold_s`: how long each action holds, a multiple of `dt_s`. `agents` in {"reactive", "scenario"}
+    or ids: behavior of the other agents; see `log2sim.simulation.runner.replay`. `sight_m`: range within which
+    others are observed. `max_others`: rows for the nearest others. `render_mode` in {"rgb_array"}, optional.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012

@@ -39,7 +39,7 @@ from log2sim.simulation.policy import (
 )
 from log2sim.simulation.reference import GRID_S, Reference
 from log2sim.simulation.simulators import Simulator
-from log2sim.simulation.vehicles.model_choice import with_slip_states
+from log2sim.simulation.vehicles.model_choice import set_slip_states
 from log2sim.simulation.vehicles.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
 
 STORE_S = 0.05  # spacing of stored states, about 20 Hz
@@ -226,7 +226,7 @@ class VehicleGroup(AgentGroup):
         slots = self._slots(index)
         state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
-            state = with_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
+            state = set_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
         self.state.put(slots, state)
         self.memory.put(slots, ControllerMemory.fresh(len(slots)))
         placed = self.state.take(slots)

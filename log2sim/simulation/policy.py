@@ -301,7 +301,7 @@ def _load_plugin(name: str) -> Policy:
         raise ConfigError(
             f"{error}; of a module or a file, expected module:attribute or file.py:attribute, such as my_driver:brake_late"
         ) from None
-    source = plugins.say_plugin("policy", name)
+    source = plugins.plugin_label("policy", name)
     return PluginPolicy(_made(target, source, PluginError), source)
 
 

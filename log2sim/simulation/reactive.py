@@ -431,7 +431,7 @@ class Traffic:
         pose = self.paths.at(np.arange(len(tau)), tau)
         pace = np.abs(pose.speed_mps[own])
         log_accel = (np.abs(self.paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
-        pose = self._with_ego(pose, ego)
+        pose = self._replace_driven_pose(pose, ego)
         # Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,).
         everyone = np.arange(len(tau))
         prediction = self._foresight.expect(everyone, tau, self.rate)
@@ -464,7 +464,7 @@ class Traffic:
         stands = pace < STANDSTILL_MPS  # the scenario's time goes on: waiting then counts as the scenario's own stop
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
-    def _with_ego(self, pose: Pose, ego: Snapshot | None) -> Pose:
+    def _replace_driven_pose(self, pose: Pose, ego: Snapshot | None) -> Pose:
         """Replace the pose of the driven agent by the one to which the policy has driven it."""
         k = self._driven
         if ego is None or k < 0 or not len(ego.x_m):

@@ -106,14 +106,8 @@ class Commands:
 
     `AgentReplay.steer_rad` and `accel_mps2` hold what the actuators did.
 
-    Attributes
-    ----------
-    pedal_mps2 : (S,) float64, m/s2
-        Throttle (positive) or brake (negative).
-    steer_rad : (S,) float64
-        At the road wheels, positive left.
-    gear : (S,) int8
-        1 forward, -1 reverse.
+    `pedal_mps2` (S,), m/s2: throttle (positive) or brake (negative). `steer_rad` (S,): at the road wheels, positive left.
+    `gear` (S,): 1 forward, -1 reverse.
     """
 
     __repr__ = short_repr
@@ -277,12 +271,12 @@ class Replay:
         check(document, "replay-1", ScenarioError)
         plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
         agents = tuple(_agent_from_dict(a) for a in document["agents"])
-        known = {**{k: document[k] for k in plain}, "metrics": _with_owners(document["metrics"])}
+        known = {**{k: document[k] for k in plain}, "metrics": _add_owners(document["metrics"])}
         warned = Warnings.from_dict(document["warnings"]) if "warnings" in document else None
         return cls(agents=agents, left_out=document.get("left_out", {}), warnings=warned, **known)
 
 
-def _with_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
+def _add_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """State whose each collision is where an older file only says whether the scenario has it, as `in_log`."""
 
     def owned(events: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

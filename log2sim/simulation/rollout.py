@@ -37,18 +37,9 @@ class World:
     Between two calls the world is at `step`, and agents whose lifetime begins there have been placed. `advance` moves it on,
     until `done`. With an external simulator in `host`, groups only compute controls, and its tick moves the agents.
 
-    Parameters
-    ----------
-    groups : sequence of Group
-    clock : Clock
-    statics : sequence of Agent
-        Agents that never move; they are in no group.
-    traffic : Traffic, optional
-        Decides the speeds of reactive agents.
-    choices : mapping, optional
-        By id, the model that moves each vehicle and why.
-    sight_m : float
-        Range within which the ego's policy observes other agents.
+    `statics`: agents that never move; they are in no group. `traffic`, optional: decides the speeds of reactive agents.
+    `choices`, optional: by id, the model that moves each vehicle and why. `sight_m`: range within which the ego's policy
+    observes other agents.
     """
 
     def __init__(

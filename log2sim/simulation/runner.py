@@ -201,7 +201,7 @@ def replay_result(
             )
             moved = _moving_agent(agent, driver, choice, trajectory, flags, t_s, states)
             errors[agent.id] = agent_errors(trajectory, moved, follows=driver in SCENARIO_FOLLOWERS)
-            replayed = _with_errors(moved, errors[agent.id])
+            replayed = _add_errors(moved, errors[agent.id])
         agents.append(replayed)
         stored.append(steps)
     trajectories = {k: trajectory for k, (_, trajectory, _) in source.items() if k in tracks}
@@ -255,7 +255,7 @@ def _moving_agent(
     )  # fmt: skip
 
 
-def _with_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
+def _add_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
     """Add the tracking errors, unless the agent is placed on its trajectory."""
     if agent.driver == "exact":
         return agent

@@ -111,7 +111,7 @@ def _checked(step: VehicleStep, model: str) -> VehicleStep:
             column = np.asarray(getattr(after, key))
             if column.shape != state.x_m.shape or not np.isfinite(column).all():
                 raise PluginError(
-                    f"{plugins.say_plugin('vehicle_model', model)}: {key} is {column!s:.80}, expected {len(state.x_m)} finite "
+                    f"{plugins.plugin_label('vehicle_model', model)}: {key} is {column!s:.80}, expected {len(state.x_m)} finite "
                     "numbers, one for each vehicle"
                 )
         return after

@@ -131,7 +131,7 @@ class Courses(NamedTuple):
 class Watch:
     """All agents of a scenario that somebody may be warned of, and what chosen ends know of them at common ticks.
 
-    The ego is warned; `of_driver` gives the same watch for another vehicle.
+    The ego is warned; `for_driver` gives the same watch for another vehicle.
 
     `scenario`: with what was observed when. `agents`: all but the ego, where they are: as in the scenario, or in a
     replay of it. `t_s` (T,), s: ticks, `TICK_S` apart.
@@ -152,7 +152,7 @@ class Watch:
         self._height_m = np.array([a.size_m[2] for a in agents])
         self._radius_m = np.array([np.hypot(*a.size_m[:2]) / 2 for a in agents])
 
-    def of_driver(self, driver: Agent) -> Watch:
+    def for_driver(self, driver: Agent) -> Watch:
         """Return a watch that warns a vehicle of the scenario in place of the ego, while the ends know it."""
         view = copy(self)
         view.ego_path = EgoPath(driver)
@@ -262,10 +262,10 @@ def warn(
     sources = {a.id: a for a in scenario.agents}
     events, driven_s = [], 0.0
     for driver in drivers:
-        watch = everybody.of_driver(driver)
+        watch = everybody.for_driver(driver)
         ticks = np.flatnonzero(table.present[list(now).index(driver.id)])
         drive = _Drive(watch, ego_states(now[driver.id], watch, table.t_s[ticks]), table.t_s[ticks], driver.id)
-        own = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), collisions.get(driver.id, {}), drive)
+        own = _add_collisions(_events(drive, watch.courses(drive.ego, ticks)), collisions.get(driver.id, {}), drive)
         if len(ends_of(scenario)) > 1:
             own = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in own]
         events += own
@@ -381,7 +381,7 @@ def _collisions(replay: Replay | None, drivers: Set[str]) -> dict[str, dict[str,
     return touched
 
 
-def _with_collisions(
+def _add_collisions(
     events: Iterable[CollisionWarning], hit: Mapping[str, float], drive: _Drive
 ) -> list[CollisionWarning]:
     """Find which agents the ego touches, and add those that nothing was predicted of."""
@@ -480,10 +480,6 @@ class BrakeWhenWarned:
 
     Its way is clear when no collision would be predicted if it drove on as in the scenario. It then goes on from there, later than
     in the scenario.
-
-    Parameters
-    ----------
-    settings : WarningSettings, optional
     """
 
     def __init__(self, settings: WarningSettings | None = None) -> None:
@@ -502,7 +498,7 @@ class BrakeWhenWarned:
         tick = int((seen.t_s - self._watch.table.t_s[0]) / TICK_S + 1e-6)
         if tick > self._tick:
             self._tick = tick
-            self._look(seen, min(tick, len(self._watch.table.t_s) - 1))
+            self._check_danger(seen, min(tick, len(self._watch.table.t_s) - 1))
         if self.braking(seen.t_s):
             return self._driver.brake(seen, self.settings.brake_mps2)
         return self._driver.drive(seen)
@@ -511,7 +507,7 @@ class BrakeWhenWarned:
         """Whether the brakes work at a time."""
         return t_s >= self._warned_s + self.settings.reaction_s - 1e-9
 
-    def _look(self, seen: Observation, tick: int) -> None:
+    def _check_danger(self, seen: Observation, tick: int) -> None:
         """Look for danger, and forget the warning where there was none for `CLEAR_S`."""
         ego, t_s = seen.ego, seen.t_s
         speed, accel = ego.speed_mps, math.copysign(ego.accel_mps2, ego.accel_mps2 * ego.speed_mps)

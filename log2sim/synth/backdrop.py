@@ -252,7 +252,7 @@ def draw_buildings(
     eye = view.map_T_cam[:2, 3]
     far_first = sorted(buildings, key=lambda walls: -float(np.min([np.linalg.norm(w.foot_m - eye) for w in walls])))
     for walls in far_first:
-        seen = [s for wall in walls if (s := _look_at(view, wall)) is not None]
+        seen = [s for wall in walls if (s := _visible_part(view, wall)) is not None]
         if not seen:
             continue
         region = (_around([s.rows for s in seen]), _around([s.columns for s in seen]))
@@ -277,7 +277,7 @@ def hide_behind_buildings(view: RenderCamera, buildings: tuple[tuple[Wall, ...],
     """Bring the depth (H, W) forward to the facades."""
     for walls in buildings:
         for wall in walls:
-            seen = _look_at(view, wall)
+            seen = _visible_part(view, wall)
             if seen is not None:
                 z = np.where(seen.mask(seen.polygon, cv2.LINE_8) > 0, seen.depth(view), np.inf)
                 np.minimum(depth[seen.region], z, out=depth[seen.region])
@@ -287,7 +287,7 @@ def _around(slices: list[slice]) -> slice:
     return slice(min(s.start for s in slices), max(s.stop for s in slices))
 
 
-def _look_at(view: RenderCamera, wall: Wall) -> _Seen | None:
+def _visible_part(view: RenderCamera, wall: Wall) -> _Seen | None:
     gap = float(np.dot(view.map_T_cam[:2, 3] - wall.foot_m, wall.outward))
     if gap <= 0:
         return None

@@ -327,10 +327,8 @@ class Scene(Table):
 def load_scene(path: Path | str) -> Scene:
     """Read a scene file.
 
-    Raises
-    ------
-    ConfigError
-        When the file is missing, is no TOML, or holds an unknown key or an impossible value; names the file and the key.
+    Raises `ConfigError` when the file is missing, is no TOML, or holds an unknown key or an impossible value; names the file
+    and the key.
     """
     path = Path(path)
     text = read_text(path, MAX_SCENE_BYTES, ConfigError)

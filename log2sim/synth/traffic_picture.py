@@ -73,7 +73,7 @@ class Look:
         return open_parts if open_parts.any() else None
 
 
-def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
+def draw_look(item: TrafficObject, rng: np.random.Generator) -> Look:
     """Draw the colors of an object."""
     shares = np.array([share for _, share in CAR_COLORS])
     body = CAR_COLORS[rng.choice(len(CAR_COLORS), p=shares / np.sum(shares))][0]
@@ -185,7 +185,7 @@ class TrafficPainter:
         for k, item, mesh in zip(
             rows, objects, meshes_of([o.parts for o in objects], [o.size_m[2] / 2 for o in objects])
         ):
-            self._looks[k] = look_of(item, np.random.default_rng([self._seed, 7, k]))
+            self._looks[k] = draw_look(item, np.random.default_rng([self._seed, 7, k]))
             self._meshes[k] = _rounded(mesh, np.array([p.material for p in item.parts]))
 
 

@@ -60,29 +60,14 @@ def driving(speed_mps: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a vehicle is, how it moves, and what the ego does.
+    """Where a vehicle is, how it moves, and what the ego does."""
 
-    Attributes
-    ----------
-    xy_m : (float, float)
-        Center of its box at the start.
-    yaw_deg : float
-    ego : dict
-        Table of the scene.
-    speed_mps : float
-        Constant, along its heading.
-    start_s : float, optional
-        It stands until then and accelerates to 4 m/s within 4 m.
-    second : int
-        Whether a second vehicle is behind it (-1) or ahead of it (1): on the far side from the ego.
-    """
-
-    xy_m: tuple[float, float]
+    xy_m: tuple[float, float]  # center of its box at the start
     yaw_deg: float
-    ego: dict[str, Any]
-    speed_mps: float = 0.0
-    start_s: float | None = None
-    second: int = -1
+    ego: dict[str, Any]  # table of the scene
+    speed_mps: float = 0.0  # constant, along its heading
+    start_s: float | None = None  # it stands until then and accelerates to 4 m/s within 4 m
+    second: int = -1  # whether a second vehicle is behind it (-1) or ahead of it (1): on the far side from the ego
 
 
 def place_of(pose: str, size_m: tuple[float, float, float]) -> Place:

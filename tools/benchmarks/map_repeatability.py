@@ -41,24 +41,12 @@ CORRELATED_CELLS = 9.0
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Offsets of patches between two maps, along the directions that their texture tells.
+    """Offsets of patches between two maps, along the directions that their texture tells."""
 
-    Attributes
-    ----------
-    xy : (N, 2) float64, m
-        Middle of the patches.
-    offset_m : (N,) float64
-        Length of what is told of the offset of the second map.
-    vector_m : (N, 2) float64
-        The offset itself, 0 along directions that the texture does not tell.
-    unlike : int
-        Patches of texture that do not look alike in both maps.
-    """
-
-    xy: Array
-    offset_m: Array
-    vector_m: Array
-    unlike: int
+    xy: Array  # (N, 2), m: middle of the patches
+    offset_m: Array  # (N,): length of what is told of the offset of the second map
+    vector_m: Array  # (N, 2): the offset itself, 0 along directions that the texture does not tell
+    unlike: int  # patches of texture that do not look alike in both maps
 
 
 def on_common_cells(a: GroundMap, b: GroundMap) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
@@ -192,7 +180,7 @@ def parts_of(log: Log) -> Iterator[tuple[str, Log, Log]]:
         yield "cameras ahead and others", log.changed(cameras=ahead), log.changed(cameras=rest)
 
 
-def say_quantiles(values_m: Array) -> str:
+def quantile_text(values_m: Array) -> str:
     """Median, 95th percentile and share within 5 cm."""
     if not len(values_m):
         return "nothing in common"
@@ -221,14 +209,14 @@ def main(arguments: list[str] | None = None) -> None:
         except LogError as error:
             print(f"{title}: {error}")
             continue
-        print(f"{title}\n  height     {say_quantiles(np.abs(height_differences(a, b)))} cells")
+        print(f"{title}\n  height     {quantile_text(np.abs(height_differences(a, b)))} cells")
         for layer in ("color", "intensity"):
             offsets = measure_offsets(a, b, layer)
             if offsets is None:
                 print(f"  {layer:10} nothing in common")
                 continue
             mean = offsets.vector_m.mean(axis=0) if len(offsets.xy) else np.zeros(2)
-            near = say_quantiles(offsets.offset_m)
+            near = quantile_text(offsets.offset_m)
             print(
                 f"  {layer:10} {near} patches, {offsets.unlike} unlike; mean {100 * mean[0]:.1f} {100 * mean[1]:.1f} cm"
             )

@@ -84,10 +84,7 @@ def loop_log(log: Log, times: int) -> Log:
 
     The world moves with the ego: agents, labels and sweeps of each turn are new ones at new places, as on a long drive.
 
-    Raises
-    ------
-    ValueError
-        For a log without an ego, or with sensors at the road.
+    Raises `ValueError` for a log without an ego, or with sensors at the road.
     """
     if log.ego is None or any(s.mount == "map" for s in (*log.cameras.values(), *log.lidars.values())):
         raise ValueError("only the sensors of an ego can drive on")

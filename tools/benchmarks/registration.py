@@ -148,18 +148,9 @@ ALONG, STANDING_SHARE = 0.9, 0.1
 class WorldSpec:
     """What a world is like.
 
-    Attributes
-    ----------
-    kind : {"street", "open"}
-        With houses, fences, trees and parked vehicles as they are drawn; or a road with nothing but moving traffic.
-    seed : int
-    road_lidar : str
-        "tilted16", "level32" or "level64".
-    poles : int
-    vehicle_rate_hz, road_rate_hz : float
-    duration_s : float
-    azimuth_step_deg : float
-        Of all LiDARs; coarse ones are cast faster.
+    `kind` in {"street", "open"}: with houses, fences, trees and parked vehicles as they are drawn; or a road with nothing but
+    moving traffic. `road_lidar`: "tilted16", "level32" or "level64". `azimuth_step_deg`: of all LiDARs; coarse ones are cast
+    faster.
     """
 
     kind: Kind = "street"

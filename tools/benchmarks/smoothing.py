@@ -129,32 +129,6 @@ def errors_of(truth: Truth, xy_m: Array, velocity_mps: Array, yaw_rad: Array, cu
     )
 
 
-def spline_estimate(world: World, strength: float | None) -> tuple[Array, Array, Array, Array]:
-    """Position, velocity, yaw and curvature by SciPy's smoothing spline; its strength None for generalized cross-validation."""
-    from scipy.interpolate import make_smoothing_spline
-
-    t, seen = world.truth.t_s, world.valid
-    axes = [make_smoothing_spline(t[seen], world.xy_m[seen, k], lam=strength) for k in (0, 1)]
-    xy, velocity, acceleration = (
-        np.stack([np.asarray(s.derivative(order)(t) if order else s(t)) for s in axes], axis=1) for order in range(3)
-    )
-    return xy, velocity, *course_of(velocity, acceleration)
-
-
-def course_of(velocity_mps: Array, acceleration_mps2: Array) -> tuple[Array, Array]:
-    """Yaw and curvature (T,) of a way with velocities and accelerations (T, 2)."""
-    speed = np.maximum(np.hypot(*velocity_mps.T), MOVING_MPS / 2)
-    turning = velocity_mps[:, 0] * acceleration_mps2[:, 1] - velocity_mps[:, 1] * acceleration_mps2[:, 0]
-    return np.arctan2(velocity_mps[:, 1], velocity_mps[:, 0]), turning / speed**3
-
-
-def best_spline_errors(world: World) -> Array:
-    """Errors (4,) of the spline whose strength suits this track's truth best: the limit of the family, found by cheating."""
-    # The strengths lie as far below and above the usual ones as the noise does.
-    tried = [errors_of(world.truth, *spline_estimate(world, k)) for k in np.logspace(-4.0, 2.5, 27)]
-    return min(tried, key=lambda errors: float(errors[0]))
-
-
 def rate_worlds(maneuver: str, rate_hz: int, sigma_m: float, seeds: int = 6) -> Iterator[tuple[Truth, Array, Array]]:
     """The truth at 20 Hz, and times (n,) and noisy positions (n, 2) at another rate that divides it, by seed."""
     truth = truth_of(maneuver, 1.0 / RATES_HZ[-1])
@@ -171,65 +145,16 @@ def standing_verdicts(truth: Truth, velocity_mps: Array) -> tuple[float, float]:
     return float(called[truth.speed_mps == 0].mean()), float(called[truth.speed_mps > SURELY_MOVING_MPS].mean())
 
 
-STEP_S, COUNT, FINE = 0.1, 201, 10
-SLOWEST_MPS = 0.5
-MISSING = 0.1
-NEAREST_SIGMAS, FARTHEST_SIGMAS = 5.0, 20.0
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Positions (T, 2), velocities (T, 2), `yaw` (T,) and `curvature` (T,) at each tenth of a second."""
-
-    xy: Array
-    velocity: Array
-    yaw: Array
-    curvature: Array
-
-
-def maneuver(name: str) -> Motion:
-    """The truth, integrated from speed and yaw rate in steps of 10 ms."""
-    t = np.arange((COUNT - 1) * FINE + 1) * STEP_S / FINE
-
-    def rises(at_s: float, over_s: float) -> Array:
-        return np.asarray(0.5 + 0.5 * np.tanh((t - at_s) / over_s))
-
-    def pulse(at_s: float, over_s: float) -> Array:
-        return np.asarray(np.exp(-(((t - at_s) / over_s) ** 2)))
-
-    if name == "lane change":
-        speed, turn = np.full_like(t, 15.0), 0.055 * (pulse(8.0, 0.9) - pulse(10.4, 0.9))
-    elif name == "turn":
-        speed = 12.0 - 7.0 * rises(5.0, 1.2) + 5.0 * rises(13.0, 1.5)
-        turn = np.pi / 2 / (1.2 * np.sqrt(np.pi)) * pulse(9.0, 1.2)
-    elif name == "stop and go":
-        speed = 13.0 * (1.0 - rises(5.0, 1.3)) + 11.0 * rises(14.0, 1.6)
-        speed = np.where(speed < 0.1, 0.0, speed)
-        turn = 0.004 * speed * np.sin(0.5 * t)
-    else:
-        speed, turn = np.full_like(t, 10.0), 0.4 * np.sin(2 * np.pi * t / 5.0)
-    yaw = 0.3 + summed(turn, t)
-    velocity = speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    xy = np.column_stack([summed(v, t) for v in velocity.T])
-    curvature = np.where(speed > SLOWEST_MPS, turn / np.maximum(speed, SLOWEST_MPS), 0.0)
-    return Motion(*(a[::FINE] for a in (xy, velocity, yaw, curvature)))
-
-
-def summed(rate: Array, t: Array) -> Array:
-    """Trapezoidal integral from zero."""
-    return np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(t))])
-
-
-ALL_S = np.arange(COUNT) * STEP_S
+ALL_S = np.arange(FRAMES) * PERIOD_S
 # Times (n,), positions (n, 2) and sigma to xy (T, 2), velocity (T, 2), yaw (T,), curvature (T,).
 Result = tuple[Array, Array, Array, Array]
 Smoother = Callable[[Array, Array, float], Result]
 
 
 def of_derivatives(xy: Array, velocity: Array, acceleration: Array) -> Result:
-    speed = np.hypot(*velocity.T)
+    speed = np.maximum(np.hypot(*velocity.T), MOVING_MPS / 2)
     across = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
-    return xy, velocity, np.arctan2(velocity[:, 1], velocity[:, 0]), across / np.maximum(speed, SLOWEST_MPS) ** 3
+    return xy, velocity, np.arctan2(velocity[:, 1], velocity[:, 0]), across / speed**3
 
 
 def log2sim(t: Array, xy: Array, sigma: float, *, told: bool = True) -> Result:
@@ -259,13 +184,13 @@ def savgol(t: Array, xy: Array, _: float, *, window: int) -> Result:
     from scipy.signal import savgol_filter
 
     filled = np.column_stack([np.interp(ALL_S, t, z) for z in xy.T])
-    return of_derivatives(*(savgol_filter(filled, window, 3, deriv=k, delta=STEP_S, axis=0) for k in range(3)))
+    return of_derivatives(*(savgol_filter(filled, window, 3, deriv=k, delta=PERIOD_S, axis=0) for k in range(3)))
 
 
 def differences(t: Array, xy: Array, _: float) -> Result:
     filled = np.column_stack([np.interp(ALL_S, t, z) for z in xy.T])
-    velocity = np.gradient(filled, STEP_S, axis=0)
-    return of_derivatives(filled, velocity, np.gradient(velocity, STEP_S, axis=0))
+    velocity = np.gradient(filled, PERIOD_S, axis=0)
+    return of_derivatives(filled, velocity, np.gradient(velocity, PERIOD_S, axis=0))
 
 
 def kalman(t: Array, xy: Array, sigma: float, *, density: float) -> Result:
@@ -274,22 +199,22 @@ def kalman(t: Array, xy: Array, sigma: float, *, density: float) -> Result:
     from filterpy.kalman import KalmanFilter
 
     kf = KalmanFilter(dim_x=4, dim_z=2)
-    kf.F = np.kron(np.eye(2), [[1.0, STEP_S], [0.0, 1.0]])
+    kf.F = np.kron(np.eye(2), [[1.0, PERIOD_S], [0.0, 1.0]])
     kf.H = np.kron(np.eye(2), [[1.0, 0.0]])
-    kf.Q = np.kron(np.eye(2), Q_discrete_white_noise(2, STEP_S, density**2))
+    kf.Q = np.kron(np.eye(2), Q_discrete_white_noise(2, PERIOD_S, density**2))
     kf.R *= sigma**2
     kf.P = np.diag([sigma**2, 400.0] * 2)
     kf.x[[0, 2], 0] = xy[0]
-    seen = dict(zip(np.rint(t / STEP_S).astype(int).tolist(), xy, strict=True))
+    seen = dict(zip(np.rint(t / PERIOD_S).astype(int).tolist(), xy, strict=True))
     states, covariances = [], []
-    for k in range(COUNT):
+    for k in range(FRAMES):
         kf.predict()
         kf.update(seen[k][:, None] if k in seen else None)
         states.append(kf.x.copy())
         covariances.append(kf.P.copy())
     x = kf.rts_smoother(np.array(states), np.array(covariances))[0][:, :, 0]
     velocity = x[:, [1, 3]]
-    return of_derivatives(x[:, [0, 2]], velocity, np.gradient(velocity, STEP_S, axis=0))
+    return of_derivatives(x[:, [0, 2]], velocity, np.gradient(velocity, PERIOD_S, axis=0))
 
 
 def smoothers() -> dict[str, Smoother]:
@@ -309,38 +234,15 @@ def smoothers() -> dict[str, Smoother]:
     return out
 
 
-def errors(found: Result, truth: Motion) -> list[float]:
-    """Root mean squares of position m, velocity m/s, and where it moves of yaw in degrees and curvature 1/m."""
-    xy, velocity, yaw, curvature = found
-    moving = np.hypot(*truth.velocity.T) > MOVING_MPS
-    turned = (yaw - truth.yaw + np.pi) % (2 * np.pi) - np.pi
-    off = [
-        np.hypot(*(xy - truth.xy).T),
-        np.hypot(*(velocity - truth.velocity).T),
-        np.degrees(turned[moving]),
-        (curvature - truth.curvature)[moving],
-    ]
-    return [float(np.sqrt(np.mean(np.square(e)))) for e in off]
-
-
 def measure(sigma: float, outliers: float, seeds: int) -> dict[str, list[float]]:
     """Median errors and milliseconds of each smoother over maneuvers and seeds."""
     rows: dict[str, list[list[float]]] = {}
-    for number, name in enumerate(("lane change", "turn", "stop and go", "slalom")):
-        truth = maneuver(name)
-        for seed in range(seeds):
-            rng = np.random.default_rng([number, seed])
-            keep = rng.random(COUNT) > MISSING
-            keep[[0, -1]] = True
-            xy = truth.xy + rng.normal(0.0, sigma, (COUNT, 2))
-            wrong = rng.random(COUNT) < outliers
-            far = rng.uniform(NEAREST_SIGMAS, FARTHEST_SIGMAS, (int(wrong.sum()), 1))
-            xy[wrong] += sigma * far * rng.normal(size=(int(wrong.sum()), 2))
-            for method, smooth in smoothers().items():
-                begin = time.process_time()
-                found = smooth(ALL_S[keep], xy[keep], sigma)
-                seconds = time.process_time() - begin
-                rows.setdefault(method, []).append([*errors(found, truth), seconds * 1e3])
+    for world in worlds(sigma, outliers, seeds):
+        for method, smooth in smoothers().items():
+            begin = time.process_time()
+            found = smooth(ALL_S[world.valid], world.xy_m[world.valid], sigma)
+            milliseconds = 1e3 * (time.process_time() - begin)
+            rows.setdefault(method, []).append([*errors_of(world.truth, *found), milliseconds])
     return {method: np.median(values, axis=0).tolist() for method, values in rows.items()}
 
 

@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 from entry import parser_of
 
-from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
+from log2sim.datatypes import Agent, AgentTable, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios.tagging import find_tags
+from log2sim.scenarios.traffic import UNSEEN_S
 from log2sim.synth.scene import load_scene
 from log2sim.synth.synthesis import synthesize
 
@@ -540,8 +541,11 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[int]]:
     def same(one: str | None, two: str | None, t_s: float) -> bool:
         if one is None or two is None:
             return one is two
-        a, b = (of[id].at([t_s], margin_s=0.3) for of, id in zip(agents, (one, two)))
-        return bool(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m)[0] < 3.0)
+        a, b = (
+            AgentTable.of([of[id]], np.array([t_s]), margin_s=UNSEEN_S).center_m[0, 0]
+            for of, id in zip(agents, (one, two))
+        )
+        return bool(np.hypot(*(a - b)[:2]) < 3.0)
 
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     for g in ours:

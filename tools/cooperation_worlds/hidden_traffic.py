@@ -37,27 +37,15 @@ KINDS = ("vehicle", "car", "pedestrian", "two_wheeler")
 
 @dataclass(frozen=True, eq=False)
 class HiddenTraffic:
-    """A random scene with sensors at both ends.
-
-    Attributes
-    ----------
-    seed : int
-    run : TrafficRun
-    pole : LidarModel
-    place : SensorState
-        Of the pole's LiDAR.
-    ego_parts, ego_size : shape of the ego, as the pole sees it.
-    late_s : float
-        Of the pole's sweeps after those of the vehicle.
-    """
+    """A random scene with sensors at both ends."""
 
     seed: int
     run: TrafficRun
     pole: LidarModel
-    place: SensorState
-    ego_parts: Parts
-    ego_size: tuple[float, float, float]
-    late_s: float
+    place: SensorState  # of the pole's LiDAR
+    ego_parts: Parts  # shape of the ego, as the pole sees it
+    ego_size: tuple[float, float, float]  # shape of the ego, as the pole sees it
+    late_s: float  # of the pole's sweeps after those of the vehicle
 
     def vehicle_returns(self, t_s: float, index: int) -> Returns:
         """Cast the vehicle's sweep whose middle is at a time."""
@@ -121,14 +109,7 @@ def _drawn(seed: int, attempt: int) -> HiddenTraffic:
 
 @dataclass(frozen=True, eq=False)
 class SeenTraffic:
-    """A log of hidden traffic, and the returns of its sweeps.
-
-    Attributes
-    ----------
-    traffic : HiddenTraffic
-    log : Log
-    returns : mapping of LiDAR to a list of Returns
-    """
+    """A log of hidden traffic, and the returns of its sweeps."""
 
     traffic: HiddenTraffic
     log: Log

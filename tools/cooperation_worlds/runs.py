@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cooperation_worlds.world import Array
+from cooperation_worlds.world import ROAD_LIDAR, Array, RoadError, disturb
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Agent, Boxes3D, Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.detection.detect_log import detect_log
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, inverse
 from log2sim.pipeline import reconstruct, start
 
 ALONE = ("vehicle", "road")
@@ -29,18 +29,10 @@ ROUNDED_S = 0.06  # a tick is there until its neighbors are
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one way of perceiving made of a log.
+    """What one way of perceiving made of a log."""
 
-    Attributes
-    ----------
-    scenario : Scenario or None
-        None where nothing was found.
-    begin_s : float
-        When it begins, after the begin of the log's scene: at the middle of its first sweep.
-    """
-
-    scenario: Scenario | None
-    begin_s: float = 0.0
+    scenario: Scenario | None  # none where nothing was found
+    begin_s: float = 0.0  # when it begins, after the begin of the log's scene: at the middle of its first sweep
 
     def at(self, agent: Agent, t_s: Array) -> tuple[Array, NDArray[np.bool_]]:
         """x, y, yaw (T, 3) of an agent at times of the scene, and at which of them it was there; between waypoints straight."""
@@ -90,10 +82,7 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
 class Rows:
     """What was measured, by test, seed, way and settings; with a file also across runs.
 
-    Parameters
-    ----------
-    path : Path or None
-        JSON lines; rows of older code are not told apart, so begin a new file after a change.
+    `path`: JSON lines; rows of older code are not told apart, so begin a new file after a change.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -119,79 +108,92 @@ class Rows:
                 file.write(json.dumps([key, row]) + "\n")
 
 
+def registration_row(log: Log, error: RoadError) -> dict[str, Any]:
+    """Errors of the pole's end before and after `log2sim` has prepared a run, and what it says about them."""
+    disturbed = disturb(log, error)
+    run = start(disturbed, settings("points", register=True))
+    before, after = _error(log, disturbed), None
+    if ROAD_LIDAR in run.log.lidars:
+        after = _error(log, run.log)
+    return {
+        "before": before,
+        "after": after,
+        "faults": [[fault.kind, fault.treatment] for fault in run.faults if fault.subject == ROAD_LIDAR],
+    }
+
+
+def _error(log: Log, other: Log) -> dict[str, float]:
+    true, pose = log.lidars[ROAD_LIDAR].mount_T_lidar, other.lidars[ROAD_LIDAR].mount_T_lidar
+    turned = inverse(true)[:3, :3] @ pose[:3, :3]
+    angle = np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))
+    late_ns = other.streams[ROAD_LIDAR].t_ns[0] - log.streams[ROAD_LIDAR].t_ns[0]
+    return {
+        "offset_m": float(np.linalg.norm(pose[:2, 3] - true[:2, 3])),
+        "turn_deg": float(np.rad2deg(angle)),
+        "delay_s": float(late_ns / NS_PER_S),
+    }
+
+
+def registration_figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Medians and 90th percentiles of the errors, of those that are used."""
+    out: dict[str, Any] = {}
+    for when in ("before", "after"):
+        of = [r[when] for r in rows if r[when] is not None]
+        for name in ("offset_m", "turn_deg", "delay_s"):
+            values = np.abs([e[name] for e in of]) if of else np.array([np.nan])
+            out[f"{name}_{when}"] = {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
+    good = [r["after"] is not None and r["after"]["offset_m"] <= 0.1 and r["after"]["turn_deg"] <= 0.3 for r in rows]
+    out["within_target"] = float(np.mean(good))
+    out["left_out"] = float(np.mean([r["after"] is None for r in rows]))
+    return out
+
+
 NAMES = {
-    "vehicle": "vehicle alone",
-    "road": "road alone",
-    "points": "both, points",
-    "boxes": "both, boxes",
-    "tracks": "both, tracks",
-}
+    "vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes", "tracks": "both, tracks",
+}  # fmt: skip
+# Title, figure and format of the columns of tests B and C.
+BLIND_AREA = (
+    ("known before contact s", "before_contact_s", ".2f"), ("distance m", "distance_m", ".1f"), ("least m", "distance_least_m", ".1f"),
+    ("20 m or more", "from_20_m", ".2f"), ("gained s", "gained_s", ".2f"), ("2 s or more", "gained_2_s", ".2f"),
+    ("never known", "never", "d"), ("collisions, braking when known", "collisions", "d"),
+    ("warned before contact s", "warned_before_s", ".2f"), ("never warned", "never_warned", "d"),
+    ("collisions, braking when warned", "collisions_warned", "d"),
+)  # fmt: skip
+OVERLAP = (
+    ("found", "found", ".2f"), ("overlap", "overlap", ".3f"), ("IoU", "iou", ".3f"), ("over the better end", "over_better_end", "+.3f"),
+    ("over the better of each variant", "over_better_by_variant", "+.3f"), ("worse variants", "worse_variants", "d"),
+)  # fmt: skip
 
 
 def range_table(figures: dict[str, Any]) -> str:
-    """Test A."""
     bins = list(next(iter(figures.values()))["recall_by_distance"])
-    head = ["", "range m", "recall at 30 m", *(f"{b} m" for b in bins)]
     rows = [
         [NAMES[w], f"{f['range_m']:.0f}", _n(f["recall_30m"]), *(_n(v) for v in f["recall_by_distance"].values())]
         for w, f in figures.items()
     ]
-    return _table(head, rows)
+    return _table(["", "range m", "recall at 30 m", *(f"{b} m" for b in bins)], rows)
 
 
 def blind_area_table(figures: dict[str, Any]) -> str:
-    """Test B."""
-    head = [
-        "", "known before contact s", "distance m", "least m", "20 m or more", "gained s", "2 s or more", "never known",
-        "collisions, braking when known", "warned before contact s", "never warned", "collisions, braking when warned",
-    ]  # fmt: skip
-    rows = [
-        [
-            NAMES[w], _n(f["before_contact_s"]), f"{f['distance_m']:.1f}", f"{f['distance_least_m']:.1f}", _n(f["from_20_m"]),
-            _n(f["gained_s"]), _n(f["gained_2_s"]), str(f["never"]), str(f["collisions"]), _n(f["warned_before_s"]),
-            str(f["never_warned"]), str(f["collisions_warned"]),
-        ]
-        for w, f in figures.items()
-    ]  # fmt: skip
-    return _table(head, rows)
+    rows = [[NAMES[w], *(format(f[key], form) for _, key, form in BLIND_AREA)] for w, f in figures.items()]
+    return _table(["", *(title for title, _, _ in BLIND_AREA)], rows)
 
 
 def overlap_table(figures: dict[str, Any]) -> str:
-    """Test C."""
-    head = [
-        "",
-        "of",
-        "found",
-        "overlap",
-        "IoU",
-        "over the better end",
-        "over the better of each variant",
-        "worse variants",
-    ]
-    rows = [
-        [
-            NAMES[w], of, _n(f["found"]), f"{f['overlap']:.3f}", f"{f['iou']:.3f}", f"{f['over_better_end']:+.3f}",
-            f"{f['over_better_by_variant']:+.3f}", str(f["worse_variants"]),
-        ]
-        for of in ("boxes", "scenario")
-        for w, f in figures[of].items()
-    ]  # fmt: skip
-    return _table(head, rows)
+    found = [(of, w, f) for of in ("boxes", "scenario") for w, f in figures[of].items()]
+    rows = [[NAMES[w], of, *(format(f[key], form) for _, key, form in OVERLAP)] for of, w, f in found]
+    return _table(["", "of", *(title for title, _, _ in OVERLAP)], rows)
 
 
 def ap_table(figures: dict[str, Any]) -> str:
-    """AP in random traffic."""
     ways = list(next(iter(figures["ap"].values())))
-    rows = [
-        [kind, *("-" if ap[w] is None else f"{100 * ap[w]:.1f}" for w in ways)] for kind, ap in figures["ap"].items()
-    ]
+    rows = [[kind, *(_n(ap[w] and 100 * ap[w], 1) for w in ways)] for kind, ap in figures["ap"].items()]
     rows += [[f"recall, vehicles {what}", *(_n(of[w]) for w in ways)] for what, of in figures["recall"].items()]
     share = f"{figures['vehicles']} vehicles, {100 * figures['hidden_from_vehicle']:.0f} % hidden from the vehicle"
     return _table(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
 
 
 def registration_table(figures: dict[str, Any]) -> str:
-    """Errors of the pole's pose and clock."""
     rows = []
     for when in ("before", "after"):
         cells = [figures[f"{name}_{when}"] for name in ("offset_m", "turn_deg", "delay_s")]
@@ -200,8 +202,8 @@ def registration_table(figures: dict[str, Any]) -> str:
     return table + f"\n\nwithin 0.1 m and 0.3 deg: {_n(figures['within_target'])}; left out: {_n(figures['left_out'])}"
 
 
-def _n(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+def _n(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -211,9 +213,5 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 TABLE: dict[str, Callable[[dict[str, Any]], str]] = {
-    "range": range_table,
-    "blind_area": blind_area_table,
-    "overlap": overlap_table,
-    "ap": ap_table,
-    "registration": registration_table,
-}
+    "range": range_table, "blind_area": blind_area_table, "overlap": overlap_table, "ap": ap_table, "registration": registration_table,
+}  # fmt: skip

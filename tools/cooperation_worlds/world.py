@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Scenario, Stream, Sweep
-from log2sim.geometry import NS_PER_S, rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import NS_PER_S, rectangles_overlap, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Material, Polytope, Shape, box
-from log2sim.synth.raycast import mount_T_lidar, sweep_stamps
+from log2sim.synth.raycast import mount_T_lidar, slab_distance, sweep_stamps
 from log2sim.synth.returns import LidarModel, ReturnModel
 from log2sim.synth.scene import Building, LidarSpec, Scene
 from log2sim.synth.synthesis import synthesize
@@ -32,35 +32,16 @@ Parts = tuple[Polytope, ...]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One variant of a test.
+    """One variant of a test."""
 
-    Attributes
-    ----------
-    test : str
-        range, blind_area or overlap.
-    seed : int
-        From which everything is drawn.
-    scene : Scene
-    parts : mapping of str to tuple of Polytope
-        Shape of every agent, and of the "ego".
-    target : str
-        The agent that the test is about.
-    contact_s : float
-        When the front of the ego reaches the target, if nobody brakes; NaN where it does not.
-    things : tuple of Solid
-        Trees, posts, bins and other things beside the road, which are no road users.
-    every : int
-        One in so many sweeps is recorded; the LiDARs turn as fast as they do.
-    """
-
-    test: str
-    seed: int
+    test: str  # range, blind_area or overlap
+    seed: int  # from which everything is drawn
     scene: Scene
-    parts: dict[str, Parts]
-    target: str
-    contact_s: float = float("nan")
-    things: tuple[Solid, ...] = ()
-    every: int = 1
+    parts: dict[str, Parts]  # shape of every agent, and of the "ego"
+    target: str  # the agent that the test is about
+    contact_s: float = np.nan  # when the front of the ego reaches the target, if nobody brakes; NaN where it does not
+    things: tuple[Solid, ...] = ()  # trees, posts, bins and other things beside the road, which are no road users
+    every: int = 1  # one in so many sweeps is recorded; the LiDARs turn as fast as they do
 
     @property
     def period_s(self) -> float:
@@ -71,6 +52,17 @@ class World:
     def moving(self) -> MovingScene:
         """The scene in motion."""
         return MovingScene.of(self.scene)
+
+    @property
+    def target_actor(self) -> Actor:
+        """The target in motion."""
+        return next(a for a in self.moving.actors if a.spec.id == self.target)
+
+    def distances_m(self, t_s: Array) -> Array:
+        """Distances (T,) between the centers of the ego and the target."""
+        body = self.moving.ego_body
+        assert body is not None
+        return np.linalg.norm((self.target_actor.at(t_s).center_m - body.at(t_s).center_m)[:, :2], axis=1)
 
 
 def log_of(world: World) -> tuple[Log, Scenario]:
@@ -176,16 +168,20 @@ LIDAR_AHEAD_M = 1.2  # of the rear axle
 MAX_TRIES = 400
 
 
+def first_that_keeps(
+    test: str, number: int, seed: int, draw: Callable[[Builder], World | None], keeps: Callable[[World], bool]
+) -> World:
+    """The first variant of a test, drawn from a seed, that keeps what the test promises."""
+    for attempt in range(MAX_TRIES):
+        world = draw(Builder(test, seed, np.random.default_rng([seed, number, attempt])))
+        if world is not None and keeps(world):
+            return world
+    raise RuntimeError(f"{test}, seed {seed}: no variant within {MAX_TRIES} tries keeps what the test promises")
+
+
 @dataclass(eq=False)
 class Builder:
-    """What has been put into a world, in a frame with right-hand traffic.
-
-    Attributes
-    ----------
-    test : str
-    seed : int
-    rng : Generator
-    """
+    """What has been put into a world, in a frame with right-hand traffic."""
 
     test: str
     seed: int
@@ -325,26 +321,11 @@ SINKS_M = 0.1
 
 @dataclass(frozen=True)
 class RoadError:
-    """What is wrong with the road's end.
+    """What is wrong with the road's end."""
 
-    Attributes
-    ----------
-    offset_m : (float, float, float)
-        Of its position in the map.
-    turn_deg : (float, float, float)
-        Roll, pitch and yaw, of its axes in the map.
-    delay_s : float
-        Its stamps are later than its records.
-    """
-
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    delay_s: float = 0.0
-
-    @property
-    def horizontal_m(self) -> float:
-        """Length of the offset in the plane."""
-        return float(np.hypot(*self.offset_m[:2]))
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its position in the map
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # roll, pitch and yaw, of its axes in the map
+    delay_s: float = 0.0  # its stamps are later than its records
 
 
 def draw_error(seed: int, share: float = 1.0, *, delayed: bool = True) -> RoadError:
@@ -380,3 +361,75 @@ def _later(read: Callable[[int], Any], late_ns: int) -> Callable[[int], Sweep]:
         return replace(sweep, stamp_ns=sweep.stamp_ns + late_ns, t_ns=t_ns)
 
     return moved
+
+
+# Points on the target's axis and sides, at shares of its half length, half width and height.
+ALONG, ACROSS, UP = (-0.8, 0.0, 0.8), (-0.8, 0.0, 0.8), (0.15, 0.4, 0.65, 0.9)
+
+
+def visible_share(world: World, lidar: str, t_s: Array, target: str = "") -> Array:
+    """Share (T,) of points in the target's box that lie within the range of a LiDAR and that no other box hides, at times (T,)."""
+    moving, spec = world.moving, next(s for s in world.scene.lidar if s.name == lidar)
+    seen = {actor.spec.id: actor for actor in moving.seen_from(spec.mount)}
+    actor = seen.pop(target or world.target)
+    stamps = world.scene.start_ns + np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
+    eye = (moving.map_T_mount(spec.mount, stamps) @ mount_T_lidar(spec))[:, :3, 3]
+    shares = np.array([(x, y, z) for x in ALONG for y in ACROSS for z in UP])
+    states, out = actor.at(t_s), np.zeros(len(t_s))
+    boxes = [(np.array(other.spec.box_m), other.at(t_s)) for other in seen.values()]
+    for k in range(len(t_s)):
+        local = shares * np.array(actor.spec.box_m) * [0.5, 0.5, 1.0] - [0, 0, actor.spec.box_m[2] / 2]
+        points = local @ rotation_from_rpy(0, 0, states.yaw_rad[k]).T + states.center_m[k]
+        ray = points - eye[k]
+        free = np.linalg.norm(ray, axis=1) < spec.range_m
+        for size, at in boxes:
+            back = rotation_from_rpy(0, 0, at.yaw_rad[k])
+            origin = np.tile((eye[k] - at.center_m[k]) @ back, (len(ray), 1))
+            free &= ~(slab_distance(size, origin, ray @ back) < 1.0)
+        for back, middle, size in _standing(world):
+            origin = np.tile((eye[k] - middle) @ back, (len(ray), 1))
+            free &= ~(slab_distance(size, origin, ray @ back) < 1.0)
+        out[k] = free.mean()
+    return out
+
+
+def _standing(world: World) -> list[tuple[Array, Array, Array]]:
+    """List what stands for good: rotation, center and size of the box around each building, and each part of a thing."""
+    out = []
+    for house in world.scene.building:
+        back = rotation_from_rpy(0, 0, np.deg2rad(house.yaw_deg))
+        out.append((back, np.array([*house.center, house.size_m[2] / 2]), np.array(house.size_m)))
+    for thing in world.things:
+        back = rotation_from_rpy(0, 0, thing.yaw_rad)
+        for part in thing.parts:
+            middle = thing.position_m + back @ (part.low + part.high) / 2
+            out.append((back, middle, np.asarray(part.high - part.low)))
+    return out
+
+
+def agents_touch(world: World, t_s: Array, gap_m: float) -> bool:
+    """Return whether two road users, the ego among them, come nearer to each other than a gap at times (T,)."""
+    states = [(actor.at(t_s), np.tile(np.array(actor.spec.box_m[:2]) + gap_m, (len(t_s), 1))) for actor in _all(world)]
+    return any(
+        rectangles_overlap(
+            *(other.center_m - one.center_m)[:, :2].T, one.yaw_rad, other.yaw_rad, size, other_size
+        ).any()
+        for k, (one, size) in enumerate(states)
+        for other, other_size in states[:k]
+    )
+
+
+def things_touch(world: World, t_s: Array, gap_m: float) -> bool:
+    """Return whether a road user may come nearer to the middle of a thing than a gap: circles around the boxes decide."""
+    places = np.array([thing.position_m[:2] for thing in world.things]).reshape(-1, 2)
+    for actor in _all(world):
+        away = np.linalg.norm(actor.at(t_s).center_m[:, None, :2] - places, axis=2)
+        if (away < np.hypot(*actor.spec.box_m[:2]) / 2 + gap_m).any():
+            return True
+    return False
+
+
+def _all(world: World) -> tuple[Actor, ...]:
+    moving = world.moving
+    assert moving.ego_body is not None
+    return (*moving.actors, moving.ego_body)

@@ -94,53 +94,44 @@ def manifest(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], obj
     return edit
 
 
-@case("calibration: quaternion not of length 1", "refused, naming the sensor")
-def long_quaternion() -> Outcome:
-    return refused(manifest(lambda m: m["sensors"][0].update(rotation_wxyz=[0.5, -0.5, 0.6, -0.5])), "rotation_wxyz")
+FIELDS = {
+    "quaternion not of length 1": (
+        lambda m: m["sensors"][0].update(rotation_wxyz=[0.5, -0.5, 0.6, -0.5]),
+        "rotation_wxyz",
+    ),
+    "focal length 0 in the file": (lambda m: m["sensors"][0]["intrinsics"].update(fx_px=0), "fx_px"),
+}
+for _name, (_change, _word) in FIELDS.items():
+    case(f"calibration: {_name}", "refused, naming the field")(lambda c=_change, w=_word: refused(manifest(c), w))
 
 
-@case("calibration: focal length 0 in the file", "refused, naming the field")
-def no_focal_length() -> Outcome:
-    return refused(manifest(lambda m: m["sensors"][0]["intrinsics"].update(fx_px=0)), "fx_px")
-
-
-def with_camera(**changes: Any) -> Log:
+def with_camera(name: str, change: Callable[[Array], object]) -> Log:
+    """The log with an array of its camera changed in place."""
     log = small_log()
-    return replace(log, cameras={"front": replace(log.cameras["front"], **changes)})
+    array = getattr(log.cameras["front"], name).copy()
+    change(array)
+    return replace(log, cameras={"front": replace(log.cameras["front"], **{name: array})})
 
 
-@case("calibration: rotation not orthonormal (log in memory)", "refused, naming the sensor")
-def skew_rotation() -> Outcome:
-    skew = small_log().cameras["front"].mount_T_cam.copy()
-    skew[0, 0] += 0.1
-    return refused_log(with_camera(mount_T_cam=skew), "'front'")
+def with_lidar(scale: float) -> Log:
+    lidar = small_log().lidars["top"]
+    return replace(small_log(), lidars={"top": replace(lidar, mount_T_lidar=lidar.mount_T_lidar * scale)})
 
 
-@case("calibration: mirrored rotation (log in memory)", "refused, naming the sensor")
-def mirrored_rotation() -> Outcome:
-    mirror = small_log().cameras["front"].mount_T_cam @ np.diag([-1.0, 1.0, 1.0, 1.0])
-    return refused_log(with_camera(mount_T_cam=mirror), "'front'")
-
-
-@case("calibration: singular K (log in memory)", "refused, naming the camera")
-def singular_intrinsics() -> Outcome:
-    k = small_log().cameras["front"].K.copy()
-    k[1, 1] = 0.0
-    return refused_log(with_camera(K=k), "'front'")
-
-
-@case("calibration: NaN in K (log in memory)", "refused, naming the camera")
-def nan_intrinsics() -> Outcome:
-    k = small_log().cameras["front"].K.copy()
-    k[0, 2] = np.nan
-    return refused_log(with_camera(K=k), "'front'")
-
-
-@case("calibration: LiDAR rotation not orthonormal (log in memory)", "refused, naming the sensor")
-def skew_lidar() -> Outcome:
-    log = small_log()
-    lidar = log.lidars["top"]
-    return refused_log(replace(log, lidars={"top": replace(lidar, mount_T_lidar=lidar.mount_T_lidar * 1.1)}), "'top'")
+MATRICES = {
+    "rotation not orthonormal": (
+        lambda: with_camera("mount_T_cam", lambda m: m.__setitem__((0, 0), m[0, 0] + 0.1)),
+        "front",
+    ),
+    "mirrored rotation": (lambda: with_camera("mount_T_cam", lambda m: np.negative(m[:3, 0], out=m[:3, 0])), "front"),
+    "singular K": (lambda: with_camera("K", lambda k: k.__setitem__((1, 1), 0.0)), "front"),
+    "NaN in K": (lambda: with_camera("K", lambda k: k.__setitem__((0, 2), np.nan)), "front"),
+    "LiDAR rotation not orthonormal": (lambda: with_lidar(1.1), "top"),
+}
+for _name, (_log, _sensor) in MATRICES.items():
+    case(f"calibration: {_name} (log in memory)", "refused, naming the sensor")(
+        lambda g=_log, s=_sensor: refused_log(g(), f"'{s}'")
+    )
 
 
 SAMPLE = Path(__file__).resolve().parents[2] / "samples/crossing"
@@ -340,6 +331,7 @@ def run(change: Change, required: Required) -> Outcome:
     return Outcome(enough and small and right, f"{words}; {numbers}", None, found["position_m"])
 
 
+# What is done to the sample, and what is required of its reconstruction.
 FAULTS: dict[str, tuple[Change, Required]] = {
     "none": (lambda log: log, Required((), 0.98, 0.98, 0.2, 0.15, 0.1)),
     "front camera frozen from 2 s": (frozen_camera, Required(("frozen_images",), speed_mps=0.2)),
@@ -361,16 +353,12 @@ FAULTS: dict[str, tuple[Change, Required]] = {
     "poses at 0.8 Hz": (every_s(1.25), Required(None, 0.98, 0.97)),
     "no LiDAR for 1 s": (no_sweeps, Required(("missing_sweeps",), nees=2.0)),
 }  # fmt: skip
-"""What is done to the sample, and what is required of its reconstruction."""
 
+# One of each kind of fault; a run takes 20 s.
 SLOW_TESTS = {
-    "front camera frozen from 2 s",
-    "one LiDAR sweep repeated for 1 s",
-    "LiDAR stamps + 100 ms, --fix-time",
-    "left and right extrinsics swapped",
-    "GNSS frozen for 1 s",
-}
-"""One of each kind of fault; a run takes 20 s."""
+    "front camera frozen from 2 s", "one LiDAR sweep repeated for 1 s", "LiDAR stamps + 100 ms, --fix-time",
+    "left and right extrinsics swapped", "GNSS frozen for 1 s",
+}  # fmt: skip
 
 for _name, (_change, _required) in FAULTS.items():
     _by: RunBy = "slow tests" if _name in SLOW_TESTS else "tool"

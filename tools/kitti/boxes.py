@@ -130,8 +130,6 @@ def _corners(boxes: Boxes) -> Array:
 def _overlap_areas(a: Array, b: Array) -> Array:
     """Area (N,) that convex counter-clockwise quadrilaterals (N, 4, 2) have in common.
 
-    Notes
-    -----
     The corners of the common polygon are corners of one inside the other and crossings of edges; sorted by angle about their
     mean, the shoelace formula gives the area. Edges that lie on each other add no crossing, but their ends are corners.
     """
@@ -213,27 +211,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Boxes of tracks (N,).
+    """Boxes of tracks (N,)."""
 
-    Attributes
-    ----------
-    frame : (N,) int64
-    track : (N,) int64
-    source : (N,) int64
-        Row of the detection, -1 where the box is only predicted.
-    model : (N,) int64
-        Row of the detection that tells size, height and heading.
-    xy_m : (N, 2) float64
-        Center in the map.
-    category : (N,) str
-    """
-
-    frame: Index
-    track: Index
-    source: Index
-    model: Index
-    xy_m: Array
-    category: NDArray[np.str_]
+    frame: Index  # (N,)
+    track: Index  # (N,)
+    source: Index  # (N,): row of the detection, -1 where the box is only predicted
+    model: Index  # (N,): row of the detection that tells size, height and heading
+    xy_m: Array  # (N, 2): center in the map
+    category: NDArray[np.str_]  # (N,)
 
     def take(self, index: NDArray[np.generic]) -> Rows:
         """The rows at `index`."""

@@ -120,26 +120,13 @@ SAME_PLACE_IOU = 0.1
 class Described:
     """Rows of tracks as boxes of the camera with what tells whether they are labeled, by track and frame.
 
-    Attributes
-    ----------
-    boxes : Boxes
-        N rows; `track_id` is the track.
-    seen : (N,) bool
-        Whether the box was detected.
-    distance : (N,) int64
-        Frames to the nearest detection of the track, online to the last one.
-    gap : (N,) int64
-        Frames in a row without a detection between two of them, 0 where there is one and beyond the ends of the track.
-    doubled : (N,) bool
-        Predicted boxes where another track is that was seen there or nearer in time.
-    hits : (N,) float64
-        Detections of the track so far.
-    confidence : (N,) float64
-        How much the track is believed by all its detections, online by those so far.
-    features : mapping
-        (N,) float64 each, by name: `score` of the detection, `near_score` and `near_share` the mean score of the detections
-        around it and the share of the frames that have one, `hidden` the share of the image box that others hide beyond what
-        does not matter, `height` the logarithm of its height.
+    `boxes`: N rows; `track_id` is the track. `seen` (N,): whether the box was detected. `distance` (N,): frames to the
+    nearest detection of the track, online to the last one. `gap` (N,): frames in a row without a detection between two of
+    them, 0 where there is one and beyond the ends of the track. `doubled` (N,): predicted boxes where another track is that
+    was seen there or nearer in time. `hits` (N,): detections of the track so far. `confidence` (N,): how much the track is
+    believed by all its detections, online by those so far. `features`: (N,) float64 each, by name: `score` of the detection,
+    `near_score` and `near_share` the mean score of the detections around it and the share of the frames that have one,
+    `hidden` the share of the image box that others hide beyond what does not matter, `height` the logarithm of its height.
     """
 
     boxes: Boxes
@@ -341,24 +328,12 @@ MOVED_ON_FOOT_M, WALKING_MPS, WALKS, RIDES = 1.0, (0.5, 2.0), -2.0, 4.0
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Detections of a sequence, in places with a pedestrian and a rider only one of them first.
+    """Detections of a sequence, in places with a pedestrian and a rider only one of them first."""
 
-    Attributes
-    ----------
-    boxes : Boxes
-        N detections for the tracker, sorted by frame, then the others of their pairs, sorted by frame as well.
-    count : int
-        N.
-    other : (N,) int64
-        Row of the other one of the pair, -1 for none.
-    rider : (N,) float64
-        How much rather it is a rider than a pedestrian, in units of a score.
-    """
-
-    boxes: Boxes
-    count: int
-    other: Index
-    rider: Array
+    boxes: Boxes  # N detections for the tracker, by frame, then the others of their pairs, by frame as well
+    count: int  # N
+    other: Index  # (N,): row of the other one of the pair, -1 for none
+    rider: Array  # (N,): how much rather it is a rider than a pedestrian, in units of a score
 
     @property
     def tracked(self) -> Boxes:

@@ -15,24 +15,13 @@ from log2sim.tracking.forward import ACCELERATION_MPS2, first_velocity, measurem
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Smoothed states, one row a track and tick, sorted by track.
+    """Smoothed states, one row a track and tick, sorted by track."""
 
-    Attributes
-    ----------
-    track : (N,) int64
-    tick : (N,) int64
-    row : (N,) int64
-        Row of the measurement in the track, -1 in a gap.
-    mean : (N, 4) float64
-        x, y, vx, vy in the map.
-    covariance : (N, 4, 4) float64
-    """
-
-    track: NDArray[np.int64]
-    tick: NDArray[np.int64]
-    row: NDArray[np.int64]
-    mean: Array
-    covariance: Array
+    track: NDArray[np.int64]  # (N,)
+    tick: NDArray[np.int64]  # (N,)
+    row: NDArray[np.int64]  # (N,): row of the measurement in the track, -1 in a gap
+    mean: Array  # (N, 4): x, y, vx, vy in the map
+    covariance: Array  # (N, 4, 4)
 
 
 def smooth_paths(
@@ -46,8 +35,6 @@ def smooth_paths(
 
     Each is carried on at both ends by `beyond` (A,) ticks, as far as there are ticks.
 
-    Notes
-    -----
     Kalman filter and Rauch-Tung-Striebel smoother. All tracks are processed in parallel, each from its own first tick on, so
     the number of steps is the length of the longest track.
     """

@@ -60,23 +60,12 @@ CATEGORIES = ("car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "bic
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A leveled cloud and its road users.
+    """A leveled cloud and its road users."""
 
-    Attributes
-    ----------
-    xyz_m : (N, 3) float32, m
-        z is the height above the estimated ground; the sensor is at x = y = 0.
-    boxes : (M, 7) float32
-        x, y, z, length, width, height, heading.
-    category : (M,) int64
-        Index into CATEGORIES.
-    points : (M,) int64
-    """
-
-    xyz_m: NDArray[np.float32]
-    boxes: NDArray[np.float32]
-    category: NDArray[np.int64]
-    points: NDArray[np.int64]
+    xyz_m: NDArray[np.float32]  # (N, 3), m: z is the height above the estimated ground; the sensor is at x = y = 0
+    boxes: NDArray[np.float32]  # (M, 7): x, y, z, length, width, height, heading
+    category: NDArray[np.int64]  # (M,): index into CATEGORIES
+    points: NDArray[np.int64]  # (M,)
 
 
 def draw_sample(mount: Mount, seed: tuple[int, ...]) -> Sample:

@@ -22,26 +22,13 @@ StepLoss = Callable[[nn.Module, np.random.Generator, int], tuple[Tensor, dict[st
 
 @dataclass(frozen=True)
 class FitPlan:
-    """How a network is fitted.
-
-    Attributes
-    ----------
-    steps : int
-    seed : int
-        Each step draws from it and its own number, so that a resumed run draws the same.
-    peak_rate : float
-        Of AdamW, reached after the warm-up; falls by a cosine to the last step.
-    warm_up_steps : int
-        In which the rate rises.
-    checkpoint : Path or None
-        File that is written every minute, and from which a run goes on.
-    """
+    """How a network is fitted."""
 
     steps: int
-    seed: int = 1
-    peak_rate: float = 1e-3
-    checkpoint: Path | None = None
-    warm_up_steps: int = 50
+    seed: int = 1  # each step draws from it and its own number, so that a resumed run draws the same
+    peak_rate: float = 1e-3  # of AdamW, reached after the warm-up; falls by a cosine to the last step
+    checkpoint: Path | None = None  # file that is written every minute, and from which a run goes on
+    warm_up_steps: int = 50  # in which the rate rises
 
 
 def fit(network: nn.Module, step_loss: StepLoss, plan: FitPlan) -> dict[str, Tensor]:

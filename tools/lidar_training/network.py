@@ -140,30 +140,15 @@ MIN_REGRESSED_PEAK = 0.45
 
 @dataclass(eq=False)
 class Targets:
-    """Maps (B, ...) at the network's stride.
+    """Maps (B, ...) at the network's stride."""
 
-    Attributes
-    ----------
-    heat : (B, 3, h, w)
-        One at an object's middle, falling around it.
-    box : (B, 10, h, w)
-        dx, dy, z, log sizes, sin and cos of twice the yaw, sin and cos of the yaw.
-    regressed, considered : (B, 1, h, w)
-        Where the box is regressed; where the heat is judged.
-    category : (B, h, w) int64
-        Index of the category, -1 where none is regressed.
-    segment : (B, h, w) int64
-        0 background, else 1 + group.
-    vote : (B, 2, h, w)
-    """
-
-    heat: Tensor
-    box: Tensor
-    regressed: Tensor
-    considered: Tensor
-    category: Tensor
-    segment: Tensor
-    vote: Tensor
+    heat: Tensor  # (B, 3, h, w): one at an object's middle, falling around it
+    box: Tensor  # (B, 10, h, w): dx, dy, z, log sizes, sin and cos of twice the yaw, sin and cos of the yaw
+    regressed: Tensor  # (B, 1, h, w): where the box is regressed; where the heat is judged
+    considered: Tensor  # (B, 1, h, w): where the box is regressed; where the heat is judged
+    category: Tensor  # (B, h, w): index of the category, -1 where none is regressed
+    segment: Tensor  # (B, h, w): 0 background, else 1 + group
+    vote: Tensor  # (B, 2, h, w)
 
 
 def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m: float) -> Targets:

@@ -27,20 +27,11 @@ MAX_LAG_NS = 100_000_000
 
 @dataclass(frozen=True, eq=False)
 class LogView:
-    """A camera in whose image road users were labeled, at the time of a cloud.
-
-    Attributes
-    ----------
-    camera : Camera
-    cam_T_cloud : (4, 4) float64
-        From map axes relative to the cloud's origin.
-    ignored_px : (R, 4) float64
-        u0, v0, u1, v1 of the parts of the image without labels.
-    """
+    """A camera in whose image road users were labeled, at the time of a cloud."""
 
     camera: Camera
-    cam_T_cloud: Array
-    ignored_px: Array
+    cam_T_cloud: Array  # (4, 4): from map axes relative to the cloud's origin
+    ignored_px: Array  # (R, 4): u0, v0, u1, v1 of the parts of the image without labels
 
     def shows(self, xyz: Array) -> NDArray[np.bool_]:
         """Mark the points (N, 3) in the labeled parts of the image."""
@@ -52,20 +43,11 @@ class LogView:
 
 @dataclass(frozen=True, eq=False)
 class LogSweep:
-    """A cloud of a log with its labels in the cloud's axes.
-
-    Attributes
-    ----------
-    cloud : Cloud
-    truth : SceneBoxes
-        Relative to the cloud's origin.
-    views : tuple of LogView
-        The cameras in whose images road users were labeled; empty where everything was.
-    """
+    """A cloud of a log with its labels in the cloud's axes."""
 
     cloud: Cloud
-    truth: SceneBoxes
-    views: tuple[LogView, ...]
+    truth: SceneBoxes  # relative to the cloud's origin
+    views: tuple[LogView, ...]  # the cameras in whose images road users were labeled; empty where everything was
 
     def labeled(self, xyz: Array) -> NDArray[np.bool_]:
         """Mark the points (N, 3), relative to the cloud's origin, where road users have labels."""
@@ -82,10 +64,7 @@ def labeled_by(views: tuple[LogView, ...], xyz: Array) -> NDArray[np.bool_]:
 def read_sweeps(log: Log, every: int = 1) -> list[LogSweep]:
     """Read every n-th sweep of a log that has labels in it.
 
-    Raises
-    ------
-    LogError
-        When there is none.
+    Raises `LogError` when there is none.
     """
     names = list(log.lidars)
     labels = create_lidar_detector("lidar:labels", log, LidarConfig())

@@ -74,20 +74,8 @@ def commands_for(kind: str, path: Path, out: Path, variant: int) -> list[list[ob
         return [
             *looks,
             # Neither the user's cache nor other processes: both are outside of what the watch allows.
-            [
-                "reconstruct",
-                path,
-                "--detector",
-                detector,
-                "--no-cache",
-                "--jobs",
-                1,
-                "--out",
-                out / "s.json",
-                "--report",
-                out / "r.json",
-            ],
-        ]
+            ["reconstruct", path, "--detector", detector, "--no-cache", "--jobs", 1, "--out", out / "s.json", "--report", out / "r.json"],
+        ]  # fmt: skip
     if kind == XOSC:
         return [["import", path, "--out", out / "s.json"]]
     assert kind == SCENARIO
@@ -126,7 +114,7 @@ def run_commands(
 
 def measured(kind: str, path: Path, out: Path, variant: int, watched: Watched) -> Ran:
     """Run the commands of an input with a limit of memory; measure the time and the peak of memory."""
-    _forget_peak()
+    Path("/proc/self/clear_refs").write_text("5")  # the peak of the memory begins anew (Linux)
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (_status_bytes("VmSize") + MEMORY_BYTES, hard))
     start = time.process_time()
@@ -161,16 +149,9 @@ def _told_in_report(path: Path) -> frozenset[str]:
     )
 
 
-def _forget_peak() -> None:
-    """Let the peak of the memory begin anew (Linux)."""
-    with open("/proc/self/clear_refs", "w") as file:
-        file.write("5")
-
-
 def _status_bytes(name: str) -> int:
-    with open("/proc/self/status") as file:
-        line = next(line for line in file if line.startswith(name))
-    return int(line.split()[1]) * 1024
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
 
 
 def prepare_process() -> None:
@@ -192,7 +173,7 @@ MEANING = {
     "refused": "one message and a documented exit code",
     "told": "a result, and a line on the terminal or in the report that a sound run does not have",
     "no effect": "the same result as without the damage",
-    "plausible": "another result without a word; the damage is none that a program can see, see damage.py",
+    "plausible": "another result without a word; the damage is none that a program can see, see damages.py",
     "swallowed": "another result without a word, though the damage can be seen",
     "crash": "an internal error, a traceback, a signal or an undocumented exit code",
     "hang": "not ended within the time limit",
@@ -251,7 +232,6 @@ PROCESSES = (
     "os.posix_spawn",
     "os.spawn",
     "os.fork",
-    "os.forkpty",
     "subprocess.Popen",
     "pty.spawn",
     "os.startfile",

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import importlib
+import multiprocessing
 import os
-import pickle
 import pkgutil
-import select
 import shutil
-import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 
 import log2sim
 from mutation.bases import KINDS, LOGS, SCENARIO, XOSC, write_base
-from mutation.binaries import CONTAINERS, FILES, MESSAGES, RAW, STORED
-from mutation.damage import Damage, Mutation, Place, damage
+from mutation.damages import ALL, Damage, Mutation, Place, damage
 from mutation.running import (
     Canaries,
     Outcome,
@@ -34,9 +31,7 @@ from mutation.running import (
     run_commands,
     variant_of,
 )
-from mutation.texts import LINES, TREES, XML
 
-ALL: tuple[Mutation, ...] = (*RAW, *LINES, *TREES, *FILES, *CONTAINERS, *STORED, *MESSAGES, *XML)
 # Of 48 inputs four are scenarios and two OpenSCENARIO files, the rest logs in turn.
 CYCLE = (*LOGS, SCENARIO, *LOGS, SCENARIO, *LOGS, SCENARIO, SCENARIO, XOSC, XOSC)
 INPUTS_PER_WORKER = 1000
@@ -99,7 +94,7 @@ class Harness:
         kind = kind_of(index)
         # A folder of its own for each, as readers may remember files by their path.
         case, sound = self.case(index), self.bases[kind]
-        _remove(case.parent)
+        shutil.rmtree(case.parent, ignore_errors=True)
         self.canaries.reset()
         top = self.folder / "sound" / kind.replace(" ", "-")
         shutil.copytree(top, case / "input")
@@ -115,7 +110,7 @@ class Harness:
         key = " ".join(map(str, command))
         if key not in self._sound:
             # A run that was late and stopped leaves its folder.
-            _remove(out)
+            shutil.rmtree(out, ignore_errors=True)
             self._sound[key] = run_commands(kind, self.bases[kind], out, [command])[0]
             if self._sound[key].code:
                 raise RuntimeError(f"a sound input of kind '{kind}' fails: {self._sound[key]}")
@@ -158,74 +153,53 @@ def run_many(
 
 def _run_batch(harness: Harness, seed: int, batch: Sequence[int], runner: Runner, time_limit_s: float) -> Iterator[Row]:
     """Rows of a worker until it has done all, or has been ended."""
-    receive, send = os.pipe()
+    fork = multiprocessing.get_context("fork")
+    receive, send = fork.Pipe(duplex=False)
     sys.stdout.flush()
-    worker = os.fork()
-    if worker == 0:
-        os.close(receive)
-        _work(harness, seed, batch, runner, send)
-    os.close(send)
+    worker = fork.Process(target=_work, args=(harness, seed, batch, runner, send), daemon=True)
+    worker.start()
+    send.close()
     try:
         for index in batch:
-            message = _receive(receive, time_limit_s)
-            if isinstance(message, Row):
-                yield message
+            late = not receive.poll(time_limit_s)
+            try:
+                row = None if late else receive.recv()
+            except EOFError:
+                row = None
+            if isinstance(row, str):
+                raise RuntimeError(f"the harness itself failed: {row}")
+            if row is not None:
+                yield row
                 continue
-            if message == "late":
-                os.kill(worker, signal.SIGKILL)
-            status = os.waitpid(worker, 0)[1]
-            worker = 0
-            verdict, reason = (
-                ("hang", f"not ended after {time_limit_s:.0f} s")
-                if message == "late"
-                else ("crash", f"the process ended with status {status}")
+            if late:
+                worker.kill()
+            worker.join()
+            reason = (
+                f"not ended after {time_limit_s:.0f} s" if late else f"the process ended with status {worker.exitcode}"
             )
             _, _, name, done = harness.make(seed, index)
+            verdict = "hang" if late else "crash"
             yield Row(seed, index, kind_of(index), f"{name}: {done.what}", done.visible, verdict, reason, time_limit_s)
             return
     finally:
-        os.close(receive)
-        if worker:
-            os.kill(worker, signal.SIGKILL)
-            os.waitpid(worker, 0)
+        receive.close()
+        worker.kill()
+        worker.join()
 
 
-def _work(harness: Harness, seed: int, batch: Sequence[int], runner: Runner, send: int) -> None:
-    """Run a batch in a new process, which never returns."""
+def _work(harness: Harness, seed: int, batch: Sequence[int], runner: Runner, send: Connection) -> None:
+    """Run a batch in a new process."""
+    silent = os.open(os.devnull, os.O_RDWR)
+    os.dup2(silent, 2)  # what libraries in C print
+    os.dup2(silent, 0)
+    watch = Watch()
     try:
-        silent = os.open(os.devnull, os.O_RDWR)
-        os.dup2(silent, 2)  # what libraries in C print
-        os.dup2(silent, 0)
-        watch = Watch()
         for index in batch:
-            row = harness.run_one(seed, index, watch, runner)
-            data = pickle.dumps(row)
-            os.write(send, len(data).to_bytes(4, "little") + data)
+            send.send(harness.run_one(seed, index, watch, runner))
     except BaseException as error:
-        data = pickle.dumps(f"{type(error).__name__}: {error}")
-        os.write(send, len(data).to_bytes(4, "little") + data)
-        raise
+        send.send(f"{type(error).__name__}: {error}")
     finally:
         os._exit(0)
-
-
-def _receive(source: int, time_limit_s: float) -> Row | str:
-    """A row; "late" after the time limit; "" when the worker died."""
-    if not select.select([source], [], [], time_limit_s)[0]:
-        return "late"
-    head = os.read(source, 4)
-    if len(head) < 4:
-        return ""
-    data, size = b"", int.from_bytes(head, "little")
-    while len(data) < size:
-        part = os.read(source, size - len(data))
-        if not part:
-            return ""
-        data += part
-    message = pickle.loads(data)
-    if isinstance(message, str):
-        raise RuntimeError(f"the harness itself failed: {message}")
-    return message
 
 
 def import_everything() -> None:
@@ -234,11 +208,3 @@ def import_everything() -> None:
     for module in pkgutil.walk_packages(log2sim.__path__, "log2sim."):
         if not module.name.endswith("__main__") and ".carla" not in module.name:
             importlib.import_module(module.name)
-
-
-def _remove(folder: Path) -> None:
-    """Remove a folder that may hold folders that must not be read."""
-    for _ in range(2):
-        if folder.exists():
-            shutil.rmtree(folder, ignore_errors=True)
-            time.sleep(0)

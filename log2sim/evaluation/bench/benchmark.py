@@ -125,7 +125,7 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[Point
         "measure": [_measure_point(context, r) for r in by_stage["measure"]],
         "homography": homographies,
         "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
-        "whole run": _with_placed_shares(whole, homographies),
+        "whole run": _add_placed_shares(whole, homographies),
     }
     return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
 
@@ -164,7 +164,7 @@ def _measure_point(context: BenchContext, run: BenchRun) -> Point:
     return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
 
 
-def _with_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
+def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
     """Add to whole runs the share of the obstacles that their homographies place."""
     if not homographies:
         return list(whole)
@@ -194,21 +194,11 @@ def _error(context: BenchContext, stage: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """The result of a benchmark.
+    """The result of a benchmark."""
 
-    Attributes
-    ----------
-    context : BenchContext
-        What all runs had in common.
-    panels : tuple of Panel
-        One for each stage.
-    notes : tuple of str
-        What could not be measured, and why.
-    """
-
-    context: BenchContext
-    panels: tuple[Panel, ...]
-    notes: tuple[str, ...]
+    context: BenchContext  # what all runs had in common
+    panels: tuple[Panel, ...]  # one for each stage
+    notes: tuple[str, ...]  # what could not be measured, and why
 
     def __repr__(self) -> str:
         """Return the log and the stages in one line."""
@@ -217,10 +207,7 @@ class Benchmark:
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame with one row for each stage and setting: time, error and the figures of the stage.
 
-        Raises
-        ------
-        MissingExtra
-            When pandas is not installed.
+        Raises `MissingExtra` when pandas is not installed.
         """
         try:
             import pandas as pd
@@ -302,42 +289,50 @@ def bench(
 
 
 SIZE_PT, LETTER_PT, LINE_PT, POINT_PT = 6.8, 3.9, 9.0, 6.0
-# Points nearer to each other than this share one block of labels.
-MAX_SHARED_LABEL_PT = 7.0
 # Labels farther from their point than this get a leader line.
 MIN_LEADER_PT = 11.5
-# Candidates for a block of labels by preference: side, horizontal gap and vertical offset from its point, in points.
-CANDIDATES = tuple(
-    (side, gap, rise)
+# Candidates for a label by preference: horizontal gap from its point, which side of it, and vertical offset, in points.
+CANDIDATES = np.array([
+    (side * 10.0, side, rise)
     for rise in (0, 9, -9, 16, -16, 24, -24, 34, -34, 46, -46, 60, -60, 76, -76)
-    for side, gap in ((1, 10), (-1, 10), (0, 0))
+    for side in (1, -1, 0)
     if side or abs(rise) > 9
-)
-
-Box = tuple[float, float, float, float]  # left, bottom, right, top in display pixels
+])  # fmt: skip
 
 
 def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
-    """Label points (K, 2) with their settings, clear of a line with corners `line` (n, 2)."""
-    pt = float(ax.figure.dpi) / 72
-    at = ax.transData.transform(xy)
-    present = next(p for p in points if p.present) if any(p.present for p in points) else points[0]
-    # Covering a point costs three times as much as covering a label.
-    taken = 3 * [_around(u, v, POINT_PT * pt) for u, v in at] + _along(ax.transData.transform(line), pt)
-    frame = ax.get_window_extent()
-    inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
-    for members in sorted(_together(at, MAX_SHARED_LABEL_PT * pt), key=lambda m: -float(at[m[0], 1])):
-        members = sorted(members, key=lambda k: not points[k].present)
-        names = [printable_label(_label(points[k], present), 42) for k in members]
-        box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
+    """Label points (K, 2) with their settings, clear of each other and of a line with corners `line` (n, 2)."""
+    pt, to_data = float(ax.figure.dpi) / 72, ax.transData.inverted()
+    at, corners = ax.transData.transform(xy) / pt, ax.transData.transform(line) / pt
+    present = next((p for p in points if p.present), points[0])
+    frame = np.array(ax.get_window_extent().extents) / pt + [3, 3, -3, -3]
+    # Rectangles that labels keep off, left, bottom, right, top in points; covering a point costs three times as much as a label.
+    ends = np.stack([corners[:-1], corners[1:]])
+    taken = [
+        *(3 * [*np.hstack([at - POINT_PT, at + POINT_PT])]), *np.hstack([ends.min(axis=0) - 1, ends.max(axis=0) + 1]),
+    ]  # fmt: skip
+    for k in sorted(range(len(points)), key=lambda k: (not points[k].present, -at[k, 1])):
+        name = printable_label(_label(points[k], present), 42)
+        size = np.array([len(name) * LETTER_PT, LINE_PT])
+        middle = at[k] + np.column_stack([CANDIDATES[:, 0] + CANDIDATES[:, 1] * size[0] / 2, CANDIDATES[:, 2]])
+        boxes = np.hstack([middle - size / 2, middle + size / 2])
+        cost = _shared(boxes, np.array(taken)).sum(axis=1) + 9 * (size.prod() - _shared(boxes, frame[None])[:, 0])
+        box = boxes[int(np.argmin(cost + np.arange(len(boxes))))]
         taken.append(box)
-        _lead(ax, at[members].mean(axis=0), box, pt)
-        for k, (member, name) in enumerate(zip(members, names)):
-            x, y = ax.transData.inverted().transform((box[0], box[3] - (k + 0.5) * LINE_PT * pt))
-            ax.text(
-                x, y, name, fontsize=SIZE_PT, family=FONT, color=INK, va="center_baseline", ha="left", parse_math=False,
-                weight="bold" if points[member].present else "normal", path_effects=halo(1.8), zorder=5,
-            )  # fmt: skip
+        end = np.clip(at[k], box[:2], box[2:])
+        if np.hypot(*(end - at[k])) > MIN_LEADER_PT:
+            ax.plot(*to_data.transform(pt * np.stack([at[k], end])).T, color=CROWD_COLOR, lw=0.6, zorder=1.5)
+        x, y = to_data.transform(pt * np.array([box[0], box[1::2].mean()]))
+        ax.text(
+            x, y, name, fontsize=SIZE_PT, family=FONT, color=INK, va="center_baseline", ha="left", parse_math=False,
+            weight="bold" if points[k].present else "normal", path_effects=halo(1.8), zorder=5,
+        )  # fmt: skip
+
+
+def _shared(a: Array, b: Array) -> Array:
+    """Areas (N, M) that rectangles (N, 4) and (M, 4) share."""
+    low, high = np.maximum(a[:, None, :2], b[None, :, :2]), np.minimum(a[:, None, 2:], b[None, :, 2:])
+    return np.asarray(np.clip(high - low, 0, None).prod(axis=2))
 
 
 def short_name(setting: str) -> str:
@@ -353,53 +348,6 @@ def _label(point: Point, present: Point) -> str:
         return name
     key, share = min(point.coverage.items(), key=lambda item: item[1])
     return f"{name} ({share:.0%} {COVERAGE[key]})"
-
-
-def _together(at: Array, reach: float) -> list[list[int]]:
-    """Group the indices of points within `reach` of the first of each group."""
-    groups: list[list[int]] = []
-    for k, place in enumerate(at):
-        group = next((g for g in groups if np.hypot(*(at[g[0]] - place)) < reach), None)
-        if group is None:
-            groups.append([k])
-        else:
-            group.append(k)
-    return groups
-
-
-def _best_box(at: Array, names: Sequence[str], taken: Sequence[Box], inside: Box, pt: float) -> Box:
-    width, height = max(map(len, names)) * LETTER_PT * pt, len(names) * LINE_PT * pt
-    boxes, costs = [], []
-    for k, (side, gap, rise) in enumerate(CANDIDATES):
-        u = at[0] + side * gap * pt - (0.0, width / 2, width)[(1, 0, -1).index(side)]
-        v = at[1] + (rise + np.sign(rise) * (len(names) - 1) * LINE_PT / 2) * pt
-        box = (float(u), float(v - height / 2), float(u + width), float(v + height / 2))
-        boxes.append(box)
-        costs.append(sum(_shared(box, other) for other in taken) + 9 * (width * height - _shared(box, inside)) + k)
-    return boxes[int(np.argmin(costs))]
-
-
-def _lead(ax: Axes, at: Array, box: Box, pt: float) -> None:
-    """Draw a leader line from labels to their point when they are far from it."""
-    end = np.clip(at, box[:2], box[2:])
-    if np.hypot(*(end - at)) > MIN_LEADER_PT * pt:
-        line = ax.transData.inverted().transform(np.stack([at, end]))
-        ax.plot(*line.T, color=CROWD_COLOR, lw=0.6, zorder=1.5)
-
-
-def _around(u: float, v: float, reach: float) -> Box:
-    return (u - reach, v - reach, u + reach, v + reach)
-
-
-def _along(corners: Array, pt: float) -> list[Box]:
-    """Cover a line of horizontal and vertical segments with boxes."""
-    low, high = np.minimum(corners[:-1], corners[1:]) - pt, np.maximum(corners[:-1], corners[1:]) + pt
-    return [(float(a), float(b), float(c), float(d)) for (a, b), (c, d) in zip(low, high)]
-
-
-def _shared(a: Box, b: Box) -> float:
-    """Compute the area that two boxes share, px^2."""
-    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
 
 
 COLUMNS = 3

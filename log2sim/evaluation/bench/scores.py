@@ -298,16 +298,16 @@ def split_holdout(
             stamp = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
             ego_T_map = inverse(base_pose(log, stamp))
             holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
-            obstacles[camera].append(_without_position(m.take(rows), stamp))
+            obstacles[camera].append(_drop_positions(m.take(rows), stamp))
             places[camera].append(KnownPositions(xy[rows], object_id[rows]))
     feet = {
-        camera: [_without_feet(log.cameras[camera], parts, obstacles[camera])]
+        camera: [_drop_feet(log.cameras[camera], parts, obstacles[camera])]
         for camera, parts in observations.feet.items()
     }
     return Holdout(replace(observations, feet=feet), obstacles, places, holdout)
 
 
-def _without_position(m: Measurements, stamp: int) -> Measurements:
+def _drop_positions(m: Measurements, stamp: int) -> Measurements:
     """Reset the rows to detections in the image of that stamp, without LiDAR evidence."""
     return replace(
         m,
@@ -319,9 +319,7 @@ def _without_position(m: Measurements, stamp: int) -> Measurements:
     )
 
 
-def _without_feet(
-    camera: Camera, parts: Sequence[Correspondences], obstacles: Sequence[Measurements]
-) -> Correspondences:
+def _drop_feet(camera: Camera, parts: Sequence[Correspondences], obstacles: Sequence[Measurements]) -> Correspondences:
     """Drop the correspondences of held-out obstacles."""
     feet = Correspondences.join(parts)
     tick = np.concatenate([np.full(len(m), k) for k, m in enumerate(obstacles)])

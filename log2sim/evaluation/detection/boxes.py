@@ -144,10 +144,8 @@ class DetectedBoxes:
     def load(cls, path: Path | str) -> DetectedBoxes:
         """Read a file.
 
-        Raises
-        ------
-        LogError
-            For a file that is missing, too large or no JSON, violates the schema, or whose stamps do not increase.
+        Raises `LogError` for a file that is missing, too large or no JSON, violates the schema, or whose stamps do not
+        increase.
         """
         document = read_json(path)
         try:

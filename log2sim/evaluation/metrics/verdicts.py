@@ -72,8 +72,6 @@ def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64],
 def summarize_verdicts(errors: StateErrors) -> dict[str, float | None]:
     """Summarize all rows; a figure without rows is None.
 
-    Notes
-    -----
     Sizes are constant per agent, so their medians run over truth agents, each with its mean over matched ticks;
     `size_median_m` is the median of the mean absolute error over length, width and height. `ade_m` is the mean over
     truth agents of their mean distance.
@@ -177,7 +175,7 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     in_ego = _in_ego(truth, other, matched, ego)
     lone = c.selected & (matched < 0) & (in_ego | ~c.ignored)
     invented, duplicate = lone & ~near, lone & near_labeled
-    known = c.selected & _of_matched(matched, truth.labeled)
+    known = c.selected & _marks_of_matched(matched, truth.labeled)
     judged = known | invented | duplicate
     errors = state_errors(truth, other, c.match, truth.labeled)
     errors = errors.take(known[errors.other, errors.tick])
@@ -227,7 +225,7 @@ def _in_ego(truth: StateTable, other: StateTable, matched: Index, ego: StateTabl
     """Mark (B, T) the agents in the ego whose matched truth is not."""
     if ego is None:
         return np.zeros(matched.shape, dtype=bool)
-    return _overlapping(other, ego) & ~_of_matched(matched, _overlapping(truth, ego))
+    return _overlapping(other, ego) & ~_marks_of_matched(matched, _overlapping(truth, ego))
 
 
 def _overlapping(side: StateTable, ego: StateTable) -> Mask:
@@ -243,7 +241,7 @@ def _overlapping(side: StateTable, ego: StateTable) -> Mask:
     return np.asarray(near)
 
 
-def _of_matched(matched: Index, of_truth: Mask) -> Mask:
+def _marks_of_matched(matched: Index, of_truth: Mask) -> Mask:
     """Look up (B, T) what is marked (A, T) of the matched truth agents; False without a match."""
     mask = matched >= 0
     _, tick = np.nonzero(mask)

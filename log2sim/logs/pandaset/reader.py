@@ -36,7 +36,7 @@ from log2sim.geometry import (
     transform,
     wrap_angle,
 )
-from log2sim.logs.checks import Span, say_apart
+from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
 from log2sim.logs.records import (
@@ -528,7 +528,7 @@ def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: 
     """
     map_T_ego, known = track.at(t_ns)
     if not known.any():
-        apart = say_apart(Span.of("ego poses", track.t_ns), Span.of("frames", t_ns))
+        apart = describe_gap(Span.of("ego poses", track.t_ns), Span.of("frames", t_ns))
         raise LogError(f"{folder}/timestamps.json and lidar/timestamps.json: {apart}")
     ego_T_cam = inverse(map_T_ego[known]) @ map_T_cam[known]
     translation = np.median(ego_T_cam[:, :3, 3], axis=0)

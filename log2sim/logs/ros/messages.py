@@ -26,7 +26,7 @@ from log2sim.errors import ConfigError, MissingExtra, RecordError
 from log2sim.files.documents import first_problem
 from log2sim.files.inputs import is_present, read_text
 from log2sim.geometry import DISTORTION_LENGTHS, NS_PER_S
-from log2sim.logs.checks import Span, say_apart
+from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.records import MAX_SWEEP_POINTS, QUATERNION_TOLERANCE, sweep_of
 from log2sim.logs.ros.bag import ENCODINGS, STAMP, Bag, Topic, stamp_of
 from log2sim.logs.ros.containers import one_line
@@ -235,14 +235,14 @@ def stamp_messages(topic: Topic, heads: Sequence[bytes | None], notes: list[str]
     return Stamped(t_ns[row], row, delay_s)
 
 
-def say_uncovered(t_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> str:
+def describe_uncovered(t_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> str:
     """Say why poses at stamps (P,) ns do not cover the time of the sensors; "" where they do."""
     covered_ns = max(0, min(end_ns, int(t_ns[-1])) - max(begin_ns, int(t_ns[0]))) if len(t_ns) else 0
     if len(t_ns) >= MIN_POSES and covered_ns >= MIN_COVERED_SHARE * (end_ns - begin_ns):
         return ""
     poses, sensors = Span.of("poses", t_ns) if len(t_ns) else None, Span("frames and sweeps", begin_ns, end_ns)
     if poses is not None and poses.is_apart(sensors):
-        return say_apart(poses, sensors)
+        return describe_gap(poses, sensors)
     seconds = f"{covered_ns / NS_PER_S:.1f} of {(end_ns - begin_ns) / NS_PER_S:.1f} s"
     return f"it gives {len(t_ns)} poses in {seconds} of the sensors"
 

@@ -20,7 +20,7 @@ from log2sim.geometry import Array, PoseTrack, shift_poses, transform, whole_kil
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree, pose_of
-from log2sim.logs.ros.messages import MIN_POSES, MapSettings, PoseSettings, decode_bytes, say_uncovered
+from log2sim.logs.ros.messages import MIN_POSES, MapSettings, PoseSettings, decode_bytes, describe_uncovered
 from log2sim.logs.stamps import strictly_increasing
 
 MAP_FRAMES = ("map", "world", "earth", "utm")
@@ -73,7 +73,7 @@ class PoseSources:
                 continue
             try:
                 poses = read(topic)
-                if problem := say_uncovered(poses.t_ns, *self.span_ns):
+                if problem := describe_uncovered(poses.t_ns, *self.span_ns):
                     raise NoPoses(problem)
                 damaged = self.damaged.get(poses.topic, 0)
                 if damaged:
@@ -152,16 +152,16 @@ class PoseSources:
                 raise NoPoses(f"it is of the frame '{child}', from which there is no transform to '{self.base}'")
             notes = (f"{name}: names no child_frame_id; taken as the pose of '{self.base}'",)
             child_T_base = np.eye(4)
-        return self._of_messages(name, stamps, [m.pose.pose for m in messages], child_T_base, notes)
+        return self._poses_from_messages(name, stamps, [m.pose.pose for m in messages], child_T_base, notes)
 
     def _from_poses(self, name: str) -> FoundPoses:
         messages, stamps = self._decoded(name)
         covariance = self.bag.topics[name].msgtype.endswith("PoseWithCovarianceStamped")
         poses = [m.pose.pose if covariance else m.pose for m in messages]
         notes = (f"{name}: does not say whose pose it is; taken as that of '{self.base}'",)
-        return self._of_messages(name, stamps, poses, np.eye(4), notes)
+        return self._poses_from_messages(name, stamps, poses, np.eye(4), notes)
 
-    def _of_messages(
+    def _poses_from_messages(
         self, name: str, stamps: NDArray[np.int64], messages: list[Any], child_T_base: Array, notes: tuple[str, ...]
     ) -> FoundPoses:
         source = "odometry" if name in self.topics.get("odometry", ()) else "pose"

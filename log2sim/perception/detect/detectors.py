@@ -70,7 +70,7 @@ class CheckedDetector:
         except (Log2SimError, MemoryError):
             raise
         except Exception as error:
-            raise PluginError(f"{self._where(frame)}: {plugins.say_exception(error)}") from error
+            raise PluginError(f"{self._where(frame)}: {plugins.exception_line(error)}") from error
         if not isinstance(found, Detections):
             raise PluginError(f"{self._where(frame)}: detect returned {type(found).__name__}, expected Detections")
         defect = find_defect(found)
@@ -485,7 +485,7 @@ def create_detector(
         detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
     if plugins.is_built_in("detector", name_or_path):
         return detector
-    return checked(detector, plugins.say_plugin("detector", name_or_path))
+    return checked(detector, plugins.plugin_label("detector", name_or_path))
 
 
 def check_settings(min_score: float | None, max_overlap: float, tiles: str | int) -> None:

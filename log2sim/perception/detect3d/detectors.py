@@ -314,7 +314,7 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
         detector: LidarDetector = create(log, settings)
     if plugins.is_built_in("lidar_detector", rest):
         return detector
-    return checked(detector, plugins.say_plugin("lidar_detector", rest))
+    return checked(detector, plugins.plugin_label("lidar_detector", rest))
 
 
 def checked(detector: Any, source: str) -> LidarDetector:
@@ -350,7 +350,7 @@ class CheckedLidarDetector:
         except (Log2SimError, MemoryError):
             raise
         except Exception as error:
-            raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {plugins.say_exception(error)}") from error
+            raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {plugins.exception_line(error)}") from error
         if not isinstance(found, Boxes3D):
             raise PluginError(f"{self.source}: detect returned {type(found).__name__}, expected Boxes3D")
         return found

@@ -308,10 +308,7 @@ UPPER_LIMITS = (
 def parse_limits(texts: Iterable[str]) -> dict[str, float]:
     """Parse limits by name from texts "name=value".
 
-    Raises
-    ------
-    ConfigError
-        When a name is not known or a value is no finite number.
+    Raises `ConfigError` when a name is not known or a value is no finite number.
     """
     limits: dict[str, float] = {}
     for text in texts:

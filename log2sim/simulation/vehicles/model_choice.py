@@ -94,7 +94,7 @@ def slipping_reference(reference: Reference, p: VehicleParameters, model: str, a
     return replace(reference, columns=slipped(reference.columns, t_s), exact=exact, slips=True)
 
 
-def with_slip_states(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
+def set_slip_states(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
     """Set the lateral velocity and the yaw rate to those of the reference's rows (C, A) at a time."""
     before, after = reference(t_s), reference(t_s + GRID_S)
     (dx, dy), turn = (after - before)[:2] / GRID_S, (after - before)[YAW]

@@ -1,9 +1,16 @@
-"""A picture and a cloud of one moment with the road users in both: what the two-stream network takes."""
+"""Train the two-stream network of Lin et al. (2021) on simulated pictures and clouds, and compare it with lidar:vehicle.
+
+    pip install 'log2sim[train]'
+    log2sim synth --traffic vehicle --layout kitti --scenes 300 --out PAIRS
+    python tools/train_lidar.py two_stream --data PAIRS --out OUT --steps 1500 --test KITTI=DRIVE --write BENCHMARKS.md
+
+A pair is a picture and a cloud of one moment with the road users in both; x of the cloud points where the camera looks.
+"""
 
 from __future__ import annotations
 
+import json
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,19 +20,24 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from lidar_training.export import MAX_EXPORT_ERROR
-from lidar_training.real_logs import LogSweep, LogView, ground_under, labeled_by
+from benchmarks.table import markdown, replace_section
+from entry import parser_of
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lidar_training.export import export_checked
+from lidar_training.fitting import FitPlan, fit
+from lidar_training.real_logs import LogSweep, LogView, ground_under, labeled_by, read_sweeps
+from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Log
 from log2sim.errors import RecordError
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision
 from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion
 from log2sim.geometry import Array, inverse, nearest_index, rotation_from_rpy, transform, wrap_angle
+from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.boxes import Rectangles, suppress
-from log2sim.perception.detect3d.detectors import LidarDetector
+from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, open_network
 from log2sim.perception.lidar.cloud import Cloud
 
 MIN_DEPTH_M = 1.0
@@ -34,31 +46,15 @@ MIN_GROUND_POINTS = 10
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A picture and a cloud; x of the cloud points where the camera looks, its origin is that of the log's cloud.
+    """A picture and a cloud; x of the cloud points where the camera looks, its origin is that of the log's cloud."""
 
-    Attributes
-    ----------
-    image : (H, W, 3) uint8
-    cloud : Cloud
-    pixel_T_cloud : (3, 4) float64
-        Projection of positions in the cloud's frame to homogeneous pixels.
-    ground : (3,) float64
-        a, b, c of the plane z = a x + b y + c of the ground.
-    boxes : (M, 7) float64
-        x, y, height of the center above the ground, length, width, height, heading.
-    truth : SceneBoxes
-        The same, with z in the cloud's frame.
-    views : tuple of LogView
-        The cameras in whose images road users were labeled, for positions in the cloud's frame.
-    """
-
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # (H, W, 3)
     cloud: Cloud
-    pixel_T_cloud: Array
-    ground: Array
-    boxes: Array
-    truth: SceneBoxes
-    views: tuple[LogView, ...]
+    pixel_T_cloud: Array  # (3, 4): projection of positions in the cloud's frame to homogeneous pixels
+    ground: Array  # (3,): a, b, c of the plane z = a x + b y + c of the ground
+    boxes: Array  # (M, 7): x, y, height of the center above the ground, length, width, height, heading
+    truth: SceneBoxes  # the same, with z in the cloud's frame
+    views: tuple[LogView, ...]  # the cameras in whose images road users were labeled, for the cloud's frame
 
     def labeled(self, xyz: Array) -> NDArray[np.bool_]:
         """Mark positions (N, 3) in the cloud's frame where road users have labels."""
@@ -150,32 +146,17 @@ DENSE, POSITIVE, NEGATIVE, UNJUDGED = 5, 1, 0, -1
 class Inputs:
     """What the network sees of a pair, and what it is to answer.
 
-    Attributes
-    ----------
-    bev : (6, 350, 400) float32
-        Greatest height in each of five slices as a share of the slice's top, and density.
-    image : (3, 176, 600) float32
-        In [-1, 1].
-    anchors : (N, 7) float32
-        x, y, z of the center above the ground, length, width, height, heading.
-    kind : (N,) int64
-        Index into CLASSES.
-    bev_boxes, image_boxes : (N, 4) float32
-        First and last coordinate of each axis (rows, columns), in [-1, 1] over the map or the picture.
-    label : (N,) int64
-        1 object, 0 none, -1 not judged.
-    goal : (N, 7) float32
-        Offsets from the anchor of positive ones.
+    Boxes of anchors in the inputs are first and last coordinate of each axis (rows, columns), in [-1, 1] over map or picture.
     """
 
-    bev: NDArray[np.float32]
-    image: NDArray[np.float32]
-    anchors: NDArray[np.float32]
-    kind: NDArray[np.int64]
-    bev_boxes: NDArray[np.float32]
-    image_boxes: NDArray[np.float32]
-    label: NDArray[np.int64]
-    goal: NDArray[np.float32]
+    bev: NDArray[np.float32]  # (6, 350, 400): greatest height in each of five slices as a share of all, and density
+    image: NDArray[np.float32]  # (3, 176, 600), in [-1, 1]
+    anchors: NDArray[np.float32]  # (N, 7): x, y, z of the center above the ground, length, width, height, heading
+    kind: NDArray[np.int64]  # (N,): index into CLASSES
+    bev_boxes: NDArray[np.float32]  # (N, 4)
+    image_boxes: NDArray[np.float32]  # (N, 4)
+    label: NDArray[np.int64]  # (N,): 1 object, 0 none, -1 not judged
+    goal: NDArray[np.float32]  # (N, 7): offsets from the anchor of positive ones
 
 
 def inputs_of(pair: Pair, *, mirrored: bool = False) -> Inputs:
@@ -197,7 +178,9 @@ def inputs_of(pair: Pair, *, mirrored: bool = False) -> Inputs:
     kept, image_boxes = kept[visible], image_boxes[visible]
     anchors, kind = anchors[kept], kind[kept]
     label, goal = targets_of(anchors, kind, boxes, pair)
-    return Inputs(bev, small_image(image), anchors, kind, bev_boxes_of(anchors), image_boxes, label, goal)
+    span, low = np.array([np.ptp(X_M), np.ptp(Y_M)] * 2), np.array([X_M[0], Y_M[0]] * 2)
+    bev_boxes = ((rectangles(anchors) - low) / span * 2 - 1).astype(np.float32)
+    return Inputs(bev, small_image(image), anchors, kind, bev_boxes, image_boxes, label, goal)
 
 
 def bev_maps(xyz: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -254,13 +237,6 @@ def points_in(density: NDArray[np.float32], anchors: NDArray[np.float32]) -> NDA
     return np.asarray(total[i1, j1] - total[i0, j1] - total[i1, j0] + total[i0, j0] > 0)
 
 
-def bev_boxes_of(anchors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Places (N, 4) of anchors in the maps."""
-    span = np.array([X_M[1] - X_M[0], Y_M[1] - Y_M[0]] * 2)
-    low = np.array([X_M[0], Y_M[0]] * 2)
-    return ((rectangles(anchors) - low) / span * 2 - 1).astype(np.float32)
-
-
 def image_boxes_of(
     anchors: NDArray[np.float32], ground: Array, projection: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -290,7 +266,8 @@ def targets_of(
     category, points = pair.truth.category, pair.truth.points
     assert points is not None
     known = np.isin(category, CLASSES) & (points >= MIN_POINTS_INSIDE) & ~pair.truth.ignored
-    label[near_any(anchors, boxes[~known])] = UNJUDGED
+    # What overlaps a box that nobody has to find is not judged.
+    label[(overlaps(rectangles(anchors), rectangles(boxes[~known])) > 0).any(axis=1)] = UNJUDGED
     for k, name in enumerate(CLASSES):
         own, true = np.flatnonzero(kind == k), boxes[known & (category == name)]
         if not len(own) or not len(true):
@@ -314,13 +291,6 @@ def targets_of(
         label[own[found]] = POSITIVE
         goal[own[found]] = encode(true[best[found]], anchors[own[found]])
     return label, goal
-
-
-def near_any(anchors: NDArray[np.float32], boxes: Array) -> NDArray[np.bool_]:
-    """Mark the anchors (N,) that overlap a box that nobody has to find."""
-    if not len(boxes):
-        return np.zeros(len(anchors), bool)
-    return np.asarray((overlaps(rectangles(anchors), rectangles(boxes)) > 0).any(axis=1))
 
 
 def overlaps(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -417,14 +387,7 @@ class TwoStream(nn.Module):
             self.score.bias.fill_(PRIOR_LOGIT)
 
     def forward(self, bev: Tensor, image: Tensor, bev_boxes: Tensor, image_boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return logits (N, K) and box codes (N, K, 7) of anchors, K classes.
-
-        Parameters
-        ----------
-        bev, image : (1, 6, H, W), (1, 3, h, w)
-        bev_boxes, image_boxes : (N, 4)
-            Places of the anchors, see `Inputs`.
-        """
+        """Return logits (N, K) and box codes (N, K, 7) of anchors, K classes; inputs as in `Inputs`, each with a batch of one."""
         fused = (crops(self.bev(bev), bev_boxes) + crops(self.image(image), image_boxes)) / 2
         hidden = self.fuse(fused)
         return self.score(hidden), self.box(hidden).view(-1, len(CLASSES), BOX_CODE)
@@ -478,8 +441,6 @@ class Batch:
 def loss_of_anchors(logits: Tensor, codes: Tensor, batch: Batch) -> tuple[Tensor, dict[str, float]]:
     """Focal loss of the scores and Smooth L1 of the boxes, not weighted against each other.
 
-    Notes
-    -----
     The paper divides the focal loss by the number of boxes, which makes it vanish beside the other where nearly all anchors
     are empty; both are divided by the number of positive ones, as RetinaNet does (Lin et al., ICCV 2017). Its alpha counts
     for objects, 1 - alpha for the rest, as there.
@@ -510,39 +471,14 @@ Search = Callable[[Pair], SceneBoxes]
 
 
 def export_two_stream(network: TwoStream, path: Path) -> None:
-    """Write the network as ONNX and check that both compute the same.
-
-    Raises
-    ------
-    RuntimeError
-        When they differ by more than `MAX_EXPORT_ERROR`.
-    """
-    import onnxruntime
-
-    network.eval()
+    """Write the network as ONNX and check that both compute the same."""
     rng = np.random.default_rng(0)
     low, side = rng.uniform(-1, 0.5, (2, 40, 2)), rng.uniform(0.05, 0.5, (2, 40, 2))
-    boxes = np.concatenate([low, low + side], axis=2).astype(np.float32)
-    arrays = (
-        rng.random((1, BEV_CHANNELS, *SHAPE), dtype=np.float32), rng.random((1, IMAGE_CHANNELS, *IMAGE_PX), dtype=np.float32),
-        boxes[0], boxes[1],
-    )  # fmt: skip
-    tensors = tuple(torch.from_numpy(a) for a in arrays)
-    with warnings.catch_warnings():
-        # The exporter that needs no further package announces its end.
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            network, (*tensors[:2], tensors[2][:9], tensors[3][:9]), str(path), input_names=list(INPUTS),
-            output_names=["logits", "codes"], opset_version=17, dynamo=False,
-            dynamic_axes={name: {0: "anchors"} for name in ("bev_boxes", "image_boxes", "logits", "codes")},
-        )  # fmt: skip
-    with torch.no_grad():
-        expected = [t.numpy() for t in network(*tensors)]
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    found = session.run(["logits", "codes"], dict(zip(INPUTS, arrays, strict=True)))
-    error = max(float((np.abs(a - b) / np.maximum(np.abs(b), 1)).max()) for a, b in zip(found, expected, strict=True))
-    if not error < MAX_EXPORT_ERROR:
-        raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
+    boxes = np.concatenate([low, low + side], axis=2)
+    arrays = rng.random((1, BEV_CHANNELS, *SHAPE)), rng.random((1, IMAGE_CHANNELS, *IMAGE_PX)), boxes[0], boxes[1]
+    tensors = {name: torch.from_numpy(a.astype(np.float32)) for name, a in zip(INPUTS, arrays, strict=True)}
+    axes = {name: {0: "anchors"} for name in ("bev_boxes", "image_boxes", "logits", "codes")}
+    export_checked(network.eval(), path, tensors, ("logits", "codes"), axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -598,7 +534,7 @@ def compare(searches: dict[str, Search], pairs: Sequence[Pair]) -> dict[str, dic
         found, begun = [], time.process_time()
         for pair in pairs:
             boxes = search(pair)
-            found.append(boxes.ignoring(~pair.labeled(boxes.box[:, :3])) if len(boxes) else boxes)
+            found.append(boxes.ignoring(~labeled_by(pair.views, boxes.box[:, :3])) if len(boxes) else boxes)
         row: dict[str, Any] = {"ms": (time.process_time() - begun) / max(len(pairs), 1) * 1e3}
         for kind, criteria in CRITERIA.items():
             f = SceneBoxes.join([b.take((b.category == kind) & (b.range_m < MAX_RANGE_M)) for b in found])
@@ -616,3 +552,75 @@ def truth_of(pair: Pair, kind: str) -> SceneBoxes:
     assert t.points is not None
     away = np.hypot(t.box[:, 0], t.box[:, 1])
     return t.ignoring((t.category != kind) | (t.points < MIN_POINTS) | (away >= MAX_RANGE_M))
+
+
+TEST_SHARE = 0.15
+PEAK_RATE = 2e-3
+
+
+def read_pairs(path: Path, every: int = 1) -> list[Pair]:
+    """Read the pairs of a log, with the camera in whose pictures it is labeled."""
+    log = open_log(path)
+    only = None if log.labels is None else log.labels.cameras
+    camera = next(iter(only)) if only else (log.reference_camera or next(iter(log.cameras)))
+    return list(pairs_of(log, camera, read_sweeps(log, every)))
+
+
+def train(pairs: list[Pair], out: Path, *, steps: int, seed: int) -> Path:
+    """Train, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file."""
+    torch.manual_seed(seed)
+    network = TwoStream().to(memory_format=torch.channels_last)
+
+    def step(n: torch.nn.Module, rng: np.random.Generator, _: int) -> Any:
+        pair = pairs[int(rng.integers(len(pairs)))]
+        batch = Batch.of(inputs_of(pair, mirrored=bool(rng.random() < 0.5)), rng)
+        return loss_of_anchors(*batch.run(n), batch)
+
+    mean = fit(network, step, FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt"))
+    network.load_state_dict(mean)
+    path = out / "two_stream.onnx"
+    export_two_stream(network, path)
+    return path
+
+
+def table(results: dict[str, dict[str, dict[str, Any]]], pairs: dict[str, int]) -> str:
+    """Write average precision by test, detector, class and criterion."""
+    columns = [(kind, str(c)) for kind, criteria in CRITERIA.items() for c in criteria]
+    head = ["tested on", "detector", *[f"{kind}, {c}" for kind, c in columns], "truths", "CPU ms"]
+    rows = []
+    for test, by_detector in results.items():
+        for name, row in by_detector.items():
+            values = [row[kind][c] for kind, c in columns]
+            cells = ["-" if v is None else f"{v:.3f}" for v in values]
+            truths = " / ".join(str(row[kind]["truths"]) for kind in CRITERIA)
+            rows.append([f"{test} ({pairs[test]})", name, *cells, truths, f"{row['ms']:.0f}"])
+    return markdown(head, rows)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Read the command line, train and compare."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder in KITTI's object layout")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the checkpoint, the ONNX file and the results"
+    )
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--test", action="append", default=[], metavar="NAME=PATH", help="another labeled log")
+    parser.add_argument("--every", type=int, default=3, help="every n-th sweep of other logs")
+    parser.add_argument("--write", type=Path, help="Markdown file whose section two-stream is replaced")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    pairs = read_pairs(options.data)
+    held = max(1, round(len(pairs) * TEST_SHARE))
+    path = train([p.in_picture_only() for p in pairs[:-held]], options.out, steps=options.steps, seed=options.seed)
+    tests = {"simulated": pairs[-held:]}
+    tests |= {name: read_pairs(Path(log), options.every) for name, log in (t.split("=", 1) for t in options.test)}
+    lidar = open_network(WEIGHTS / "vehicle.onnx", LidarConfig(min_score=MIN_SCORE), name="lidar:vehicle")
+    searches = {"two-stream": TwoStreamDetector.open(path), "`lidar:vehicle`": search_by_lidar(lidar)}
+    results = {name: compare(searches, frames) for name, frames in tests.items()}
+    (options.out / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    text = table(results, {name: len(frames) for name, frames in tests.items()})
+    print(text)
+    if options.write:
+        replace_section(options.write, "two-stream", text)

@@ -1,4 +1,9 @@
-"""The network of Zou, Guo, Chen and Yuan (2021) for a 16-line LiDAR at the roadside, and its losses.
+"""Train the network of Zou, Guo, Chen and Yuan (2021) for a 16-line LiDAR at the roadside on shards of tools/train_lidar.py, and export it.
+
+    pip install 'log2sim[train]'
+    python tools/train_lidar.py roadside --out DIR --only generate
+    python tools/train_lidar.py zou2021 --data DIR/data --out OUT --steps 1500
+    log2sim reconstruct LOG --detector lidar:OUT/zou2021.onnx --set lidar.decode=votes
 
 The paper leaves some things open or prints what cannot be meant. What is done here:
 
@@ -10,26 +15,25 @@ The paper leaves some things open or prints what cannot be meant. What is done h
   the export, and makes training in minutes possible.
 - Outputs: the text says 8 channels, the table 14. The quantities it names need 11: offset x, y; logits of background, ground,
   large vehicle, small vehicle, two-wheeler and pedestrian; height; heading x, y.
+- Boxes have the mean sizes of their class.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from lidar_training.clouds import CATEGORIES, Sample, Shard, augmented, grid_of, window_of
-from lidar_training.export import MAX_EXPORT_ERROR, describe, description
-from lidar_training.network import IN_CHANNELS, MIN_POINTS, OUT_CHANNELS, loss_of, targets_of
+from entry import parser_of
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from log2sim.perception.detect3d.network import load_network
+from lidar_training.clouds import CATEGORIES, Sample, Shard, augmented, grid_of, window_of
+from lidar_training.export import describe, description, export_checked
+from lidar_training.fitting import FitPlan, fit
+from lidar_training.network import IN_CHANNELS, MIN_POINTS
 
 PAPER_CHANNELS, PAPER_OUTPUTS = 8, 11
 OFFSET, CLASSES, HEIGHT, HEADING = slice(0, 2), slice(2, 8), slice(8, 9), slice(9, 11)
@@ -51,13 +55,7 @@ class PaperGrid(nn.Module):
     """The paper's 8 channels from the 12 of `log2sim.perception.detect3d.network`."""
 
     def forward(self, grid: Tensor, middle_m: Tensor | None = None) -> Tensor:
-        """Map grids (B, 12, H, W) to (B, 8, H, W).
-
-        Parameters
-        ----------
-        middle_m : (B, 2), optional
-            From the middle of each grid to that of the window which it is a part of; by default it is the whole window.
-        """
+        """Map grids (B, 12, H, W) to (B, 8, H, W); `middle_m` (B, 2) leads from the middle of each to that of the window it is a part of."""
         x = (torch.arange(grid.shape[2], dtype=grid.dtype) + 0.5 - grid.shape[2] / 2) * CELL_M
         y = (torch.arange(grid.shape[3], dtype=grid.dtype) + 0.5 - grid.shape[3] / 2) * CELL_M
         zero = torch.zeros_like(grid[:, :1])
@@ -88,10 +86,7 @@ def _up(inputs: int, outputs: int) -> nn.ConvTranspose2d:
 class Zou2021Network(nn.Module):
     """Fully convolutional network of the paper's table: five times down, five times up, skips by concatenation.
 
-    Parameters
-    ----------
-    share : float
-        Share of the paper's channels, for tests.
+    `share` is that of the paper's channels which it has.
     """
 
     def __init__(self, share: float = 1.0) -> None:
@@ -161,10 +156,7 @@ class LaidOut(nn.Module):
             logits[:, TWO_WHEELER:],
             out[:, OFFSET],
         ]  # fmt: skip
-        maps = torch.cat(parts, dim=1)
-        if maps.shape[1] != OUT_CHANNELS:
-            raise ValueError(f"{maps.shape[1]} channels, expected {OUT_CHANNELS}")
-        return maps
+        return torch.cat(parts, dim=1)
 
 
 def smooth_l1(difference: Tensor) -> Tensor:
@@ -177,8 +169,6 @@ def smooth_l1(difference: Tensor) -> Tensor:
 def loss_of_cells(out: Tensor, targets: CellTargets) -> tuple[Tensor, dict[str, float]]:
     """Return the loss of outputs (B, 11, H, W) and its four parts.
 
-    Notes
-    -----
     The class of every cell that is not empty by focal loss; height and heading by Smooth L1, the offset by the logarithm of
     1 + |error| (printed relative to the true offset, which breaks where that is 0), on the cells of road users. The total is
     1/2 sum (l^2 L + log(l^2 + 1)) with l = 1/4, so that all weights are constant.
@@ -214,24 +204,12 @@ MARGIN_M = 0.14
 
 @dataclass(eq=False)
 class CellTargets:
-    """Maps of a batch.
+    """Maps of a batch."""
 
-    Attributes
-    ----------
-    label : (B, H, W) int64
-        The class, 0 background, 1 ground; `IGNORED` in empty cells and on road users with too few points.
-    offset : (B, 2, H, W) float32
-        To the center of the cell's road user, m.
-    height : (B, 1, H, W) float32
-        Of the road user, m.
-    heading : (B, 2, H, W) float32
-        Cosine and sine.
-    """
-
-    label: Tensor
-    offset: Tensor
-    height: Tensor
-    heading: Tensor
+    label: Tensor  # (B, H, W) int64: the class, 0 background, 1 ground; `IGNORED` in empty cells and on road users with too few points
+    offset: Tensor  # (B, 2, H, W), m: to the center of the cell's road user
+    height: Tensor  # (B, 1, H, W), m: of the road user
+    heading: Tensor  # (B, 2, H, W): cosine and sine
 
 
 def cell_targets(
@@ -269,112 +247,60 @@ def cell_targets(
 
 
 RANGE_M = 30.0
-# As far as any of its grids can be: sides of 16 cells but not of 32, unequal ones.
-CHECKED_CELLS = (208, 176)
-
-
-def export_zou2021(network: Zou2021Network, path: Path, card: dict[str, Any]) -> None:
-    """Write the network as ONNX and check that both compute the same.
-
-    Raises
-    ------
-    RuntimeError
-        When they differ by more than `MAX_EXPORT_ERROR`.
-    """
-    laid_out = LaidOut(network).eval()
-    axes = {0: "batch", 2: "x", 3: "y"}
-    with warnings.catch_warnings():
-        # The exporter that needs no further package announces its end.
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            laid_out, (torch.zeros(1, IN_CHANNELS, 128, 96),), str(path), input_names=["grid"], output_names=["maps"],
-            opset_version=17, dynamo=False, dynamic_axes={"grid": axes, "maps": axes},
-        )  # fmt: skip
-    describe(path, description("zou2021", CELL_M, RANGE_M) | {"stride": 1, "card": card})
-    grid = np.random.default_rng(0).random((IN_CHANNELS, *CHECKED_CELLS), dtype=np.float32)
-    with torch.no_grad():
-        expected = laid_out(torch.from_numpy(grid[None]))[0].numpy()
-    difference = load_network(path).run(grid) - expected
-    error = float((np.abs(difference) / np.maximum(np.abs(expected), 1)).max())
-    if not error < MAX_EXPORT_ERROR:
-        raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
-
-
+PEAK_RATE = 2e-3
 BATCH = 4
-CELLS = 256
-# The paper's network works at full resolution: parts of a window save most of its time.
-ZOU2021_CELLS = (128, 160)
-PART_M = 12.0
-"""Largest distance along an axis between the middles of such a part and of its window."""
+# The network works at full resolution: parts of a window save most of its time.
+PART_CELLS = (128, 160)
+PART_M = 12.0  # largest distance along an axis between the middles of such a part and of its window
 
 
-class Samples(Protocol):
-    """Samples by number: a shard, or a list of samples."""
+def export_zou2021(network: Zou2021Network, path: Path, card: dict[str, object]) -> None:
+    """Write the network as ONNX, laid out for decoding by votes, and check that both compute the same."""
+    laid_out, axes = LaidOut(network).eval(), {0: "batch", 2: "x", 3: "y"}
+    # Sides of 16 cells but not of 32, unequal ones: as far as any of its grids can be.
+    checked = torch.rand((1, IN_CHANNELS, 208, 176), generator=torch.Generator().manual_seed(0))
+    export_checked(laid_out, path, {"grid": checked}, ("maps",), {"grid": axes, "maps": axes})
+    describe(path, description("zou2021", CELL_M, RANGE_M) | {"stride": 1, "card": card})
 
-    def __len__(self) -> int: ...
 
-    def __getitem__(self, k: int) -> Sample: ...
-
-
-def shards_in(folders: Sequence[Path]) -> list[Shard]:
-    """Open the shards of folders, in the order of their names."""
-    paths = [path for folder in folders for path in sorted(folder.glob("*.npz"))]
-    if not paths:
+def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | None, share: float = 1.0) -> Path:
+    """Train, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file."""
+    shards = [Shard(path) for folder in data for path in sorted(folder.glob("*.npz"))]
+    if not shards:
         raise FileNotFoundError(
-            f"{', '.join(map(str, folders))}: no shards; make them by tools/train_lidar.py --only generate"
+            f"{', '.join(map(str, data))}: no shards; make them by tools/train_lidar.py --only generate"
         )
-    return [Shard(path) for path in paths]
+    out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(seed)
+    network = Zou2021Network(share).to(memory_format=torch.channels_last)
+    if start is not None:
+        network.load_state_dict(torch.load(start, weights_only=True)["mean"])
+
+    def step(network: nn.Module, rng: np.random.Generator, _: int) -> tuple[Tensor, dict[str, float]]:
+        drawn = [shards[int(rng.integers(len(shards)))] for _ in range(BATCH)]
+        samples = [augmented(shard[int(rng.integers(len(shard)))], rng) for shard in drawn]
+        cells = int(rng.choice(PART_CELLS))
+        lows = [window_of(rng, cells, CELL_M) for _ in samples]
+        grids = np.stack([grid_of(s, low, cells, CELL_M) for s, low in zip(samples, lows, strict=True)])
+        middle = torch.from_numpy(rng.uniform(-PART_M, PART_M, (len(samples), 2)).astype(np.float32))
+        maps = network(torch.from_numpy(grids).to(memory_format=torch.channels_last), middle)
+        return loss_of_cells(maps, cell_targets(samples, lows, grids, CELL_M))
+
+    network.load_state_dict(fit(network, step, FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt")))
+    path = out / "zou2021.onnx"
+    export_zou2021(network, path, {"steps": steps, "seed": seed, "share": share, "samples": sum(map(len, shards))})
+    return path
 
 
-@dataclass(frozen=True, eq=False)
-class Mixture:
-    """Simulated samples, half of whose places in a batch another source may take.
-
-    Attributes
-    ----------
-    simulated : sequence of Samples
-    other : Samples
-        Empty for none.
-    """
-
-    simulated: Sequence[Samples]
-    other: Samples = field(default_factory=list)
-
-    def draw(self, rng: np.random.Generator) -> list[Sample]:
-        """Draw a batch of augmented samples."""
-        out = []
-        for k in range(BATCH):
-            source = self.simulated[int(rng.integers(len(self.simulated)))]
-            if k % 2 and len(self.other):
-                source = self.other
-            out.append(augmented(source[int(rng.integers(len(source)))], rng))
-        return out
-
-
-def windows(
-    samples: list[Sample], cells: int, cell_m: float, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], list[NDArray[np.float64]]]:
-    """Rasterize samples in random windows: grids (B, 12, H, W) and lower corners."""
-    lows = [window_of(rng, cells, cell_m) for _ in samples]
-    return np.stack([grid_of(s, low, cells, cell_m) for s, low in zip(samples, lows, strict=True)]), lows
-
-
-def zou2021_loss(
-    network: nn.Module, samples: list[Sample], rng: np.random.Generator
-) -> tuple[Tensor, dict[str, float]]:
-    """Return the loss of the paper's network on samples."""
-    grids, lows = windows(samples, int(rng.choice(ZOU2021_CELLS)), CELL_M, rng)
-    middle = torch.from_numpy(rng.uniform(-PART_M, PART_M, (len(samples), 2)).astype(np.float32))
-    out = network(torch.from_numpy(grids).to(memory_format=torch.channels_last), middle)
-    return loss_of_cells(out, cell_targets(samples, lows, grids, CELL_M))
-
-
-def centers_loss(cell_m: float):
-    """Return the loss on samples of a network of `lidar_training.network` with cells of a size."""
-
-    def loss(network: nn.Module, samples: list[Sample], rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
-        grids, lows = windows(samples, CELLS, cell_m, rng)
-        grid = torch.from_numpy(grids).to(memory_format=torch.channels_last)
-        return loss_of(network(grid), targets_of(samples, lows, CELLS, cell_m), grid)
-
-    return loss
+def main(arguments: list[str] | None = None) -> None:
+    """Read the command line and train."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders of shards")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the ONNX file")
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--share", type=float, default=1.0, help="share of the paper's channels")
+    parser.add_argument("--start", type=Path, help="checkpoint of another run to start from")
+    o = parser.parse_args(arguments)
+    path = train(o.data, o.out, steps=o.steps, seed=o.seed, start=o.start, share=o.share)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
