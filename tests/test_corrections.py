@@ -93,6 +93,18 @@ def test_a_static_agent_that_is_put_at_different_places_moves_through_them_for_a
     assert found.waypoints.sigma_xy_m[k[0]] < 0.06 < 2.0 < found.waypoints.sigma_xy_m[k[1]]
 
 
+def test_a_pose_far_beyond_the_sigmas_bends_no_speed_where_these_change() -> None:
+    source = straight("car-1")  # 10 m/s
+    w = source.waypoints
+    unsure = replace(source, waypoints=replace(w, sigma_xy_m=np.where(w.t_s < 1.0, 0.3, 0.1)))
+    found = after(scenario(unsure), {"kind": "move", "agent": at(2.0, 20.0, 0.0), "poses": [at(2.0, 23.0, 0.0)]})[
+        "car-1"
+    ]
+    # The push of 3 m comes and goes over seconds: at most by the steepest slope of the Matern correlation, exp(-1) 3 ** 0.5 / 2 s of it.
+    steepest = 3.0 * math.exp(-1) * math.sqrt(3) / 2.0
+    assert np.abs(found.waypoints.speed_mps - 10.0).max() < 1.2 * steepest
+
+
 @pytest.mark.parametrize("source", [straight("car-1"), circling(40.0, 8.0)])
 def test_merging_the_parts_of_a_trajectory_gives_it_back(source: Any) -> None:
     w = source.waypoints

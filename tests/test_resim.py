@@ -121,7 +121,7 @@ def test_sweeps_that_were_left_out_come_back_as_recorded(recorded: tuple[Log, Sc
         simulated[rows] = np.linalg.norm(sweep.xyz_m, axis=1)
         came, comes = np.isfinite(shots.range_m), np.isfinite(simulated)
         error = np.abs(simulated - shots.range_m)[came & comes & (shots.range_m < 40)]
-        assert np.median(error) < 0.04
+        assert np.median(error) < 0.045
         assert np.quantile(error, 0.9) < 0.15
         assert (came == comes).mean() > 0.93
 

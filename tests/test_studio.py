@@ -20,12 +20,13 @@ from command_line import run
 from test_edit import parked, scenario, straight
 
 from log2sim import open_log
-from log2sim.datatypes import Agent, Finding, Log, Scenario
+from log2sim.datatypes import COLOR_NAMES, Agent, Finding, Log, Scenario
+from log2sim.datatypes.color_names import name_of
 from log2sim.edit.corrections import load_corrections
 from log2sim.errors import ScenarioError
 from log2sim.geometry import apply, inverse, project
 from log2sim.visualization.recording import Recorded
-from log2sim.visualization.studio import Studio
+from log2sim.visualization.studio import PAINTS, Studio
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -219,8 +220,18 @@ def test_a_scenario_is_corrected_on_the_page(chromium: Browser, studio: Studio) 
     )
     shown(browser, studio, 4)
     assert studio.result.scenario["car-1"].category == "truck"
+    for name in ("blue", "red"):  # at once: the second waits for the first and takes its place
+        browser.run(
+            "const e = document.getElementById('studio-color'); e.value = arguments[0]; e.dispatchEvent(new Event('change'))",
+            name,
+        )
+    browser.wait(
+        "document.getElementById('studio-color').value === 'red' && log2sim.corrections().at(-1).name === 'red'"
+    )
+    shown(browser, studio, 5)
+    assert (studio.result.scenario["car-1"].color or {})["name"] == "red"
     browser.press("\ue017")  # Delete
-    assert "car-1" not in shown(browser, studio, 5)
+    assert "car-1" not in shown(browser, studio, 6)
     assert [entry for entry in browser.log("browser") if entry["level"] == "SEVERE"] == []
     assert {address.split("/")[2] for address in browser.requests()} <= {studio.origin.removeprefix("http://")}
 
@@ -353,6 +364,16 @@ def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, 
             )
         )
         browser.wait(f"log2sim.chosen === '{name}'")
+        # Its shape is that of the camera's pictures on a phone, too, so that the calibration holds.
+        browser.open(served.address, size=(420, 800))
+        browser.run("log2sim.choose(arguments[0])", name)
+        click(browser, "move")
+        browser.run(
+            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
+        )
+        shape = "const c = document.querySelector('[aria-label=\"Picture of front\"]'); return c.clientWidth / c.clientHeight"
+        camera = log.cameras["front"]
+        assert browser.run(shape) == pytest.approx(camera.width_px / camera.height_px, rel=0.01)
         assert [line for line in browser.log("browser") if line["level"] == "SEVERE"] == []
     finally:
         served.close()
@@ -373,3 +394,7 @@ def in_view(log: Log, scenario: Scenario, agent: Agent, t_s: float) -> np.ndarra
     )
     inside = seen[0] and 0 < uv[0, 0] < camera.width_px and 0 < uv[0, 1] < camera.height_px
     return uv[0] if inside else None
+
+
+def test_paints_have_the_colors_of_their_names() -> None:
+    assert {name: name_of(rgb) for name, rgb in PAINTS.items()} == {name: name for name in COLOR_NAMES}

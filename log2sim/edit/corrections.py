@@ -302,8 +302,8 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
     The error of the trajectory is a Gaussian process with the stated sigmas and a Matern covariance (smoothness 3/2) of
     correlation time `over_s`; of a static agent it is the same at all times. A single pose of sigma s moves the place at its
     time by the Kalman gain sigma^2 / (sigma^2 + s^2) of its distance (Rasmussen and Williams, "Gaussian Processes for Machine
-    Learning", 2006, section 2.2), and less before and after. Where the poses contradict the stated sigmas, these are too small
-    and grow until the distance is as expected. A static agent that they put at different places moves through them.
+    Learning", 2006, section 2.2), and less before and after. Where the poses contradict the stated sigmas, there is a
+    further error, equally large at all times, which grows until the distance is as expected. A static agent that they put at different places moves through them.
     """
     key_s = np.array([p["t_s"] for p in poses])
     w = agent.waypoints
@@ -332,16 +332,18 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
     def posterior(sigma: Array, offset: Array, noise: Array, at: Array) -> tuple[Array, Array]:
         """Return the mean offsets (T, axes) and the standard deviations (T,) after offsets (K, axes) at times `at` (K,)."""
         at_key = np.interp(at, w.t_s, sigma)
-        prior, cross = at_key[:, None] * at_key * correlation(at, at), sigma[:, None] * at_key * correlation(w.t_s, at)
-        scale = 1.0
+        prior, more = at_key[:, None] * at_key, 0.0
         for _ in range(50):
-            squared = float(np.sum(offset * np.linalg.solve(scale * prior + np.diag(noise**2), offset))) / offset.size
+            covariance = (prior + more) * correlation(at, at) + np.diag(noise**2)
+            squared = float(np.sum(offset * np.linalg.solve(covariance, offset))) / offset.size
             if squared <= 1.01:
                 break
-            scale *= squared
-        inverse = np.linalg.inv(scale * prior + np.diag(noise**2))
-        left = scale * sigma**2 - scale**2 * np.einsum("tk,kl,tl->t", cross, inverse, cross)
-        return scale * cross @ inverse @ offset, np.sqrt(np.maximum(left, 1e-6**2))
+            stated = float(np.mean(at_key**2))
+            more = (stated + more) * squared - stated
+        cross = (sigma[:, None] * at_key + more) * correlation(w.t_s, at)
+        inverse = np.linalg.inv(covariance)
+        left = sigma**2 + more - np.einsum("tk,kl,tl->t", cross, inverse, cross)
+        return cross @ inverse @ offset, np.sqrt(np.maximum(left, 1e-6**2))
 
     here = agent.trajectory.at(key_s)
     offset = np.array([[p["x_m"], p["y_m"]] for p in poses]) - np.stack([here.x_m, here.y_m], axis=1)

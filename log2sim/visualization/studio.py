@@ -24,6 +24,11 @@ from log2sim.visualization.recording import Recorded, records_within
 # A hundred thousand corrections have some 20 MB.
 MAX_BODY_BYTES = 32_000_000
 HOST = "127.0.0.1"
+# sRGB of usual paints by the names of `COLOR_NAMES`.
+PAINTS = {
+    "black": (25, 25, 27), "white": (238, 238, 236), "gray": (105, 106, 108), "silver": (180, 182, 184), "red": (165, 25, 30),
+    "blue": (30, 65, 150), "green": (30, 100, 55), "yellow": (235, 200, 40), "brown": (95, 65, 45), "orange": (230, 110, 30),
+}  # fmt: skip
 
 
 class Studio:
@@ -95,6 +100,7 @@ class Studio:
                 "map_offset_m": list(self.scenario.map.offset_m),
                 "log": self.scenario.name,
                 "categories": list(CATEGORIES),
+                "paints": PAINTS,
                 "corrections": self.document["corrections"],
                 "before": [{**entry, "doubts": [], "doubted": []} for entry in _agents(self.scenario)],
                 "scales": SCALES,

@@ -189,9 +189,16 @@ def on_the_page(scenario: Scenario, steps: list[list[Step]], folder: Path) -> tu
                     for pose in entry["poses"]:
                         seek(pose["t_ns"])
                         key("E")
-                        here = browser.run("return log2sim.poseOf()")
-                        browser.mouse(window(*here), window(pose["x_m"], pose["y_m"]))
+                        x, y, yaw, ahead = browser.run("return log2sim.poseOf()")
+                        browser.mouse(window(x, y), window(pose["x_m"], pose["y_m"]))
                         counts["drags"] += 1
+                        if abs(wrap_angle(pose["yaw_rad"] - yaw)) > 2 * HAND_RAD:
+                            x, y, yaw, ahead = browser.run("return log2sim.poseOf()")
+                            tips = [
+                                window(x + ahead * np.cos(a), y + ahead * np.sin(a)) for a in (yaw, pose["yaw_rad"])
+                            ]
+                            browser.mouse(*tips)
+                            counts["drags"] += 1
                         key("\ue007")
                         made += 1
                         browser.wait(f"log2sim.corrections().length === {made}")

@@ -21,9 +21,10 @@ class Editor {
     this.before = new Map(entry.before.map((agent) => [agent.id, new Track(agent, entry.scales)]));
     this.corrected = entry.corrected;  // since the boxes in the pictures were projected
     this.changes = 0;  // so that pictures know when to draw again
-    this.busy = false;
+    this.sent = Promise.resolve();  // one after the other
     byId("studio").hidden = false;
     byId("studio-category").append(...entry.categories.map((name) => element("option", {}, name)));
+    byId("studio-color").append(element("option", { value: "" }, "color"), ...Object.keys(entry.paints).map((name) => element("option", {}, name)));
     const actions = {
       "studio-next": () => this.next(), "studio-undo": () => this.undo(), "studio-redo": () => this.redo(), "studio-download": () => this.download(),
       "studio-add": () => this.toggle("add"), "studio-confirm": () => this.put("confirm"), "studio-delete": () => this.put("delete"),
@@ -33,6 +34,7 @@ class Editor {
     };
     for (const [id, run] of Object.entries(actions)) byId(id).addEventListener("click", run);
     byId("studio-category").addEventListener("change", (event) => this.put("category", { category: event.target.value }));
+    byId("studio-color").addEventListener("change", ({ target }) => target.value && this.put("color", { name: target.value, rgb: entry.paints[target.value] }));
     this.keys = {
       J: () => this.next(), K: actions["studio-confirm"], B: actions["studio-flip"], M: actions["studio-merge"], S: actions["studio-split"],
       E: actions["studio-move"], Z: () => this.undo(), Y: () => this.redo(), Delete: actions["studio-delete"],
@@ -89,13 +91,13 @@ class Editor {
     return { t_ns: Math.round(this.entry.t0_ns + t * 1e9), x_m: track.px, y_m: track.py };
   }
 
-  // The corrections so far but those of a kind of an agent, which has one category and one size: the last.
-  without(kind, track) {
+  // Corrections but those of a kind of an agent, which has one category, size and color: the last.
+  without(made, kind, track) {
     const same = ({ agent }) => {
       track.moveTo((agent.t_ns - this.entry.t0_ns) / 1e9);
       return track.present && track.contains(agent.x_m, agent.y_m, 0);
     };
-    const kept = this.made.filter((entry) => entry.kind !== kind || !same(entry));
+    const kept = made.filter((entry) => entry.kind !== kind || !same(entry));
     track.moveTo(state.t);
     return kept;
   }
@@ -104,8 +106,8 @@ class Editor {
   put(kind, more = {}) {
     const track = state.chosen;
     if (!track || track.ego) return this.say("Choose an agent first; the ego is that of the log.");
-    const kept = kind === "category" || kind === "size" ? this.without(kind, track) : this.made;
-    this.send([...kept, { kind, agent: this.reference(track), ...more, time: new Date().toISOString() }], track.id);
+    const entry = { kind, agent: this.reference(track), ...more, time: new Date().toISOString() };
+    this.send((made) => [...(["category", "size", "color"].includes(kind) ? this.without(made, kind, track) : made), entry]);
   }
 
   toggle(mode) {
@@ -181,7 +183,7 @@ class Editor {
     const kind = this.mode, pose = { t_ns: this.stamp(), x_m: place[0], y_m: place[1], yaw_rad: 0 };
     this.toggle(null);
     const entry = kind === "erase" ? { at: place } : { category: byId("studio-category").value || "car", poses: [pose] };
-    this.send([...this.made, { kind, ...entry, time }], state.chosen?.id);
+    this.send((made) => [...made, { kind, ...entry, time }]);
     return true;
   }
 
@@ -190,7 +192,8 @@ class Editor {
     const points_m = this.line, feature = byId("studio-feature").value;
     if (points_m.length < 2) return this.say("A line has two points or more.");
     this.toggle(null);
-    this.send([...this.made, { kind: "draw", feature, points_m, time: new Date().toISOString() }], state.chosen?.id);
+    const entry = { kind: "draw", feature, points_m, time: new Date().toISOString() };
+    this.send((made) => [...made, entry]);
   }
 
   // Pixel of a handle of the box that is moved.
@@ -262,10 +265,10 @@ class Editor {
     const { x, y, yaw, length, width, height, moved, turned, sized } = this.pose, track = state.chosen, time = new Date().toISOString();
     const pose = { t_ns: this.stamp(), x_m: x, y_m: y, ...(turned ? { yaw_rad: yaw } : {}) }, agent = this.reference(track);
     this.toggle(null);
-    const made = [], kept = sized ? this.without("size", track) : this.made;
-    if (sized) made.push({ kind: "size", agent, size_m: [length, width, height].map((value) => Math.round(value * 100) / 100), time });
-    if (moved || turned || !sized) made.push({ kind: "move", agent, poses: [pose], time });
-    this.send([...kept, ...made], track.id);
+    const entries = [];
+    if (sized) entries.push({ kind: "size", agent, size_m: [length, width, height].map((value) => Math.round(value * 100) / 100), time });
+    if (moved || turned || !sized) entries.push({ kind: "move", agent, poses: [pose], time });
+    this.send((made) => [...(sized ? this.without(made, "size", track) : made), ...entries]);
   }
 
   resize() {
@@ -285,13 +288,9 @@ class Editor {
     chooseVisible(track);
   }
 
-  undo() {
-    if (this.made.length) this.send(this.made.slice(0, -1), state.chosen?.id, () => this.undone.push(this.made.at(-1)));
-  }
+  undo() { this.send((made) => (made.length ? made.slice(0, -1) : null), () => this.undone.push(this.made.at(-1))); }
 
-  redo() {
-    if (this.undone.length) this.send([...this.made, this.undone.at(-1)], state.chosen?.id, () => this.undone.pop());
-  }
+  redo() { this.send((made) => (this.undone.length ? [...made, this.undone.at(-1)] : null), () => this.undone.pop()); }
 
   document(made) {
     return { format: "log2sim-corrections", version: 1, log: this.entry.log, map_offset_m: this.entry.map_offset_m, corrections: made };
@@ -303,12 +302,14 @@ class Editor {
     URL.revokeObjectURL(link.href);
   }
 
-  // Have a list of corrections applied and kept; what it makes of the scenario is shown.
-  async send(made, id, done = () => { this.undone = []; }) {
-    if (this.busy) return;
-    this.busy = true;
-    this.say("…");
+  // Have corrections, which `build` makes of those so far, applied and kept, once those sent before are; what it makes of the scenario is shown.
+  send(build, done = () => { this.undone = []; }) { this.sent = this.sent.then(() => this.exchange(build, done)); }
+
+  async exchange(build, done) {
     try {
+      const made = build(this.made);
+      if (made === null) return;
+      this.say("…");
       const answer = await fetch(this.entry.address, { method: "PUT", headers: { "Content-Type": "application/json" }, body: JSON.stringify(this.document(made)) });
       const reply = await answer.json();
       if (!answer.ok) throw new Error(reply.error);
@@ -318,11 +319,10 @@ class Editor {
       this.corrected = true;
       this.changes++;
       data.features = loadFeatures(reply);
-      replaceTracks(reply.agents, reply.scales, id);
+      replaceTracks(reply.agents, reply.scales);
     } catch (error) {
       this.say(error instanceof TypeError ? "The program that serves this page does not answer; download the corrections." : error.message);
     }
-    this.busy = false;
     this.show();
   }
 
@@ -340,6 +340,7 @@ class Editor {
     byId("studio-redo").disabled = this.undone.length === 0;
     if (none) return;
     byId("studio-category").value = track.category;
+    byId("studio-color").value = Object.keys(this.entry.paints).find((name) => track.paintName.startsWith(name)) ?? "";
     for (const name of ["length", "width", "height"]) byId(`studio-${name}`).value = track[name].toFixed(2);
   }
 
@@ -419,12 +420,12 @@ class Editor {
 }
 
 // Show other tracks of the scenario; the ego stays the same object, as much refers to it.
-const replaceTracks = (entries, scales, id) => {
+const replaceTracks = (entries, scales) => {
   const made = entries.map((entry) => (entry.ego && ego ? ego : new Track(entry, scales)));
   tracks.splice(0, tracks.length, ...made);
   prepareTracks();
   applyTheme(data.layers);
-  const chosen = tracks.find((track) => track.id === id) ?? null;
+  const chosen = tracks.find((track) => track.id === state.chosen?.id) ?? null;
   list.show();
   listDoubtful();
   byId("doubts-toggle").hidden = doubtful.length === 0;
