@@ -719,7 +719,9 @@ class Crowd:
         away = np.asarray(place[:, j] - place[:, self.rows[i]])
         one, two = (np.broadcast_to(self.size_m[k], (*away.shape, 2)).reshape(-1, 2) for k in (self.rows[i], j))
         headings = yaw[:, self.rows[i]].ravel(), yaw[:, j].ravel()
-        return away, rectangles_overlap(away.real.ravel(), away.imag.ravel(), *headings, one, two).reshape(away.shape)
+        hit = rectangles_overlap(away.real.ravel(), away.imag.ravel(), *headings, one, two).reshape(away.shape)
+        # People brush past each other and walk shoulder to shoulder: their boxes overlap in logs, too.
+        return away, hit & ~((self.group[i] == "pedestrian") & (self.now.group[j] == "pedestrian"))
 
     def _shaken(self, jitter: Array) -> tuple[Complex, Array]:
         """Return places and headings (R, A) as labels have them, off by jitter (3, R, M), but where boxes would overlap by it."""
