@@ -2,7 +2,8 @@
 
 python tools/bench.py resim samples/crossing out/scenario.json
 python tools/bench.py resim samples/crossing out/scenario.json --figures pictures --camera front --images out/
-python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3
+python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3 --figures sweeps
+python tools/bench.py resim samples/crossing.toml --figures pictures --sideways 0 -0.5 -1 -2 -3
 python tools/bench.py resim samples/crossing out/scenario.json --picture out/sweeps.jpg --without bus-1
 """
 
@@ -134,14 +135,12 @@ def shares(counts: list[Figures]) -> Figures:
     return {**rest, "boxes": n["recorded"], "found again": again, "right": right}
 
 
-def compare_pictures(true: Array, other: Array, boxes: list[Array]) -> Figures:
+def compare_pictures(true: Array, other: Array) -> Figures:
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     gray = [np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) for image in (true, other)]
-    return {
-        "PSNR dB": min(float(peak_signal_noise_ratio(true, other)), 99.0),
-        "SSIM": float(structural_similarity(*gray)), **found_again(box_iou(*boxes), 0.5),
-    }  # fmt: skip
+    signal = min(float(peak_signal_noise_ratio(true, other)), 99.0)
+    return {"PSNR dB": signal, "SSIM": float(structural_similarity(*gray))}
 
 
 def pictures(
@@ -161,8 +160,10 @@ def pictures(
         image, unknown = simulation.picture(camera, int(t_ns[i]))
         spent = time.process_time() - begin
         own = boxes(i, true)
-        rows[0].append(compare_pictures(true, image, [own, boxes(i, image)]) | {"made up": unknown.mean(), "s": spent})
-        rows[1].append(compare_pictures(true, read(i - 1), [own, boxes(i, read(i - 1))]))
+        more = {"made up": unknown.mean(), "s": spent}
+        rows[0].append(compare_pictures(true, image) | found_again(box_iou(own, boxes(i, image)), 0.5) | more)
+        before = read(i - 1)
+        rows[1].append(compare_pictures(true, before) | found_again(box_iou(own, boxes(i, before)), 0.5))
         if folder is not None:
             cv2.imwrite(str(folder / f"{camera}_{i}.png"), np.vstack([true, image]))
     return [(f"pictures of {camera}", shares(rows[0])), ("the one before", shares(rows[1]))]
@@ -211,6 +212,27 @@ def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[st
     return out
 
 
+def pictures_sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:
+    """Make pictures from beside the first camera, and compare them, and those that it took, with the true ones from there."""
+    scene = load_scene(scene_path)
+    scene = scene.model_copy(update={"camera": scene.camera[:1]})
+    log, truth = synthesize(scene, observe=False)
+    world, spec, out = build_world(log, truth, [scene.lidar[0].name]), scene.camera[0], []
+    made, t_ns = Pictures(log, world, truth), log.streams[spec.name].t_ns
+    for off_m in meters:
+        x, y, z = spec.position_m
+        moved = scene.model_copy(update={"camera": (spec.model_copy(update={"position_m": (x, y + off_m, z)}),)})
+        true_log = synthesize(moved, observe=False)[0].changed(ego=log.ego)
+        rows: tuple[list[Figures], list[Figures]] = [], []
+        for i in range(0, len(t_ns), every):
+            true = true_log.streams[spec.name].read(i)
+            image, unknown = made.make(true_log, truth, world.agents, spec.name, int(t_ns[i]))
+            rows[0].append(compare_pictures(true, image) | {"made up": unknown.mean()})
+            rows[1].append(compare_pictures(true, log.streams[spec.name].read(i)))
+        out += [(f"picture {off_m:g} m sideways", mean(rows[0])), ("as it was taken", mean(rows[1]))]
+    return out
+
+
 def mean(figures: list[Figures]) -> Figures:
     return {key: float(np.mean([f[key] for f in figures])) for key in figures[0]}
 
@@ -233,7 +255,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=7, help="sweeps of a scene that are compared")
     given = parser.parse_args(argv)
     if given.scenario is None:
-        rows = sideways(given.log, given.sideways, given.every)
+        rows = sideways(given.log, given.sideways, given.every) if "sweeps" in given.figures else []
+        if "pictures" in given.figures:
+            rows += pictures_sideways(given.log, given.sideways, given.every)
     else:
         scenario = Scenario.load(given.scenario)
         log = localize_like(open_log(given.log), scenario.provenance)
