@@ -4,9 +4,10 @@
     log2sim replay blocked.json --ego samples/egos.py:BrakeLate --out late.json
     log2sim replay blocked.json --ego samples/egos.py:BrakeInTime --out in_time.json
     log2sim replay scenario.json --ego samples/egos.py:ChangeLane --agents reactive --out change.json
+    log2sim replay blocked.json --ego samples/egos.py:BrakeForPoints --log samples/crossing --recorded scenario.json --out seen.json
 
 In the scenario of samples/crossing the first line puts a parked car into the lane of the ego. `BrakeLate` hits it, `BrakeInTime`
-stops behind it.
+stops behind it, and so does `BrakeForPoints`, which knows of no agent: it sees points of the LiDAR.
 
 A policy is called once a step with an `Observation` and answers with `Controls`. These drivers take all they need from what
 they see, so they drive any scenario that has an ego.
@@ -93,6 +94,40 @@ class ChangeLane:
         soon_m = ahead_m + (pace_mps - seen.ego.speed_mps) * self.over_s
         near = (np.minimum(ahead_m, soon_m) < 20.0) & (np.maximum(ahead_m, soon_m) > -10.0)
         return not np.any(in_lane & near)
+
+
+class BrakeForPoints:
+    """Drives the way of the scenario and brakes for points of a LiDAR before it; it looks `every_s` seconds.
+
+    `lidar`: of the log. `height_m`, `front_m`: the LiDAR above the ground, and the bumper ahead of it.
+    """
+
+    def __init__(
+        self, lidar: str = "lidar_top", height_m: float = 1.9, front_m: float = 2.5, every_s: float = 0.2
+    ) -> None:
+        self.lidar, self.height_m, self.front_m, self.every_s = lidar, height_m, front_m, every_s
+        self.looked_s, self.gap_m = -np.inf, np.inf
+
+    def reset(self, scenario: Scenario) -> None:
+        self.looked_s, self.gap_m = -np.inf, np.inf
+
+    def __call__(self, seen: Observation) -> Controls:
+        ego, path = seen.ego, seen.path
+        if seen.t_s - self.looked_s > self.every_s - 1e-6:
+            x, y, z = seen.sweep(self.lidar).xyz_m.T
+            # The way, as the LiDAR sees it.
+            c, s = np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)
+            dx, dy = path.x_m - ego.x_m, path.y_m - ego.y_m
+            ahead_m, left_m = c * dx + s * dy, c * dy - s * dx
+            on_way = np.abs(y - np.interp(x, ahead_m, left_m)) < ego.width_m / 2 + 0.2
+            on_way &= (x > self.front_m) & (x < 40) & (z > 0.3 - self.height_m) & (z < 0.3)
+            near = np.sort(x[on_way] - self.front_m)
+            # One point alone may be noise.
+            self.looked_s, self.gap_m = seen.t_s, float(near[2]) if len(near) > 2 else np.inf
+        left_m = max(self.gap_m - 2.0 - (seen.t_s - self.looked_s) * ego.speed_mps, 0.1)
+        needed_mps2 = ego.speed_mps**2 / (2 * left_m)
+        accel = hold_speed(ego, float(path.speed_mps[0]))
+        return Controls(-min(needed_mps2, FULL_BRAKE_MPS2) if needed_mps2 > 2.0 else accel, steer_along(ego, path))
 
 
 def hold_speed(ego: EgoState, speed_mps: float) -> float:

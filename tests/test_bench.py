@@ -37,6 +37,7 @@ from log2sim.geometry import Array, apply_homography
 from log2sim.perception.detect.layouts import COCO_80, LAYOUTS, InputSpec
 from log2sim.perception.detect.onnx_detector import OnnxDetector, OnnxModel
 from log2sim.perception.first_pass import Observations
+from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
 from log2sim.perception.sync import schedule_of
 from log2sim.plan import select_sensors
@@ -153,6 +154,12 @@ def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
     (log, truth), (context, seen, _) = tiny, first_pass
     known = true_positions(log, context.schedule, seen, truth, when="imaged")
     holdout = split_holdout(log, context.schedule, seen, known, np.random.default_rng(0))
+    # What is held out is not fitted to.
+    fitted, everything = (Correspondences.join(o.feet["front"]) for o in (holdout.observations, seen))
+    held = Correspondences.join(holdout.feet["front"])
+    same = (fitted.tick[:, None] == held.tick) & (np.abs(fitted.uv[:, None] - held.uv).max(axis=2) < 1)
+    assert not same.any()
+    assert 0 < len(fitted.uv) < len(everything.uv)
     base = calibrated_homography(log, log.cameras["front"])
     assert base is not None
     uv = [apply_homography(np.linalg.inv(base.ground_H_image), f.xy_ego)[0] for f in holdout.feet["front"]]

@@ -21,7 +21,7 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes
-from log2sim.evaluation.detection.truth import labeled_sweeps, truth_of_sweeps
+from log2sim.evaluation.detection.truth import LabelTracks, labeled_sweeps, truth_of_sweeps
 from log2sim.files.documents import check
 from log2sim.geometry import points_in_box
 from log2sim.perception.lidar.cloud import sweep_to_map
@@ -177,6 +177,15 @@ def test_sweeps_between_labels_of_every_sweep_are_labeled_and_those_between_spar
     assert labeled(middle[[0, 5, 10]] + 3_000_000, 0.5) == [0, 5, 10]
     assert labeled(dense, 0.1, asked=middle[4:5]) == [0]
     assert labeled(dense, 0.1, told=middle[[0, 3, 19]]) == [0, 3, 19]
+
+
+def test_boxes_between_labels_lie_on_the_way_of_their_track() -> None:
+    t_s = np.array([0.1, 0.125, 0.27, 0.45, 0.53])
+    tracks = LabelTracks.of(labels_at(0.1, 0.2, 0.3, 0.4, 0.5))
+    pose, row = tracks.at(np.zeros(len(t_s), np.int64), np.round(t_s * NS).astype(np.int64))
+    np.testing.assert_allclose(pose[:, 0], 10 * t_s)
+    assert row.tolist() == [0, 0, 2, 3, 4]
+    assert np.cos(pose[3, 3]) == pytest.approx(-1.0)  # not half way round
 
 
 def test_labels_as_detector_are_found_again_by_every_protocol(tiny: Log) -> None:

@@ -12,7 +12,7 @@ from worlds import CAR, PARKED, tiny_log
 from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.road import Area, map_figures, signal_figures
+from log2sim.evaluation.road import Area, map_figures, seen_ground, signal_figures
 
 ROAD = {"line": [[-60.0, 0.0], [80.0, 0.0]], "width_m": 8.0, "marking": "solid", "color": "white"}
 
@@ -58,6 +58,14 @@ def test_shares_and_errors_follow_from_lengths_and_offsets(truth: Scenario) -> N
     assert figures["kind_accuracy"] == 1
     assert figures["color_accuracy"] == 0
     assert figures["false_m_per_100_m"] == pytest.approx(100 * 51.5 / 3, rel=0.02)
+
+
+def test_runs_of_cells_reach_from_their_first_cell_along_x(truth: Scenario) -> None:
+    seen = {"cell_m": 0.5, "runs": [[6, -4, 8], [0, 2, 1]]}
+    ground = seen_ground(replace(truth, provenance={"seen_ground": seen}), np.array([10.0, -20.0, 3.0]))
+    assert ground is not None
+    assert ground.bounds == (10.0, -22.0, 17.0, -18.5)
+    assert ground.area == pytest.approx(9 * 0.25)
 
 
 def test_what_no_sensor_saw_is_not_missed_but_what_is_found_there_counts(truth: Scenario) -> None:

@@ -43,6 +43,8 @@ def test_a_result_keeps_its_schema_and_prints():
     lines = blocks[1].splitlines()
     assert [line.split()[0] for line in lines[1:]] == [*rows, "ego"]
     assert len(set(map(len, lines[:-1]))) == 1
+    shares = next(block for block in blocks if block.startswith("wrong in %")).splitlines()
+    assert {"all", "0-15", "15-30"} <= {line.split()[0] for line in shares if line.strip()}
 
 
 def test_a_known_shift_is_the_position_error_and_the_ego_stands_apart():

@@ -80,6 +80,8 @@ def sealed(text: Any, body: bytes = b"") -> bytes:
         sealed({"array": ["|O", 1]}, bytes(8)),
         sealed({"array": ["<U1000000000", 1]}),
         sealed({"array": ["<U1", 1]}, b"\xff" * 4),
+        sealed({"array": ["<U1", 1]}, b"\x00\xd8\0\0"),
+        sealed({"array": ["<U1", 1]}, b"\xff\xdf\0\0"),
         sealed({"array": ["no type", 1]}),
         sealed({"of": "Popen", "fields": {}}),
         sealed({"of": "Row", "fields": {"other": 1}}),
@@ -91,6 +93,11 @@ def sealed(text: Any, body: bytes = b"") -> bytes:
 def test_a_right_check_sum_does_not_make_wrong_bytes_right(content: bytes) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         unpack(content, (Row,))
+
+
+def test_letters_beside_halves_of_pairs_are_texts() -> None:
+    letters = np.array(["\ud7ff", "\ue000", "\U0010ffff"])
+    assert unpack(pack(letters), ()).tolist() == letters.tolist()
 
 
 def test_what_holds_references_is_not_packed() -> None:

@@ -228,3 +228,22 @@ def test_who_is_lost_from_sight_before_a_crossing_still_crosses_with_a_time_that
     assert near[0].probability > 0.9
     assert 0.5 < unsure[0].probability < near[0].probability
     assert not of("crossing_path", cut(3.5))  # too long ago
+
+
+def test_speeds_and_headings_of_labels_that_jump_are_no_braking_and_no_turning_back() -> None:
+    stage = Stage(np.random.default_rng(4), 10.0, False, 0.0)
+    line = route([(-300, 0), (300, 0)], 5.0)
+    jumps = np.where((stage.t > 3.0) & (stage.t < 3.5), 18.5, 15.0)  # half a second between two keyframes
+    brakes = np.clip(15.0 - 5.0 * np.maximum(stage.t - 6.0, 0.0), 9.0, None)
+    stage.add("ego", line, jumps)
+    stage.add("car-1", line + np.array([0.0, 50.0]), brakes)
+    creeps = np.where((stage.t > 4.0) & (stage.t < 5.0), 2.5, 0.0)
+    stage.add("car-2", line + np.array([0.0, 100.0]), creeps, start_m=300.0)
+    world = stage.world("jumps", [], ()).scenario
+    w = world["car-2"].waypoints
+    flips = replace(
+        world["car-2"], waypoints=replace(w, yaw_rad=np.where((w.t_s > 4.4) & (w.t_s < 4.8), np.pi - 1e-6, w.yaw_rad))
+    )
+    found = find_tags(replace(world, agents=(*world.agents[:2], flips)))
+    assert [g.agent for g in found if g.tag == "hard_braking"] == ["car-1"]
+    assert not [g for g in found if g.tag in ("u_turn", "turning")]

@@ -59,6 +59,11 @@ MUTANTS = (
     ("hypotheses are not counted", "agents/hypotheses.py", "- np.log(count))", ")", "hypotheses"),
     ("lit lamps", "road/signals.py", "log += 0.0 if", "log += 0.0 if True or", "traffic_lights"),
     ("points beyond a gap of time", "evaluation/metrics/comparison.py", "<= MAX_TRUTH_GAP_S) & table", "<= 2 * MAX_TRUTH_GAP_S) & table", "metrics_evaluate"),
+    ("boxes between labels", "evaluation/detection/truth.py", "stamps[partner] - stamps[nearest]", "stamps[partner] + stamps[nearest]", "detection_files"),
+    ("cells that were seen", "evaluation/road.py", "low[:, 1] + cell_m", "low[:, 1] - cell_m", "evaluate_lanes"),
+    ("held-out feet", "evaluation/bench/scores.py", "feet.uv[:, None] - uv", "feet.uv[:, None] + uv", "bench"),
+    ("halves of pairs", "files/packing.py", "code < 0xE000", "code >= 0xE000", "packing"),
+    ("figures by range", "evaluation/metrics/table.py", 'found["by_range"] or {}', 'found["by_range"] and {}', "metrics_evaluate"),
 )  # fmt: skip
 
 

@@ -10,7 +10,6 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from extremes import CASES, Case, Outcome, outcome_of
 
@@ -30,21 +29,17 @@ def main(arguments: list[str] | None = None) -> int:
     for case in chosen:
         start = time.perf_counter()
         outcome = outcome_of(case)
-        rows.append(as_row(case, outcome, time.perf_counter() - start))
+        rows.append({
+            "case": case.name, "required": case.required, "ok": outcome.ok, "found": outcome.found,
+            "condition": outcome.condition, "error": outcome.error, "unit": outcome.unit,
+            "seconds": round(time.perf_counter() - start, 3),
+        })  # fmt: skip
         print(line(case, outcome))
     missed = sum(not r["ok"] for r in rows)
     print(f"{len(rows)} cases, {missed} not as required")
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 1 if missed else 0
-
-
-def as_row(case: Case, outcome: Outcome, seconds: float) -> dict[str, Any]:
-    """A case as it stands in the JSON file."""
-    return {
-        "case": case.name, "required": case.required, "ok": outcome.ok, "found": outcome.found,
-        "condition": outcome.condition, "error": outcome.error, "unit": outcome.unit, "seconds": round(seconds, 3),
-    }  # fmt: skip
 
 
 def line(case: Case, outcome: Outcome) -> str:

@@ -53,6 +53,14 @@ def replay(
             "Policy that drives the ego: a plug-in, or of a module or file.", "NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE"
         ),
     ] = None,
+    log: Annotated[
+        Path | None,
+        option("--ego: what the policy sees by its observations' sweep and image comes from this log.", "LOG"),
+    ] = None,
+    recorded: Annotated[
+        Path | None,
+        option("--log: what was reconstructed from it, where the scenario is an edit. [default: the scenario]", "FILE"),
+    ] = None,
     warn: Annotated[
         str | None,
         choose(
@@ -114,6 +122,7 @@ def replay(
     --------
     log2sim replay s.json -o replay.json
     log2sim replay s.json --ego policy.py:drive --agents reactive
+    log2sim replay s.json --ego samples/egos.py:BrakeForPoints --log samples/crossing
     log2sim replay s.json --warn road --brake --strict
     """
     from dataclasses import replace as changed
@@ -140,6 +149,10 @@ def replay(
     if foresight != "path" and react is None and agents != "reactive":
         raise ConfigError("--foresight: nobody reacts; add --agents reactive or --react")
     limits = parse_limits(limit or ())
+    if log is not None and ego is None:
+        raise ConfigError("--log: is what the policy of --ego sees; add --ego")
+    if recorded is not None and log is None:
+        raise ConfigError("--recorded: was reconstructed from the log of --log; add --log")
     if brake and (warn is None or ego is not None):
         raise ConfigError("--brake: brakes when the ego is warned; add --warn, and leave out --ego")
     warning = None if warn is None else WarningSettings(warn, horizon, reaction_s=reaction, brake_mps2=deceleration)
@@ -151,6 +164,15 @@ def replay(
     policy = load_policy(ego) if ego is not None else BrakeWhenWarned(warning) if brake else None
     moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as report_progress:
+        if log is not None and policy is not None:
+            from log2sim.localization.choice import localize_like
+            from log2sim.logs.opening import open_log
+            from log2sim.resim.simulate import simulate, with_sensors
+
+            source = loaded if recorded is None else Scenario.load(recorded)
+            opened = localize_like(open_log(log), source.provenance)
+            now = kept.aligned_to(source)
+            policy = with_sensors(policy, simulate(opened, source, now, cameras=True, progress=report_progress))
         result = run(
             kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, foresight=foresight, host=moved_by,
             quarantined=confidence is not None, progress=partial(report_progress, "replay"),

@@ -1,4 +1,4 @@
-"""Simulate the LiDARs of a log in what happens now."""
+"""Simulate the sensors of a log in what happens now."""
 
 from __future__ import annotations
 
@@ -18,19 +18,22 @@ def resimulate(
     replay: Annotated[
         Path | None, option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE")
     ] = None,
-    sensors: Annotated[str | None, option("Only these LiDARs.", "A,B", default="all")] = None,
+    sensors: Annotated[
+        str | None, option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
+    ] = None,
+    cameras: Annotated[bool, option("All cameras, too.", None, "--cameras")] = False,
     sequence: Annotated[str | None, option("Sequence of a log with several.", "NAME")] = None,
     seed: Annotated[int, option("Seed of noise and lost returns.", min=0)] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write what the LiDARs of a log would have recorded from where the ego drives now, among its agents.
+    """Write what the LiDARs and cameras of a log would have recorded from where the ego drives now, among its agents.
 
     Examples
     --------
     log2sim resimulate s.json --log samples/crossing -o simulated/
     log2sim edit s.json --lateral ego=2 -o left.json
-    log2sim resimulate s.json --log samples/crossing --replay left.json -o from_the_left/
+    log2sim resimulate s.json --log samples/crossing --replay left.json -o from_the_left/ --cameras
     """
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
@@ -45,7 +48,9 @@ def resimulate(
     names = tuple(name.strip() for name in sensors.split(",")) if sensors else ()
     with progress(quiet=quiet) as report:
         recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
-        notes = run(recorded, source, now, out, sensors=names, seed=seed, overwrite=overwrite, progress=report)
+        notes = run(
+            recorded, source, now, out, sensors=names, cameras=cameras, seed=seed, overwrite=overwrite, progress=report
+        )
     for note in notes:
         say(f"note: {note}", quiet=quiet)
     report_written(out, quiet=quiet)

@@ -222,8 +222,6 @@ MAX_REST, MAX_REST_SIGMAS = 0.05, 10.0
 MAX_SKIP_S = 0.25
 # Vehicles that drive off or stop change their speed by less than this share of what they can.
 USUAL_CHANGE_SHARE = 1 / 3
-# Successive samples that repeat one, at least.
-MIN_SAME = 3
 # Parts farther back are no longer compared: between them almost any motion is possible.
 MAX_COMPARED = 30
 
@@ -269,9 +267,7 @@ def find_parts(samples: Samples) -> list[Part]:
     cores = [np.arange(first, end) for first, end in zip(edges[::2].tolist(), edges[1::2].tolist())]
     if not cores:
         return []
-    grown = _grown(samples, cores)
-    rows = [r for part in grown[:-1] for r in _split_at_rest(samples, part)] + grown[-1:]
-    parts = [Part(r) for r in rows]
+    parts = [Part(rows) for rows in _grown(samples, cores)]
     return _choose(samples, _marked_at_rest(samples, parts))
 
 
@@ -338,18 +334,6 @@ def _end(samples: Samples, rows: NDArray[np.intp], *, first: bool) -> _End:
     slack = MAX_JERK * span**2 / 12 if degree == 2 else samples.max_change * span / 2
     change = 2 * solution[2] if degree == 2 else np.zeros_like(solution[0])
     return _End(t_end, solution[0], solution[1], change, float(spread[0]), float(spread[1]), slack)
-
-
-def _split_at_rest(samples: Samples, rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Divide a part that ends in one place, at which the path goes on with a break, unless the vehicle stopped there by itself."""
-    same = (samples.values[rows] == samples.values[rows[-1]]).all(axis=1)
-    moving = len(rows) - int(np.argmin(same[::-1])) if not same.all() else 0
-    if len(rows) - moving < MIN_SAME or moving < MIN_SAME:
-        return [rows]
-    end = _end(samples, rows[:moving], first=False)
-    place = samples.values[rows[-1]]
-    rest = _End(float(samples.t_s[rows[moving]]), place, np.zeros_like(place), np.zeros_like(place), 0.0, 0.0, 0.0)
-    return [rows] if _same_rate(samples, end, rest, USUAL_CHANGE_SHARE) else [rows[:moving], rows[moving:]]
 
 
 def _marked_at_rest(samples: Samples, parts: list[Part]) -> list[Part]:

@@ -46,7 +46,7 @@ MIN_SHARE = 0.2
 SAME_PLACE_M = 0.5
 # Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
 AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
-PRIOR_RAYS = 2.0
+PRIOR_RAYS, PRIOR_UNSEEN = 2.0, 0.15  # that end on a disc before any is counted; share of them for one that nobody saw
 BODY_DISC_M = 0.08  # radius of the discs of a body that nobody saw
 
 Progress = Callable[[str, int, int], None]
@@ -114,7 +114,7 @@ def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
 def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
     """Put the agents of a scenario into the background, each disc where it is when the sensor looks there."""
     parts, ids = [world.background], []
-    move = _given_T_refined(world, rays)
+    move = given_T_refined(world, rays.origin[len(rays.origin) // 2] + rays.shift_m, int(rays.t_ns[0]))
     rotation = move[:3, :3].astype(np.float32)
     offset = move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m
     center = [world.background.center_m @ rotation.T + offset.astype(np.float32)]
@@ -141,16 +141,13 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
     return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
 
 
-def _given_T_refined(world: World, rays: Rays) -> Array:
-    """Return the pose (4, 4) of the map of the background in that of the agents, as it was where the ego is now."""
+def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
+    """Return the pose (4, 4) of the map of the background in that of the agents, as it was where a sensor is now, (3,) m."""
     if world.given is None or world.refined is None:
         return np.eye(4)
-    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
     distance = np.linalg.norm(world.given.map_T_ego[:, :3, 3] - here, axis=1)
     # Of several times at which it was there, the one nearest to now.
-    late = np.where(
-        distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - rays.t_ns[0]), np.iinfo(np.int64).max
-    )
+    late = np.where(distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - t_ns), np.iinfo(np.int64).max)
     k = int(late.argmin())
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
 
@@ -229,9 +226,10 @@ def build_world(
     world = World(shift, log.ego if refined is not None else None, refined, standing, agents, models, notes)
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
-    trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
-    world = replace(world, background=_trimmed(world.background), agents=trimmed)
-    world = _weighed(log, scenario, world, leave_out, progress)
+    for _ in range(2):
+        trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
+        world = replace(world, background=_trimmed(world.background), agents=trimmed)
+        world = _weighed(log, scenario, world, leave_out, progress)
     there = {id: surfels.take(surfels.share > MIN_SHARE) for id, surfels in world.agents.items()}
     return replace(world, background=world.background.take(world.background.share > MIN_SHARE), agents=there)
 
@@ -358,7 +356,7 @@ def completed(agent: Agent, seen: Surfels) -> Surfels:
         if len(whole):
             far = np.isinf(cKDTree(whole.center_m).query(more.center_m, distance_upper_bound=COVERED_M)[0])
             more = more.take(far)
-        whole = joined([whole, more])
+        whole = joined([whole, replace(more, share=np.full(len(more), PRIOR_UNSEEN, np.float32))])
     return whole
 
 
@@ -399,7 +397,8 @@ def _weighed(
             np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing])
             first = nothing & (met.range_m == nearest[met.ray])
             np.add.at(lost, column[met.surfel[first]], met.weight[first])
-    share = ((hit + PRIOR_RAYS) / (hit + passed + PRIOR_RAYS)).astype(np.float32)
+    prior = PRIOR_RAYS * np.concatenate([world.background.share, *(world.agents[id].share for id in ids)])
+    share = ((hit + prior) / (hit + passed + prior)).astype(np.float32)
     returned = ((hit + PRIOR_RAYS) / (hit + lost + PRIOR_RAYS)).astype(np.float32)
 
     def judged(surfels: Surfels, at: int) -> Surfels:
@@ -410,8 +409,8 @@ def _weighed(
     return replace(world, background=judged(world.background, 0), agents=agents)
 
 
-def body_of(agent: Agent) -> Surfels:
-    """Return a body of an agent's category and size in its frame, with the shapes of `synth`, its discs as far apart as they are wide."""
+def mesh_of(agent: Agent) -> shapes.Mesh:
+    """Return the body of an agent's category and size in its frame, with the shapes of `synth`."""
     size = (float(agent.size_m[0]), float(agent.size_m[1]), float(agent.size_m[2]))
     makers = {
         "car": lambda: shapes.car(size, "hatch"),
@@ -419,8 +418,12 @@ def body_of(agent: Agent) -> Surfels:
         "bus": lambda: shapes.bus(size),
         "pedestrian": lambda: shapes.pedestrian(size, 0, bool(agent.static)),
     }
-    mesh = makers.get(agent.category, lambda: shapes.cyclist(size, 0))()
-    mesh = mesh.fitted(size)
+    return makers.get(agent.category, lambda: shapes.cyclist(size, 0))().fitted(size)
+
+
+def body_of(agent: Agent) -> Surfels:
+    """Return discs on the body of an agent, as far apart as they are wide."""
+    mesh = mesh_of(agent)
     corner = mesh.vertices_m[mesh.faces]
     cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = np.linalg.norm(cross, axis=1) / 2

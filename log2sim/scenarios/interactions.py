@@ -17,7 +17,7 @@ from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_ti
 from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
 from log2sim.scenarios.traffic import SAME_WAY_RAD, SIDE_M, Beside, Traffic, latched, probability_above, runs, turned
 from log2sim.simulation.metrics.collisions import BoxTracks
-from log2sim.simulation.metrics.conflicts import CROSSING_RAD, post_encroachment_times, time_to_touch
+from log2sim.simulation.metrics.conflicts import post_encroachment_times, time_to_touch
 
 FOLLOWING_S = 3.0
 """Time headway up to which a vehicle follows another (HCM 2016, percent time spent following)."""
@@ -316,7 +316,7 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
         if pet > CROSSING_S or min(speed_a, speed_c) < 0.5 or not (traffic.wheeled[a] or traffic.wheeled[c]):
             continue
         angle = float(abs(wrap_angle(on.course_rad[a, i] - on.course_rad[c, j])))
-        if not SAME_WAY_RAD <= angle <= ONCOMING_RAD + CROSSING_RAD:
+        if not SAME_WAY_RAD <= angle <= np.pi - JOINING_RAD:
             continue
         begin, ttc, touch = _planar_ttc(traffic, a, c, j)
         sigma_s = float(np.hypot(on.sigma_m[a, i] / speed_a, on.sigma_m[c, j] / speed_c))

@@ -251,13 +251,14 @@ def _hard_braking(traffic: Traffic, k: int) -> Iterator[Tag]:
     """Find where an agent decelerates by more than `COMFORTABLE_MPS2` for at least 0.5 s."""
     accel, speed = traffic.accel_mps2[k], traffic.speed_mps[k]
     hard: Mask = (accel < -COMFORTABLE_MPS2) & np.isfinite(accel)
-    for i, j in runs(hard, round(0.5 / TICK_S), BREAK):
+    for i, j in runs(hard, round(0.5 / TICK_S) + 1, BREAK):
         n = i + int(np.argmin(accel[i : j + 1]))
-        after = speed[j + 1 : j + 1 + BREAK]
-        after = after[np.isfinite(after)]
-        # It is the log that jumps where no brakes are as hard, and where the speed is soon what it was.
-        back = len(after) > 0 and float(np.median(after)) > (speed[i] + speed[j]) / 2
-        if -accel[n] > MAX_BRAKING_MPS2 or back or speed[i] < MOVING_MPS:
+        # It is the log that jumps where no brakes are as hard, where the speed is soon what it was, and where it was lower just before.
+        middle = (speed[i] + speed[j]) / 2
+        before, after = speed[max(i - BREAK, 0) : i], speed[j + 1 : j + 1 + BREAK]
+        jumps = (np.nanmedian(before) < middle) if np.isfinite(before).any() else False
+        jumps |= (np.nanmedian(after) > middle) if np.isfinite(after).any() else False
+        if -accel[n] > MAX_BRAKING_MPS2 or jumps or speed[i] < MOVING_MPS:
             continue
         # Two speeds half a second apart, whose errors are independent, tell the deceleration.
         sigma = np.sqrt(2.0) * traffic.sigma_speed_mps[k, n] / max((j - i) * TICK_S, 0.5)

@@ -394,7 +394,8 @@ def smoothed(table: MotionTable) -> tuple[Complex, Complex]:
 
 
 def _parabolas(values: Complex, window: int, smooth: Callable[..., Array]) -> Complex:
-    return np.asarray(smooth(values.real, window, 2) + 1j * smooth(values.imag, window, 2))
+    real, imaginary = smooth(np.stack([values.real, values.imag]), window, 2)
+    return np.asarray(real + 1j * imaginary)
 
 
 def rate(values: Array) -> Array:

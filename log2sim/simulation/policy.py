@@ -15,8 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Scenario, Sweep
@@ -170,7 +171,7 @@ class Observation:
     dt_s : float
         The returned controls hold for this long.
     look : callable or None
-        What `sweep` calls; None where no sensors are simulated.
+        What `sweep` and `image` call; None where no sensors are simulated.
     """
 
     t_s: float
@@ -179,7 +180,7 @@ class Observation:
     others: Others
     route: Route
     path: PathAhead
-    look: Callable[[Observation, str], Sweep] | None = None
+    look: Callable[[Observation, Literal["sweep", "image"], str], Any] | None = None
 
     def sweep(self, name: str) -> Sweep:
         """Return the sweep of a LiDAR that ends now, its points in the LiDAR's frame at their own times; it is cast when asked for.
@@ -187,13 +188,28 @@ class Observation:
         Raises
         ------
         ConfigError
-            Where no sensors are simulated (`log2sim.resim.simulate.with_sensors` does), or for an unknown LiDAR.
+            Where no sensors are simulated (`log2sim.resim.simulate.with_sensors` does), or for a LiDAR that is not simulated.
         """
+        sweep: Sweep = self._looked("sweep", name)
+        return sweep
+
+    def image(self, name: str) -> NDArray[np.uint8]:
+        """Return the picture (H, W, 3), BGR, that a camera takes now; it is made when asked for.
+
+        Raises
+        ------
+        ConfigError
+            As of `sweep`; and where the ego is too far off the recorded path.
+        """
+        image: NDArray[np.uint8] = self._looked("image", name)
+        return image
+
+    def _looked(self, kind: Literal["sweep", "image"], name: str) -> Any:
         if self.look is None:
             raise ConfigError(
-                f"sweep '{name}': no sensors are simulated; wrap the policy by log2sim.resim.simulate.with_sensors"
+                f"{kind} '{name}': no sensors are simulated; wrap the policy by log2sim.resim.simulate.with_sensors"
             )
-        return self.look(self, name)
+        return self.look(self, kind, name)
 
 
 # A function, or an object with `__call__` and, if it has a state of its own, `reset(scenario)`.

@@ -76,11 +76,6 @@ class Actor:
         return shapes.pedestrian(size, phase, self.path is None)
 
 
-def actors_of(scene: Scene) -> tuple[Actor, ...]:
-    """Make the actors of a scene, in its order."""
-    return tuple(_actor(spec, i) for i, spec in enumerate(scene.agent))
-
-
 def _actor(spec: AgentSpec, index: int) -> Actor:
     appearance = Appearance(
         spec.category, spec.box_m, spec.color, spec.shape, spec.second_color, spec.skin, spec.hair, seed=index
@@ -143,7 +138,7 @@ class MovingScene:
             size, offset_m = scene.ego.size_m, scene.ego.rear_axle_offset_m
             spec = AgentSpec.model_construct(id="ego", category="car", size_m=size, color=EGO_COLOR, shape="sedan")
             body = Actor(spec, Appearance("car", size, EGO_COLOR, "sedan"), motion.path, offset_m=offset_m)
-        return cls(scene, motion, actors_of(scene), body)
+        return cls(scene, motion, tuple(_actor(spec, i) for i, spec in enumerate(scene.agent)), body)
 
     def map_T_mount(self, mount: Mount, t_ns: NDArray[np.int64]) -> Array:
         """Poses (T, 4, 4) of what a sensor is fixed to, at absolute stamps (T,)."""

@@ -289,16 +289,17 @@ def log_of(
     period = 1.0 / scene.lidar.rate_hz
     t_sweep = np.arange(period / 2, duration_s - period / 2 + 1e-9, period)
     t_image = np.arange(0.5 / camera_rate_hz, duration_s + 1e-9, 1.0 / camera_rate_hz)
+    t_pose = np.arange(int(np.ceil(duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
     return Log(
         name=name,
         format="synthetic",
         cameras={CAMERA: camera},
         lidars={LIDAR: Lidar(LIDAR, mount, mount_T_lidar)},  # type: ignore[arg-type]
         streams={
-            CAMERA: Stream(CAMERA, _stamps(t_image), lambda i: film.image(float(t_image[i]), i)),
-            LIDAR: Stream(LIDAR, _stamps(t_sweep + period / 2), _sweeps(run, t_sweep, period, seed)),
+            CAMERA: Stream(CAMERA, stamps_of(t_image), lambda i: film.image(float(t_image[i]), i)),
+            LIDAR: Stream(LIDAR, stamps_of(t_sweep + period / 2), _sweeps(run, t_sweep, period, seed)),
         },
-        ego=_poses(run, mount_T_lidar, duration_s) if mount == "ego" else None,
+        ego=poses_of(run, mount_T_lidar, t_pose) if mount == "ego" else None,
         ego_vehicle=EgoVehicle(CAR_SIZE_M, REAR_AXLE_OFFSET_M),
         labels=film.labels(t_image),
         image_labels={CAMERA: film.image_labels(t_image)} if image_labels else {},
@@ -307,19 +308,21 @@ def log_of(
     )
 
 
-def _stamps(t_s: Array) -> NDArray[np.int64]:
+def stamps_of(t_s: Array) -> NDArray[np.int64]:
+    """Return absolute stamps (F,) of times (F,), s."""
     stamps: NDArray[np.int64] = START_NS + np.rint(t_s * NS_PER_S).astype(np.int64)
     return stamps
 
 
-def _map_T_lidar(scene: TrafficScene) -> Array:
+def map_T_lidar_of(scene: TrafficScene) -> Array:
+    """Return the pose of the LiDAR that records a scene."""
     return transform(scene.sensor.rotation, scene.sensor.position_m)
 
 
-def _poses(run: TrafficRun, ego_T_lidar: Array, duration_s: float) -> PoseTrack:
-    t_s = np.arange(int(np.ceil(duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
-    poses = np.array([_map_T_lidar(run.at(float(t))) @ inverse(ego_T_lidar) for t in t_s])
-    return PoseTrack(_stamps(t_s), poses)
+def poses_of(run: TrafficRun, ego_T_lidar: Array, t_s: Array) -> PoseTrack:
+    """Return the poses of the ego at times (F,), s."""
+    poses = np.array([map_T_lidar_of(run.at(float(t))) @ inverse(ego_T_lidar) for t in t_s])
+    return PoseTrack(stamps_of(t_s), poses)
 
 
 def _sweeps(run: TrafficRun, t_s: Array, period_s: float, seed: int) -> Callable[[int], Sweep]:
@@ -327,8 +330,8 @@ def _sweeps(run: TrafficRun, t_s: Array, period_s: float, seed: int) -> Callable
 
     def read(i: int) -> Sweep:
         returns = run.at(float(t_s[i])).cast(np.random.default_rng([seed, 4, i]))
-        t_ns = _stamps(t_s[i] + returns.t_s.astype(np.float64))
-        return Sweep(int(_stamps(t_s[i : i + 1] + period_s / 2)[0]), returns.xyz_m, "map", t_ns)
+        t_ns = stamps_of(t_s[i] + returns.t_s.astype(np.float64))
+        return Sweep(int(stamps_of(t_s[i : i + 1] + period_s / 2)[0]), returns.xyz_m, "map", t_ns)
 
     return read
 
@@ -346,7 +349,7 @@ class _Film:
 
     def _taken(self, t_s: float) -> Any:
         scene = self._run.at(t_s)
-        map_T_cam = _map_T_lidar(scene) @ self._lidar_T_cam
+        map_T_cam = map_T_lidar_of(scene) @ self._lidar_T_cam
         instant, seen = self._painter.instant(scene, self._light, self._camera, map_T_cam)
         return scene, map_T_cam, instant, seen
 
@@ -357,7 +360,7 @@ class _Film:
     def labels(self, t_s: Array) -> Labels:
         """Boxes of all road users in space at times (F,)."""
         rows: list[tuple[int, int, str, Array, tuple[float, float, float], float]] = []
-        for t, stamp in zip(t_s, _stamps(t_s)):
+        for t, stamp in zip(t_s, stamps_of(t_s)):
             for k, item in enumerate(self._run.at(float(t)).objects):
                 if item.category:
                     center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
@@ -374,7 +377,7 @@ class _Film:
     def image_labels(self, t_s: Array) -> ImageLabels:
         """Boxes of the road users that the picture shows, at times (F,)."""
         flat: list[tuple[int, Array, str]] = []
-        for t, stamp in zip(t_s, _stamps(t_s)):
+        for t, stamp in zip(t_s, stamps_of(t_s)):
             scene, map_T_cam, instant, seen = self._instant(float(t))
             for k, part in zip(seen, segment(self._camera, map_T_cam, instant)):
                 if part is not None and scene.objects[k].category and _is_clear(part):

@@ -41,11 +41,6 @@ CASES = (
 )  # fmt: skip
 
 
-def exact_scene(scene: Scene) -> Scene:
-    """The scene with exact poses."""
-    return scene.model_copy(update={"gnss": scene.gnss.model_copy(update=WITHOUT_ERRORS)})
-
-
 def injected(seen: SweepPairs, case: Injected) -> SweepPairs:
     """What the sweeps show with a fault: their motions are turned with the mount, their stamps are late."""
     turn = exp_of(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.radians(case.yaw_deg)]))
@@ -57,7 +52,8 @@ def injected(seen: SweepPairs, case: Injected) -> SweepPairs:
 
 def rows_of(scene: Scene, seeds: int) -> list[str]:
     """A line for each case; none for a scene without a LiDAR on the ego."""
-    log, _ = synthesize(exact_scene(scene), seed=1, observe=False)
+    exact = scene.model_copy(update={"gnss": scene.gnss.model_copy(update=WITHOUT_ERRORS)})
+    log, _ = synthesize(exact, seed=1, observe=False)
     lidar = next((name for name, lidar in log.lidars.items() if lidar.mount == "ego"), None)
     seen = None if lidar is None else pair_sweeps(log, lidar, None, lambda *_: None)
     if seen is None or lidar is None:

@@ -90,7 +90,7 @@ def loop_log(log: Log, times: int) -> Log:
         raise ValueError("only the sensors of an ego can drive on")
     ego = log.ego
     first_ns, last_ns = int(ego.t_ns[0]), int(ego.t_ns[-1])
-    steps = [_power(_way(ego), k) for k in range(times)]
+    steps = [np.linalg.matrix_power(_way(ego), k) for k in range(times)]
     late_ns = [k * (last_ns - first_ns) for k in range(times)]
     streams = {name: _looped(stream, first_ns, last_ns, late_ns, steps) for name, stream in log.streams.items()}
     poses = PoseTrack(
@@ -118,10 +118,6 @@ def _way(ego: PoseTrack) -> Array:
     out[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     out[:3, 3] = last[:3, 3] - out[:3, :3] @ first[:3, 3]
     return out
-
-
-def _power(step: Array, times: int) -> Array:
-    return np.linalg.matrix_power(step, times)
 
 
 def _looped(stream: Stream, first_ns: int, last_ns: int, late_ns: list[int], steps: list[Array]) -> Stream:

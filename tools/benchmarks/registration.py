@@ -14,11 +14,10 @@ from typing import Literal
 
 import numpy as np
 from entry import parser_of
-from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import EgoVehicle, Lidar, Log, Stream, Sweep
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, Array, apply, inverse, rotation_from_rpy, transform
 from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside import RoadRegistration, register_road
 from log2sim.localization.surfaces import exp_of
@@ -26,7 +25,7 @@ from log2sim.plan import choose_detector, select_sensors
 from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel
 from log2sim.synth.traffic import Road, TrafficObject, TrafficScene, draw_scene
-from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS, TrafficRun, run_of
+from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, TrafficRun, poses_of, run_of, stamps_of
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 TARGET_M, TARGET_DEG, TARGET_S = 0.1, 0.3, 0.02
@@ -199,9 +198,10 @@ def draw_world(spec: WorldSpec) -> World:
         phase_s = float(rng.uniform(0, 1 / spec.road_rate_hz))
         reader = _road_reader(run, ego_body, model, map_T_lidar, spec.seed + 1000 * (k + 1))
         streams[name] = _stream(name, spec.road_rate_hz, spec.duration_s, phase_s, reader)
+    t_pose = np.arange(int(np.ceil(spec.duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
     log = Log(
         name=f"{spec.kind}-{spec.seed}", format="synthetic", cameras={}, lidars=lidars, streams=streams,
-        ego=_poses(run, ego_T_lidar, spec.duration_s), ego_vehicle=EgoVehicle(size, REAR_AXLE_OFFSET_M),
+        ego=poses_of(run, ego_T_lidar, t_pose), ego_vehicle=EgoVehicle(size, REAR_AXLE_OFFSET_M),
     )  # fmt: skip
     return World(log, spec, names)
 
@@ -258,18 +258,13 @@ def _stream(
     """Make a stream whose stamps are the ends of sweeps."""
     period = 1.0 / rate_hz
     middle = np.arange(period / 2 + phase_s, duration_s - period / 2, period)
-    t_ns = _stamps(middle + period / 2)
+    t_ns = stamps_of(middle + period / 2)
 
     @lru_cache(maxsize=256)
     def read(i: int) -> Sweep:
         return cast(i, float(middle[i]))
 
     return Stream(name, t_ns, read)
-
-
-def _stamps(t_s: Array) -> NDArray[np.int64]:
-    stamps: NDArray[np.int64] = START_NS + np.rint(t_s * NS_PER_S).astype(np.int64)
-    return stamps
 
 
 def _solids(objects: tuple[TrafficObject, ...], seed: int) -> list[Solid]:
@@ -288,8 +283,8 @@ def _ego_reader(run: TrafficRun, model: LidarModel, seed: int) -> Callable[[int,
         now = run.at(t_s)
         rng = np.random.default_rng([seed, 4, i])
         returns = cast_polytopes(model, now.sensor, _solids(now.objects, seed), now.surface, rng, now.returns)
-        t_ns = _stamps(t_s + returns.t_s.astype(np.float64))
-        return Sweep(int(_stamps(np.array([t_s + period / 2]))[0]), returns.xyz_m, "map", t_ns)
+        t_ns = stamps_of(t_s + returns.t_s.astype(np.float64))
+        return Sweep(int(stamps_of(np.array([t_s + period / 2]))[0]), returns.xyz_m, "map", t_ns)
 
     return cast
 
@@ -310,17 +305,10 @@ def _road_reader(
         sensor = SensorState(map_T_lidar[:3, :3], map_T_lidar[:3, 3], np.zeros(2))
         rng = np.random.default_rng([seed, 4, i])
         returns = cast_polytopes(model, sensor, _solids(tuple(objects), seed), now.surface, rng, now.returns)
-        t_ns = _stamps(t_s + returns.t_s.astype(np.float64))
-        return Sweep(int(_stamps(np.array([t_s + period / 2]))[0]), apply(lidar_T_map, returns.xyz_m), "lidar", t_ns)
+        t_ns = stamps_of(t_s + returns.t_s.astype(np.float64))
+        return Sweep(int(stamps_of(np.array([t_s + period / 2]))[0]), apply(lidar_T_map, returns.xyz_m), "lidar", t_ns)
 
     return cast
-
-
-def _poses(run: TrafficRun, ego_T_lidar: Array, duration_s: float) -> PoseTrack:
-    t_s = np.arange(int(np.ceil(duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
-    sensors = [run.at(float(t)).sensor for t in t_s]
-    poses = np.array([transform(s.rotation, s.position_m) @ inverse(ego_T_lidar) for s in sensors])
-    return PoseTrack(_stamps(t_s), poses)
 
 
 def misplaced(log: Log, pole: str, shift_m: float, turn_deg: float) -> Log:

@@ -1,7 +1,9 @@
-"""Measure simulated sweeps against recorded ones that were left out, and from beside the path against true ones.
+"""Measure simulated sweeps and pictures against recorded ones that were left out, and from beside the path against true ones.
 
 python tools/bench.py resim samples/crossing out/scenario.json
-python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3
+python tools/bench.py resim samples/crossing out/scenario.json --figures pictures --camera front --images out/
+python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3 --figures sweeps
+python tools/bench.py resim samples/crossing.toml --figures pictures --sideways 0 -0.5 -1 -2 -3
 python tools/bench.py resim samples/crossing out/scenario.json --picture out/sweeps.jpg --without bus-1
 """
 
@@ -12,18 +14,26 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 from entry import parser_of
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.datatypes import Log, Scenario
-from log2sim.geometry import Array, apply, inverse
+from log2sim.config import LidarConfig
+from log2sim.datatypes import Frame, Log, Scenario, Sweep
+from log2sim.geometry import Array, apply, bev_iou, box_corners_bev, box_iou, inverse
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import open_log
+from log2sim.perception.detect.detectors import create_detector
+from log2sim.perception.detect3d.detectors import open_shipped
+from log2sim.perception.first_pass import cloud_origin
+from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.resim.cameras import Pictures
 from log2sim.resim.rays import Shots, all_shots, angles_of, poses_of, recorded_shots
 from log2sim.resim.simulate import Simulation
-from log2sim.resim.world import build_world
+from log2sim.resim.world import World, build_world
 from log2sim.synth import load_scene, synthesize
 
 EVERY = 5
@@ -63,13 +73,14 @@ def moved_sweep(log: Log, name: str, source: int, target: int) -> Array:
     return apply(inverse(log.map_T_sensor(name, t_ns[target : target + 1])[0][0]), points)
 
 
-def held_out(log: Log, scenario: Scenario, name: str) -> list[tuple[str, Figures]]:
-    begin = time.process_time()
-    world = build_world(log, scenario, [name], leave_out=lambda _, i: i % EVERY == EVERY // 2)
-    count = len(log.streams[name].t_ns)
-    build_s = (time.process_time() - begin) / count
+def left_out(_: str, i: int) -> bool:
+    """Which records the world and the pictures are made without."""
+    return i % EVERY == EVERY // 2
+
+
+def held_out(log: Log, scenario: Scenario, name: str, world: World) -> list[tuple[str, Figures]]:
     simulation, simulated, moved, cast_s = Simulation(log, world, scenario), [], [], []
-    for i in range(EVERY // 2, count, EVERY):
+    for i in range(EVERY // 2, len(log.streams[name].t_ns), EVERY):
         shots = simulation.shots(name, i)
         begin = time.process_time()
         sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(i))
@@ -79,8 +90,83 @@ def held_out(log: Log, scenario: Scenario, name: str) -> list[tuple[str, Figures
         true = true[shots.range_m < LIMIT_M]
         baseline = moved_sweep(log, name, i - 1, i)
         moved.append(chamfer(true, baseline[np.linalg.norm(baseline, axis=1) < LIMIT_M]))
-    speed = {"build s/sweep": build_s, "sweeps/s": 1 / float(np.mean(cast_s)), "surfels": float(len(world.background))}
+    speed = {"sweeps/s": 1 / float(np.mean(cast_s)), "surfels": float(len(world.background))}
     return [("held out", {**mean(simulated), **speed}), ("nearest sweep, moved", mean(moved))]
+
+
+def found_again(overlap: NDArray[np.floating], least: float) -> Figures:
+    """Shares of the boxes of one that the other has, of overlaps (A, B); counts, to be summed."""
+    return {
+        "recorded": overlap.shape[0], "found again": float((overlap.max(axis=1, initial=0) > least).sum()),
+        "simulated": overlap.shape[1], "right": float((overlap.max(axis=0, initial=0) > least).sum()),
+    }  # fmt: skip
+
+
+def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World) -> list[tuple[str, Figures]]:
+    """Detect in recorded sweeps that were left out and in simulated ones of the same moments, within 30 m, BEV IoU 0.7."""
+    detector, simulation, out = open_shipped("vehicle", LidarConfig()), Simulation(log, world, scenario), []
+
+    def boxes(i: int, sweep: Sweep) -> Array:
+        origin, ground_z = cloud_origin(log, int(log.streams[name].t_ns[i]))
+        cloud = assemble_cloud(log, {name: sweep}, origin=origin, ground_z=ground_z, max_range_m=50.0)
+        found = detector.detect(cloud)
+        corners = box_corners_bev(found.center_m[:, :2], found.size_m[:, 0], found.size_m[:, 1], found.yaw_rad)
+        here = log.map_T_sensor(name, log.streams[name].t_ns[i])[0][0][:2, 3]
+        sure = (found.score > 0.5) & (np.linalg.norm(found.center_m[:, :2] - here, axis=1) < 30)
+        return corners[sure]
+
+    for i in range(EVERY // 2, len(log.streams[name].t_ns), EVERY):
+        sweep = simulation.cast(
+            name, simulation.shots(name, i), log, int(log.streams[name].t_ns[i]), np.random.default_rng(i)
+        )[0]
+        recorded, simulated = boxes(i, log.streams[name].read(i)), boxes(i, sweep)
+        a, b = np.broadcast_arrays(recorded[:, None], simulated[None])
+        out.append(found_again(bev_iou(a, b), 0.7))
+    return [("boxes in sweeps", shares(out))]
+
+
+def shares(counts: list[Figures]) -> Figures:
+    """Turn counts of several records to shares."""
+    n = {key: sum(c[key] for c in counts) for key in counts[0]}
+    rest = mean(
+        [{k: v for k, v in c.items() if k not in ("recorded", "found again", "simulated", "right")} for c in counts]
+    )
+    again, right = (n[a] / n[b] if n[b] else np.nan for a, b in (("found again", "recorded"), ("right", "simulated")))
+    return {**rest, "boxes": n["recorded"], "found again": again, "right": right}
+
+
+def compare_pictures(true: Array, other: Array) -> Figures:
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    gray = [np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) for image in (true, other)]
+    signal = min(float(peak_signal_noise_ratio(true, other)), 99.0)
+    return {"PSNR dB": signal, "SSIM": float(structural_similarity(*gray))}
+
+
+def pictures(
+    log: Log, scenario: Scenario, camera: str, world: World, count: int, folder: Path | None
+) -> list[tuple[str, Figures]]:
+    """Compare pictures that were left out with simulated ones, and with the nearest recorded ones as they are; and what SSD sees in both."""
+    simulation = Simulation(log, world, scenario, 0, Pictures(log, world, scenario, left_out))
+    detector, t_ns, read = create_detector("ssd-mobilenet-v2", log), log.streams[camera].t_ns, log.streams[camera].read
+
+    def boxes(i: int, image: Array) -> Array:
+        return detector.detect(Frame(log.cameras[camera], int(t_ns[i]), lambda: image)).box_px
+
+    rows: tuple[list[Figures], list[Figures]] = [], []
+    chosen = np.arange(EVERY // 2, len(t_ns), EVERY)
+    for i in chosen[np.unique(np.linspace(0, len(chosen) - 1, count).astype(int))]:
+        true, begin = read(i), time.process_time()
+        image, unknown = simulation.picture(camera, int(t_ns[i]))
+        spent = time.process_time() - begin
+        own = boxes(i, true)
+        more = {"made up": unknown.mean(), "s": spent}
+        rows[0].append(compare_pictures(true, image) | found_again(box_iou(own, boxes(i, image)), 0.5) | more)
+        before = read(i - 1)
+        rows[1].append(compare_pictures(true, before) | found_again(box_iou(own, boxes(i, before)), 0.5))
+        if folder is not None:
+            cv2.imwrite(str(folder / f"{camera}_{i}.png"), np.vstack([true, image]))
+    return [(f"pictures of {camera}", shares(rows[0])), ("the one before", shares(rows[1]))]
 
 
 def picture(log: Log, scenario: Scenario, name: str, index: int, without: str, path: Path) -> None:
@@ -126,6 +212,27 @@ def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[st
     return out
 
 
+def pictures_sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:
+    """Make pictures from beside the first camera, and compare them, and those that it took, with the true ones from there."""
+    scene = load_scene(scene_path)
+    scene = scene.model_copy(update={"camera": scene.camera[:1]})
+    log, truth = synthesize(scene, observe=False)
+    world, spec, out = build_world(log, truth, [scene.lidar[0].name]), scene.camera[0], []
+    made, t_ns = Pictures(log, world, truth), log.streams[spec.name].t_ns
+    for off_m in meters:
+        x, y, z = spec.position_m
+        moved = scene.model_copy(update={"camera": (spec.model_copy(update={"position_m": (x, y + off_m, z)}),)})
+        true_log = synthesize(moved, observe=False)[0].changed(ego=log.ego)
+        rows: tuple[list[Figures], list[Figures]] = [], []
+        for i in range(0, len(t_ns), every):
+            true = true_log.streams[spec.name].read(i)
+            image, unknown = made.make(true_log, truth, world.agents, spec.name, int(t_ns[i]))
+            rows[0].append(compare_pictures(true, image) | {"made up": unknown.mean()})
+            rows[1].append(compare_pictures(true, log.streams[spec.name].read(i)))
+        out += [(f"picture {off_m:g} m sideways", mean(rows[0])), ("as it was taken", mean(rows[1]))]
+    return out
+
+
 def mean(figures: list[Figures]) -> Figures:
     return {key: float(np.mean([f[key] for f in figures])) for key in figures[0]}
 
@@ -135,6 +242,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("log", type=Path, help="a log, or a scene file for --sideways")
     parser.add_argument("scenario", type=Path, nargs="?", help="what was reconstructed from it")
     parser.add_argument("--lidar", help="by default the first of the log")
+    parser.add_argument(
+        "--figures", nargs="+", choices=["sweeps", "boxes", "pictures"], default=["sweeps", "boxes", "pictures"]
+    )
+    parser.add_argument("--camera", help="of pictures; by default the first of the log")
+    parser.add_argument("--count", type=int, default=8, help="of pictures")
+    parser.add_argument("--images", type=Path, help="folder for pictures, recorded above simulated")
     parser.add_argument("--sideways", type=float, nargs="+", default=[0.0, 0.5, 1.0, 2.0, 3.0], metavar="M")
     parser.add_argument("--picture", type=Path, help="draw a sweep instead")
     parser.add_argument("--sweep", type=int, default=22, help="of --picture")
@@ -142,7 +255,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=7, help="sweeps of a scene that are compared")
     given = parser.parse_args(argv)
     if given.scenario is None:
-        rows = sideways(given.log, given.sideways, given.every)
+        rows = sideways(given.log, given.sideways, given.every) if "sweeps" in given.figures else []
+        if "pictures" in given.figures:
+            rows += pictures_sideways(given.log, given.sideways, given.every)
     else:
         scenario = Scenario.load(given.scenario)
         log = localize_like(open_log(given.log), scenario.provenance)
@@ -150,7 +265,16 @@ def main(argv: list[str] | None = None) -> int:
         if given.picture is not None:
             picture(log, scenario, name, given.sweep, given.without, given.picture)
             return 0
-        rows = held_out(log, scenario, name)
+        begin, rows = time.process_time(), []
+        world = build_world(log, scenario, [name], leave_out=left_out)
+        print(f"build s/sweep {(time.process_time() - begin) / len(log.streams[name].t_ns):.3f}")
+        if "sweeps" in given.figures:
+            rows += held_out(log, scenario, name, world)
+        if "boxes" in given.figures:
+            rows += boxes_in_sweeps(log, scenario, name, world)
+        camera = given.camera or next(iter(log.cameras), None)
+        if "pictures" in given.figures and camera is not None:
+            rows += pictures(log, scenario, camera, world, given.count, given.images)
     for label, figures in rows:
         print(f"{label:22s}", ", ".join(f"{key} {value:.3f}" for key, value in figures.items()))
     print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")

@@ -15,11 +15,19 @@ from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream,
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision
 from log2sim.evaluation.detection.protocols import Criterion, match_detections
-from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, rotation_from_rpy, transform
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel, Weather
 from log2sim.synth.traffic import TrafficScene, draw_scene
-from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS, TrafficRun, run_of
+from log2sim.synth.traffic_data import (
+    REAR_AXLE_OFFSET_M,
+    REAR_AXLE_TO_LIDAR_M,
+    START_NS,
+    TrafficRun,
+    poses_of,
+    run_of,
+    stamps_of,
+)
 from log2sim.synth.traffic_shapes import car
 
 VEHICLE_MODELS = ("hdl64e", "pandar64", "os1-64", "vlp32c")
@@ -126,7 +134,7 @@ def seen(traffic: HiddenTraffic) -> SeenTraffic:
     scene = traffic.run.scene
     ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
     map_T_pole = transform(traffic.place.rotation, traffic.place.position_m)
-    stamps = {VEHICLE_LIDAR: _stamps(middles), ROAD_LIDAR: _stamps(middles + traffic.late_s)}
+    stamps = {VEHICLE_LIDAR: stamps_of(middles), ROAD_LIDAR: stamps_of(middles + traffic.late_s)}
     streams = {}
     for name, all_returns in returns.items():
         sweeps = []
@@ -136,7 +144,6 @@ def seen(traffic: HiddenTraffic) -> SeenTraffic:
             sweeps.append(Sweep(int(middle + PERIOD_S / 2 * NS_PER_S), xyz, frame, t_ns))  # type: ignore[arg-type]
         streams[name] = Stream(name, np.array([s.stamp_ns for s in sweeps]), sweeps.__getitem__)
     t_s = np.arange(-0.1, SWEEPS * PERIOD_S + 0.2, 0.02)
-    poses = np.array([_map_T_lidar(traffic.run.at(float(t))) @ inverse(ego_T_lidar) for t in t_s])
     log = Log(
         name=f"hidden_traffic_{traffic.seed}",
         format="synthetic",
@@ -146,7 +153,7 @@ def seen(traffic: HiddenTraffic) -> SeenTraffic:
             ROAD_LIDAR: Lidar(ROAD_LIDAR, "map", map_T_pole),
         },
         streams=streams,
-        ego=PoseTrack(_stamps(t_s), poses),
+        ego=poses_of(traffic.run, ego_T_lidar, t_s),
         ego_vehicle=EgoVehicle(traffic.ego_size, REAR_AXLE_OFFSET_M),
     )
     return SeenTraffic(traffic, log, returns)
@@ -157,14 +164,6 @@ def _first_sweeps(traffic: HiddenTraffic) -> SeenTraffic:
     vehicle, road = traffic.vehicle_returns(PERIOD_S / 2, 0), traffic.road_returns(PERIOD_S / 2, 0)
     nothing = Log("", "", {}, {}, {}, None)
     return SeenTraffic(traffic, nothing, {VEHICLE_LIDAR: [vehicle], ROAD_LIDAR: [road]})
-
-
-def _stamps(t_s: Array) -> NDArray[np.int64]:
-    return np.asarray(START_NS + np.rint(t_s * NS_PER_S).astype(np.int64))
-
-
-def _map_T_lidar(scene: TrafficScene) -> Array:
-    return transform(scene.sensor.rotation, scene.sensor.position_m)
 
 
 def _local(xyz: NDArray[np.float32], map_T_lidar: Array) -> NDArray[np.float32]:

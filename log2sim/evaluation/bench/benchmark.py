@@ -130,11 +130,6 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[Point
     return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
 
 
-def make_ends_panel(points: Sequence[Point], truth: Scenario | None) -> Panel:
-    """Make the panel of vehicle, road, and both; the present setting comes first."""
-    return _panel(ENDS_STAGE, points, points[0].ms_per_tick, truth is not None)
-
-
 def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) -> Panel:
     error, label, unit = ERRORS[stage][0 if known else 1]
     recommendation = recommend(points, unit, whole_ms)
@@ -284,7 +279,8 @@ def bench(
         context = make_context_of_ends(log, ends, truth, scope)
         panels, notes = [], ["the log has no camera: only vehicle, road, and both are compared"]
     if ends:
-        panels.append(make_ends_panel(whole_points(log, ends, truth, scope, report), truth))
+        points = whole_points(log, ends, truth, scope, report)
+        panels.append(_panel(ENDS_STAGE, points, points[0].ms_per_tick, truth is not None))
     return Benchmark(context, tuple(panels), tuple(notes))
 
 
@@ -595,14 +591,10 @@ def _rows(panel: Panel) -> list[str]:
             "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
             *(_table_cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
-        for p, on_front in _by_time(panel)
+        for p, on_front in sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)
     ]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     return ["  ".join(c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(r, widths))) for r in cells]
-
-
-def _by_time(panel: Panel) -> list[tuple[Point, bool]]:
-    return sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)
 
 
 def _table_cell(value: float | None, digits: int) -> str:

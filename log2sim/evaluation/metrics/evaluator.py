@@ -157,32 +157,21 @@ def agent_rows(c: Comparison) -> list[dict[str, Any]]:
     return rows
 
 
-def false_rows(other: StateTable, false: Mask, hit: Mask) -> list[dict[str, Any]]:
-    """Make one row per reconstructed agent that is false at some tick."""
+def uncounted_rows(other: StateTable, kind: str, mask: Mask, **counts: Mask) -> list[dict[str, Any]]:
+    """Make one row per reconstructed agent that is of a kind, such as false, at the ticks of a mask (B, T), if there are any.
+
+    Ticks of the agent in the masks `counts` are counted by their names.
+    """
     return [
         {
             "id": other.agents[j].id,
             "category": str(other.category[j]),
-            "false_ticks": int(false[j].sum()),
-            "matched_ticks": int(hit[j].sum()),
+            f"{kind}_ticks": int(mask[j].sum()),
+            **{name: int(count[j].sum()) for name, count in counts.items()},
             "ticks": int(other.present[j].sum()),
-            "mean_range_m": float(other.range_m[j, false[j]].mean()),
+            "mean_range_m": float(other.range_m[j, mask[j]].mean()),
         }
-        for j in np.flatnonzero(false.any(1))
-    ]
-
-
-def ignored_rows(other: StateTable, ignored: Mask) -> list[dict[str, Any]]:
-    """Make one row per reconstructed agent that is ignored at some tick."""
-    return [
-        {
-            "id": other.agents[j].id,
-            "category": str(other.category[j]),
-            "ignored_ticks": int(ignored[j].sum()),
-            "ticks": int(other.present[j].sum()),
-            "mean_range_m": float(other.range_m[j, ignored[j]].mean()),
-        }
-        for j in np.flatnonzero(ignored.any(1))
+        for j in np.flatnonzero(mask.any(1))
     ]
 
 
@@ -438,8 +427,10 @@ def evaluate(
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
         "agents": agent_rows(compared),
-        "false_agents": false_rows(ours, compared.false, matched_ticks(compared, compared.counted)),
-        "ignored_agents": ignored_rows(ours, compared.ignored),
+        "false_agents": uncounted_rows(
+            ours, "false", compared.false, matched_ticks=matched_ticks(compared, compared.counted)
+        ),
+        "ignored_agents": uncounted_rows(ours, "ignored", compared.ignored),
     }
     return dict(rounded_tree(result))
 
