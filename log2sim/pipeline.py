@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.confidence import rate_agents
 from log2sim.agents.conflicts import extend_static
 from log2sim.agents.estimate import ego_agent, ego_path, estimate_agents, simplify, with_observers, with_pose_errors
 from log2sim.agents.evidence import Recording
@@ -135,8 +134,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
     with clock.stage("judge", run.progress):
         searched = schedule.drop_frames(observations.unseen)
         judged = judge(candidates, ego, Recording(log, searched, observations.obstacles, timeline))
-        rated = rate_agents(judged, timeline, lidar=bool(log.lidars))
-        agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
+        agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in judged]
         if config.track.static_for_all:
             agents = extend_static(agents, ego, observations.obstacles, timeline)
         agents = [replace(a, quarantined=a.confidence < config.track.quarantine_confidence) for a in agents]

@@ -1,8 +1,8 @@
-"""The rating of agents: signs of evidence, invariance, and errors that more ticks do not average away."""
+"""The judgement of agents: signs of evidence, invariance, and errors that more ticks do not average away."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,25 +12,15 @@ from hypothesis import strategies as st
 from test_size import T0_NS, measured, moved
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence import (
-    MAX_CONFIDENCE,
-    MIN_CONFIDENCE,
-    POSITION_VARIANCE,
-    SIGNS,
-    SPEED_VARIANCE,
-    WITH_LIDAR,
-    WITHOUT_LIDAR,
-    YAW_VARIANCE,
-    Evidence,
-    confidence_of,
-    evidence_of,
-    rate_agents,
-)
+from log2sim.agents.evidence import SIGNS, Recording, gather
 from log2sim.agents.hypotheses import Part
+from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, judge, probabilities
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
-from log2sim.datatypes import Finding, Track
+from log2sim.agents.weights import RIGHT, THERE, VARIANCES
+from log2sim.datatypes import Finding, Log, Track
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.perception.sync import Schedule
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
 
@@ -38,7 +28,9 @@ TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
 DARK = [None] * len(TIMELINE.t_ns)
 
 
-NAMES = [f.name for f in fields(Evidence)]
+RECORDING = Recording(
+    Log("one", "none", {}, {"top": None}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), DARK, TIMELINE
+)
 
 
 @cache
@@ -58,29 +50,29 @@ def candidate_of(track: Track, *, static: bool = True) -> AgentCandidate:
 
 
 def rated(candidate: AgentCandidate) -> AgentCandidate:
-    return rate_agents([candidate], TIMELINE, lidar=True)[0]
+    return judge([candidate], None, RECORDING)[0]
 
 
 def test_every_weight_has_the_sign_of_its_reason():
-    assert set(WITH_LIDAR) | set(WITHOUT_LIDAR) == {"bias", *NAMES} == {"bias", *SIGNS}
-    for weights in (WITH_LIDAR, WITHOUT_LIDAR):
-        assert [name for name, weight in weights.items() if SIGNS.get(name, 0) * weight < 0] == []
-    assert min(*POSITION_VARIANCE.values(), *YAW_VARIANCE.values(), *SPEED_VARIANCE.values()) >= 0
+    for table in (*THERE.values(), *RIGHT.values()):
+        assert set(table) <= {"bias", *SIGNS}
+        assert [name for name, weight in table.items() if SIGNS.get(name, 0) * weight < 0] == []
+    assert min(weight for table in VARIANCES.values() for weight in table.values()) >= 0
 
 
 @settings(deadline=None)
 @given(
-    st.lists(st.floats(-3, 3), min_size=len(NAMES), max_size=len(NAMES)),
-    st.sampled_from(NAMES),
+    st.lists(st.floats(-3, 3), min_size=len(SIGNS), max_size=len(SIGNS)),
+    st.sampled_from(sorted(SIGNS)),
     st.floats(0, 3),
     st.booleans(),
 )
 def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more, lidar):
-    weak = Evidence(**dict(zip(NAMES, values)))
-    weight = (WITH_LIDAR if lidar else WITHOUT_LIDAR).get(name, 0.0)
-    strong = replace(weak, **{name: getattr(weak, name) + (SIGNS[name] or np.sign(weight)) * more})
-    low, high = confidence_of(weak, lidar=lidar), confidence_of(strong, lidar=lidar)
-    assert MIN_CONFIDENCE <= low <= high <= MAX_CONFIDENCE
+    table = {"bias": np.ones(2)} | {n: np.full(2, v) for n, v in zip(SIGNS, values)}
+    table[name] = table[name] + np.array([0.0, SIGNS[name] * more])
+    there, right = probabilities(table, lidar=lidar)
+    assert there[0] <= there[1]
+    assert MIN_CONFIDENCE <= right[0] <= right[1] <= MAX_CONFIDENCE
 
 
 @pytest.mark.parametrize("make", [parked, driving])
@@ -94,18 +86,16 @@ def test_ratings_are_those_of_a_map_that_is_shifted_and_turned(make):
     np.testing.assert_allclose(a.waypoints.sigma_yaw_rad, b.waypoints.sigma_yaw_rad, rtol=0.05)
 
 
-def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
+def test_doubts_and_scattered_positions_lower_a_confidence_and_a_hidden_length_widens_sigmas():
     candidate = parked()
     before = rated(candidate).agent.confidence
-    assert rated(candidate.doubted([Finding("empty", text="rays pass through")])).agent.confidence < before
+    assert rated(candidate.doubted([Finding("jump", text="it jumps")])).agent.confidence < before
     m = candidate.track.measurements
     wild = m.center_m + np.random.default_rng(0).normal(0, 2.0, m.center_m.shape) * [1, 1, 0]
     scattered = replace(candidate, track=replace(candidate.track, measurements=replace(m, center_m=wild)))
     assert rated(scattered).agent.confidence < before
     high = m.low_m + (m.high_m - m.low_m) * [0.3, 1.0]
     part = replace(candidate, track=replace(candidate.track, measurements=replace(m, high_m=high)))
-    assert evidence_of(part, TIMELINE).hidden > evidence_of(candidate, TIMELINE).hidden + 0.4
-    assert rated(part).agent.confidence < before
     assert rated(part).agent.waypoints.sigma_xy_m[0] > 1.1 * rated(candidate).agent.waypoints.sigma_xy_m[0]
 
 
@@ -116,9 +106,9 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
         m, points=np.zeros(3, dtype=np.int64), low_m=np.full((3, 2), np.nan), high_m=np.full((3, 2), np.nan),
         source=np.full(3, "topdown", dtype="<U16"), camera=np.full(3, "front"), yaw_rad=np.full(3, np.nan),
     )  # fmt: skip
-    found = evidence_of(replace(candidate, track=replace(candidate.track, measurements=bare)), TIMELINE)
-    assert np.isfinite(list(asdict(found).values())).all()
-    assert (found.hidden, found.blind) == (1.0, 1.0)
+    found = gather([replace(candidate, track=replace(candidate.track, measurements=bare))], RECORDING)
+    assert np.isfinite(list(found.values())).all()
+    assert judge([], None, RECORDING) == []
 
 
 @given(st.floats(1e-6, 1 - 1e-6))

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.candidate import image_confidence, is_confirmed
+from log2sim.agents.evidence import image_confidence
 from log2sim.agents.moving import heading_log_odds
 from log2sim.agents.size import (
-    TICK_CORRELATION,
     independent,
-    independent_along,
 )
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.geometry import NS_PER_S, rotation_from_rpy, wrap_angle
@@ -117,30 +115,6 @@ def test_more_ticks_are_surer_about_the_front_up_to_a_limit() -> None:
     assert heading_log_odds(track_of(3).measurements, yaw + np.pi / 2) == 0.0
     assert independent(1) == 1
     assert independent(10**6) == pytest.approx(2.0)
-
-
-def test_ticks_in_one_place_are_alike_and_far_ones_are_independent() -> None:
-    here, far = np.zeros((30, 2)), np.column_stack([np.arange(30) * 1e3, np.zeros(30)])
-    assert independent_along(here, 0.7) == pytest.approx(independent(30))
-    assert independent_along(far, 0.7) == pytest.approx(30)
-    # Two ticks, one length from each other: 4 / (2 + 2 c / e).
-    pair = np.array([[0.0, 0.0], [0.0, 2.0]])
-    assert independent_along(pair, 2.0) == pytest.approx(4 / (2 + 2 * TICK_CORRELATION / np.e))
-
-
-def test_who_walks_on_needs_less_sure_boxes_than_what_stays() -> None:
-    rng = np.random.default_rng(5)
-
-    def person(speed_mps: float, score: float) -> Track:
-        track = track_of(46, score)
-        center = track.measurements.center_m + rng.normal(0, 0.05, (46, 3))
-        center[:, 0] += 0.1 * speed_mps * np.arange(46)
-        measured = replace(track.measurements, center_m=center, category=np.full(46, "pedestrian"))
-        return Track("pedestrian", track.tick, measured)
-
-    assert is_confirmed(person(1.5, 0.58), typical=True)
-    assert not is_confirmed(person(0.0, 0.58), typical=True)
-    assert not is_confirmed(person(1.5, 0.45), typical=True)
 
 
 def test_ticks_at_which_no_picture_was_searched_do_not_count_against_what_pictures_show() -> None:

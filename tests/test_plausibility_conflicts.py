@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import rows_at
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents
 from log2sim.agents.conflicts import (
@@ -15,7 +16,7 @@ from log2sim.agents.conflicts import (
     resolve_conflicts,
 )
 from log2sim.agents.judge import suppress_duplicates
-from log2sim.datatypes import Agent, Waypoints
+from log2sim.datatypes import Agent, Track, Waypoints
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -30,7 +31,7 @@ def backward(built):
 
 
 def judged(*built, ego=None):
-    """What is left of agents with their evidence, with doubts."""
+    """What is left of agents with their confidence, with doubts."""
     named = name_agents(resolve_conflicts([candidate(a, e) for a, e in built], ego, T))
     return list(zip([c.agent for c in named], conflict_doubts(named, ego, T)))
 
@@ -49,21 +50,21 @@ def test_overlaps_have_the_shares_of_exact_rectangles() -> None:
 def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters() -> None:
     ego = agent(0.0)
     # Both are 4.4 m long: they meet when the centers are that far apart, at 2.24 s; waypoints stand every second.
-    ((cut, doubts),) = judged((passing(0.3), 9.0), ego=ego)
+    ((cut, doubts),) = judged((passing(0.3), 0.9), ego=ego)
     assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
     assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
     assert doubts == []
-    ((late, _),) = judged((backward(passing(0.3)), 9.0), ego=ego)
+    ((late, _),) = judged((backward(passing(0.3)), 0.9), ego=ego)
     assert late.waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
 
 
 def test_what_is_in_the_ego_all_the_time_is_dropped() -> None:
-    assert judged((agent(1.0, 0.5, yaw=0.7), 50.0), ego=agent(0.0)) == []
+    assert judged((agent(1.0, 0.5, yaw=0.7), 0.9), ego=agent(0.0)) == []
 
 
 def test_of_two_that_meet_at_an_end_the_less_likely_one_ends_before() -> None:
     standing = agent(0.0)
-    for evidence, ends in (((9.0, 1.0), 2.0), ((1.0, 9.0), 4.0)):
+    for evidence, ends in (((0.9, 0.1), 2.0), ((0.1, 0.9), 4.0)):
         found = {a.waypoints.speed_mps[0]: a for a, _ in judged((standing, evidence[0]), (passing(0.3), evidence[1]))}
         assert found[2.5].waypoints.t_s[-1] == ends
 
@@ -71,7 +72,7 @@ def test_of_two_that_meet_at_an_end_the_less_likely_one_ends_before() -> None:
 def test_who_drives_through_the_middle_of_another_is_doubted_by_name_and_time() -> None:
     standing = agent(0.0)
     through = agent(-6.0, speed=3.0)
-    found = {a.waypoints.speed_mps[0]: (a, d) for a, d in judged((standing, 9.0), (through, 1.0))}
+    found = {a.waypoints.speed_mps[0]: (a, d) for a, d in judged((standing, 0.9), (through, 0.1))}
     assert found[0.0][1] == []
     kept, (doubt,) = found[3.0]
     assert len(kept.waypoints) == 5
@@ -117,9 +118,10 @@ def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4
     return Agent("", category, size, waypoints)
 
 
-def candidate(built, evidence=1.0):
-    """A confirmed candidate; duplicates are judged without its track."""
-    return AgentCandidate(built, evidence, True, None, None)
+def candidate(built, confidence=0.5):
+    """A candidate; duplicates and conflicts are judged without its geometry."""
+    track = Track(built.category, np.arange(3), rows_at(np.zeros((3, 2)), built.category))
+    return AgentCandidate(replace(built, confidence=confidence), track, None)
 
 
 def kept(*built, ego=None):
@@ -132,22 +134,22 @@ def names(*built, ego=None):
 
 
 def test_of_two_in_one_place_the_one_with_more_evidence_stays():
-    left = kept((agent(10.0), 3.0), (agent(10.8, size=(5.0, 1.9, 1.6)), 9.0))
+    left = kept((agent(10.0), 0.3), (agent(10.8, size=(5.0, 1.9, 1.6)), 0.9))
     assert [a.size_m[0] for a in left] == [5.0]
     assert left[0].id == "car-1"
 
 
 def test_neighbors_bumper_to_bumper_both_stay_and_are_numbered_by_their_start():
-    assert names((agent(15.0), 9.0), (agent(10.3), 3.0)) == ["car-1", "car-2"]
+    assert names((agent(15.0), 0.9), (agent(10.3), 0.3)) == ["car-1", "car-2"]
     later = replace(agent(30.0).waypoints, t_s=np.linspace(1.0, 4.0, 5))
-    ordered = kept((replace(agent(30.0), waypoints=later), 9.0), (agent(50.0), 1.0))
+    ordered = kept((replace(agent(30.0), waypoints=later), 0.9), (agent(50.0), 0.1))
     assert [a.waypoints.x_m[0] for a in ordered] == [50.0, 30.0]
 
 
 @pytest.mark.parametrize(("apart_m", "count"), [(0.2, 1), (0.5, 2)])
 def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, count):
     body = (0.7, 0.6, 1.75)
-    pair = [(agent(x, category="pedestrian", size=body), 1.0) for x in (5.0, 5.0 + apart_m)]
+    pair = [(agent(x, category="pedestrian", size=body), 0.1) for x in (5.0, 5.0 + apart_m)]
     assert len(names(*pair)) == count
 
 
@@ -155,4 +157,4 @@ def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, count):
 def test_a_person_whose_center_is_outside_a_car_is_beside_it(y_m, count):
     # The car's side is at 0.9 m, as far as sizes of cars are known.
     person = agent(10.5, y_m, category="pedestrian", size=(0.7, 0.7, 1.75))
-    assert len(names((agent(10.0), 9.0), (person, 2.0))) == count
+    assert len(names((agent(10.0), 0.9), (person, 0.2))) == count

@@ -9,15 +9,11 @@ import pytest
 from test_plausibility_conflicts import agent, candidate
 from worlds import rows_at
 
-from log2sim.agents.candidate import Support, Timeline
-from log2sim.agents.evidence import (
-    Ending,
-    Recording,
-    classify_rays,
-    count_rays,
-    weigh,
-)
-from log2sim.agents.judge import decide, missing_nats
+from log2sim.agents.candidate import Timeline
+from log2sim.agents.evidence import SIGNS, Recording, gather, missing_nats
+from log2sim.agents.judge import MIN_THERE, decide
+from log2sim.agents.rays import Ending, classify_rays, count_rays
+from log2sim.agents.size import static_geometry
 from log2sim.datatypes import Log, Obstacles, Rays, Track
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.sync import Schedule
@@ -31,7 +27,7 @@ TIMELINE = Timeline(np.arange(5) * NS_PER_S, 0)
 def classify(start, end, yaw=0.0, size=CAR):
     """The ending of one ray about a box whose center is the origin."""
     start, end = np.array([start], dtype=float), np.array([end], dtype=float)
-    return Ending(classify_rays(start, end - start, np.array([yaw]), np.array([size]))[0][0])
+    return Ending(classify_rays(start, end - start, np.array([yaw]), np.array([size]))[0])
 
 
 @pytest.mark.parametrize(
@@ -72,7 +68,7 @@ def clouds(cloud):
 
 
 def counted(built, cloud):
-    counts, _ = count_rays([over_map(built)], clouds(cloud), TIMELINE)
+    counts = count_rays([over_map(built)], clouds(cloud), TIMELINE)
     return [int(v.sum()) // 5 for v in counts]
 
 
@@ -89,64 +85,52 @@ def test_rays_that_end_at_the_back_of_a_car_support_it() -> None:
     assert (through, before) == (0, 0)
 
 
-def test_an_agent_through_whose_place_nearly_all_rays_pass_is_refuted() -> None:
-    support = Support(inside=10, through=90, seen_ticks=9)
-    assert decide(replace(candidate(agent(5.0)), support=support), 0.9) is None
-    # The rays of two ticks, or few ones, may be chance; a box that is too large has something in it.
-    for other in ({"seen_ticks": 2}, {"inside": 1, "through": 9}, {"inside": 40}):
-        assert decide(replace(candidate(agent(5.0)), support=replace(support, **other)), 0.9) is not None
-
-
-def with_support(**figures):
-    return replace(candidate(agent(5.0)), support=Support(**figures))
-
-
 def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
-    # 10 of 40 at a rate of 0.9 against 0.05; forty ticks that err alike count as 40 / (1 + 39 / 2) independent ones.
-    mean = 0.25 * np.log(0.05 / 0.9) + 0.75 * np.log(0.95 / 0.1)
-    assert missing_nats(Support(shown_ticks=40, detected_ticks=10), 0.9) == pytest.approx(mean * 40 / 20.5)
-    # A detector that finds half of all misses more, so that missing says less.
-    assert missing_nats(Support(shown_ticks=40, detected_ticks=10), 0.5) < 0
-    assert missing_nats(Support(shown_ticks=3, detected_ticks=0), 0.9) == 0
-    assert missing_nats(Support(shown_ticks=40, detected_ticks=0), 0.0) == 0
+    # Two are detected at all of 40 ticks, one at 10: 90 of 120. Forty ticks that err alike count as 40 / (1 + 39 / 2) independent ones.
+    shown, detected = np.full(5, 40.0), np.array([40.0, 40.0, 10.0, 0.0, 0.0])
+    shown[4] = 3
+    nats = missing_nats(shown, detected)
+    mean = 0.25 * np.log(0.05 / 0.75) + 0.75 * np.log(0.95 / 0.25)
+    assert nats == pytest.approx([0, 0, max(mean * 40 / 20.5, 0), np.log(0.95 / 0.25) * 40 / 20.5, 0])
+    # A detector that finds half of all misses more, so that missing says less; one that finds nothing says nothing.
+    assert 0 < missing_nats(np.full(2, 40.0), np.array([20.0, 0.0]))[1] < nats[3]
+    assert (missing_nats(shown, np.zeros(5)) == 0).all()
 
 
-def test_what_no_ray_reaches_is_refuted_and_what_has_no_point_doubted():
-    assert decide(with_support(unreached=True), 0.9) is None
-    (doubt,) = decide(with_support(pointless=True), 0.9)
-    assert doubt.kind == "hardly_observed"
+def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
+    row = dict.fromkeys((*SIGNS, "shown_ticks", "image_ticks"), 0.0) | {"confirmed": 1.0}
+    assert decide(agent(5.0), row, MIN_THERE[True] - 0.01, lidar=True) is None
+    assert decide(agent(5.0), row, MIN_THERE[True], lidar=True) == []
+    assert decide(agent(5.0), row | {"confirmed": 0.0}, 0.9, lidar=True) is None
+    (doubt,) = decide(agent(5.0), row | {"through": 0.9}, 0.9, lidar=True)
+    assert (doubt.kind, doubt.values["through_share"]) == ("empty", 0.9)
 
 
 VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)
 
 
 @pytest.mark.parametrize(
-    ("thing", "points", "pointless", "unreached"),
+    ("thing", "points", "pointless", "through"),
     [
         # Images show a car where the LiDAR sees a van before it, or look past its corner once.
-        (VAN, [0, 0, 0, 0, 0], True, True),
-        (VAN, [0, 0, 0, 30, 0], False, False),
+        (VAN, [0, 0, 0, 0, 0], True, 0.0),
+        (VAN, [0, 0, 0, 30, 0], False, 0.0),
         # Of some rays that reach its place most go on.
-        (CORNER, [0, 0, 0, 0, 0], True, True),
+        (CORNER, [0, 0, 0, 0, 0], True, 0.7),
         # Its points are those of what stands beside it, but rays end in it.
-        (BACK, [0, 0, 0, 0, 0], True, False),
-        (BACK, [9, 9, 9, 9, 9], False, False),
+        (BACK, [0, 0, 0, 0, 0], True, 0.0),
+        (BACK, [9, 9, 9, 9, 9], False, 0.0),
     ],
 )
-def test_where_the_lidar_looks_an_object_has_points(thing, points, pointless, unreached):
-    car = over_map(agent(20.0))
+def test_where_the_lidar_looks_an_object_has_points(thing, points, pointless, through):
     found = rows_at(np.array([[20.0, 0.0]] * 5) + ORIGIN[:2], "car", points=np.array(points), camera="front")
     found = replace(found, t_ns=TIMELINE.t_ns, sensor_m=np.tile(ORIGIN + SENSOR, (5, 1)))
-    seen = replace(candidate(car), track=Track("car", np.arange(5), found))
-    recording = Recording(
-        Log("one", "none", {}, {}, {}),
-        Schedule("front", TIMELINE.t_ns, {}, {}, {}),
-        clouds(fan(40.0, things=[thing])),
-        TIMELINE,
-    )
-    (weighed,) = weigh([seen], recording)
-    assert (weighed.support.pointless, weighed.support.unreached) == (pointless, unreached)
-    assert (decide(weighed, 0.9) is None) is unreached
-
-
-"""Axes of a camera that looks along x."""
+    track = Track("car", np.arange(5), found)
+    seen = replace(candidate(over_map(agent(20.0))), track=track, geometry=static_geometry(track))
+    schedule = Schedule("front", TIMELINE.t_ns, {}, {}, {})
+    recording = Recording(Log("one", "none", {}, {}, {}), schedule, clouds(fan(40.0, things=[thing])), TIMELINE)
+    table = gather([seen], recording)
+    assert set(SIGNS) <= set(table)
+    assert np.isfinite(list(table.values())).all()
+    assert table["pointless"] == pointless
+    assert table["through"] == pytest.approx(through, abs=0.15)

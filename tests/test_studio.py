@@ -24,7 +24,7 @@ from log2sim.datatypes import COLOR_NAMES, Agent, Finding, Log, Scenario
 from log2sim.datatypes.color_names import name_of
 from log2sim.edit.corrections import load_corrections
 from log2sim.errors import ScenarioError
-from log2sim.geometry import apply, inverse, project
+from log2sim.geometry import Camera, apply, inverse, project
 from log2sim.visualization.recording import Recorded
 from log2sim.visualization.studio import PAINTS, Studio
 
@@ -398,3 +398,35 @@ def in_view(log: Log, scenario: Scenario, agent: Agent, t_s: float) -> np.ndarra
 
 def test_paints_have_the_colors_of_their_names() -> None:
     assert {name: name_of(rgb) for name, rgb in PAINTS.items()} == {name: name for name in COLOR_NAMES}
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("none", ()),
+        ("brown", (-0.3, 0.1, 0.002, -0.001, -0.02)),
+        ("brown", (-0.2, 0.05, 0.001, 0.002, 0.01, 0.1, 0.02, 0.003)),
+        ("fisheye", (-0.02, 0.01, -0.003, 0.0005)),
+    ],
+)
+def test_the_page_projects_as_log2sim_does(model: str, distortion: tuple[float, ...], chromium: Browser) -> None:
+    K = np.array([[900.0, 0, 640], [0, 880.0, 360], [0, 0, 1]])
+    cam_T_map = np.array([[0.0, -1, 0, 0.3], [0, 0, -1, 1.6], [1, 0, 0, -2.0], [0, 0, 0, 1]])
+    camera = Camera("c", 1280, 720, K, "map", inverse(cam_T_map), model, distortion)
+    ground = np.array([[x, y, 0.2] for x in (6.0, 15.0, 60.0) for y in (-2.5, 0.0, 2.0)])
+    uv, valid = project(camera, apply(cam_T_map, ground))
+    assert valid.all()
+    entry = {"K": [900, 880, 640, 360], "model": model, "distortion": list(distortion), "reach": 1e6}
+    entry |= {"t_s": [0.0], "cam_T_map": [cam_T_map[:3].ravel().tolist()]}
+    source = (ROOT / "log2sim/visualization/page/surface.js").read_text(encoding="utf-8")
+    chromium.open("about:blank")
+    pixels, places = chromium.run(
+        source
+        + """const [entry, points] = arguments, camera = new Calibrated(entry), m = entry.cam_T_map[0];
+        const pixels = points.map((point) => camera.pixel(camera.toCamera(m, ...point)));
+        return [pixels, pixels.map(([u, v], k) => camera.ground(m, u, v, points[k][2]))];""",
+        entry,
+        ground.tolist(),
+    )
+    np.testing.assert_allclose(pixels, uv, atol=1e-6)
+    np.testing.assert_allclose(places, ground[:, :2], atol=1e-3)

@@ -29,12 +29,10 @@ def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
     assert len(one)
     assert one.score.min() >= confidence_logs.MIN_SCORE
     cases = pickle.loads(pickle.dumps(confidence_logs.cases_of(1, 8)))
-    agents = [agent for case in cases for agent in fit_confidence.agents_of(case)]
+    agents = [agent for case in cases for agent in fit_confidence.agents_of(case, "one")]
     assert [sum(a.lidar == lidar for a in agents) > 3 for lidar in (True, False)] == [True, True]
-    assert all(0 <= a.right <= 1 and a.ticks > 0 for a in agents)
-    x = fit_confidence.matrix_of(agents)
-    assert np.isfinite(x).all()
-    tables, by_kind = fit_confidence.fit_all(agents)
-    p = fit_confidence.probabilities(agents, tables)
-    assert ((p > 0) & (p < 1)).all()
-    assert set(by_kind) == {"position", "yaw", "speed"}
+    assert all(0 <= a.right <= a.there <= 1 and a.ticks > 0 for a in agents)
+    assert np.isfinite([list(a.evidence.values()) for a in agents]).all()
+    there, p = fit_confidence.probabilities(agents, fit_confidence.fit_there_and_right(agents))
+    assert ((p > 0) & (p < 1) & (there < 1)).all()
+    assert set(fit_confidence.fit_all_variances(agents, p)) == {"sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"}

@@ -59,7 +59,7 @@ STAGES = {
     "fusion": (("fuse_by_end",), "perception.fusion", ""),
     "tracking": (("track_ends", "mark_unrecorded"), "tracking", "track"),
     "agents": (("estimate_agents", "decide_headings"), "agents", "smooth"),
-    "judgement": (("judge", "rate_agents"), "agents.judge agents.conflicts agents.confidence", ""),
+    "judgement": (("judge",), "agents.judge agents.conflicts agents.evidence agents.rays agents.weights", ""),
     "road": (("describe",), "road", "map appearance"),
 }  # fmt: skip
 # Figures with the change that counts as one step, and whether more is better.

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, spans_of
-from log2sim.agents.evidence import MIN_TICK_RAYS, count_at
+from log2sim.agents.evidence import MIN_TICK_RAYS
+from log2sim.agents.rays import count_at
 from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Finding, Obstacles, Waypoints
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
@@ -106,7 +107,7 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
     Parameters
     ----------
     candidates : sequence of AgentCandidate
-        Their `evidence` says which is more likely.
+        Their confidence says which is more likely.
     ego : Agent, optional
         It is where it is.
     t_s : (T,) float64
@@ -118,7 +119,7 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
     doubted. Nothing of it stays in the ego, at whose place nothing else can be.
     """
     agents = [c.agent for c in candidates]
-    evidence = [c.evidence for c in candidates]
+    evidence = [a.confidence for a in agents]
     if ego is not None:
         agents, evidence = [*agents, ego], [*evidence, np.inf]
     conflicts, present = find_conflicts(agents, t_s)
@@ -175,7 +176,7 @@ def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s
         if b == len(candidates):
             doubts[a].append(_doubt(Finding("in_ego"), conflict, t_s, agents[a]))
         elif conflict.depth_m.max() > IN_ONE_PLACE_M:
-            weaker, other = (a, b) if candidates[a].evidence <= candidates[b].evidence else (b, a)
+            weaker, other = (a, b) if agents[a].confidence <= agents[b].confidence else (b, a)
             case = "static" if agents[a].static and agents[b].static else ""
             found = Finding("passes_through", other=agents[other].id, case=case)
             doubts[weaker].append(_doubt(found, conflict, t_s, agents[weaker]))
@@ -246,7 +247,7 @@ def _free_places(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], t_
         near = np.hypot(*(boxes.xy_m[:, 0] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M
         rows = np.flatnonzero(outside & near)
         if len(rows):
-            inside, through, _ = count_at(boxes.take(rows), 0, cloud.origin, cloud.free)[0]
+            inside, through, _ = count_at(boxes.take(rows), 0, cloud.origin, cloud.free)
             free[rows, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
     return free
 

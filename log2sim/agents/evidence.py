@@ -1,24 +1,35 @@
-"""Evidence for and against candidates over the whole log: rays, views, structure, sizes.
+"""Evidence for and against candidates over the whole log: one table, a column for each reason.
 
-Of the rays toward an agent those that end before it say nothing, those that end in it support it, and those that go on
-behind it contradict it.
+What the weights of `agents/weights.py` make of a column is a log-likelihood ratio in nats; `agents/judge.py` adds them up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import IntEnum
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import AgentCandidate, Support, Timeline
-from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Finding, Log, Measurements, Obstacles, Rays
-from log2sim.geometry import NS_PER_S, Array, Camera, apply, cross_slab, inverse, project
-from log2sim.perception.boxes import rotate
+from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.rays import count_rays
+from log2sim.agents.size import independent
+from log2sim.datatypes import (
+    GROUP_OF,
+    MAX_SIZE_M,
+    MIN_SIZE_M,
+    TYPICAL_SIZE_M,
+    Agent,
+    AgentTable,
+    Log,
+    Measurements,
+    Obstacles,
+    Track,
+)
+from log2sim.datatypes.log_odds import log_odds_of
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
+from log2sim.perception.boxes import LIMIT_SIGMAS
+from log2sim.perception.lidar.measure import logit
 from log2sim.perception.sync import Schedule
 
 
@@ -44,24 +55,236 @@ class Recording:
         return self.timeline.seconds(self.timeline.t_ns)
 
 
-# Rounding.
-SAME_M = 0.005
+SIGNS = {
+    "sweep": 1, "weak_sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
+    "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
+    "through_gaps": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+}  # fmt: skip
+"""Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
+
+- sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
+  where negative; and of its detections in images. 0 without any.
+- no_sweep, no_image: 1 without any detection in a sweep, in an image, where others have some.
+- travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
+- few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
+- range: logarithm of the median distance, in units of 20 m.
+- scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
+- sigma: logarithm of the standard deviation of its position, in units of 0.1 m.
+- unlikely_size: 1 where the observed size is none of its category.
+- odd_size: by how many standard deviations of the category length and width differ from the typical ones.
+- odd_height: root mean square logarithm of the height that its image boxes span where a homography places it, in units of the
+  typical one: at the wrong distance, or on other ground than was thought, it is too high or too low. 0 without any.
+- heading: log-odds that the front is the front; 0 where nothing was decided.
+- other_category: share of its measurements of another category.
+- impossible: 1 where its motion is doubted.
+- sigma_speed: logarithm of the standard deviation of the speed of what moves, in units of 0.3 m/s.
+- through, through_gaps: share of the rays toward its solid part that go on behind it, of vehicles and of what has gaps, as people
+  and bicycles have; 0 with few.
+- pointless: 1 where the LiDAR looks toward it and none of its detections has a point.
+- nearer: 1 where its points are those of something nearer, which the heights of its image boxes tell.
+- missing: nats against it by the images that show its place well and in which it is not detected.
+- moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
+"""
+
+# Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, `confirmed`, 1
+# where the detections suffice, and `shown_ticks` and `image_ticks`:
+# the ticks at which a searched image shows a candidate well, and at which it is detected in one of these.
+Table = dict[str, Array]
 
 
-def doubt_size(agent: Agent) -> list[Finding]:
-    """Doubt a vehicle that is wider than any on the road, by more than the error of an observed side, or as long as sizes go.
+def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
+    """Gather the evidence for and against each of C candidates."""
+    if not candidates:
+        return {name: np.zeros(0) for name in ("bias", "confirmed", *SIGNS, "shown_ticks", "image_ticks")}
+    rows = [_own_columns(c, recording.timeline) for c in candidates]
+    most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
+    parts = [_sensed_columns(candidates[k : k + most], recording) for k in range(0, len(rows), most)]
+    table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for name in ("no_sweep", "no_image"):
+        table[name] *= table[name].min() == 0
+    return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
 
-    Sizes are limited to those of the category: a vehicle at the greatest length was observed to be longer.
+
+# Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
+# of ten of clutter. A box of one size that is moved on by its velocity alone seldom does by chance.
+MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), 4.6
+
+
+# Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
+LIMITS: dict[str, tuple[float, float]] = {
+    "range": (np.log(0.1), np.log(5.0)), "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
+    "odd_height": (0.0, np.log(2.0)), "heading": (-MAX_LOG_ODDS, MAX_LOG_ODDS), "sigma_speed": (np.log(0.07), np.log(17.0)),
+}  # fmt: skip
+
+
+def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, float]:
+    """Return the columns of one candidate that need nothing but itself."""
+    track, agent, m, w = candidate.track, candidate.agent, candidate.track.measurements, candidate.agent.waypoints
+    in_sweep, in_image = np.isfinite(m.box_yaw_rad), m.camera != ""
+    in_image |= ~in_sweep
+    group, moving = GROUP_OF[agent.category], not agent.static
+    sweep = sweep_log_odds(track) if in_sweep.any() else 0.0
+    if group == "vehicle" and in_sweep.any():
+        sweep = min(sweep + MATCH_NATS * candidate.followed, MAX_LOG_ODDS)
+    travel = float(np.log1p(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m)) / agent.size_m[0])) if moving else 0.0
+    columns: dict[str, float] = {
+        "sweep": max(sweep, 0.0),
+        "weak_sweep": min(sweep, 0.0),
+        "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
+        "no_sweep": float(not in_sweep.any()),
+        "no_image": float(not in_image.any()),
+        "travel": travel,
+        "few": 1.0 / len(m),
+        "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
+        "range": np.log(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)) / 20.0 + 1e-3),
+        "scatter": np.log1p(_scatter(candidate, timeline)),
+        "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
+        "unlikely_size": float(not candidate.geometry.is_likely),
+        "odd_size": _odd_size(agent),
+        "odd_height": _odd_height(candidate),
+        "heading": float(log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), 0.01, 0.99))),
+        "other_category": float((m.category != agent.category).mean()),
+        "impossible": float(any(d.kind != "heading_ambiguous" for d in agent.doubts)),
+        "sigma_speed": np.log(np.median(w.sigma_speed_mps) / 0.3 + 1e-3)
+        if moving and w.sigma_speed_mps is not None
+        else 0.0,
+        "moving": float(moving),
+        "confirmed": float(_is_confirmed(candidate, sweep, travel)),
+        "two_wheeler": float(group == "two_wheeler"),
+        "pedestrian": float(group == "pedestrian"),
+    }
+    return columns | {name: float(np.clip(columns[name], low, high)) for name, (low, high) in LIMITS.items()}
+
+
+def _odd_size(agent: Agent) -> float:
+    """Return by how many standard deviations of the category length and width differ from the typical ones."""
+    smallest, typical, largest = (np.array(t[agent.category][:2]) for t in (MIN_SIZE_M, TYPICAL_SIZE_M, MAX_SIZE_M))
+    return float(np.hypot(*(np.log(np.array(agent.size_m[:2]) / typical) * LIMIT_SIGMAS / np.log(largest / smallest))))
+
+
+# Confidence by images that suffices. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes
+# and signs look like. Boxes in sweeps suffice where an object is twice as likely as none; what moves on is not what stays.
+MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS = 0.3, 0.6, float(np.log(2.0))
+
+
+def _is_confirmed(candidate: AgentCandidate, sweep: float, travel: float) -> bool:
+    """Return whether the detections of a candidate suffice, given its columns."""
+    ordinary = candidate.geometry.is_likely and GROUP_OF[candidate.agent.category] != "pedestrian"
+    least = MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE
+    return image_confidence(candidate.track) >= least or (sweep > 0 and sweep + travel >= MIN_SWEEP_LOG_ODDS)
+
+
+# Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
+# are not independent, so the confidence saturates.
+CONFIDENCE_DETECTIONS = 5
+HIDDEN_S = 1.0
+# Stamps of cameras and sweeps jitter; ticks are not nearer to each other than this.
+MIN_PERIOD_S = 0.01
+
+
+def image_confidence(track: Track) -> float:
+    """Return the share of its searched ticks at which a track is detected in images, times the mean of the best scores there."""
+    m = track.measurements
+    in_image = np.isnan(m.box_yaw_rad) | (m.camera != "")
+    rate = detection_rate(m.t_ns, track.tick, track.unrecorded) * min(in_image.mean() / track.searched, 1.0)
+    return float(rate * np.sort(m.score[in_image])[-CONFIDENCE_DETECTIONS:].mean()) if in_image.any() else 0.0
+
+
+def sweep_log_odds(track: Track) -> float:
+    """Return the log-odds that a track is an object, from its boxes in LiDAR sweeps, of which it has some.
+
+    Notes
+    -----
+    The scores are calibrated probabilities, so their log-odds add up, scaled down to those of as many independent ticks. A
+    long false track has a few high scores by chance, which is why not the best alone count.
     """
-    length_m, width_m, _ = agent.size_m
-    if GROUP_OF[agent.category] != "vehicle":
-        return []
-    if width_m > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M:
-        return [Finding("unlikely_size", case="width", values={"width_m": width_m, "limit_m": MAX_ROAD_WIDTH_M})]
-    longest_m = MAX_SIZE_M[agent.category][0]
-    if length_m >= longest_m - SAME_M:
-        return [Finding("unlikely_size", case="length", values={"limit_m": longest_m}, other=agent.category)]
-    return []
+    m = track.measurements
+    in_sweep = np.isfinite(m.box_yaw_rad)
+    odds = float(logit(m.score[in_sweep]).mean()) * independent(int(in_sweep.sum()))
+    rate = detection_rate(m.t_ns, track.tick, track.unrecorded)
+    return float(logit(np.array(rate / (1 + np.exp(-odds)))))
+
+
+def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded: NDArray[np.int64]) -> float:
+    """Return the share of ticks with a detection between the first and the last of ticks (n,), which have stamps (n,).
+
+    A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate, at least one tick
+    without a detection. Ticks (U,) at which nothing was recorded do not count.
+    """
+    # Both ends may measure an object at one tick.
+    tick, first = np.unique(tick, return_index=True)
+    ticks = np.diff(tick)
+    if len(ticks) == 0:
+        return 1.0
+    # Not the time between detections: something that is detected at every fifth tick has a rate of a fifth.
+    period_s = max(float(np.median(np.diff(t_ns[first]) / NS_PER_S / ticks)), MIN_PERIOD_S)
+    recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
+    hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
+    return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))
+
+
+def _scatter(candidate: AgentCandidate, timeline: Timeline) -> float:
+    """Return the median of the squared distances of measurements from the trajectory in standard deviations."""
+    m, at = candidate.track.measurements, timeline.seconds(candidate.track.measurements.t_ns)
+    w, geometry = candidate.agent.waypoints, candidate.geometry
+    # The place of a standing agent is fitted to its measurements, so their residuals are no test of it; and the measured
+    # centers of a long moving vehicle lag behind its points.
+    centers = (m.center_m[:, :2], m.covariance) if candidate.agent.static else (geometry.xy_m, geometry.covariance)
+    off = centers[0] - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
+    return float(np.median(np.einsum("na,nab,nb->n", off, np.linalg.pinv(centers[1]), off)))
+
+
+def _odd_height(candidate: AgentCandidate) -> float:
+    """Return the root mean square logarithm of the heights of image boxes over the typical one, of whole boxes if there are any."""
+    m = candidate.track.measurements
+    placed = (m.source == "topdown") & np.isfinite(m.height_px_m)
+    rows = placed & ~m.truncated if (placed & ~m.truncated).any() else placed
+    if not rows.any():
+        return 0.0
+    share = np.log(m.height_px_m[rows] / TYPICAL_SIZE_M[candidate.agent.category][2] + 1e-3)
+    return float(np.sqrt(np.mean(np.clip(share, -LIMITS["odd_height"][1], LIMITS["odd_height"][1]) ** 2)))
+
+
+# Agents times ticks that are looked at together; each takes about a hundred bytes.
+MAX_CELLS = 400_000
+# Rays toward a place before it is said that the LiDAR looks there, and at a tick before they say anything.
+MIN_LOOKING_RAYS, MIN_TICK_RAYS = 30, 8
+# Rays of fewer ticks may all have gone through a window or past a corner.
+MIN_SEEN_TICKS = 3
+# Fewer image boxes with points may each be wrong. The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5
+# is three standard deviations low. Then the points are not those of what the image shows, but of something nearer that hides it.
+MIN_HEIGHTS, MIN_HEIGHT_SHARE = 3, 0.5
+
+
+def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
+    """Return the columns that rays and images tell, of candidates of which there are not too many."""
+    agents = [c.agent for c in candidates]
+    inside, through, before = count_rays(agents, recording.clouds, recording.timeline)
+    met = inside + through
+    # Elsewhere only the border of what hides it shows.
+    seen = (met > 0) & (met >= before)
+    sums = [np.where(seen, rays, 0).sum(axis=1) for rays in (met, through)]
+    known = (sums[0] >= MIN_LOOKING_RAYS) & (seen.sum(axis=1) >= MIN_SEEN_TICKS)
+    shown = shown_in_images(AgentTable.of(agents, recording.t_s), recording) & seen & (met >= MIN_TICK_RAYS)
+    of = [c.track.measurements for c in candidates]
+    looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
+    through_share = np.where(known, sums[1] / np.maximum(sums[0], 1), 0.0)
+    solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
+    return {
+        "through": np.where(solid, through_share, 0.0),
+        "through_gaps": np.where(solid, 0.0, through_share),
+        "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
+        "nearer": np.array([_height_share(m) < MIN_HEIGHT_SHARE for m in of], dtype=np.float64),
+        "shown_ticks": shown.sum(axis=1).astype(np.float64),
+        "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
+    }  # fmt: skip
+
+
+def _height_share(m: Measurements) -> float:
+    """Return the median height of the image boxes of a track at its distance over that of its points; 1 with few of both."""
+    rows = ~m.truncated & (m.points > 0) & (m.top_m > m.bottom_m) & np.isfinite(m.height_px_m)
+    return float(np.median(m.height_px_m[rows] / (m.top_m - m.bottom_m)[rows])) if rows.sum() >= MIN_HEIGHTS else 1.0
 
 
 # Smaller objects are "small" in COCO (Lin et al., ECCV 2014), where detectors find less than half of them.
@@ -96,389 +319,22 @@ def _shown(camera: Camera, map_T_cam: Array, center_m: Array, height_m: Array) -
     return np.asarray(inside & (camera.K[1, 1] * height_m >= MIN_HEIGHT_PX * in_cam[:, 2]))
 
 
-# A ray is toward an agent where it runs through so much of its box, or through this share of its width if that is less: rays
-# that cut a corner may miss the rounded body.
-MIN_CHORD_M, MIN_CHORD_SHARE = 0.5, 0.4
-# Boxes are taken smaller on each side by their error, at most by this share of their size. A ray that ends within twice that
-# distance of the smaller box, or above or below it, ends at it.
-INSET_M, MAX_INSET_SHARE = 0.3, 0.25
-MARGIN_M = 2 * INSET_M
-# Rays of a near agent are thousands; so many in its azimuths, of all heights, suffice for a share.
-MAX_RAYS = 400
-SCATTER = 7919  # a prime, larger than any step
-# A cloud belongs to an agent's first and last tick though its stamp may lie outside of the agent's life.
-MAX_LAG_S = 0.1
-
-Floats = NDArray[np.floating[Any]]
+# Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken
+# to find one that is there: no detector finds all. Fewer ticks tell no rate.
+FALSE_RATE, MAX_USUAL_RATE, MIN_SHOWN_TICKS = 0.05, 0.9, 8
 
 
-class Layer(NamedTuple):
-    """A layer of a box, as shares of its height."""
-
-    low: float
-    high: float
-
-
-SOLID = Layer(0.25, 0.55)
-"""The part of a vehicle that no ray passes: above the gap below its floor and below its windows."""
-WHOLE = Layer(0.1, 1.0)
-"""All of a box that is above the errors of the ground."""
-
-
-class Ending(IntEnum):
-    """Where a ray ends."""
-
-    INSIDE = 0
-    THROUGH = 1
-    BEFORE = 2
-    ELSEWHERE = 3
-
-
-def count_rays(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline) -> NDArray[np.int64]:
-    """Count the rays toward the solid part and the whole of A agents in T clouds by their ending, (2, 3, A, T).
-
-    They end at the agent, go on behind it, or end before it. They are 0 at ticks without a cloud or outside of an agent's life.
+def missing_nats(shown: Array, detected: Array) -> Array:
+    """Return the nats (C,) against candidates by the ticks at which images show them well, and those at which one detects them.
 
     Notes
     -----
-    Boxes are those of the stamp of a cloud, moved to the time of each ray by their velocity. Takes about 3 ms for a tick
-    of 70 agents and 30 000 rays.
+    The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, that of all that is detected
+    in images at all, nothing at `FALSE_RATE`. Successive images err alike, which is why they count as few independent ones.
     """
-    counts = np.zeros((2, 3, len(agents), len(clouds)), dtype=np.int64)
-    if agents:
-        stamps = [timeline.t_ns[k] if cloud is None else cloud.stamp_ns for k, cloud in enumerate(clouds)]
-        t_s = (np.array(stamps, dtype=np.int64) - timeline.t0_ns) / NS_PER_S
-        boxes = AgentTable.of(agents, t_s, margin_s=MAX_LAG_S)
-        for tick in np.flatnonzero(boxes.present.any(axis=0)).tolist():
-            cloud = clouds[tick]
-            if cloud is not None and cloud.free is not None and len(cloud.free):
-                counts[..., tick] = count_at(boxes, tick, cloud.origin, cloud.free)
-    return counts
-
-
-def count_at(boxes: AgentTable, tick: int, origin: Array, rays: Rays) -> NDArray[np.int64]:
-    """Count the rays of one tick toward the solid part and the whole by their ending (2, 3, A)."""
-    agent = np.flatnonzero(boxes.present[:, tick])
-    center, velocity, size = (
-        boxes.center_m[agent, tick] - origin,
-        boxes.heading_velocity_mps[agent, tick],
-        boxes.size_m[agent],
-    )
-    counts = np.zeros((2, 3, len(boxes.present)), dtype=np.int64)
-    start = rays.start
-    to = rays.end - start
-    last_s = float(np.abs(rays.t_s).max())
-    for sensor in range(len(rays.position)):
-        own = np.flatnonzero(rays.sensor == sensor)
-        drift = np.hypot(*(velocity - rays.velocity_mps[sensor, :2]).T) * last_s
-        box, ray = _near_rays(center - rays.position[sensor], size, drift, to[own])
-        ray = own[ray]
-        relative = start[ray] - center[box]
-        relative[:, :2] -= velocity[box] * rays.t_s[ray, None]
-        yaw, sizes = boxes.yaw_rad[agent[box], tick], size[box]
-        for k, endings in enumerate(classify_rays(relative, to[ray], yaw, sizes, (SOLID, WHOLE))):
-            for ending in (Ending.INSIDE, Ending.THROUGH, Ending.BEFORE):
-                counts[k, ending] += np.bincount(agent[box[endings == ending]], minlength=counts.shape[2])
-    return counts
-
-
-def _near_rays(
-    to_center: Array, size_m: Array, drift_m: Array, to: Floats
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pair M boxes with those of K rays that may meet them, at most `MAX_RAYS` in the azimuths of each.
-
-    Parameters
-    ----------
-    to_center : (M, 3) float64, m
-        From the sensor to the boxes.
-    size_m : (M, 3) float64
-    drift_m : (M,) float64
-        How far sensor and box move past each other during the sweep.
-    to : (K, 3) float64, m
-        From the sensor to the ends of the rays.
-
-    Returns
-    -------
-    box, ray : (n,) intp
-        Indices of both. None for a box around the sensor.
-    """
-    if len(to) == 0:
-        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    azimuth = np.arctan2(to[:, 1], to[:, 0])
-    with np.errstate(divide="ignore", invalid="ignore"):  # an upright ray has no slope and meets no box
-        slope = to[:, 2] / np.hypot(to[:, 0], to[:, 1])
-    order = np.argsort(azimuth)
-    turns = np.concatenate([azimuth[order] - 2 * np.pi, azimuth[order], azimuth[order] + 2 * np.pi])
-    distance, reach = np.hypot(to_center[:, 0], to_center[:, 1]), np.hypot(size_m[:, 0], size_m[:, 1]) / 2 + drift_m
-    middle = np.arctan2(to_center[:, 1], to_center[:, 0])
-    half = np.where(distance > reach, np.arcsin(np.minimum(reach / np.maximum(distance, reach), 1.0)), 0.0)
-    first, last = np.searchsorted(turns, middle - half), np.searchsorted(turns, middle + half)
-    step = np.maximum(-(-(last - first) // MAX_RAYS), 1)
-    count = (last - first) // step
-    box = np.repeat(np.arange(len(count)), count)
-    rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    # One of every `step` rays, not always the same laser of the LiDAR.
-    ray = order[(first[box] + rank * step[box] + rank * SCATTER % step[box]) % len(order)]
-    z = to_center[:, 2:] + size_m[:, 2:] * (np.array(WHOLE) - 0.5)
-    near, far = np.maximum(distance - reach, MIN_CHORD_M)[:, None], (distance + reach)[:, None]
-    slopes = np.hstack([z / near, z / far])
-    level = (slope[ray] >= slopes.min(axis=1)[box]) & (slope[ray] <= slopes.max(axis=1)[box])
-    return box[level], ray[level]
-
-
-def classify_rays(
-    start: Floats, to: Floats, yaw_rad: Array, size_m: Array, layers: Sequence[Layer] = (SOLID,)
-) -> list[NDArray[np.int64]]:
-    """Tell for each of n rays and each layer of its box where the ray ends, as `Ending` (n,) for every layer.
-
-    Parameters
-    ----------
-    start : (n, 3) float64, m
-        Relative to the center of the box.
-    to : (n, 3) float64, m
-        From the start to the end.
-    yaw_rad : (n,) float64
-        Of the box.
-    size_m : (n, 3) float64
-    """
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    # One array for each axis: numpy takes several times as long for short last axes.
-    origin = c * start[:, 0] + s * start[:, 1], c * start[:, 1] - s * start[:, 0], np.asarray(start[:, 2], np.float64)
-    along = c * to[:, 0] + s * to[:, 1], c * to[:, 1] - s * to[:, 0], np.asarray(to[:, 2], np.float64)
-    half = [side / 2 - np.minimum(INSET_M, MAX_INSET_SHARE * side) for side in (size_m[:, 0], size_m[:, 1])]
-    sides = [cross_slab(origin[k], along[k], -half[k], half[k]) for k in range(2)]
-    wider = [cross_slab(origin[k], along[k], -half[k] - MARGIN_M, half[k] + MARGIN_M) for k in range(2)]
-    arrive = np.fmax(wider[0][0], wider[1][0])
-    length = np.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2)
-    least_m = np.minimum(MIN_CHORD_M, MIN_CHORD_SHARE * size_m[:, 1])
-    endings = []
-    for layer in layers:
-        rising = cross_slab(origin[2], along[2], (layer.low - 0.5) * size_m[:, 2], (layer.high - 0.5) * size_m[:, 2])
-        enter = np.fmax(np.fmax(sides[0][0], sides[1][0]), rising[0])
-        leave = np.fmin(np.fmin(sides[0][1], sides[1][1]), rising[1])
-        inside = ((leave - enter) * length >= least_m) & (enter > 0)
-        ending = np.where(inside, int(Ending.INSIDE), int(Ending.ELSEWHERE))
-        ending[inside & (arrive > 1)] = Ending.BEFORE
-        ending[inside & ~(arrive > 1) & ((1 - leave) * length > MARGIN_M)] = Ending.THROUGH
-        endings.append(ending)
-    return endings
-
-
-# Points up to this far outside a box may be its own: error of a box.
-STRUCTURE_MARGIN_M = 0.3
-# Thickness to either side of what counts as one surface. Walls are flatter; what else the points of a vehicle show, its
-# second side, its roof and its windows, recedes by more.
-SURFACE_M = 0.2
-# Shares of the points in a box that are nearly all, and most, of them.
-MIN_SURFACE_SHARE, MIN_MOST_SHARE = 0.85, 0.5
-# Surfaces are followed along cells of this length over at most so many empty ones: 0.5 m is less than the distance of parked
-# vehicles with their two rounded corners.
-CELL_M, MAX_EMPTY_CELLS = 0.25, 2
-# A surface that is longer than the longest vehicle of its category by this is no side of one.
-EXCESS_M = 0.5
-# Fewer points, or points in fewer cells (1 m of a side), show no surface.
-MIN_POINTS, MIN_CELLS = 12, 4
-# Points below may be curbs.
-BOTTOM_M = 0.3
-# The points in each cell of a surface that are nearest to the sensor, without the strays.
-FRONT_QUANTILE = 0.8
-# Ticks that are searched for each agent, evenly spread over its life: standing structure looks much the same at all of them.
-SEARCHED_TICKS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """The surface that the points in a box are on.
-
-    Attributes
-    ----------
-    share : float
-        Of the points in the box that are on it.
-    length_m : float
-        Of the surface, without a gap, in the box and beyond.
-    """
-
-    share: float
-    length_m: float
-
-
-def structure_shares(
-    agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline
-) -> tuple[Array, Array]:
-    """Return shares (A,), (A,) of the searched ticks at which nearly all and most points of a vehicle are on a longer surface.
-
-    A few ticks, evenly spread over the life of an agent, are searched: standing structure shows the same at all of them.
-    """
-    shares = np.zeros((2, len(agents)))
-    stamp_of = {k: cloud.stamp_ns for k, cloud in enumerate(clouds) if cloud is not None}
-    ticks = np.array(list(stamp_of), dtype=np.intp)
-    rows = [i for i, agent in enumerate(agents) if GROUP_OF[agent.category] == "vehicle"]
-    if len(ticks) == 0 or not rows:
-        return shares[0], shares[1]
-    stamps = np.array(list(stamp_of.values()), dtype=np.int64)
-    boxes = AgentTable.of([agents[i] for i in rows], (stamps - timeline.t0_ns) / NS_PER_S, margin_s=MAX_LAG_S)
-    for row, i in enumerate(rows):
-        alive = np.flatnonzero(boxes.present[row])
-        searched = alive[np.unique(np.linspace(0, len(alive) - 1, min(len(alive), SEARCHED_TICKS)).astype(np.intp))]
-        longest_m = MAX_SIZE_M[agents[i].category][0] + EXCESS_M
-        found = [_surface_at(boxes, row, int(k), clouds[ticks[k]], longest_m) for k in searched]
-        longer = [s.share for s in found if s is not None and s.length_m > longest_m]
-        for k, least in enumerate((MIN_SURFACE_SHARE, MIN_MOST_SHARE)):
-            shares[k, i] = sum(share >= least for share in longer) / max(len(searched), 1)
-    return shares[0], shares[1]
-
-
-def _surface_at(boxes: AgentTable, row: int, column: int, cloud: Obstacles | None, reach_m: float) -> Surface | None:
-    """Follow the surface of one agent in one cloud up to `reach_m` from its center."""
-    if cloud is None:
-        return None
-    center, size, yaw = boxes.center_m[row, column] - cloud.origin, boxes.size_m[row], float(boxes.yaw_rad[row, column])
-    near = cloud.near(boxes.center_m[row, column, :2], reach_m)
-    near = near[cloud.xyz[near, 2] > center[2] - size[2] / 2 + BOTTOM_M]
-    local = rotate(cloud.xyz[near, :2].astype(np.float64) - center[:2], -yaw)
-    sensor = rotate(cloud.sensor_of(near)[:2].astype(np.float64) - center[:2], -yaw)
-    return find_surface(local, size[:2], sensor)
-
-
-def find_surface(local: Array, size_m: Array, sensor: Array) -> Surface | None:
-    """Find the surface that most points in a box are on, along its length or its width.
-
-    Parameters
-    ----------
-    local : (N, 2) float64, m
-        Points in and around the box, in its axes, relative to its center.
-    size_m : (2,) float64
-        Length and width.
-    sensor : (2,) float64, m
-        Likewise.
-
-    Returns
-    -------
-    Surface or None
-        None with too few points in the box.
-    """
-    inside: NDArray[np.bool_] = np.all(np.abs(local) <= size_m / 2 + STRUCTURE_MARGIN_M, axis=1)
-    if inside.sum() < MIN_POINTS:
-        return None
-    found = [
-        _along(local[:, axis], local[:, 1 - axis] * (1 if sensor[1 - axis] >= 0 else -1), inside) for axis in (0, 1)
-    ]
-    return max((s for s in found if s is not None), key=lambda s: s.share, default=None)
-
-
-def _along(u: Array, v: Array, inside: NDArray[np.bool_]) -> Surface | None:
-    """Follow the surface of the points `inside` along u; v grows toward the sensor."""
-    cell = np.floor(u / CELL_M).astype(np.int64)
-    order = np.flatnonzero(inside)[np.lexsort((v[inside], cell[inside]))]
-    cells, first, count = np.unique(cell[order], return_index=True, return_counts=True)
-    if len(cells) < MIN_CELLS:
-        return None
-    front = v[order[first + (FRONT_QUANTILE * (count - 1)).astype(np.intp)]]
-    at = (cells + 0.5) * CELL_M
-    i, j = np.triu_indices(len(at), 1)
-    slope = np.median((front[j] - front[i]) / (at[j] - at[i]))  # Theil (1950)
-    on = np.abs(v - slope * u - np.median(front - slope * at)) <= SURFACE_M
-    own = np.sort(cell[on & inside])
-    if len(own) < MIN_POINTS:
-        return None
-    occupied = np.unique(cell[on])
-    gap = np.flatnonzero(np.diff(occupied) > MAX_EMPTY_CELLS + 1)
-    middle = int(np.searchsorted(occupied, own[len(own) // 2]))
-    start = int(gap[gap < middle].max(initial=-1)) + 1
-    end = int(gap[gap >= middle].min(initial=len(occupied) - 1))
-    return Surface(float(on[inside].mean()), float((occupied[end] - occupied[start] + 1) * CELL_M))
-
-
-# A detection is never surer than this: 3 nats.
-MAX_SCORE = 0.95
-# Fewer rays at a tick say nothing.
-MIN_TICK_RAYS = 8
-# Nats of the rays of a tick: all of them end in what is there; more are not believed, since rays of one tick err alike.
-RAY_NATS = 2.0
-# Nats of a tick of a motion that no road user has.
-MOTION_NATS = 1.0
-# Agents times ticks that are looked at together; each takes about a hundred bytes.
-MAX_CELLS = 400_000
-# Rays toward a place before it is said that the LiDAR looks there.
-MIN_LOOKING_RAYS = 30
-# Fewer image boxes with points may each be wrong.
-MIN_HEIGHTS = 3
-
-
-def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[AgentCandidate]:
-    """Return the candidates with what the LiDAR and the cameras say about them, and with all evidence for them.
-
-    Notes
-    -----
-    Evidence is a sum over ticks of nats for the agent against nothing: of each detection by its score, of the rays by the
-    share that goes through, and less for a motion that breaks the limits of road users.
-    """
-    weighed = list(candidates)
-    order = sorted(range(len(candidates)), key=lambda k: float(candidates[k].agent.waypoints.t_s[0]))
-    most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
-    for first in range(0, len(order), most):
-        rows = order[first : first + most]
-        for k, candidate in zip(rows, _weigh_together([candidates[k] for k in rows], recording)):
-            weighed[k] = candidate
-    return weighed
-
-
-def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) -> list[AgentCandidate]:
-    """Weigh candidates of which there are not too many."""
-    agents, clouds, timeline = [c.agent for c in candidates], recording.clouds, recording.timeline
-    solid, (inside, through, before) = count_rays(agents, clouds, timeline)
-    in_structure, beside = structure_shares(agents, clouds, timeline)
-    met = inside + through
-    shown = shown_in_images(AgentTable.of(agents, recording.t_s), recording) & (met >= before) & (met >= MIN_TICK_RAYS)
-    weighed = []
-    for k, candidate in enumerate(candidates):
-        rays = int(before[k].sum() + met[k].sum())
-        pointless = bool(rays >= MIN_LOOKING_RAYS and not (candidate.track.measurements.points > 0).any())
-        # Where points of it went to something beside it, rays still end in it.
-        unreached = pointless and inside[k].sum() <= rays / 2
-        support = replace(
-            _support(*solid[:, k]),
-            in_structure=float(in_structure[k]),
-            beside_structure=float(beside[k]),
-            pointless=pointless,
-            unreached=bool(unreached and _same_view(candidate, clouds)),
-            shown_ticks=int(shown[k].sum()),
-            detected_ticks=int(shown[k, candidate.track.tick].sum()),
-            image_ticks=int(shown[k, candidate.track.tick[candidate.track.measurements.camera != ""]].sum()),
-            image_height_share=image_height_share(candidate.track.measurements),
-        )
-        weighed.append(replace(candidate, support=support, evidence=_nats(candidate, *solid[:2, k])))
-    return weighed
-
-
-def _support(inside: NDArray[np.int64], through: NDArray[np.int64], before: NDArray[np.int64]) -> Support:
-    """Sum the rays of one agent over ticks (T,), without those at which only the border of what hides it shows."""
-    met = inside + through
-    seen = (met > 0) & (met >= before)
-    return Support(int(inside[seen].sum()), int(through[seen].sum()), int(before.sum()), int(seen.sum()))
-
-
-def image_height_share(m: Measurements) -> float | None:
-    """Return the median height of the image boxes of a track at its distance over that of its points; None with few of both."""
-    rows = ~m.truncated & (m.points > 0) & (m.top_m > m.bottom_m) & np.isfinite(m.height_px_m)
-    return float(np.median(m.height_px_m[rows] / (m.top_m - m.bottom_m)[rows])) if rows.sum() >= MIN_HEIGHTS else None
-
-
-def _same_view(candidate: AgentCandidate, clouds: Sequence[Obstacles | None]) -> bool:
-    """Return whether the cameras that detect a candidate are where the LiDARs are."""
-    track = candidate.track
-    for tick, sensor in zip(track.tick.tolist(), track.measurements.sensor_m):
-        cloud = clouds[tick]
-        if cloud is not None:
-            return bool(np.linalg.norm(sensor - cloud.origin - cloud.sensor) <= MAX_BASELINE_M)
-    return False
-
-
-def _nats(candidate: AgentCandidate, inside: NDArray[np.int64], through: NDArray[np.int64]) -> float:
-    """Sum the evidence for one candidate, given its rays (T,)."""
-    detections = -np.log1p(-MAX_SCORE * candidate.track.measurements.score).sum()
-    met = inside + through
-    decided = met >= MIN_TICK_RAYS
-    rays: Array = RAY_NATS * (1 - 2 * through[decided] / met[decided])
-    impossible = MOTION_NATS * len(candidate.agent.waypoints) if candidate.agent.doubts else 0.0
-    return float(detections + rays.sum() - impossible)
+    usual = min(detected.sum() / max(float(shown[detected > 0].sum()), 1.0), MAX_USUAL_RATE)
+    if usual <= FALSE_RATE:
+        return np.zeros(len(shown))
+    rate = detected / np.maximum(shown, 1)
+    mean = rate * np.log(FALSE_RATE / usual) + (1 - rate) * np.log((1 - FALSE_RATE) / (1 - usual))
+    return np.where(shown < MIN_SHOWN_TICKS, 0.0, np.maximum(mean, 0.0) * [independent(int(n)) for n in shown])

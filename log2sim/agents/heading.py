@@ -515,7 +515,7 @@ def _own_log_odds(candidate: AgentCandidate, timeline: Timeline) -> float:
 def _path_of(candidate: AgentCandidate, log_odds: float) -> Array:
     """Return x, y and heading (K, 3) at the waypoints at which a candidate shows the direction of traffic."""
     w = candidate.agent.waypoints
-    moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & candidate.confirmed & (abs(log_odds) > MIN_FLOW_LOG_ODDS)
+    moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & (abs(log_odds) > MIN_FLOW_LOG_ODDS)
     yaw = w.yaw_rad[moving] + (0.0 if log_odds > 0 else np.pi)
     return np.stack([w.x_m[moving], w.y_m[moving], yaw], axis=1)
 

@@ -1,18 +1,113 @@
-"""The judge: of all candidates together, which are agents, and what speaks against each."""
+"""The judge: of all candidates together, which are agents, how far each can be trusted, and what speaks against it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from log2sim.agents.candidate import AgentCandidate, Support, name_agents
+from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents
 from log2sim.agents.conflicts import conflict_doubts, resolve_conflicts
-from log2sim.agents.evidence import MIN_LOOKING_RAYS, Recording, doubt_size, weigh
-from log2sim.agents.size import independent
-from log2sim.datatypes import GROUP_OF, Agent, AgentTable, Finding
-from log2sim.geometry import overlap_of_smaller
+from log2sim.agents.evidence import Recording, Table, gather
+from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
+from log2sim.agents.weights import RIGHT, THERE, VARIANCES
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, AgentTable, Finding
+from log2sim.datatypes.log_odds import probability_of
+from log2sim.geometry import Array, overlap_of_smaller
+
+# What was detected well enough is dropped where it is rather not there. Without a LiDAR, what is not there is mostly placed wrong,
+# which is for doubts.
+MIN_THERE = {True: 0.5, False: 0.25}
+# A reason that makes an agent e times less likely is told.
+DOUBT_NATS = 1.0
+# Never 0 or 1: an agent may be right or wrong for a reason that no evidence shows.
+MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
+
+
+def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording) -> list[AgentCandidate]:
+    """Keep the candidates that are there and can be true together, each named, with its confidence and what speaks against it.
+
+    Parameters
+    ----------
+    candidates : sequence of AgentCandidate
+        Of all tracks.
+    ego : Agent, optional
+        At its place there is no other agent.
+    """
+    t_s, lidar = recording.t_s, bool(recording.log.lidars)
+    table = gather(candidates, recording)
+    there, right = probabilities(table, lidar=lidar)
+    kept = [
+        _rated(c.doubted(doubts), float(right[k]), recording.timeline)
+        for k, c in enumerate(candidates)
+        if (doubts := decide(c.agent, {name: float(column[k]) for name, column in table.items()}, there[k], lidar=lidar)) is not None
+    ]  # fmt: skip
+    apart = resolve_conflicts(suppress_duplicates(kept, ego), ego, t_s)
+    # A doubt may name another agent.
+    named = name_agents(apart)
+    return [c.doubted(found) for c, found in zip(named, conflict_doubts(named, ego, t_s))]
+
+
+def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
+    """Return the probabilities (C,) that something is where each candidate is, and that the candidate is right.
+
+    Notes
+    -----
+    Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
+    speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
+    is right where it is. Each weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points
+    is rather wrong; without one, nothing has points, and what images say of the distance counts instead: each case has its weights.
+    """
+    there, state = (
+        probability_of(np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0))
+        for weights in (THERE, RIGHT)
+    )
+    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
+
+
+def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: bool) -> list[Finding] | None:
+    """Return what is doubtful about a candidate, None if it is dropped: nothing is there, or something else.
+
+    Parameters
+    ----------
+    evidence : mapping
+        Its row of the table.
+    there : float
+        Probability that something is there, from `probabilities`.
+    """
+    if not evidence["confirmed"] or there < MIN_THERE[lidar]:
+        return None
+    counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
+    reasons = {
+        "through": Finding("empty", values={"through_share": evidence["through"]}),
+        "pointless": Finding("hardly_observed", case="no_points"),
+        "missing": Finding("hardly_observed", case="images", values=counts),
+    }
+    weights = THERE[lidar]
+    told = [found for name, found in reasons.items() if -weights.get(name, 0.0) * evidence[name] > DOUBT_NATS]
+    return [*told, *doubt_size(agent)]
+
+
+# Rounding.
+SAME_M = 0.005
+
+
+def doubt_size(agent: Agent) -> list[Finding]:
+    """Doubt a vehicle that is wider than any on the road, by more than the error of an observed side, or as long as sizes go.
+
+    Sizes are limited to those of the category: a vehicle at the greatest length was observed to be longer.
+    """
+    length_m, width_m, _ = agent.size_m
+    if GROUP_OF[agent.category] != "vehicle":
+        return []
+    if width_m > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M:
+        return [Finding("unlikely_size", case="width", values={"width_m": width_m, "limit_m": MAX_ROAD_WIDTH_M})]
+    longest_m = MAX_SIZE_M[agent.category][0]
+    if length_m >= longest_m - SAME_M:
+        return [Finding("unlikely_size", case="length", values={"limit_m": longest_m}, other=agent.category)]
+    return []
+
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
 # by distance, since the boxes of two people who stand close together overlap.
@@ -24,8 +119,8 @@ SAMPLES = 12
 
 
 def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
-    """Keep, of the candidates that overlap, the one with the most evidence, and none that overlaps the ego."""
-    ordered = sorted(built, key=lambda b: -b.evidence)
+    """Keep, of the candidates that overlap, the one with most ticks that are right by its confidence, and none that overlaps the ego."""
+    ordered = sorted(built, key=lambda b: -b.agent.confidence * len(b.track))
     agents = [*([] if ego is None else [ego]), *(c.agent for c in ordered)]
     ways = [a.waypoints for a in agents]
     # First and last time and place: agents that are not there at the same time and near enough are no duplicates.
@@ -57,107 +152,68 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
     return bool(np.median(overlap_of_smaller(*(boxes.rectangles(k, slice(None)) for k in range(2)))) > least)
 
 
-# Nats against a candidate, of which each reason has some: odds of 20 to 1 drop it. What is certain outweighs any detections.
-REFUTED_NATS, CERTAIN_NATS = 3.0, 10.0
-# One labeled vehicle in ten stands so close to something that most of its points are on a surface that goes on beyond it.
-BESIDE_STRUCTURE_NATS = 2.3
-# Through labeled vehicles in real logs, and exact ones in synthetic ones, pass less than 0.2 of the rays toward their solid part;
-# people and bicycles have gaps. Above the lower share something may be there that is smaller than the box or beside it, above the
-# higher one nothing is.
-DOUBTED_SHARE, EMPTY_SHARE = 0.35, 0.8
-# Rays of fewer ticks may all have gone through a window or past a corner.
-MIN_EMPTY_TICKS = 3
-# A surface counts that is there at more than this share of the searched ticks.
-MOSTLY = 0.5
-# Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken
-# to find one that is there: no detector finds all.
-FALSE_RATE = 0.05
-MAX_USUAL_RATE = 0.9
-# Fewer ticks tell no rate.
-MIN_SHOWN_TICKS = 8
-# The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5 is three standard deviations low. Then the
-# points are not those of what the image shows, but of something nearer that hides it.
-MIN_IMAGE_HEIGHT_SHARE = 0.5
-
-
-def usual_detection_rate(candidates: Sequence[AgentCandidate]) -> float:
-    """Return the share of the ticks at which a searched image shows a candidate well and it is detected, over all of them."""
-    supports = [c.support for c in candidates if c.support is not None]
-    shown = sum(s.shown_ticks for s in supports)
-    return sum(s.detected_ticks for s in supports) / shown if shown else 0.0
-
-
-def decide(candidate: AgentCandidate, usual_rate: float) -> list[Finding] | None:
-    """Return what is doubtful about a weighed candidate, None if it is dropped: nothing is there, or something else.
-
-    Parameters
-    ----------
-    usual_rate : float
-        Of `usual_detection_rate`.
-    """
-    s = candidate.support
-    if s is None:
-        return doubt_size(candidate.agent)
-    known = s.inside + s.through >= MIN_LOOKING_RAYS and s.seen_ticks >= MIN_EMPTY_TICKS
-    through = (s.through_share or 0.0) if known else 0.0
-    undetected = missing_nats(s, usual_rate)
-    height_share = 1.0 if s.image_height_share is None else s.image_height_share
-    against = {
-        "points of something nearer": CERTAIN_NATS * (height_share < MIN_IMAGE_HEIGHT_SHARE),
-        "rays do not end in it": CERTAIN_NATS * s.unreached,
-        "rays pass through": CERTAIN_NATS * (through > EMPTY_SHARE),
-        "part of something longer": CERTAIN_NATS * (s.in_structure > MOSTLY),
-        "beside something longer": BESIDE_STRUCTURE_NATS * (s.beside_structure > MOSTLY),
-        "not detected": undetected,
-    }
-    if sum(against.values()) > REFUTED_NATS:
-        return None
-    doubts = []
-    if through > DOUBTED_SHARE and GROUP_OF[candidate.agent.category] == "vehicle":
-        doubts.append(Finding("empty", values={"through_share": through}))
-    if s.pointless:
-        doubts.append(Finding("hardly_observed", case="no_points"))
-    # Where sweeps alone show it, images next to them should, too.
-    only_sweeps = missing_nats(replace(s, detected_ticks=s.image_ticks), usual_rate) > REFUTED_NATS
-    if undetected > 0 or only_sweeps:
-        case, ticks = ("any", s.detected_ticks) if undetected > 0 else ("images", s.image_ticks)
-        counts = {"detected_ticks": float(ticks), "shown_ticks": float(s.shown_ticks)}
-        doubts.append(Finding("hardly_observed", case=case, values=counts))
-    return [*doubts, *doubt_size(candidate.agent)]
-
-
-def missing_nats(s: Support, usual_rate: float) -> float:
-    """Return the evidence against an agent, in nats, by the share of the ticks that show it well at which it is detected.
+def _rated(candidate: AgentCandidate, confidence: float, timeline: Timeline) -> AgentCandidate:
+    """Return a candidate with its confidence and larger standard deviations.
 
     Notes
     -----
-    The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, nothing at `FALSE_RATE`.
-    Successive images err alike, which is why they count as few independent ones.
+    A variance is a sum of terms, each a reason for an error, times weights that fit simulated logs (`tools/fit.py confidence`).
+    Smoothing and fits take the errors of ticks as independent; but a box that is laid against the wrong end, or has a wrong length,
+    is off by as much at every tick.
     """
-    usual = min(usual_rate, MAX_USUAL_RATE)
-    if s.shown_ticks < MIN_SHOWN_TICKS or usual <= FALSE_RATE:
-        return 0.0
-    rate = s.detected_ticks / s.shown_ticks
-    mean = rate * np.log(FALSE_RATE / usual) + (1 - rate) * np.log((1 - FALSE_RATE) / (1 - usual))
-    return float(mean) * independent(s.shown_ticks)
+    w = candidate.agent.waypoints
+    sigmas = {
+        name: np.sqrt(sum(weight * terms[reason] for reason, weight in VARIANCES[name].items()))
+        for name, terms in variance_terms(candidate, confidence, timeline).items()
+    }
+    return replace(candidate, agent=replace(candidate.agent, confidence=confidence, waypoints=replace(w, **sigmas)))
 
 
-def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording) -> list[AgentCandidate]:
-    """Keep the candidates that are confirmed and can be true together, each named and with what speaks against it.
+def variance_terms(candidate: AgentCandidate, confidence: float, timeline: Timeline) -> dict[str, dict[str, Array]]:
+    """Return the reasons for errors at the waypoints (T,) by what is wrong, the names of `Waypoints`: variances but for their weights.
 
-    Parameters
-    ----------
-    candidates : sequence of AgentCandidate
-        Of all tracks.
-    ego : Agent, optional
-        At its place there is no other agent.
+    - given: what smoothing or the fit says;
+    - given_moving: errors of neighboring ticks are alike, and smoothing averages them;
+    - hidden: a box is laid against one end, and the part of its length that was never seen is on either side of the points;
+    - range: the spacing of rays and errors of the pose grow with the distance;
+    - wrong: the more probably an agent is wrong, the larger its errors are too: of a position mostly by up to half its length,
+      of a yaw by any angle;
+    - standing, moving: a standing agent that is probably wrong may move, and a moving one stand, or move at another speed.
     """
-    t_s = recording.t_s
-    weighed = weigh([c for c in candidates if c.confirmed], recording)
-    usual_rate = usual_detection_rate(weighed)
-    decided = [(c, decide(c, usual_rate)) for c in weighed]
-    apart = suppress_duplicates([c.doubted(doubts) for c, doubts in decided if doubts is not None], ego)
-    apart = resolve_conflicts(apart, ego, t_s)
-    # A doubt may name another agent.
-    named = name_agents(apart)
-    return [c.doubted(found) for c, found in zip(named, conflict_doubts(named, ego, t_s))]
+    agent, m = candidate.agent, candidate.track.measurements
+    w, length_m = agent.waypoints, agent.size_m[0]
+    ones, wrong, moving = np.ones(len(w)), (1 - confidence) ** 2, float(not agent.static)
+    range_m = float(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)))
+    hidden_m = (1 - seen_share(candidate, timeline)[0]) * length_m
+    terms: dict[str, dict[str, Array]] = {
+        "sigma_xy_m": {
+            "given": w.sigma_xy_m**2,
+            "given_moving": moving * w.sigma_xy_m**2,
+            "hidden": hidden_m**2 * ones,
+            "range": (range_m / 10.0) ** 2 * ones,
+            "wrong": wrong * length_m**2 * ones,
+        }
+    }
+    if w.sigma_yaw_rad is not None:
+        terms["sigma_yaw_rad"] = {"given": w.sigma_yaw_rad**2, "wrong": wrong * ones}
+    if w.sigma_speed_mps is not None:
+        speed = {"standing": (1 - moving) * wrong * ones, "moving": moving * wrong * (1.0 + np.abs(w.speed_mps)) ** 2}
+        terms["sigma_speed_mps"] = {"given": w.sigma_speed_mps**2, **speed}
+    return terms
+
+
+# Of the extents seen at all ticks, this quantile counts as seen at some time: stray points lengthen a few.
+SEEN_QUANTILE = 0.85
+
+
+def seen_share(candidate: AgentCandidate, timeline: Timeline) -> Array:
+    """Return the shares (2,) of length and width that points spanned at one time; 0 without points."""
+    m, w = candidate.track.measurements, candidate.agent.waypoints
+    extent = m.high_m - m.low_m
+    rows = np.isfinite(extent).all(axis=1) & np.isfinite(m.yaw_rad)
+    if not rows.any():
+        return np.zeros(2)
+    across = np.abs(np.cos(m.yaw_rad - np.interp(timeline.seconds(m.t_ns), w.t_s, np.unwrap(w.yaw_rad)))) < np.sqrt(0.5)
+    extent = np.where(across[:, None], extent[:, ::-1], extent)[rows]
+    seen = np.quantile(extent, SEEN_QUANTILE, axis=0) / np.array(candidate.agent.size_m[:2])
+    return np.asarray(np.clip(seen, 0.0, 1.0))

@@ -14,10 +14,9 @@ from log2sim.agents.candidate import (
     AgentCandidate,
     Timeline,
     candidate_of,
-    followed_confidence,
     spans_of,
 )
-from log2sim.agents.size import TrackGeometry, independent, moving_geometry
+from log2sim.agents.size import TrackGeometry, independent, independent_along, moving_geometry
 from log2sim.agents.smooth import motion_model
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
@@ -271,6 +270,8 @@ SAME_MOMENT_S = 1e-3
 MAX_YAW_OFF_RAD = np.pi / 4
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
 HEIGHT_MEDIAN_HALF = 4
+# So many places tell enough.
+MAX_PLACES = 200
 
 
 def moving_candidate(
@@ -321,8 +322,9 @@ def moving_candidate(
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
     ordered = sorted(matches, key=lambda match: match.tick)
     free = left_free(obstacles, ordered, geometry.size_m, float(np.median(geometry.z_m)) - geometry.size_m[2] / 2)
-    followed = followed_confidence(track, np.array([match.xy_m for match in ordered]).reshape(-1, 2)[free])
-    return candidate_of(track, geometry, waypoints, quality, static=False, followed=followed).doubted(doubts)
+    places = np.array([match.xy_m for match in ordered]).reshape(-1, 2)[free][:MAX_PLACES]
+    candidate = candidate_of(track, geometry, waypoints, quality, static=False).doubted(doubts)
+    return replace(candidate, followed=independent_along(places, TYPICAL_SIZE_M[track.category][0]))
 
 
 def _one_at_a_moment(track: Track) -> Track:

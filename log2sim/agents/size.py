@@ -21,8 +21,6 @@ from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
 
 # Errors of one detector about one object are alike at neighboring ticks: correlation between any two of them.
 TICK_CORRELATION = 0.5
-# So many places of a long track do for how much its ticks have in common.
-MAX_PLACES = 200
 
 
 def independent(count: int) -> float:
@@ -36,12 +34,12 @@ def independent_along(xy_m: Array, length_m: float) -> float:
     What a detector mistakes for a road user stays where it is. Something that moves on is seen from other sides and before other
     things, so that errors at two places are the less alike the more lengths they are from each other.
     """
-    count = min(len(xy_m), MAX_PLACES)
-    places = xy_m[np.linspace(0, len(xy_m) - 1, count).round().astype(np.intp)]
-    apart_m = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    if not len(xy_m):
+        return 0.0
+    apart_m = np.hypot(*(xy_m[:, None] - xy_m[None]).transpose(2, 0, 1))
     alike = TICK_CORRELATION * np.exp(-apart_m / length_m)
     np.fill_diagonal(alike, 1.0)
-    return float(count**2 / alike.sum())
+    return float(len(xy_m) ** 2 / alike.sum())
 
 
 def typical_box_size(m: BoxEvidence) -> Array | None:

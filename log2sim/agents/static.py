@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
-from log2sim.agents.evidence import Ending, classify_rays
 from log2sim.agents.hypotheses import Part, main_place
+from log2sim.agents.rays import Ending, classify_rays
 from log2sim.agents.size import TrackGeometry, independent, static_geometry
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
@@ -312,7 +312,7 @@ def _ends_by_rays(
 def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
     """Return whether most of several rays toward the solid part of a box of a size (3,) at a center (2,) go on behind it."""
     first = start - np.append(center, size[2] / 2)
-    (ending,) = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
+    ending = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
     passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
     return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
 

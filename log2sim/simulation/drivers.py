@@ -341,7 +341,9 @@ class Crowd:
         self.conflicts = list(self._conflicts()) if noisy else []
         self.place = np.broadcast_to(present.place_m, (count, len(present.agents))).copy()
         self.yaw = np.broadcast_to(present.yaw_rad, (count, len(present.agents))).copy()
-        self.touching = self._overlaps(*self._near_pairs(0.0))
+        i, j = self._near_pairs(0.0)
+        overlap = self._overlapping(self.place, self.yaw, i, j)[1][0]
+        self.touching = set(zip(i[overlap].tolist(), j[overlap].tolist()))  # which is the log's doing
         if noisy:
             self._fit_time_gaps()
 
@@ -596,20 +598,16 @@ class Crowd:
     def run(self, ticks: int) -> tuple[Complex, Array]:
         """Simulate and return places and headings (R, A, T)."""
         places, yaws = (np.empty((*self.place.shape, ticks), dtype=c.dtype) for c in (self.place, self.yaw))
-        wanted = np.zeros(self.speed.shape)
+        wanted, shape = np.zeros(self.speed.shape), (self.count, len(self.rows), ticks)
+        more = self._spread(SHAKE_SPREAD, (*shape[:2], 1))
+        jitter = self.rng.standard_normal((3, *shape)) * self.now.shake[:, None, self.rows, None] * more
         for n in range(ticks):
             if n % 2 == 0:  # drivers look twice in 0.4 s
                 wanted = self._accelerations()
                 if self.noisy and n % 10 == 0:
                     self._change_lanes(n)
             self._advance(wanted, n)
-            places[..., n], yaws[..., n] = self.place, self.yaw
-        if self.noisy:
-            shape = (self.count, len(self.rows), ticks)
-            more = self._spread(SHAKE_SPREAD, (*shape[:2], 1))
-            jitter = self.rng.standard_normal((3, *shape)) * self.now.shake[:, None, self.rows, None] * more
-            places[:, self.rows] += (jitter[0] + 1j * jitter[1]) * np.exp(1j * yaws[:, self.rows])
-            yaws[:, self.rows] += jitter[2]
+            places[..., n], yaws[..., n] = self._shaken(jitter[..., n]) if self.noisy else (self.place, self.yaw)
         return places, wrap_angle(yaws)
 
     def _at(self, way: Array) -> tuple[Complex, Complex]:
@@ -716,13 +714,25 @@ class Crowd:
     def _touched(self, i: Index, j: Index) -> Mask:
         return np.array([(a, b) in self.touching for a, b in zip(i.tolist(), j.tolist())], dtype=bool)
 
-    def _overlaps(self, i: Index, j: Index) -> set[tuple[int, int]]:
-        """Return the pairs that overlap now, which is the log's doing."""
-        away = self.place[0, j] - self.place[0, self.rows[i]]
-        hit = rectangles_overlap(
-            away.real, away.imag, self.yaw[0, self.rows[i]], self.yaw[0, j], self.size_m[self.rows[i]], self.size_m[j]
-        )
-        return set(zip(i[hit].tolist(), j[hit].tolist()))
+    def _overlapping(self, place: Complex, yaw: Array, i: Index, j: Index) -> tuple[Complex, Mask]:
+        """Return how far agents j (P,) are from movers i (P,), (R, P), and whether their boxes overlap."""
+        away = np.asarray(place[:, j] - place[:, self.rows[i]])
+        one, two = (np.broadcast_to(self.size_m[k], (*away.shape, 2)).reshape(-1, 2) for k in (self.rows[i], j))
+        headings = yaw[:, self.rows[i]].ravel(), yaw[:, j].ravel()
+        hit = rectangles_overlap(away.real.ravel(), away.imag.ravel(), *headings, one, two).reshape(away.shape)
+        # People brush past each other and walk shoulder to shoulder: their boxes overlap in logs, too.
+        return away, hit & ~((self.group[i] == "pedestrian") & (self.now.group[j] == "pedestrian"))
+
+    def _shaken(self, jitter: Array) -> tuple[Complex, Array]:
+        """Return places and headings (R, A) as labels have them, off by jitter (3, R, M), but where boxes would overlap by it."""
+        place, yaw = self.place.copy(), self.yaw.copy()
+        place[:, self.rows] += (jitter[0] + 1j * jitter[1]) * np.exp(1j * yaw[:, self.rows])
+        yaw[:, self.rows] += jitter[2]
+        i, j = self._near_pairs(1.0)
+        r, pair = np.nonzero(self._overlapping(place, yaw, i, j)[1])
+        for k in (self.rows[i[pair]], j[pair]):
+            place[r, k], yaw[r, k] = self.place[r, k], self.yaw[r, k]
+        return place, yaw
 
     def _advance(self, wanted: Array, n: int) -> None:
         """Move agents by a tick; who would drive into another stays where it is."""
@@ -750,20 +760,7 @@ class Crowd:
         place[:, self.rows], heading[:, self.rows] = at, np.where(way > 0, yaw, self.yaw[:, self.rows])
         i, j = self._near_pairs(1.0)
         if len(i):
-            away = place[:, j] - place[:, self.rows[i]]
-            shape = away.shape
-            one, two = (
-                np.broadcast_to(self.size_m[self.rows[i]], (*shape, 2)),
-                np.broadcast_to(self.size_m[j], (*shape, 2)),
-            )
-            hit = rectangles_overlap(
-                away.real.ravel(),
-                away.imag.ravel(),
-                heading[:, self.rows[i]].ravel(),
-                heading[:, j].ravel(),
-                one.reshape(-1, 2),
-                two.reshape(-1, 2),
-            ).reshape(shape)
+            away, hit = self._overlapping(place, heading, i, j)
             ahead = (away * np.exp(-1j * (heading[:, self.rows[i]] - self.offset[i]))).real > 0
             hit &= ahead & ~self._touched(i, j)
             stays = np.zeros(self.speed.shape, dtype=bool)

@@ -29,6 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=32, help="rollouts")
     parser.add_argument("--horizon", type=float, default=8.0, help="s")
     parser.add_argument("--every", type=float, default=8.0, help="s between the moments")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="also write the figures of each moment here")
     options = parser.parse_args(arguments)
     found: dict[str, list[Realism]] = {model: [] for model in options.models}
@@ -46,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
             agents += len(who)
             for model in options.models:
                 begin = time.process_time()
-                rng = np.random.default_rng(0)
+                rng = np.random.default_rng(options.seed)
                 drawn = roll_out(scenario, now_s, model, horizon_s=options.horizon, count=options.count, rng=rng)
                 spent[model] += time.process_time() - begin
                 result = realism(log, drawn, who, now, road)

@@ -1,20 +1,22 @@
-"""Fit the weights by which agents are rated, and those of their systematic errors, on synthetic logs.
+"""Fit the weights of the evidence by which agents are judged, and those of their systematic errors, on simulated logs.
 
     python tools/fit.py confidence_logs --logs 60 --seed 2 --out FOLDER
-    python tools/fit.py confidence FOLDER > log2sim/agents/confidence.py
+    python tools/fit.py confidence FOLDER ... > log2sim/agents/weights.py
 
-Goes on from the first passes that the former made, judges the agents as `evaluate` does, and prints the module. Tables of
-logs that were held out go to stderr: each fifth of the logs is rated by weights that fit the others.
+Goes on from the first passes that the former made, judges every candidate as `evaluate` does, also those that are dropped, and
+prints the module. Tables go to stderr: each fifth of the logs is rated by weights that fit the others; and each kind of content
+(mount, what is searched, rate) by weights that fit the other kinds.
 """
 
 from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from entry import parser_of
@@ -22,20 +24,11 @@ from numpy.typing import NDArray
 
 from fits.confidence_logs import Case
 from log2sim import pipeline
-from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence import (
-    MAX_CONFIDENCE,
-    MIN_CONFIDENCE,
-    SIGNS,
-    Evidence,
-    evidence_of,
-    position_terms,
-    seen_share,
-    speed_terms,
-    yaw_at_measurements,
-    yaw_terms,
-)
-from log2sim.datatypes import CATEGORIES, Agent
+from log2sim.agents import judge as judging
+from log2sim.agents.candidate import Timeline
+from log2sim.agents.evidence import SIGNS, Table, gather
+from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, variance_terms
+from log2sim.datatypes import CATEGORIES, GROUP_OF
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.comparison import Selection
 from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
@@ -43,106 +36,98 @@ from log2sim.evaluation.metrics.evaluator import compare_scenarios
 from log2sim.evaluation.metrics.verdicts import judge_against_truth
 from log2sim.geometry import Array
 
-Table = dict[str, float]
+Weights = dict[bool, dict[str, float]]
 
 FOLDS = 5
-# Standard deviation of the weights of evidence that is scaled to a standard deviation of 1, before anything is seen.
-PRIOR_SIGMA = 0.5
+# Standard deviation of the weights of evidence that is scaled to a standard deviation of 1, before anything is seen; weights that
+# change log-odds by less than this in a standard deviation are left out.
+PRIOR_SIGMA, MIN_EFFECT = 0.5, 0.05
 # A weight of a variance is not below this, so that its logarithm exists. Of what smoothing says remains at least a quarter, half
 # of the standard deviation: it alone knows gaps, ends and turns.
 MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
-RANGES_M = ((0, 15), (15, 30), (30, 50), (50, np.inf))
+# Recorded logs have more that looks a little like a road user than simulated ones, so that a score that speaks against an object
+# counts in full, as the calibrated probability that it is.
+FIXED = {"weak_sweep": 1.0}
+# Columns that say nothing of whether something is there, and those that say nothing of whether it is right where it is.
+ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_sweep", "no_image", "travel", "missing", "pointless", "nearer", "image", "sweep", "weak_sweep", "few")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Rated:
-    """One judged agent: evidence, share of right ticks, and squared errors with their terms, means over matched ticks."""
+    """One judged candidate: its row of the table, shares of ticks, and squared errors with their terms, means over ticks."""
 
     log: str
     case: str
+    hz: float
     lidar: bool
-    id: str
-    evidence: Evidence
+    category: str
+    evidence: dict[str, float]
     ticks: int
+    there: float
     right: float
-    before: float
     doubted: bool
-    range_m: float
-    candidate: Agent
-    seen: Array
+    terms: dict[str, dict[str, float]]
     errors: dict[str, float]
 
 
-def agents_of(case: Case) -> list[Rated]:
-    """Reconstruct a case and judge its agents."""
-    kept: list[AgentCandidate] = []
-    original = pipeline.rate_agents
+def agents_of(case: Case, log: str) -> list[Rated]:
+    """Reconstruct a case with all candidates kept, and judge them."""
+    gathered: list[tuple[Any, Table]] = []
+    judged: list[Any] = []
 
-    def keep(candidates: Sequence[AgentCandidate], timeline: Timeline, *, lidar: bool) -> list[AgentCandidate]:
-        kept.extend(candidates)
-        return list(candidates)
+    def keep_table(candidates: Sequence[Any], recording: Any) -> Table:
+        gathered.append((list(candidates), gather(candidates, recording)))
+        return gathered[-1][1] | {"confirmed": np.ones(len(candidates))}
 
-    pipeline.rate_agents = keep
-    try:
+    def keep_candidates(*arguments: Any) -> Any:
+        judged.extend(judging.judge(*arguments))
+        return judged
+
+    with (
+        patch.object(judging, "MIN_THERE", {True: 0.0, False: 0.0}),
+        patch.object(judging, "gather", keep_table),
+        patch.object(pipeline, "judge", keep_candidates),
+    ):
         scenario = case.second().scenario
-    finally:
-        pipeline.rate_agents = original
     t_ns, lidar = case.run.schedule.t_ns, bool(case.run.log.lidars)
     timeline = Timeline(t_ns, int(t_ns[0]))
     compared, _, ego = compare_scenarios(scenario, case.truth, Selection(None, frozenset(CATEGORIES)))
-    v, out = judge_against_truth(compared, ego), []
+    v, out, ((candidates, table),) = judge_against_truth(compared, ego), [], gathered
+    tracks = [id(c.track) for c in candidates]
     for k, agent in enumerate(scenario.others):
         ticks = v.judged[k]
         if not ticks.any():
             continue
-        candidate = next(c for c in kept if c.agent.id == agent.id)
+        candidate = next(c for c in judged if c.agent.id == agent.id)
+        row = tracks.index(id(candidate.track))
         matched = ticks & (v.matched[k] >= 0)
         squared = {
-            "position": (v.error_m[k] ** 2).sum(axis=1) / 2,
-            "yaw": v.error_rad[k] ** 2,
-            "speed": v.error_mps[k] ** 2,
+            "sigma_xy_m": (v.error_m[k] ** 2).sum(axis=1) / 2,
+            "sigma_yaw_rad": v.error_rad[k] ** 2,
+            "sigma_speed_mps": v.error_mps[k] ** 2,
         }
-        errors = {
-            n: float(np.mean(e[matched & np.isfinite(e)]))
-            for n, e in squared.items()
-            if (matched & np.isfinite(e)).any()
-        }
-        evidence = evidence_of(candidate, timeline)
-        seen = seen_share(candidate, yaw_at_measurements(candidate, timeline))
-        doubted = bool(agent.doubts)
-        range_m = float(np.median(compared.other.range_m[k, ticks]))
-        out.append(
-            Rated(
-                case.name.split(" ")[0],
-                case.name,
-                lidar,
-                agent.id,
-                evidence,
-                int(ticks.sum()),
-                float(1 - v.wrong[k, ticks].mean()),
-                agent.confidence,
-                doubted,
-                range_m,
-                candidate.agent,
-                seen,
-                errors,
-            )
-        )
+        usable = {kind: e[matched & np.isfinite(e)] for kind, e in squared.items()}
+        terms = variance_terms(candidates[row], 0.0, timeline)
+        out.append(Rated(
+            log, case.name, round(1e9 / float(np.median(np.diff(t_ns)))), lidar, agent.category,
+            {name: float(column[row]) for name, column in table.items()}, int(ticks.sum()),
+            float(1 - v.measures["invented"][k, ticks].mean()), float(1 - v.wrong[k, ticks].mean()), bool(agent.doubts),
+            {kind: {name: float(t.mean()) for name, t in of.items()} for kind, of in terms.items()},
+            {kind: float(e.mean()) for kind, e in usable.items() if len(e) and kind in terms},
+        ))  # fmt: skip
     return out
 
 
-def matrix_of(agents: Sequence[Rated], names: Sequence[str] = tuple(SIGNS)) -> Array:
-    return np.array([[getattr(a.evidence, name) for name in names] for a in agents])
-
-
-def targets_of(agents: Sequence[Rated]) -> Array:
+def half_verdict(share: Array) -> Array:
     """Half the verdict on the agent, half the share of its right ticks: what reliability counts, of agents and of ticks."""
-    right = np.array([a.right for a in agents])
-    return (right + (right >= 1 - MAX_WRONG_SHARE)) / 2
+    return (share + (share >= 1 - MAX_WRONG_SHARE)) / 2
 
 
-def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> tuple[float, Array]:
-    """Find the most likely bias and weights (F,) of evidence (A, F) for agents that are right to some share (A,)."""
+def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int], known: Array) -> tuple[float, Array]:
+    """Find the most likely bias and weights (F,) of evidence (A, F) for agents that are right to some share (A,).
+
+    `known` (A,) are log-odds of which it is known how much they count.
+    """
     from scipy.optimize import minimize
 
     mean, scale = x.mean(axis=0), x.std(axis=0)
@@ -150,7 +135,7 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
     z = (x - mean) / scale
 
     def loss(w: Array) -> tuple[float, Array]:
-        odds = w[0] + z @ w[1:]
+        odds = w[0] + z @ w[1:] + known
         value = weight @ (np.logaddexp(0.0, odds) - right * odds) + (w[1:] ** 2).sum() / (2 * PRIOR_SIGMA**2)
         slope = weight * (probability_of(odds) - right)
         return float(value), np.append(slope.sum(), z.T @ slope + w[1:] / PRIOR_SIGMA**2)
@@ -161,11 +146,51 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
     return float(w[0] - (w[1:] / scale) @ mean), w[1:] / scale
 
 
-def probabilities(agents: Sequence[Rated], tables: Mapping[bool, Table]) -> Array:
-    """Rate agents (A,) by the tables of weights with and without a LiDAR."""
-    rows = [(list(tables[a.lidar].items()), {"bias": 1.0, **asdict(a.evidence)}) for a in agents]
-    odds = np.array([sum(weight * values[name] for name, weight in table) for table, values in rows])
-    return np.clip(probability_of(odds), MIN_CONFIDENCE, MAX_CONFIDENCE)
+def fit_table(
+    agents: Sequence[Rated], target: Callable[[Rated], float], weight: Callable[[Rated], float], out: Sequence[str]
+) -> Weights:
+    """Fit weights with and without a LiDAR of all columns but some; those without effect are left out, and the others fitted again."""
+    tables = {}
+    for lidar in sorted({a.lidar for a in agents}, reverse=True):
+        own = [a for a in agents if a.lidar == lidar]
+        names = [name for name in SIGNS if name not in (*out, *FIXED)]
+        fixed = {
+            name: weight for name, weight in FIXED.items() if name not in out and any(a.evidence[name] for a in own)
+        }
+        known = np.array([sum(w * a.evidence[name] for name, w in fixed.items()) for a in own], dtype=np.float64)
+        for _ in range(2):
+            x = np.array([[a.evidence[name] for name in names] for a in own])
+            # An agent of many ticks counts more, since they do in the calibration of ticks, but less than they are.
+            w = np.sqrt([a.ticks for a in own]) * [weight(a) for a in own]
+            y = half_verdict(np.array([target(a) for a in own]))
+            bias, found = fit_weights(x, y, w / w.mean(), [SIGNS[name] for name in names], known)
+            tables[lidar] = {"bias": bias, **fixed, **dict(zip(names, found.tolist()))}
+            names = [n for n, effect in zip(names, np.abs(found) * x.std(axis=0)) if effect > MIN_EFFECT]
+    return tables
+
+
+def fit_there_and_right(agents: Sequence[Rated]) -> tuple[Weights, Weights]:
+    """Fit the weights of whether something is there, and of whether an agent is right where something is."""
+    there = fit_table(agents, lambda a: a.there, lambda a: 1.0, ONLY_RIGHT)
+    right = fit_table(agents, lambda a: min(a.right / max(a.there, 1e-9), 1.0), lambda a: a.there, ONLY_THERE)
+    return there, right
+
+
+def probabilities(agents: Sequence[Rated], tables: tuple[Weights, Weights]) -> tuple[Array, Array]:
+    """Rate agents (A,): the probabilities that they are there and that they are right."""
+    there, state = (
+        probability_of([sum(w * a.evidence.get(n, 1.0) for n, w in table[a.lidar].items()) for a in agents])
+        for table in tables
+    )
+    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
+
+
+def terms_of(a: Rated, kind: str, confidence: float) -> dict[str, float]:
+    """Return the means of the terms of a variance at a confidence."""
+    return {
+        n: v * ((1 - confidence) ** 2 if n in ("wrong", "standing", "moving") else 1.0)
+        for n, v in a.terms[kind].items()
+    }
 
 
 def fit_variances(terms: Array, squared: Array, least: Array) -> Array:
@@ -186,156 +211,111 @@ def fit_variances(terms: Array, squared: Array, least: Array) -> Array:
     return np.exp(found.x) * scale
 
 
-def terms_of(kind: str, a: Rated, confidence: float) -> dict[str, float]:
-    w, size = a.candidate.waypoints, a.candidate.size_m
-    terms = {
-        "position": lambda: position_terms(w, size, a.seen, a.evidence, confidence),
-        "yaw": lambda: yaw_terms(w, confidence),
-        "speed": lambda: speed_terms(w, a.evidence, confidence),
-    }[kind]()
-    return {name: float(values.mean()) for name, values in terms.items()}
-
-
-def has_sigma(kind: str, a: Rated) -> bool:
-    w = a.candidate.waypoints
-    known = {"position": w.sigma_xy_m, "yaw": w.sigma_yaw_rad, "speed": w.sigma_speed_mps}[kind]
-    return kind in a.errors and known is not None
-
-
-def held_out(agents: Sequence[Rated]) -> tuple[Array, dict[str, tuple[Array, Array]]]:
-    """Rate each agent by weights that fit other logs: probabilities (A,), and by kind the rows and variances."""
-    logs = np.unique([a.log for a in agents], return_inverse=True)[1]
-    p, variances = np.zeros(len(agents)), {kind: ([], []) for kind in ("position", "yaw", "speed")}
-    for fold in range(FOLDS):
-        rest = [a for a, log in zip(agents, logs) if log % FOLDS != fold]
-        rows = np.flatnonzero(logs % FOLDS == fold)
-        tables, by_kind = fit_all(rest)
-        p[rows] = probabilities([agents[k] for k in rows], tables)
-        for kind, found in by_kind.items():
-            for k in rows:
-                if has_sigma(kind, agents[k]):
-                    terms = terms_of(kind, agents[k], p[k])
-                    variances[kind][0].append(k)
-                    variances[kind][1].append(sum(found[name] * value for name, value in terms.items()))
-    return p, {kind: (np.array(rows, dtype=int), np.array(v)) for kind, (rows, v) in variances.items()}
-
-
-def fit_all(agents: Sequence[Rated]) -> tuple[dict[bool, Table], dict[str, Table]]:
-    """Fit the weights of evidence with and without a LiDAR, and by kind of error those of the terms of its variance."""
-    tables = {}
-    for lidar in {a.lidar for a in agents}:
-        own = [a for a in agents if a.lidar == lidar]
-        x = matrix_of(own)
-        names = [name for name, used in zip(SIGNS, np.ptp(x, axis=0) > 0) if used]
-        # An agent of many ticks counts more, since they do in the calibration of ticks, but less than they are.
-        ticks = np.sqrt([a.ticks for a in own])
-        signs = [SIGNS[name] for name in names]
-        bias, weights = fit_weights(matrix_of(own, names), targets_of(own), ticks / ticks.mean(), signs)
-        tables[lidar] = {**dict(zip(names, weights.tolist())), "bias": bias}
-    p = probabilities(agents, tables)
+def fit_all_variances(agents: Sequence[Rated], p: Array) -> dict[str, dict[str, float]]:
+    """Fit the weights of the terms of variances by kind of error."""
     by_kind = {}
-    for kind in ("position", "yaw", "speed"):
-        rows = [(a, float(c)) for a, c in zip(agents, p) if has_sigma(kind, a)]
-        if not rows:
-            continue
-        names = list(terms_of(kind, *rows[0]))
-        terms = np.array([list(terms_of(kind, a, c).values()) for a, c in rows])
+    for kind in ("sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"):
+        rows = [(terms_of(a, kind, float(c)), a.errors[kind]) for a, c in zip(agents, p) if kind in a.errors]
+        names = list(rows[0][0])
         least = np.array([MIN_GIVEN_WEIGHT if name == "given" else MIN_WEIGHT for name in names])
-        found = fit_variances(terms, np.array([a.errors[kind] for a, _ in rows]) + 1e-8, least)
+        terms = np.array([list(terms.values()) for terms, _ in rows])
+        found = fit_variances(terms, np.array([e for _, e in rows]) + 1e-8, least)
         by_kind[kind] = dict(zip(names, found.tolist()))
-    return tables, by_kind
+    return by_kind
 
 
 def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def say_confidence(title: str, p: Array, agents: Sequence[Rated]) -> None:
-    """Print reliability and what is doubted: by a probability below one half, or by a doubt."""
-    if not agents:
-        return
-    ticks, right = np.array([a.ticks for a in agents]), np.array([a.right for a in agents])
-    doubted = (p < 0.5) | np.array([a.doubted for a in agents])
-    of_agents = reliability(p, right >= 1 - MAX_WRONG_SHARE)
-    tick_rows = np.repeat(np.arange(len(p)), ticks)
-    rights = np.concatenate([np.arange(n) < round(r * n) for n, r in zip(ticks, right)])
-    of_ticks = reliability(p[tick_rows], rights)
+def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
+    """Print what is kept, and of this reliability and what is doubted: by a probability below one half, or by a doubt."""
+    kept = np.array([bool(a.evidence["confirmed"]) and p >= MIN_THERE[a.lidar] for a, p in zip(agents, there)])
+    ticks, exists = np.array([a.ticks for a in agents]), np.array([a.there for a in agents])
+    recall = (ticks * exists)[kept].sum() / max((ticks * exists).sum(), 1)
+    invented = (ticks * (1 - exists))[kept].sum() / max(ticks[kept].sum(), 1)
+    of = [a for a, keep in zip(agents, kept) if keep]
+    if not of:
+        return say(f"{title}: none of {len(agents)} kept")
+    right, p, ticks = np.array([a.right for a in of]), p[kept], ticks[kept]
+    doubted = (p < 0.5) | [a.doubted for a in of]
+    error = reliability(p, right >= 1 - MAX_WRONG_SHARE)["expected_calibration_error"]
     wrong, good = ticks * (1 - right), ticks * right
     say(
-        f"{title}: {len(agents)} agents, {wrong.sum() / ticks.sum():.3f} of {ticks.sum()} ticks wrong; expected calibration error "
-        f"{of_ticks['expected_calibration_error']:.3f} of ticks, {of_agents['expected_calibration_error']:.3f} of agents; doubted "
-        f"{wrong[doubted].sum() / max(wrong.sum(), 1):.2f} of wrong, {good[doubted].sum() / max(good.sum(), 1):.3f} of right ticks"
+        f"{title}: {len(of)} of {len(agents)} kept, {recall:.2f} of what is there, {invented:.3f} of these ticks invented, "
+        f"{wrong.sum() / ticks.sum():.3f} wrong; doubted {wrong[doubted].sum() / max(wrong.sum(), 1):.2f} of wrong, "
+        f"{good[doubted].sum() / max(good.sum(), 1):.3f} of right ticks; calibration error of agents {error:.3f}"
     )
-    say("   " + " ".join(f"{b['low']:.1f}: {b['right']:.2f} ({b['count']})" for b in of_agents["bins"] if b["count"]))
 
 
-def say_sigma(kind: str, rows: NDArray[Any], variance: Array, agents: Sequence[Rated]) -> None:
-    """Print squared errors over variances by range, before and after."""
-    if not len(rows):
-        return
-    chosen = [agents[k] for k in rows]
-    squared = np.array([a.errors[kind] for a in chosen])
-    before = np.array([max(terms_of(kind, a, 1.0)["given"], 1e-9) for a in chosen])
-    ranges, ticks = np.array([a.range_m for a in chosen]), np.array([a.ticks for a in chosen])
-    for low, high in ((0, np.inf), *RANGES_M):
-        k = (ranges >= low) & (ranges < high)
-        if k.any():
-            was, now = (np.average(squared[k] / v[k], weights=ticks[k]) for v in (before, variance))
-            middle = [float(np.median(squared[k] / v[k])) for v in (before, variance)]
-            say(
-                f"   {kind} {low:g}-{high:g} m, {k.sum()} agents: NEES {was:.2f} -> {now:.2f}, median {middle[0]:.2f} -> {middle[1]:.2f}"
-            )
+def report(agents: Sequence[Rated]) -> None:
+    """Print tables of agents rated by what fits other logs, and other kinds of content."""
+    logs = np.unique([a.log for a in agents], return_inverse=True)[1] % FOLDS
+    kinds = np.array(
+        [f"{a.case.split('-')[0]}, {a.case.split('(')[-1].rstrip(')').split(',')[0]}, {a.hz:.0f} Hz" for a in agents]
+    )
+    for title, group in (("other logs", logs), ("other kinds of content", kinds)):
+        there, p, variance = np.zeros(len(agents)), np.zeros(len(agents)), {}
+        for fold in np.unique(group):
+            rows = np.flatnonzero(group == fold)
+            rest = [a for a, g in zip(agents, group) if g != fold]
+            tables = fit_there_and_right(rest)
+            there[rows], p[rows] = probabilities([agents[k] for k in rows], tables)
+            weights = fit_all_variances(rest, probabilities(rest, tables)[1])
+            for kind, found in weights.items():
+                for k in (k for k in rows if kind in agents[k].errors):
+                    variance[k, kind] = sum(found[n] * v for n, v in terms_of(agents[k], kind, p[k]).items())
+        sets: dict[str, NDArray[np.bool_]] = {"all": np.ones(len(agents), dtype=bool)}
+        sets |= {"LiDAR": np.array([a.lidar for a in agents]), "no LiDAR": np.array([not a.lidar for a in agents])}
+        for of in ("vehicle", "two_wheeler", "pedestrian"):
+            sets[f"{of}, LiDAR"] = np.array([a.lidar and GROUP_OF[a.category] == of for a in agents])
+        if title == "other kinds of content":
+            sets |= {str(kind): kinds == kind for kind in np.unique(kinds)}
+        for name, rows in sets.items():
+            say_rated(f"{title}, {name}", [a for a, use in zip(agents, rows) if use], there[rows], p[rows])
+        for kind in ("sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"):
+            ratio = [
+                a.errors[kind] / variance[k, kind]
+                for k, a in enumerate(agents)
+                if kind in a.errors and there[k] >= MIN_THERE[a.lidar]
+            ]
+            say(f"{title}, {kind}: NEES {np.mean(ratio):.2f}, median {np.median(ratio):.2f}")
 
 
 def module_text(command: str, agents: Sequence[Rated]) -> str:
-    counts = [sum(a.lidar == lidar for a in agents) for lidar in (True, False)]
-    found, by_kind = fit_all(agents)
+    there, right = fit_there_and_right(agents)
+    variances = fit_all_variances(agents, probabilities(agents, (there, right))[1])
+    logs = len({a.log for a in agents})
     lines = [
-        '"""Weights of the evidence (`evidence.Evidence`) and of systematic errors (`systematic`).',
+        '"""Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.',
         "",
-        f"Printed by `{command}`: {counts[0]} agents with a LiDAR and",
-        f"{counts[1]} without, of {len({a.log for a in agents})} synthetic logs.",
+        f"Printed by `{command}`: {len(agents)} candidates of {logs} simulated logs.",
+        "`THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right",
+        "where something is; `VARIANCES` weigh the terms of variances.",
         '"""',
         "",
-        "from __future__ import annotations",
-        "",
     ]
-    tables = {"WITH_LIDAR": found.get(True, {}), "WITHOUT_LIDAR": found.get(False, {})}
-    tables |= {f"{kind.upper()}_VARIANCE": by_kind.get(kind, {}) for kind in ("position", "yaw", "speed")}
-    for name, table in tables.items():
-        lines += [f"{name} = {{", *(f'    "{key}": {float(f"{value:.4g}")},' for key, value in table.items()), "}"]
-    return "\n".join(lines)
+    for name, table in (("THERE", there), ("RIGHT", right), ("VARIANCES", variances)):
+        lines.append(f"{name} = {{")
+        for key, weights in table.items():
+            lines += [
+                f"    {key!r}: {{",
+                *(f"        {n!r}: {float(f'{w:.3g}')}," for n, w in weights.items()),
+                "    },",
+            ]
+        lines.append("}")
+    return "\n".join(lines).replace("'", '"')
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = parser_of(__doc__)
-    parser.add_argument("folder", type=Path, help="of confidence_logs.py")
+    parser.add_argument("folders", type=Path, nargs="+", help="of confidence_logs.py")
     options = parser.parse_args(arguments)
     agents: list[Rated] = []
-    for path in sorted(options.folder.glob("*.pkl")):
-        for case in pickle.loads(path.read_bytes()):
-            found = [replace(agent, log=path.stem) for agent in agents_of(case)]
-            agents += found
-            say(f"{case.name}: {len(found)} agents")
+    paths = [path for folder in options.folders for path in sorted(folder.glob("*.pkl"))]
+    for path in paths:
+        agents += [agent for case in pickle.loads(path.read_bytes()) for agent in agents_of(case, path.stem)]
+        say(f"{path.stem}: {len(agents)} candidates")
     report(agents)
-    seeds = ", ".join(sorted({path.stem.split("-")[0] for path in options.folder.glob("*.pkl")}))
-    command = f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --seed {seeds}"
-    print(module_text(command, agents))
-
-
-def report(agents: Sequence[Rated]) -> None:
-    """Print tables of agents rated by what fits other logs."""
-    p, variances = held_out(agents)
-    say_confidence("before", np.array([a.before for a in agents]), agents)
-    say_confidence("held out", p, agents)
-    kinds = {
-        "sweeps": lambda a: a.evidence.sweep != 0,
-        "images and points": lambda a: a.evidence.sweep == 0 and a.evidence.blind < 0.5,
-        "images": lambda a: a.evidence.blind >= 0.5 and a.lidar,
-        "no LiDAR": lambda a: not a.lidar,
-    }
-    for title, chosen in kinds.items():
-        rows = [k for k, a in enumerate(agents) if chosen(a)]
-        say_confidence(f"held out, {title}", p[rows], [agents[k] for k in rows])
-    for kind, (rows, variance) in variances.items():
-        say_sigma(kind, rows, variance, agents)
+    seeds = ", ".join(sorted({path.stem.split("-")[0] for path in paths}))
+    print(module_text(f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --seed {seeds}", agents))
