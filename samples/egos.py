@@ -7,7 +7,7 @@
     log2sim replay blocked.json --ego samples/egos.py:BrakeForPoints --log samples/crossing --recorded scenario.json --out seen.json
 
 In the scenario of samples/crossing the first line puts a parked car into the lane of the ego. `BrakeLate` hits it, `BrakeInTime`
-stops behind it, and so does `BrakeForPoints`, which knows of no agent: it sees points of the LiDAR.
+stops behind it. `BrakeForPoints` knows of no agent: it brakes for the points that the LiDAR would see.
 
 A policy is called once a step with an `Observation` and answers with `Controls`. These drivers take all they need from what
 they see, so they drive any scenario that has an ego.

@@ -30,7 +30,7 @@ TRUTH_FILE = "truth.json"
 SAME_PATH_M, SAME_YAW_RAD = 0.02, np.deg2rad(0.2)
 # Farther off its recorded path the ego sees mostly what nothing was recorded of.
 MAX_OFF_PATH_M = 6.0
-# At 3 m beside it pictures of `samples/crossing.toml` have lost 8 dB of the 31 dB that they have on it, and 8 % of them is made up.
+# At 3 m beside it pictures of `samples/crossing.toml` have lost 8 dB of those at half a meter, and 13 % of them is made up.
 MAX_PICTURES_OFF_M = 3.0
 MASKS = (
     "masks"  # folder of a log: by camera a mask for each picture, white where no recorded picture shows what is there
