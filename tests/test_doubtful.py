@@ -97,7 +97,7 @@ def test_doubts_move_in_time_with_their_agent() -> None:
     assert (fast.doubts[0].start_s, fast.doubts[0].end_s) == (3.0, 4.0)  # from its first waypoint on
 
 
-@pytest.mark.parametrize("to", [f for f in formats() if f not in ("mcap", "osi", "rerun")])
+@pytest.mark.parametrize("to", [f for f in formats() if f not in ("lanelet2", "mcap", "osi", "rerun")])
 def test_an_export_keeps_or_drops_them_and_says_how_many(to: str, tmp_path: Path) -> None:
     doubted().save(tmp_path / "s.json")
 

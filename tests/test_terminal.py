@@ -47,7 +47,7 @@ def test_names_in_a_log_do_not_steer_the_terminal(tmp_path: Path) -> None:
         ("log2sim rec", ["reconstruct"]),
         ("log2sim replay s.json --mode p", ["pid"]),
         ("log2sim reconstruct LOG --detector lidar:v", ["lidar:vehicle"]),
-        ("log2sim export s.json --to open", ["openscenario"]),
+        ("log2sim export s.json --to opens", ["openscenario"]),
     ],
 )
 def test_bash_completes(words: str, expected: list[str]) -> None:
