@@ -9,6 +9,7 @@ THERE = {
     True: {
         "bias": 2.66,
         "weak_sweep": 1.0,
+        "missing": -1.0,
         "sweep": 0.276,
         "image": 0.219,
         "no_image": -0.193,

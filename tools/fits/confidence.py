@@ -46,8 +46,9 @@ PRIOR_SIGMA, MIN_EFFECT = 0.5, 0.05
 # of the standard deviation: it alone knows gaps, ends and turns.
 MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
 # Recorded logs have more that looks a little like a road user than simulated ones, so that a score that speaks against an object
-# counts in full, as the calibrated probability that it is.
-FIXED = {"weak_sweep": 1.0}
+# counts in full, as the calibrated probability that it is. So does what images that show its place do not show, which is a ratio
+# of likelihoods already: the simulated detector of images misses more than real ones do.
+FIXED = {"weak_sweep": 1.0, "missing": -1.0}
 # Columns that say nothing of whether something is there, and those that say nothing of whether it is right where it is.
 ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_sweep", "no_image", "travel", "missing", "pointless", "nearer", "image", "sweep", "weak_sweep", "few")  # fmt: skip
 
