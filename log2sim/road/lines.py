@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from log2sim.geometry import Array
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.paint import Pieces, log_odds_of_line
+from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, Trace, fit_curve, stretches_of, trace
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
@@ -238,7 +239,14 @@ MIN_LINE_M = 1.0
 # Contrast of yellowness: paint is 0.5 to 1.2 in daylight, gray and white are below 0.1.
 MIN_YELLOW = 0.2
 REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
+# Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
+BESIDE_M, MAX_BESIDE, CROWDED = (0.45, 1.7), 1, -5.0
+BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
+MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
+# Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
+REMNANT_SHARE, REMNANT = 0.65, -6.0
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
+PARALLEL_RAD = np.deg2rad(15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +311,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             line = _line_of(curve, own, stretch, traced)
             if line is not None:
                 out.append(line)
-    return drop_repeats(out)
+    return _in_context(drop_repeats(out))
 
 
 def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch, traced: Trace) -> PaintedLine | None:
@@ -344,3 +352,61 @@ def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
 def _dense(xy: Array) -> Array:
     curve = Curve(xy)
     return curve.at(np.arange(0, curve.s[-1] + 0.05, 0.1))
+
+
+def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
+    """Lower the log-odds of lines that form combs or grids, or run beside much brighter ones."""
+    if len(lines) < 2:
+        return lines
+    dense = [_dense(line.xy)[::5] for line in lines]
+    owner = np.repeat(np.arange(len(lines)), [len(d) for d in dense])
+    points = np.concatenate(dense)
+    heading = np.concatenate([_headings(d) for d in dense])
+    pairs = cKDTree(points).query_pairs(BESIDE_M[1], output_type="ndarray")
+    a, b = np.concatenate([pairs, pairs[:, ::-1]]).T
+    a, b = a[owner[a] != owner[b]], b[owner[a] != owner[b]]
+    turn = np.abs((heading[a] - heading[b] + np.pi / 2) % np.pi - np.pi / 2)
+    offset = points[b] - points[a]
+    distance = np.abs(offset[:, 1] * np.cos(heading[a]) - offset[:, 0] * np.sin(heading[a]))
+    parallel = (turn < PARALLEL_RAD) & (distance > BESIDE_M[0])
+    crossing = (turn > np.pi / 4) & (np.linalg.norm(offset, axis=1) < 0.5)
+    length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
+    contrast = np.array([float(np.median(np.nan_to_num(line.pieces.color))) for line in lines])
+    # Pairs of lines, not a table of all: a long log has thousands.
+    i, j, count = _counted(owner[a[parallel]], owner[b[parallel]])
+    beside = count > BESIDE_PER_M * length[i]
+    i, j = i[beside], j[beside]
+    crowded = np.bincount(i[_alike(lines, contrast, i, j)], minlength=len(lines)) > MAX_BESIDE
+    added = np.where(crowded, CROWDED, 0.0)
+    # Combs do not tell against what they cross, unless that is a comb, too.
+    k, other, _ = _counted(owner[a[crossing]], owner[b[crossing]])
+    told = _alike(lines, contrast, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
+    crossings = np.bincount(k[told], minlength=len(lines))
+    added += np.where((crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length), CROWDED, 0.0)
+    brighter = odds[j] > odds[i] - 1
+    brightest = np.full(len(lines), -np.inf)
+    np.maximum.at(brightest, i[brighter], contrast[j[brighter]])
+    added += np.where(np.isfinite(brightest) & (contrast < REMNANT_SHARE * brightest), REMNANT, 0.0)
+    return [replace(line, log_odds=line.log_odds + more) for line, more in zip(lines, added.tolist())]
+
+
+def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
+    """Return each pair of numbers (P,), (P,) once, and how often (P,) it is there."""
+    most = int(second.max(initial=0)) + 1
+    pair, count = np.unique(first * most + second, return_counts=True)
+    return pair // most, pair % most, count
+
+
+def _alike(lines: list[PaintedLine], contrast: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
+    """Mask (P,) of pairs of lines that look alike, and the other as likely as the one: what combs and grids are made of."""
+    width, odds = np.array([line.width_m for line in lines]), np.array([line.log_odds for line in lines])
+    same = np.maximum(width[one], width[other]) <= 2 * np.minimum(width[one], width[other])
+    same &= np.maximum(contrast[one], contrast[other]) <= 2 * np.minimum(contrast[one], contrast[other])
+    return np.asarray(same & (odds[other] > odds[one] - 2))
+
+
+def _headings(points: Array) -> Array:
+    if len(points) < 2:
+        return np.zeros(len(points))
+    d = np.gradient(points, axis=0)
+    return np.asarray(np.arctan2(d[:, 1], d[:, 0]) % np.pi)
