@@ -168,7 +168,7 @@ def test_a_policy_sees_others_as_late_and_as_far_off_as_its_sensors_are(folder) 
     from dataclasses import replace as changed
 
     from log2sim.simulation.runner import replay
-    from log2sim.simulation.sensing import LateEyes, Sensing
+    from log2sim.simulation.sensing import DelayedPolicy, Sensing
 
     index = open_index(folder, jobs=1)
     world = Scenario.load(index.folder / ask(index, "cut_in").rows[0]["file"])
@@ -182,7 +182,7 @@ def test_a_policy_sees_others_as_late_and_as_far_off_as_its_sensors_are(folder) 
         seen.append((o.t_s, places(o)))
         return Controls(0.0, 0.0)
 
-    class Spy(LateEyes):
+    class Spy(DelayedPolicy):
         def __call__(self, o):
             exact[round(o.t_s, 3)] = places(o)
             return super().__call__(o)

@@ -1,8 +1,9 @@
 """Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.
 
 Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --seed 11`: 2081 candidates of 60 simulated logs.
-`THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right
-where something is; `VARIANCES` weigh the terms of variances.
+They were fitted before the network of the vehicle was trained on; `weak_sweep` and `missing` are set, see `FIXED` there.
+`THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right where something is;
+`VARIANCES` weigh the terms of variances.
 """
 
 THERE = {

@@ -73,14 +73,14 @@ def run_test(
     from log2sim.scenarios.logical import Base, choose_base, fit
     from log2sim.scenarios.query import ask
     from log2sim.simulation.policy import load_policy
-    from log2sim.simulation.sensing import LateEyes, parse_sensing
+    from log2sim.simulation.sensing import DelayedPolicy, parse_sensing
     from log2sim.visualization.page.writer import write_page
 
     refuse_folder(out, overwrite=overwrite, holding="test.json", kind="folder of a test")
     limits, driver = parse_limits(limit or ()), load_policy(policy)
     sensing = parse_sensing(latency, noise)
     if sensing:
-        driver = LateEyes(driver, sensing)
+        driver = DelayedPolicy(driver, sensing)
     index = open_index(path)
     rows = ask(index, condition).rows
     logical = fit(rows)

@@ -66,7 +66,7 @@ CAM_T_LEVEL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, y le
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class DepthMap:
     """What a picture shows at its nodes, h rows and w columns, `step` pixels apart from the first pixel on.
 
     Attributes
@@ -114,7 +114,7 @@ def nodes_of(camera: Camera) -> tuple[int, Array]:
     return step, np.stack([u, v], -1)
 
 
-def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfels], name: str, t_ns: int) -> Seen:
+def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfels], name: str, t_ns: int) -> DepthMap:
     """Cast rays through the nodes of a camera, where it is in a log at a stamp, among the agents of a scenario."""
     camera = log.cameras[name]
     step, uv = nodes_of(camera)
@@ -169,7 +169,7 @@ def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfel
         ground = (np.abs(own[:, :2]) < half[:2] + SHADOW_M).all(axis=1) & (np.abs(own[:, 2] + half[2]) < 0.3)
         flat[(flat == 0) & ground] = k + 1
         local[flat == k + 1] = own[flat == k + 1]
-    return Seen(step, owner, depth, met, local.reshape(*shape, 3), beside.reshape(shape), placed.ids)
+    return DepthMap(step, owner, depth, met, local.reshape(*shape, 3), beside.reshape(shape), placed.ids)
 
 
 def pose_of(scenario: Scenario, id: str, t_ns: int) -> Array:
@@ -243,7 +243,7 @@ class Pictures:
         self.image = lru_cache(maxsize=16)(self._image)
         self.gain = lru_cache(maxsize=4096)(self._gain)
 
-    def _seen(self, frame: int) -> Seen:
+    def _seen(self, frame: int) -> DepthMap:
         name, _, t_ns = self.frames[frame]
         return look(self.world, self.log, self.source, self.world.agents, name, t_ns)
 
@@ -389,7 +389,7 @@ class Pictures:
         return image, unknown
 
     def _composed(
-        self, camera: Camera, seen: Seen, source: NDArray[np.int64], flow: NDArray[np.float32], reference: int
+        self, camera: Camera, seen: DepthMap, source: NDArray[np.int64], flow: NDArray[np.float32], reference: int
     ) -> tuple[Image, NDArray[np.bool_]]:
         """Put together the pixels that nodes (h, w) take from recorded pictures, by how far they moved (h, w, 2), px."""
         v, u = (np.arange(n, dtype=np.float32) for n in (camera.height_px, camera.width_px))
@@ -446,7 +446,7 @@ def _filled(image: Image, unknown: NDArray[np.bool_], step: int) -> Image:
 
 
 def _draw(
-    image: Image, camera: Camera, map_T_cam: Array, seen: Seen, agents: list[tuple[Agent, Array]]
+    image: Image, camera: Camera, map_T_cam: Array, seen: DepthMap, agents: list[tuple[Agent, Array]]
 ) -> tuple[Image, NDArray[np.bool_]]:
     """Draw agents of which there is no picture with the bodies of `synth`, as bright as the ground is in the picture."""
     bodies = []

@@ -151,9 +151,6 @@ def _join(values: Array, sigma: Array) -> tuple[Array, float]:
     return mean, sigma_mean * max(1.0, chi_squared**0.5)
 
 
-Bool = NDArray[np.bool_]
-
-
 @dataclass(frozen=True)
 class Block:
     """A block of a vehicle and the weights of its sides."""

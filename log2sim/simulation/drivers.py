@@ -7,7 +7,7 @@ drawn anew for each rollout, so that rollouts are samples of what may happen.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 from log2sim.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
 from log2sim.prediction.prediction import ACCELERATION_S, MOVING
 from log2sim.road.polyline import Polyline
-from log2sim.simulation.metrics.realism import Motions
+from log2sim.simulation.metrics.realism import Motions, sizes_of
 from log2sim.simulation.reactive import EXPONENT, IdmParameters, idm_parameters, leader_demand
 from log2sim.simulation.vehicles.parameters import WHEELED
 
@@ -34,7 +34,7 @@ HISTORY_S = 1.0
 POINTS = 161
 """Of the path of each agent, evenly spaced."""
 
-LOOKS = 24
+LOOKAHEAD = 24
 """Places ahead on its path at which a driver looks for others."""
 
 CHORD_M = 2.0
@@ -63,7 +63,7 @@ class Present:
         Along the course.
     moves : (A,) bool
         False for those that are static.
-    shake : (3, A) float64
+    jitter : (3, A) float64
         What the log jitters by along, across, in m, and in heading, in rad: one standard deviation.
     """
 
@@ -75,17 +75,21 @@ class Present:
     accel_mps2: Array
     turn_radps: Array
     moves: Mask
-    shake: Array
+    jitter: Array
 
     @property
     def size_m(self) -> Array:
         """Length and width (A, 2)."""
-        return np.array([a.size_m[:2] for a in self.agents], dtype=np.float64).reshape(-1, 2)
+        return sizes_of(self.agents)
 
     @property
     def group(self) -> NDArray[np.str_]:
         """Groups of categories (A,)."""
-        return np.array([GROUP_OF.get(a.category, "other") for a in self.agents], dtype="<U16")
+        return _groups_of(self.agents)
+
+
+def _groups_of(agents: Sequence[Agent]) -> NDArray[np.str_]:
+    return np.array([GROUP_OF.get(a.category, "other") for a in agents], dtype="<U16")
 
 
 def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]:
@@ -146,7 +150,7 @@ def observe(scenario: Scenario, now_s: float) -> Present:
     slow = np.abs(velocity) < 2 * STANDSTILL_MPS
     course = np.where(wheeled | slow, np.where(wheeled & (forward < -0.5), yaw + np.pi, yaw), np.angle(velocity))
     speed = np.where(wheeled, np.abs(forward), np.abs(velocity))
-    accel, shake = np.zeros(len(known)), np.full((3, len(known)), np.nan)
+    accel, jitter = np.zeros(len(known)), np.full((3, len(known)), np.nan)
     for k in np.flatnonzero([not a.static for a in known]).tolist():
         there = np.flatnonzero(table.present[k] & (table.piece[k] == table.piece[k, last[k]]))
         if len(there) < 7:
@@ -156,12 +160,12 @@ def observe(scenario: Scenario, now_s: float) -> Present:
         fits = [np.polyfit(t, c, 2) for c in (way.real, way.imag)]
         accel[k] = 2 * fits[0][0]
         rest = [c - np.polyval(fit, t) for c, fit in zip((way.real, way.imag), fits)]
-        shake[:, k] = [_jitter(c) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
-    group = np.array([GROUP_OF.get(a.category, "other") for a in known], dtype="<U16")
+        jitter[:, k] = [_jitter(c) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
+    group = _groups_of(known)
     return Present(
         tuple(known), place, wrap_angle(course), yaw, np.where(slow, 0.0, speed), np.clip(accel, -4.0, 3.0),
         np.where(slow, 0.0, smooth.turn_radps[row, last]), np.array([not a.static for a in known], dtype=bool),
-        np.stack([_shrunk(c, group) for c in shake]),
+        np.stack([_drawn_to_group(c, group) for c in jitter]),
     )  # fmt: skip
 
 
@@ -170,7 +174,7 @@ def _jitter(values: Array) -> float:
     return float(np.median(np.abs(values[4:] - 2 * values[2:-2] + values[:-4])) * NORMAL_PER_MEDIAN / np.sqrt(6.0))
 
 
-def _shrunk(own: Array, group: NDArray[np.str_]) -> Array:
+def _drawn_to_group(own: Array, group: NDArray[np.str_]) -> Array:
     """Return variances' roots (A,) drawn halfway to those of the group, which stand in where nothing is known; 0 without either."""
     out = np.zeros(len(own))
     for name in np.unique(group):
@@ -246,10 +250,10 @@ FREE_MPS = {"vehicle": 8.0, "two_wheeler": 4.5, "pedestrian": 1.3, "other": 5.0}
 START_PER_S = {"vehicle": 0.06, "two_wheeler": 0.06, "pedestrian": 0.1, "other": 0.02}
 """How often those who stand set off by themselves."""
 
-WIND = {"vehicle": 0.5, "two_wheeler": 0.7, "pedestrian": 0.3, "other": 0.7}
-"""Median of a driver's lateral acceleration without lanes, as a share of what is usual; it is spread by a factor of `WIND_SPREAD`."""
+LATERAL_SHARE = {"vehicle": 0.5, "two_wheeler": 0.7, "pedestrian": 0.3, "other": 0.7}
+"""Median of a driver's lateral acceleration without lanes, as a share of what is usual; it is spread by a factor of `LATERAL_SPREAD`."""
 
-WIND_SPREAD, HASTE_SPREAD, EAGER_SPREAD, SHAKE_SPREAD = 2.0, 1.12, 1.5, 2.0
+LATERAL_SPREAD, SPEED_SPREAD, ACCELERATION_SPREAD, JITTER_SPREAD = 2.0, 1.12, 1.5, 2.0
 """Factors of one standard deviation, of lateral acceleration, desired speed and acceleration noise of drivers, and of the log's jitter."""
 
 WANDER_M, WANDER_AFTER_M = 0.15, 30.0
@@ -316,10 +320,10 @@ class Crowd:
         free = np.array([FREE_MPS[g] for g in self.group])
         # Who drives slowly speeds up, to a speed between its own and that usual without others.
         more = self.rng.random(shape) * np.maximum(free - speed, 0.0) * noisy
-        self.desired = np.where(self.waits, free, np.maximum(speed + more, 0.5)) * self._spread(HASTE_SPREAD, shape)
+        self.desired = np.where(self.waits, free, np.maximum(speed + more, 0.5)) * self._spread(SPEED_SPREAD, shape)
         self.noise = np.broadcast_to(present.accel_mps2[self.rows] * noisy, shape).copy()
         usual = np.array([MOVING[g].along_mps2 for g in self.group])
-        self.sigma = usual * self._spread(EAGER_SPREAD, shape)
+        self.sigma = usual * self._spread(ACCELERATION_SPREAD, shape)
         self.way = np.zeros(shape)
         self.shift = np.zeros(shape)  # beside the path, after changes of lane
         self.change = np.full((3, *shape), np.nan)  # tick, from, to
@@ -419,8 +423,8 @@ class Crowd:
         speed = np.maximum(now.speed_mps[rows], np.where(walks, 1.0, 3.0))
         lasts = speed * ACCELERATION_S
         kept = np.exp(-self.step_m / lasts)
-        usual = np.array([MOVING[g].across_mps2 * WIND[g] for g in self.group]) / speed**2
-        sigma = usual * self._spread(WIND_SPREAD, (tried, *shape)) * self.noisy
+        usual = np.array([MOVING[g].across_mps2 * LATERAL_SHARE[g] for g in self.group]) / speed**2
+        sigma = usual * self._spread(LATERAL_SPREAD, (tried, *shape)) * self.noisy
         if self.noisy:
             sigma = sigma[..., self.companion]
         start = np.divide(now.turn_radps[rows], speed)
@@ -599,15 +603,15 @@ class Crowd:
         """Simulate and return places and headings (R, A, T)."""
         places, yaws = (np.empty((*self.place.shape, ticks), dtype=c.dtype) for c in (self.place, self.yaw))
         wanted, shape = np.zeros(self.speed.shape), (self.count, len(self.rows), ticks)
-        more = self._spread(SHAKE_SPREAD, (*shape[:2], 1))
-        jitter = self.rng.standard_normal((3, *shape)) * self.now.shake[:, None, self.rows, None] * more
+        more = self._spread(JITTER_SPREAD, (*shape[:2], 1))
+        jitter = self.rng.standard_normal((3, *shape)) * self.now.jitter[:, None, self.rows, None] * more
         for n in range(ticks):
             if n % 2 == 0:  # drivers look twice in 0.4 s
                 wanted = self._accelerations()
                 if self.noisy and n % 10 == 0:
                     self._change_lanes(n)
             self._advance(wanted, n)
-            places[..., n], yaws[..., n] = self._shaken(jitter[..., n]) if self.noisy else (self.place, self.yaw)
+            places[..., n], yaws[..., n] = self._jittered(jitter[..., n]) if self.noisy else (self.place, self.yaw)
         return places, wrap_angle(yaws)
 
     def _at(self, way: Array) -> tuple[Complex, Complex]:
@@ -679,7 +683,7 @@ class Crowd:
         i, j = self._near_pairs(reach)
         if not len(i):
             return taken, leads, gaps
-        ahead = reach[..., None] * (np.arange(LOOKS) + 0.5) / LOOKS
+        ahead = reach[..., None] * (np.arange(LOOKAHEAD) + 0.5) / LOOKAHEAD
         at, direction = self._at(self.way[..., None] + ahead)
         velocity = self._velocity()
         half_i, half_j = self.size_m[self.rows[i]] / 2, self.size_m[j] / 2
@@ -689,7 +693,7 @@ class Crowd:
         long = half_j[:, 0, None] * cos + half_j[:, 1, None] * sin
         wide = half_j[:, 0, None] * sin + half_j[:, 1, None] * cos
         met = (np.abs(away.imag) < wide + half_i[:, 1, None] + SIDE_M) & (
-            np.abs(away.real) < long + reach[:, i, None] / LOOKS / 2
+            np.abs(away.real) < long + reach[:, i, None] / LOOKAHEAD / 2
         )
         met &= ahead[:, i] + away.real > 0
         first = met.argmax(axis=2)[..., None]
@@ -723,7 +727,7 @@ class Crowd:
         # People brush past each other and walk shoulder to shoulder: their boxes overlap in logs, too.
         return away, hit & ~((self.group[i] == "pedestrian") & (self.now.group[j] == "pedestrian"))
 
-    def _shaken(self, jitter: Array) -> tuple[Complex, Array]:
+    def _jittered(self, jitter: Array) -> tuple[Complex, Array]:
         """Return places and headings (R, A) as labels have them, off by jitter (3, R, M), but where boxes would overlap by it."""
         place, yaw = self.place.copy(), self.yaw.copy()
         place[:, self.rows] += (jitter[0] + 1j * jitter[1]) * np.exp(1j * yaw[:, self.rows])

@@ -12,7 +12,7 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.simulation.policy import Controls, Observation, Others, Policy, query_policy, reset_policy
 
-LASTS_S = 0.5
+CORRELATION_S = 0.5
 """For how long an error of a place lasts: trackers average over some sweeps."""
 
 
@@ -25,7 +25,7 @@ class Sensing:
     latency_s, latency_sigma_s : float, s
         Of each observation, normal and never negative; what comes late is passed over where a newer one is there already.
     noise_m : float, m
-        Standard deviation of the places of others on both axes, correlated over `LASTS_S`.
+        Standard deviation of the places of others on both axes, correlated over `CORRELATION_S`.
     """
 
     latency_s: float = 0.0
@@ -48,7 +48,7 @@ def parse_sensing(latency: str, noise_m: float) -> Sensing:
     return Sensing(values[0], values[1] if len(values) > 1 else 0.0, noise_m)
 
 
-class LateEyes:
+class DelayedPolicy:
     """A policy behind sensors; the same scenario has the same errors.
 
     What the policy knows of the ego, its route and its path is exact and current. `observation.sweep` is not delayed.
@@ -91,7 +91,7 @@ class LateEyes:
         others = observation.others
         if not (self.sensing.noise_m and len(others)):
             return others
-        kept = float(np.exp(-observation.dt_s / LASTS_S))
+        kept = float(np.exp(-observation.dt_s / CORRELATION_S))
         for id in others.id.tolist():
             drawn = complex(*self._rng.standard_normal(2)) * self.sensing.noise_m
             self._errors[id] = self._errors[id] * kept + drawn * np.sqrt(1 - kept**2) if id in self._errors else drawn

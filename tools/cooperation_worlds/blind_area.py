@@ -136,7 +136,6 @@ STEP_S, MATCH_M = 0.05, 1.0
 SWEEPS_BEFORE_KNOWN = 2
 # The paper's 12.7 m from 30 km/h: a reaction of 1 s, then braking with 8 m/s2.
 REACTION_S, BRAKING_MPS2 = 1.0, 8.0
-STOPPING_M = SPEED_MPS * REACTION_S + SPEED_MPS**2 / (2 * BRAKING_MPS2)
 AFTER_CONTACT_S = 4.0
 MOMENTS = ("known_s", "warned_s")
 
