@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from log2sim.datatypes import Agent, MapLane, Scenario, Waypoints
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal, Waypoints
 from log2sim.errors import ConfigError
-from log2sim.simulation.drivers import judged, recorded, roll_out
+from log2sim.simulation.drivers import roll_out
 from log2sim.simulation.metrics.realism import Motions, Road, features, realism, signed_distance
+from log2sim.simulation.present import judged, recorded
 
 T_S = np.arange(0.0, 9.01, 0.1)
 
@@ -150,3 +151,51 @@ def test_rollouts_of_the_log_are_the_log_and_unknown_models_name_the_nearest():
     assert realism(log, drawn, judged(log, now), now).ade_m == 0.0
     with pytest.raises(ConfigError, match="drivers"):
         roll_out(world, 1.0, "driver", rng=np.random.default_rng(0))
+
+
+def at_light(*, states, t_s, start_m=-30.0, speed=10.0, lanes=True, line=True, heading=np.pi, aside=3.0):
+    """Return a car that comes up to a stop line at x = 0 whose light stands across a junction, 20 m on."""
+    x = start_m + speed * T_S
+    points = np.column_stack([np.arange(-100.0, 201.0, 5.0), np.zeros((61, 2)).T[0], np.zeros(61)])
+    lane = MapLane("l", points, np.full(61, 3.5))
+    stop = Marking("s", "stop_line", np.array([[0.0, -1.75, 0.0], [0.0, 1.75, 0.0]]), 0.4, "white")
+    features = MapFeatures(lanes=(lane,) * lanes, markings=(stop,) * line)
+    light = Signal("t", np.array([20.0, aside, 4.0]), heading, np.array(t_s), np.array(states))
+    return replace(scenario(agent("ego", x, 0.0, 0.0, speed)), map_features=features, signals=(light,))
+
+
+def fronts(world, now_s=1.0, horizon_s=8.0):
+    """Return where the front of the car is after each tick (R, T)."""
+    drawn = (
+        roll_out(world, now_s, count=8, horizon_s=horizon_s, rng=np.random.default_rng(0)).position_m[:, 0, 11:].real
+    )
+    return drawn + 2.25
+
+
+@pytest.mark.parametrize("lanes", [True, False])
+def test_drivers_stop_at_the_stop_line_of_a_red_light_and_go_on_at_green(lanes):
+    red = fronts(at_light(states=["red"], t_s=[0.0], lanes=lanes))
+    assert ((red[:, -1] > -6.0) & (red[:, -1] < 0.5)).all()
+    assert red.max() < 0.5
+    assert (fronts(at_light(states=["green"], t_s=[0.0], lanes=lanes))[:, -1] > 20.0).all()
+    then_green = fronts(at_light(states=["red", "green"], t_s=[0.0, 5.0], lanes=lanes))
+    assert then_green[:, 38].max() < 0.5
+    assert (then_green[:, -1] > 3.0).all()
+
+
+def test_lights_that_face_others_stand_aside_or_turn_yellow_too_late_stop_nobody():
+    for more in ({"heading": 0.0}, {"aside": 30.0}):
+        assert (fronts(at_light(states=["red"], t_s=[0.0], **more))[:, -1] > 20.0).all()
+    late = at_light(states=["green", "yellow", "red"], t_s=[0.0, 1.5, 4.5], start_m=-24.0)
+    assert (fronts(late)[:, -1] > 20.0).all()  # 9 m before the line when it turns yellow: 5.5 m/s2 would be needed
+    early = at_light(states=["green", "yellow", "red"], t_s=[0.0, 1.1, 4.1], start_m=-50.0)
+    assert fronts(early).max() < 0.5
+
+
+def test_without_a_stop_line_drivers_stop_before_the_light_and_who_stands_there_sets_off_at_green():
+    found = fronts(at_light(states=["red"], t_s=[0.0], line=False, start_m=-15.0))
+    assert ((found[:, -1] > 11.0) & (found[:, -1] < 17.5)).all()
+    waits = at_light(states=["red", "green"], t_s=[0.0, 3.0], start_m=-4.0, speed=0.0)
+    found = fronts(waits)
+    assert (found[:, 15] < 0.0).all()
+    assert (found[:, -1] > 3.0).all()

@@ -24,6 +24,7 @@ from log2sim.scenarios.traffic import (
     runs,
     turned,
 )
+from log2sim.simulation.driver_paths import STOP_STATES, light_ahead
 
 COMFORTABLE_MPS2 = 3.4
 """Deceleration that most drivers find comfortable (AASHTO, "Green Book" 2018, 3.2.2)."""
@@ -52,8 +53,8 @@ BREAK = round(0.5 / TICK_S)
 LATERAL_MPS = 0.2
 """Lateral speed at which a lane change begins and ends: drivers who keep a lane are slower (de Gelder et al. 2020)."""
 
-LIGHT_M, CROSSWALK_M = 30.0, 8.0
-"""How far ahead of its front the light or crosswalk is that an agent stands at; stop lines are up to 25 m before lights across a junction."""
+CROSSWALK_M = 8.0
+"""How far ahead of its front the crosswalk is that an agent stands at."""
 
 
 def single_tags(traffic: Traffic) -> Iterator[Tag]:
@@ -200,12 +201,11 @@ def _waits(traffic: Traffic, k: int, span: tuple[int, int, int], still: float, p
     front_m = traffic.table.size_m[k, 0] / 2
     times = traffic.table.t_s[span[0] : span[2] + 1]
     for signal in scenario.signals:
-        way = (complex(signal.position_m[0], signal.position_m[1]) - place) * turn
-        faces = signal.heading_rad is None or np.cos(signal.heading_rad + np.angle(turn)) < -0.5
-        red = np.isin(signal.at(times), ("red", "red_yellow", "yellow"))
-        if faces and 0 < way.real - front_m < LIGHT_M and abs(way.imag) < 12.0 and red.any():
+        way = light_ahead(signal, place + front_m / turn, -float(np.angle(turn)))
+        red = np.isin(signal.at(times), STOP_STATES)
+        if way is not None and red.any():
             n = span[0] + np.flatnonzero(red)
-            yield tag_of(traffic, "standing_at_light", k, (int(n[0]), int(n[0]), int(n[-1])), still * signal.confidence, gap_m=way.real - front_m, duration_s=(n[-1] - n[0]) * TICK_S)  # fmt: skip
+            yield tag_of(traffic, "standing_at_light", k, (int(n[0]), int(n[0]), int(n[-1])), still * signal.confidence, gap_m=way[0], duration_s=(n[-1] - n[0]) * TICK_S)  # fmt: skip
             break
     for marking in scenario.map_features.markings if scenario.map_features else ():
         if marking.kind != "crosswalk":

@@ -17,8 +17,9 @@ from entry import parser_of
 
 from benchmarks.table import markdown
 from log2sim.datatypes import Scenario
-from log2sim.simulation.drivers import MODELS, judged, moments, recorded, roll_out
+from log2sim.simulation.drivers import MODELS, roll_out
 from log2sim.simulation.metrics.realism import COMPONENTS, Realism, Road, realism
+from log2sim.simulation.present import judged, moments, recorded
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,0 +1,157 @@
+"""What is known of the agents of a scenario at a moment from which they are simulated: their last second, and what they did then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, Scenario
+from log2sim.geometry import Array, wrap_angle
+from log2sim.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
+from log2sim.simulation.metrics.realism import Motions, sizes_of
+from log2sim.simulation.vehicles.parameters import WHEELED
+
+HISTORY_S = 1.0
+"""Of the past is known; with the present eleven ticks, as in the challenge."""
+
+NORMAL_PER_MEDIAN = 1.4826
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Present:
+    """Agents (A,) at the moment from which they are simulated, as their own last second tells.
+
+    Attributes
+    ----------
+    place_m : (A,) complex128
+    course_rad, yaw_rad : (A,) float64
+        Direction of travel and of the box.
+    speed_mps, accel_mps2, turn_radps : (A,) float64
+        Along the course.
+    moves : (A,) bool
+        False for those that are static.
+    jitter : (3, A) float64
+        What the log jitters by along, across, in m, and in heading, in rad: one standard deviation.
+    """
+
+    agents: tuple[Agent, ...]
+    place_m: Complex
+    course_rad: Array
+    yaw_rad: Array
+    speed_mps: Array
+    accel_mps2: Array
+    turn_radps: Array
+    moves: Mask
+    jitter: Array
+
+    @property
+    def size_m(self) -> Array:
+        """Length and width (A, 2)."""
+        return sizes_of(self.agents)
+
+    @property
+    def group(self) -> NDArray[np.str_]:
+        """Groups of categories (A,)."""
+        return _groups_of(self.agents)
+
+
+def _groups_of(agents: Sequence[Agent]) -> NDArray[np.str_]:
+    return np.array([GROUP_OF.get(a.category, "other") for a in agents], dtype="<U16")
+
+
+def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]:
+    """Return times from which agents can be simulated: with a past, and half the horizon at least to compare with."""
+    w = max(scenario.agents, key=lambda a: len(a.waypoints)).waypoints
+    wanted = np.arange(w.t_s[0] + HISTORY_S, w.t_s[-1] - min(horizon_s, w.t_s[-1] - w.t_s[0] - HISTORY_S) / 2, every_s)
+    # Where others have waypoints, too, so that nothing is taken from later ones.
+    rows = np.unique(np.searchsorted(w.t_s, wanted - TICK_S / 4))
+    return [float(t) for t in w.t_s[rows]]
+
+
+def recorded(scenario: Scenario, now_s: float, horizon_s: float = 8.0) -> tuple[Motions, int]:
+    """Return what the agents that are there at a time did from `HISTORY_S` before, (1, A, T), and the tick of that time."""
+    before, after = round(HISTORY_S / TICK_S), round(horizon_s / TICK_S)
+    t_s: Array = now_s + np.arange(-before, after + 1, dtype=np.float64) * TICK_S
+    there = [
+        a for a in scenario.agents if a.is_permanent or a.waypoints.t_s[0] - 1e-3 <= now_s <= a.waypoints.t_s[-1] + 1e-3
+    ]
+    table = tabulate(there, t_s, TICK_S)
+    jumps = table.piece != table.piece[:, before, None]
+    yaw = np.where(jumps, np.nan, table.yaw_rad)
+    return Motions(tuple(there), TICK_S, np.where(jumps, np.nan, table.position_m)[None], yaw[None]), before
+
+
+def judged(log: Motions, now: int) -> list[int]:
+    """Return the rows of agents that move within the log or wait, and were there a while: those whose realism is measured."""
+    past = log.present[0, :, : now + 1].sum(axis=1)
+    return [k for k, a in enumerate(log.agents) if not a.static and past[k] > now / 2]
+
+
+def observe(scenario: Scenario, now_s: float) -> Present:
+    """Fit the state of agents at a time to their last second; nothing later is looked at."""
+    log, now = recorded(scenario, now_s, 0.0)
+    known = []
+    for a in log.agents:
+        past = (a.waypoints.t_s <= now_s + TICK_S / 2) & (a.waypoints.t_s >= now_s - HISTORY_S - TICK_S)
+        known.append(
+            a
+            if a.is_permanent or a.static or not past.any()
+            else replace(a, waypoints=a.waypoints.take(np.flatnonzero(past)))
+        )
+    t_s: Array = now_s + np.arange(-now, 1, dtype=np.float64) * TICK_S
+    table = tabulate(known, t_s, TICK_S)
+    smooth = smooth_motion(table)
+    row = np.arange(len(known))
+    last = table.present.shape[1] - 1 - table.present[:, ::-1].argmax(axis=1)
+    yaw, velocity, place = (
+        table.yaw_rad[row, last],
+        smooth.velocity_mps[row, last],
+        table.position_m[row, last] + smooth.velocity_mps[row, last] * (now_s - t_s[last]),
+    )
+    for k in np.flatnonzero(~table.present.any(axis=1)).tolist():  # seen once, between two ticks
+        w = known[k].waypoints
+        yaw[k], velocity[k] = w.yaw_rad[-1], w.speed_mps[-1] * np.exp(1j * w.yaw_rad[-1])
+        place[k] = complex(w.x_m[-1], w.y_m[-1]) + velocity[k] * (now_s - w.t_s[-1])
+    wheeled = np.array([a.category in WHEELED for a in known], dtype=bool)
+    forward = (velocity * np.exp(-1j * yaw)).real
+    slow = np.abs(velocity) < 2 * STANDSTILL_MPS
+    course = np.where(wheeled | slow, np.where(wheeled & (forward < -0.5), yaw + np.pi, yaw), np.angle(velocity))
+    speed = np.where(wheeled, np.abs(forward), np.abs(velocity))
+    accel, jitter = np.zeros(len(known)), np.full((3, len(known)), np.nan)
+    for k in np.flatnonzero([not a.static for a in known]).tolist():
+        there = np.flatnonzero(table.present[k] & (table.piece[k] == table.piece[k, last[k]]))
+        if len(there) < 7:
+            continue
+        t = t_s[there] - t_s[there[-1]]
+        way = (table.position_m[k, there] - table.position_m[k, there[-1]]) * np.exp(-1j * course[k])
+        fits = [np.polyfit(t, c, 2) for c in (way.real, way.imag)]
+        accel[k] = 2 * fits[0][0]
+        rest = [c - np.polyval(fit, t) for c, fit in zip((way.real, way.imag), fits)]
+        jitter[:, k] = [_jitter(c) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
+    group = _groups_of(known)
+    return Present(
+        tuple(known), place, wrap_angle(course), yaw, np.where(slow, 0.0, speed), np.clip(accel, -4.0, 3.0),
+        np.where(slow, 0.0, smooth.turn_radps[row, last]), np.array([not a.static for a in known], dtype=bool),
+        np.stack([_drawn_to_group(c, group) for c in jitter]),
+    )  # fmt: skip
+
+
+def _jitter(values: Array) -> float:
+    """Return the standard deviation of white noise in values at successive ticks, whose second differences have one of sqrt(6) times that."""
+    return float(np.median(np.abs(values[4:] - 2 * values[2:-2] + values[:-4])) * NORMAL_PER_MEDIAN / np.sqrt(6.0))
+
+
+def _drawn_to_group(own: Array, group: NDArray[np.str_]) -> Array:
+    """Return variances' roots (A,) drawn halfway to those of the group, which stand in where nothing is known; 0 without either."""
+    out = np.zeros(len(own))
+    for name in np.unique(group):
+        rows = group == name
+        known = own[rows & np.isfinite(own)]
+        usual = float(np.median(known)) if len(known) else 0.0
+        out[rows] = np.sqrt((np.where(np.isfinite(own[rows]), own[rows], usual) ** 2 + usual**2) / 2)
+    return out
