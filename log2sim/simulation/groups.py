@@ -38,9 +38,17 @@ from log2sim.simulation.policy import (
     Route,
 )
 from log2sim.simulation.reference import GRID_S, Reference
-from log2sim.simulation.simulators import Simulator
+from log2sim.simulation.simulators import VehicleStep
 from log2sim.simulation.vehicles.model_choice import set_slip_states
-from log2sim.simulation.vehicles.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
+from log2sim.simulation.vehicles.vehicle import (
+    Columns,
+    PointControls,
+    PointState,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+    step_point,
+)
 
 STORE_S = 0.05  # spacing of stored states, about 20 Hz
 MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10 ms
@@ -113,9 +121,21 @@ class AgentGroup(ABC):
         self.live = np.zeros(0, dtype=np.intp)
         self.row = np.zeros((0, 0))
         self.now_s = 0.0
+        self.kept: dict[str, Columns] = {}
+
+    def keep(self, **columns: Columns) -> None:
+        """Keep columns of all agents, of which those of the living ones are the attributes of these names."""
+        self.kept = columns
+        self._take()
+
+    def _take(self) -> None:
+        for name, all_agents in self.kept.items():
+            setattr(self, name, all_agents.take(self.live))
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
-        """Prepare the reference tables of the agents that live within the steps [begin, end)."""
+        """Prepare reference tables and columns of the agents that live within the steps [begin, end)."""
+        for name, all_agents in self.kept.items():
+            all_agents.put(self.live, getattr(self, name))
         self.live = np.flatnonzero((self.first < end) & (self.last >= begin) & (self.last >= self.first))
         self._row0 = int(np.floor(begin_s / GRID_S))
         rows = int(np.floor(end_s / GRID_S)) + 3 - self._row0
@@ -124,6 +144,7 @@ class AgentGroup(ABC):
             self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
             for slot, i in enumerate(self.live):
                 _copy_rows(self._table[:, :, slot], self.references[i], self._row0)
+        self._take()
 
     def log_times(self, t_s: float) -> Array:
         """Return the times of the scenario (A,) whose places the living agents follow at a time."""
@@ -188,6 +209,10 @@ class VehicleGroup(AgentGroup):
     """Vehicles that follow their trajectories through a vehicle model."""
 
     driver = "pid"
+    state: VehicleState
+    memory: ControllerMemory
+    commands: VehicleControls
+    living: VehicleParameters
 
     def __init__(
         self,
@@ -196,30 +221,14 @@ class VehicleGroup(AgentGroup):
         first: NDArray[np.intp],
         last: NDArray[np.intp],
         parameters: VehicleParameters,
-        simulator: Simulator,
+        move: VehicleStep,
     ) -> None:
         super().__init__(agents, references, first, last)
-        self.parameters, self.simulator = parameters, simulator
-        self._all = VehicleState.zeros(len(agents))
-        self._all_memory = ControllerMemory.fresh(len(agents))
-        self._all_commands = VehicleControls(np.zeros(len(agents)), np.zeros(len(agents)), np.zeros(len(agents), bool))
-        self._open(self.live)
-
-    def _open(self, live: NDArray[np.intp]) -> None:
-        self.state, self.memory, self.living = (
-            self._all.take(live),
-            self._all_memory.take(live),
-            self.parameters.take(live),
+        self.parameters, self.move, count = parameters, move, len(agents)
+        commands = VehicleControls(np.zeros(count), np.zeros(count), np.zeros(count, bool))
+        self.keep(
+            state=VehicleState.zeros(count), memory=ControllerMemory.fresh(count), commands=commands, living=parameters
         )
-        self.commands = self._all_commands.take(live)
-
-    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
-        """Prepare tables and states of the vehicles that live within the steps [begin, end)."""
-        self._all.put(self.live, self.state)
-        self._all_memory.put(self.live, self.memory)
-        self._all_commands.put(self.live, self.commands)
-        super().open_window(begin, end, begin_s, end_s)
-        self._open(self.live)
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
@@ -247,7 +256,7 @@ class VehicleGroup(AgentGroup):
 
     def _step(self, dt_s: float) -> None:
         self.commands, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
-        self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
+        self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
 class PolicyVehicle(VehicleGroup):
@@ -262,32 +271,22 @@ class PolicyVehicle(VehicleGroup):
         self.commands = VehicleControls(
             np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
         )
-        self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
+        self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
 class PedestrianGroup(AgentGroup):
     """Pedestrians, and all else without wheels, as point masses that follow their trajectories."""
 
     driver = "pid"
+    state: PointState
+    commands: PointControls
+    move = staticmethod(step_point)
 
     def __init__(
-        self,
-        agents: Sequence[Agent],
-        references: Sequence[Reference],
-        first: NDArray[np.intp],
-        last: NDArray[np.intp],
-        simulator: Simulator,
+        self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray[np.intp], last: NDArray[np.intp]
     ) -> None:
         super().__init__(agents, references, first, last)
-        self.simulator = simulator
-        self._all = PointState.zeros(len(agents))
-        self.state = self._all.take(self.live)
-
-    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
-        """Prepare tables and states of the points that live within the steps [begin, end)."""
-        self._all.put(self.live, self.state)
-        super().open_window(begin, end, begin_s, end_s)
-        self.state = self._all.take(self.live)
+        self.keep(state=PointState.zeros(len(agents)), commands=PointControls.zeros(len(agents)))
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put points on their references."""
@@ -303,7 +302,8 @@ class PedestrianGroup(AgentGroup):
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), unknown, unknown, unknown, unknown)
 
     def _step(self, dt_s: float) -> None:
-        self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)
+        self.commands = follow_points(self.row, self.state)
+        self.state = self.move(self.state, self.commands, dt_s)
 
 
 def _copy_rows(window: Array, reference: Reference, row0: int) -> None:

@@ -38,7 +38,7 @@ from log2sim.simulation.reactive import (
 from log2sim.simulation.reference import log_reference, point_reference, vehicle_reference_of
 from log2sim.simulation.result import AgentReplay, Commands, Replay
 from log2sim.simulation.rollout import Progress, World, rollout
-from log2sim.simulation.simulators import EmbeddedSimulator, ExternalSimulator, load_step
+from log2sim.simulation.simulators import ExternalSimulator, load_step
 from log2sim.simulation.vehicles.model_choice import AUTO, ModelChoice, choose_model, slipping_reference, understeer
 from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
@@ -103,9 +103,7 @@ def agent_groups(
         walking = [a for a in assignment[driver] if a.category not in WHEELED]
         if walking:
             references = [point_reference(Trajectory.through(a.waypoints)) for a in walking]
-            groups.append(
-                on_foot(walking, references, *_lifespans(walking, clock), EmbeddedSimulator(load_step("kinematic")))
-            )
+            groups.append(on_foot(walking, references, *_lifespans(walking, clock)))
     for driver, tape in (
         ("exact", LogReplayGroup),
         *([("reactive", ReactiveLogReplayGroup)] if mode == "exact" else []),
@@ -135,7 +133,7 @@ def _vehicle_groups(
             ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
             ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
             followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
-        groups.append(kind(moved, followed, *_lifespans(moved, clock), p, EmbeddedSimulator(load_step(name))))
+        groups.append(kind(moved, followed, *_lifespans(moved, clock), p, load_step(name)))
     return groups
 
 

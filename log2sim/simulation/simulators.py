@@ -1,49 +1,30 @@
-"""What a replay needs of a simulator, and the embedded one.
-
-A simulator moves all agents at once by stateless steps. Vehicle models are plug-ins of the kind `vehicle_model`; to add a
-simulator, implement the two methods of `Simulator`, or `ExternalSimulator` for one that runs in another process, such
-as a game engine.
-"""
+"""Simulators: the vehicle models of this package and of plug-ins, which move agents by stateless steps, and those in other processes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from log2sim.datatypes import Agent
-from log2sim.errors import PluginError
+from log2sim.errors import ConfigError, PluginError
 from log2sim.files import plugins
-from log2sim.simulation.vehicles.vehicle import (
-    PointControls,
-    PointState,
-    VehicleControls,
-    VehicleParameters,
-    VehicleState,
-    step_point,
-)
+from log2sim.files.plugins import nearest
+from log2sim.simulation.vehicles.vehicle import VehicleControls, VehicleParameters, VehicleState
 
+VehicleStep = Callable[[VehicleState, VehicleControls, VehicleParameters, float], VehicleState]
+"""Moves vehicles for so many s with constant controls; no argument is changed."""
 
-class Simulator(Protocol):
-    """Moves agents by `dt_s` with constant controls; no argument is changed."""
-
-    def step_vehicles(
-        self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
-    ) -> VehicleState:
-        """Return the state of the vehicles after the step."""
-        ...
-
-    def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
-        """Return the state of the points (pedestrians and everything without wheels) after the step."""
-        ...
+SIMULATORS = ("own", "carla")
 
 
 class ExternalSimulator(Protocol):
     """A simulator in another process, with one clock for all agents: a step of the replay is one tick of it.
 
-    `open` takes the groups over: from then on their simulators only record the controls. `tick` is called when all
-    groups have set their controls; it moves all agents and writes the new states back into the groups.
+    `open` takes the groups over: from then on they only decide their controls. `tick` is called when all groups have; it moves
+    all agents and writes the new states back into the groups.
     """
 
     @property
@@ -69,37 +50,38 @@ class ExternalSimulator(Protocol):
         ...
 
 
-VehicleStep = Callable[[VehicleState, VehicleControls, VehicleParameters, float], VehicleState]
+def external_simulator(name: str, address: str | None, port: int | None, map: str | None) -> ExternalSimulator | None:
+    """Return the simulator of a name, with an address, port and world (town or OpenDRIVE file); None for the embedded one.
 
+    Raises `ConfigError` for an unknown name, options that it does not use, or a missing file.
+    """
+    if name not in SIMULATORS:
+        raise ConfigError(
+            f"unknown simulator '{name}'{nearest(name, list(SIMULATORS))}; known: {', '.join(SIMULATORS)}"
+        )
+    if name == "own":
+        if address is not None or port is not None or map is not None:
+            raise ConfigError("--host, --port and --map are for --simulator carla; add it, or leave them out")
+        return None
+    from log2sim.simulation.carla.simulator import CarlaServer, CarlaSimulator
 
-class EmbeddedSimulator:
-    """Vehicles by one of the models of this package, and point masses."""
-
-    def __init__(self, step: VehicleStep) -> None:
-        self._step = step
-
-    def step_vehicles(
-        self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
-    ) -> VehicleState:
-        """Move vehicles by the chosen model."""
-        return self._step(state, controls, parameters, dt_s)
-
-    def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
-        """Move point masses."""
-        return step_point(state, controls, dt_s)
+    opendrive = Path(map) if map is not None and map.endswith(".xodr") else None
+    if opendrive is not None and not opendrive.is_file():
+        raise ConfigError(f"--map: {opendrive}: no such file")
+    own = CarlaServer()
+    town = None if opendrive else map
+    return CarlaSimulator(CarlaServer(address or own.host, port or own.port, town=town, opendrive=opendrive))
 
 
 def load_step(model: str) -> VehicleStep:
     """Return the step of a vehicle model by its name.
 
-    Raises `ConfigError` when there is no such model. Raises `PluginError` when one of another package cannot be used.
+    Raises `ConfigError` when there is no such model. Raises `PluginError` when one of another package cannot be used; its
+    faults are told with the name of the package.
     """
     step: VehicleStep = plugins.load("vehicle_model", model)
-    return step if plugins.is_built_in("vehicle_model", model) else _checked(step, model)
-
-
-def _checked(step: VehicleStep, model: str) -> VehicleStep:
-    """Return a step of another package whose faults are told with the name of the package."""
+    if plugins.is_built_in("vehicle_model", model):
+        return step
 
     def checked(
         state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float

@@ -21,14 +21,7 @@ from log2sim.geometry import Array, whole_kilometers
 from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents
 from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, StepClock, VehicleGroup
-from log2sim.simulation.vehicles.vehicle import (
-    PointControls,
-    PointState,
-    VehicleControls,
-    VehicleParameters,
-    VehicleState,
-    step_point,
-)
+from log2sim.simulation.vehicles.vehicle import PointState, step_point
 
 
 @dataclass(frozen=True)
@@ -40,26 +33,6 @@ class CarlaServer:
     timeout_s: float = 60.0
     town: str | None = None
     opendrive: Path | None = None  # an OpenDRIVE file
-
-
-class _PendingControls:
-    """The simulator of one group: it records the controls for the tick, which moves all groups at once."""
-
-    def __init__(self) -> None:
-        self.vehicles = VehicleControls(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
-        self.points = PointControls.zeros(0)
-
-    def step_vehicles(
-        self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
-    ) -> VehicleState:
-        """Record the controls of vehicles."""
-        self.vehicles = controls
-        return state
-
-    def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
-        """Record the controls of points."""
-        self.points = controls
-        return state
 
 
 class CarlaSimulator:
@@ -95,13 +68,11 @@ class CarlaSimulator:
             ground = "log" if self.server.town is None and self.server.opendrive is None else "map"
             shown = {"agents": [data[a.id] for a in replayed]}
             self._player = player.ScenarioPlayer(self.session, shown, "exact", physics=False, ground=ground)
-        self._vehicle_groups = [(g, _PendingControls()) for g in groups if isinstance(g, VehicleGroup)]
-        self._pedestrian_groups = [(g, _PendingControls()) for g in groups if isinstance(g, PedestrianGroup)]
+        self._vehicle_groups = [g for g in groups if isinstance(g, VehicleGroup)]
+        self._pedestrian_groups = [g for g in groups if isinstance(g, PedestrianGroup)]
         self._delayed = [g for g in log_groups if not g.follows_scenario_time]
-        for group, pending in self._vehicle_groups:
-            group.simulator = pending
-        for points, pending in self._pedestrian_groups:
-            points.simulator = pending
+        for group in (*self._vehicle_groups, *self._pedestrian_groups):
+            group.move = lambda state, *_: state  # a tick moves all groups at once
         with _translated_errors():
             self.session.__enter__()
 
@@ -109,20 +80,20 @@ class CarlaSimulator:
         """Move all groups from a step to the next."""
         with _translated_errors():
             commands = self._player.commands(self.clock.time(step + 1))
-            vehicles = [(group, pending) for group, pending in self._vehicle_groups if len(group.live)]
-            pedestrians = [(points, pending) for points, pending in self._pedestrian_groups if len(points.live)]
-            for group, pending in vehicles:
+            vehicles = [group for group in self._vehicle_groups if len(group.live)]
+            pedestrians = [points for points in self._pedestrian_groups if len(points.live)]
+            for group in vehicles:
                 for slot in self._present(group, step):
-                    commands += self._drive(group, pending, slot, step)
-            for points, pending in pedestrians:
-                commands += self._walk(points, pending, step)
+                    commands += self._drive(group, slot, step)
+            for points in pedestrians:
+                commands += self._walk(points, step)
             for delayed in self._delayed:
                 commands += self._show(delayed, step)
             self.session.send(commands)
             self.session.world.tick()
-            for group, pending in vehicles:
-                self._read_vehicles(group, pending, step)
-            for points, _ in pedestrians:
+            for group in vehicles:
+                self._read_vehicles(group, step)
+            for points in pedestrians:
                 self._read_points(points, step)
             ego = self._trajectories.get("ego")
             if ego is not None:
@@ -142,7 +113,7 @@ class CarlaSimulator:
                 self.session.remove(group.agents[i].id)
         return slots
 
-    def _drive(self, group: VehicleGroup, pending: _PendingControls, slot: int, step: int) -> Iterator[Any]:
+    def _drive(self, group: VehicleGroup, slot: int, step: int) -> Iterator[Any]:
         """Yield the commands for one vehicle: its inputs, after its pose unless its state came from CARLA."""
         state, i, command = group.state, group.live[slot], self.carla.command
         name, speed = group.agents[i].id, float(state.speed_mps[slot])
@@ -156,14 +127,14 @@ class CarlaSimulator:
             velocity = self.carla.Vector3D(speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
             yield command.ApplyTransform(actor.handle.id, actor.transform(*place))
             yield command.ApplyTargetVelocity(actor.handle.id, velocity)
-        controls = pending.vehicles
+        controls = group.commands
         curvature = -math.tan(controls.steer_rad[slot]) / float(group.living.wheelbase_m[slot])
         inputs = actor.control(float(controls.pedal_mps2[slot]), curvature, speed, bool(controls.reverse[slot]))
         yield command.ApplyVehicleControl(actor.handle.id, inputs)
 
-    def _walk(self, group: PedestrianGroup, pending: _PendingControls, step: int) -> Iterator[Any]:
+    def _walk(self, group: PedestrianGroup, step: int) -> Iterator[Any]:
         """Yield the commands for points: walkers walk to where the point model leads, objects are placed there."""
-        goal, dt_s = step_point(group.state, pending.points, self.clock.dt_s), self.clock.dt_s
+        goal, dt_s = step_point(group.state, group.commands, self.clock.dt_s), self.clock.dt_s
         for slot in self._present(group, step):
             name, state = group.agents[group.live[slot]].id, group.state
             yaw = -float(group.row[2][slot])
@@ -193,9 +164,9 @@ class CarlaSimulator:
             if walks:
                 yield self._player.walk(actor, vx, vy, yaw)
 
-    def _read_vehicles(self, group: VehicleGroup, pending: _PendingControls, step: int) -> None:
+    def _read_vehicles(self, group: VehicleGroup, step: int) -> None:
         """Read the states of vehicles from CARLA; actuator states, which it does not report, are the commands."""
-        state, controls = group.state, pending.vehicles
+        state, controls = group.state, group.commands
         x, y, yaw, speed, pedal = (
             c.copy() for c in (state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.pedal_mps2)
         )
