@@ -13,9 +13,20 @@ import numpy as np
 from log2sim.datatypes import Tag
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.prediction.motion_table import TICK_S
+from log2sim.prediction.prediction import MOVING, drift_variance
 from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
 from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
-from log2sim.scenarios.traffic import SAME_WAY_RAD, SIDE_M, Beside, Traffic, latched, probability_above, runs, turned
+from log2sim.scenarios.traffic import (
+    SAME_WAY_RAD,
+    SIDE_M,
+    UNSEEN_S,
+    Beside,
+    Traffic,
+    latched,
+    probability_above,
+    runs,
+    turned,
+)
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import post_encroachment_times, time_to_touch
 
@@ -41,6 +52,7 @@ KEEPING_MPS = 0.5
 """Lateral speed of who keeps a lane: a third to a half of those in lane changes."""
 
 ONCOMING_RAD = np.radians(135.0)
+MOST_PER_TICK_M = 5.0  # by which one gets ahead of another within a tick: 50 m/s
 WINDOW = round(4.0 / TICK_S)  # ticks around a lane's edge in which a lane change is looked at
 
 
@@ -197,28 +209,39 @@ def _is_change_of(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> bool:
 
 
 def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
-    """Find when `o` passes `r`: from behind its rear to ahead of its front, while both go the same way."""
+    """Find when `o` passes `r`: from behind its rear to ahead of its front, while both go the same way.
+
+    For `UNSEEN_S` before and after both were seen their speeds are supposed to be those of then.
+    """
     reach = (traffic.table.size_m[r, 0] + traffic.table.size_m[o, 0]) / 2
-    ahead = b.ahead_m[o]
+    faster = traffic.speed_mps[o] - traffic.speed_mps[r]
+    ahead, aside, slower = b.ahead_m[o].copy(), b.aside_m[o].copy(), traffic.speed_mps[r].copy()
+    same, sigma = b.same_way[o].copy(), np.hypot(traffic.sigma_m[r], traffic.sigma_m[o])
+    drift = 2.0 * MOVING["vehicle"].along_mps2 ** 2
+    seen, unseen = np.flatnonzero(np.isfinite(ahead)), round(UNSEEN_S / TICK_S)
+    for edge, rows in (
+        (seen[0], np.arange(max(seen[0] - unseen, 0), seen[0])),
+        (seen[-1], np.arange(seen[-1] + 1, min(seen[-1] + 1 + unseen, len(ahead)))),
+    ):
+        lead_s = (rows - edge) * TICK_S
+        ahead[rows], aside[rows] = ahead[edge] + faster[edge] * lead_s, aside[edge]
+        same[rows], slower[rows] = same[edge], slower[edge]
+        sigma[rows] = np.sqrt(sigma[edge] ** 2 + drift * drift_variance(np.abs(lead_s)))
     passed = latched(ahead > reach, ahead < -reach, np.ones(len(ahead), dtype=bool))
     for n in (np.flatnonzero(passed[1:] & ~passed[:-1]) + 1).tolist():
         start = int(np.flatnonzero(ahead[:n] < -reach)[-1])
         part = slice(start, n + 1)
-        if not (
-            np.isfinite(ahead[part]).all()
-            and b.same_way[o, part].all()
-            and (traffic.speed_mps[r, part] >= MOVING_MPS).all()
-        ):
+        if not (np.isfinite(ahead[part]).all() and same[part].all() and (slower[part] >= MOVING_MPS).all()):
             continue
-        aside = b.aside_m[o, part]
-        if np.abs(aside).max() > 4.5 * b.half_m:  # two lanes beside: farther is another carriageway
+        # Two lanes beside, since farther is another carriageway; and where the path of `r` jumps, nobody passes.
+        if np.abs(aside[part]).max() > 4.5 * b.half_m or np.diff(ahead[part]).max() > MOST_PER_TICK_M:
             continue
         middle = start + int(np.argmin(np.abs(ahead[part])))
-        sigma = float(np.hypot(traffic.sigma_m[r, middle], traffic.sigma_m[o, middle]))
-        sure = probability_above(-ahead[start], 0.0, sigma) * probability_above(ahead[n], 0.0, sigma)
-        clearance = abs(b.aside_m[o, middle]) - traffic.table.size_m[[r, o], 1].sum() / 2
-        yield tag_of(traffic, "overtaking", o, (start, middle, n), sure, r, lateral_gap_m=clearance, side=np.sign(b.aside_m[o, middle]),
-                     relative_speed_mps=traffic.speed_mps[o, middle] - traffic.speed_mps[r, middle], duration_s=(n - start) * TICK_S)  # fmt: skip
+        sure = probability_above(-ahead[start], 0.0, sigma[start]) * probability_above(ahead[n], 0.0, sigma[n])
+        clearance = abs(aside[middle]) - traffic.table.size_m[[r, o], 1].sum() / 2
+        relative = (ahead[n] - ahead[start]) / ((n - start) * TICK_S) if np.isnan(faster[middle]) else faster[middle]
+        yield tag_of(traffic, "overtaking", o, (start, middle, n), sure, r, lateral_gap_m=clearance, side=np.sign(aside[middle]),
+                     relative_speed_mps=relative, duration_s=(n - start) * TICK_S)  # fmt: skip
 
 
 def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:

@@ -15,15 +15,7 @@ import numpy as np
 from log2sim.datatypes import STANDSTILL_MPS, Tag
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S
-from log2sim.scenarios.traffic import (
-    LANE_CHANGE_S,
-    Mask,
-    Traffic,
-    latched,
-    probability_above,
-    runs,
-    turned,
-)
+from log2sim.scenarios.traffic import LANE_CHANGE_S, Mask, Traffic, latched, probability_above, runs, turned
 from log2sim.simulation.driver_paths import STOP_STATES, light_ahead
 
 COMFORTABLE_MPS2 = 3.4

@@ -110,6 +110,13 @@ class PathTable:
         foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + SEARCH_AHEAD_M, x, y)
         return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
 
+    def progress(self, agent: int, x_m: Array, y_m: Array) -> Array:
+        """Return how far along its path an agent is at successive places (S,) of the map."""
+        gone, out = 0.0, np.zeros(len(x_m))
+        for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
+            out[k] = gone = self.progress_near(agent, gone, x, y)
+        return out
+
     def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
         """Return when the scenario was at distances along paths, broadcast together; its end for places beyond."""
         t_s = self.along(agent, distance_m)[4]
@@ -118,10 +125,8 @@ class PathTable:
 
 def scenario_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
     """Return when the scenario was nearest to the successive positions (S,) of an agent that drives freely."""
-    table, gone_m = PathTable([trajectory]), np.zeros(len(x_m))
-    for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
-        gone_m[k] = table.progress_near(0, gone_m[k - 1] if k else 0.0, x, y)
-    return table.times(np.zeros(1, dtype=np.intp), gone_m)
+    table = PathTable([trajectory])
+    return table.times(np.zeros(1, dtype=np.intp), table.progress(0, x_m, y_m))
 
 
 def scenario_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array) -> Array:
@@ -190,17 +195,13 @@ def _row_ranges(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.i
 HORIZON_S = np.arange(0.0, 3.01, 0.25)
 
 
-class PredictedBoxes(NamedTuple):
-    """Boxes of the other agents of pairs (P,) at the times of the horizon (H,)."""
+class Prediction(NamedTuple):
+    """Boxes of agents (P,) at the times of the horizon (H,), relative to the origin of the path table; all (P, H)."""
 
-    # x_m, y_m, yaw_rad, speed_mps: (P, H)
     x_m: Array
     y_m: Array
     yaw_rad: Array
     speed_mps: Array
-    # length_m, width_m: (P,)
-    length_m: Array
-    width_m: Array
 
 
 class SweptCorridor(NamedTuple):
@@ -235,8 +236,10 @@ class Leaders(NamedTuple):
     own_t_s: Array  # (P,) the scenario's time of the agent at that place
 
 
-def leaders(paths: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, margins: SafetyMargins) -> Leaders:
-    """Find for each pair what the agent has to keep clear of in the other's box, now or within the horizon.
+def leaders(
+    paths: PathTable, corridor: SweptCorridor, boxes: Prediction, size_m: Array, margins: SafetyMargins
+) -> Leaders:
+    """Find for each pair what the agent has to keep clear of in the other's box, of `size_m` (P, 3), now or within the horizon.
 
     A box that is in the corridor and will stay there is followed. A crossing box counts if the agent, at its intended
     progress, comes near it while it is in the corridor. Boxes whose center is behind that of the agent never count. For a
@@ -247,7 +250,7 @@ def leaders(paths: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, ma
     foot = paths.foot(c.agent, c.distance_m, c.reach_m, boxes.x_m, boxes.y_m)
     cos, sin = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
     turn_cos, turn_sin = cos * foot.cos + sin * foot.sin, sin * foot.cos - cos * foot.sin
-    half_length, half_width = boxes.length_m[:, None] / 2, boxes.width_m[:, None] / 2
+    half_length, half_width = size_m[:, :1] / 2, size_m[:, 1:2] / 2
     within = c.width_m[:, None] / 2 + margins.side_m
     center = foot.distance_m + foot.ahead_m - c.distance_m[:, None]
     inside = np.abs(foot.left_m) < within + half_length * np.abs(turn_sin) + half_width * np.abs(turn_cos)
@@ -292,14 +295,11 @@ def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_
 # A driven agent this near to its path in the scenario, and pointing along it, is expected to stay on it.
 ON_PATH_M, ON_PATH_COS = 1.5, 0.9
 
-# x, y relative to the origin of the path table, yaw and speed, all (P, H) at the times of the horizon.
-Prediction = tuple[Array, Array, Array, Array]
-
 
 def predict_by_log(paths: PathTable, agent: NDArray[np.intp], t_s: Array, rate: Array) -> Prediction:
     """Predict agents (P,) that follow their trajectories from times (P,) at rates (P,)."""
     pose = paths.at(agent[:, None], t_s[:, None] + rate[:, None] * HORIZON_S)
-    return pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps * rate[:, None]
+    return Prediction(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps * rate[:, None])
 
 
 def predict_along_path(
@@ -308,7 +308,8 @@ def predict_along_path(
     """Predict an agent that goes along its path at speeds (P,) from distances (P,), with an offset to the left."""
     ahead = distance_m[:, None] + pace_mps[:, None] * HORIZON_S
     x, y, cos, sin, _ = paths.along(np.array([agent])[:, None], ahead)
-    return x - left_m * sin, y + left_m * cos, np.arctan2(sin, cos), np.broadcast_to(pace_mps[:, None], ahead.shape)
+    pace = np.broadcast_to(pace_mps[:, None], ahead.shape)
+    return Prediction(x - left_m * sin, y + left_m * cos, np.arctan2(sin, cos), pace)
 
 
 def predict_policy_vehicle(
@@ -324,4 +325,4 @@ def predict_policy_vehicle(
         return predict_along_path(paths, agent, foot.distance_m[0] + foot.ahead_m[0], np.array([speed_mps]), left_m)
     traveled = speed_mps * HORIZON_S[None]
     same = np.ones_like(traveled)
-    return x_m + traveled * cos, y_m + traveled * sin, yaw_rad * same, speed_mps * same
+    return Prediction(x_m + traveled * cos, y_m + traveled * sin, yaw_rad * same, speed_mps * same)

@@ -108,14 +108,7 @@ class Crowd:
     """R rollouts of M agents that move among A."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        now_s: float,
-        horizon_s: float,
-        count: int,
-        rng: np.random.Generator,
-        *,
-        noisy: bool,
+        self, scenario: Scenario, now_s: float, horizon_s: float, count: int, rng: np.random.Generator, *, noisy: bool
     ) -> None:
         self.now_s, self.rng, self.noisy, self.count = now_s, rng, noisy, count
         self.now = present = observe(scenario, now_s)

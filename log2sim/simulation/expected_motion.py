@@ -126,11 +126,7 @@ class Known:
 
 
 def known_agents(
-    agents: Sequence[Agent],
-    spans: Sequence[Sequence[Span]],
-    t_s: Array,
-    interval_s: float,
-    present: NDArray[np.bool_],
+    agents: Sequence[Agent], spans: Sequence[Sequence[Span]], t_s: Array, interval_s: float, present: NDArray[np.bool_]
 ) -> Known:
     """Find at ticks (T,) what is known of agents (A,), which are present (A, T) and observed every `interval_s` in spans."""
     shape = (len(agents), len(t_s))
@@ -350,10 +346,7 @@ class EgoPath:
 
     def progress(self, x_m: Array, y_m: Array) -> Array:
         """Return how far along the path successive places (N,) are."""
-        gone, out = 0.0, np.zeros(len(x_m))
-        for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
-            out[k] = gone = self._paths.progress_near(0, gone, x, y)
-        return out
+        return self._paths.progress(0, x_m, y_m)
 
     def at(self, ego: EgoStates, lead_s: Array) -> ExpectedPaths:
         """Return where the ego is expected at leads (H,): on its path, as far aside as it is; off it, straight on.

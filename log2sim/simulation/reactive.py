@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ from log2sim.simulation.corridors import (
     TIME_STEP_S,
     PathTable,
     Pose,
-    PredictedBoxes,
     Prediction,
     SafetyMargins,
     SweptCorridor,
@@ -108,19 +106,6 @@ DRIVEN_TURN_S = 0.3
 Index = NDArray[np.intp]
 
 
-class Foresight(Protocol):
-    """Predictions (P, H) at the times of `HORIZON_S`."""
-
-    def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
-        """Predict agents (P,) that pass their trajectories at rates (P,), from where these are at times (P,)."""
-
-    def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
-        """Predict an agent that a policy drives, from where it is among all poses; (1, H)."""
-
-    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
-        """Predict that agent by the same rules from where the scenario has it at times (P,)."""
-
-
 class PathForesight:
     """Others go where the scenario has them go."""
 
@@ -128,25 +113,25 @@ class PathForesight:
         self._paths = paths
 
     def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
-        """See `Foresight`."""
+        """Predict agents (P,) that pass their trajectories at rates (P,), from where these are at times (P,)."""
         return predict_by_log(self._paths, agent, t_s, rate)
 
     def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
-        """See `Foresight`."""
+        """Predict an agent that a policy drives, from where it is among all poses; (1, H)."""
         x, y, yaw, speed = (float(c[agent]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
         return predict_policy_vehicle(self._paths, agent, x, y, yaw, speed)
 
     def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
-        """See `Foresight`."""
+        """Predict that agent by the same rules from where the scenario has it at times (P,)."""
         pose = self._paths.at(np.full(len(t_s), agent), t_s)
         return predict_along_path(self._paths, agent, pose.distance_m, np.abs(pose.speed_mps))
 
 
-class MotionForesight:
+class MotionForesight(PathForesight):
     """Others go on at the speed and turn rate that they had so far, smoothed as `log2sim.prediction` does."""
 
     def __init__(self, paths: PathTable, agents: Sequence[Agent]) -> None:
-        self._paths = paths
+        super().__init__(paths)
         begin_s, end_s = float(paths.begin_s.min()), float(paths.end_s.max())
         self._begin_s = begin_s
         ticks = np.arange(int((end_s - begin_s) / TICK_S) + 1, dtype=np.float64)
@@ -158,7 +143,7 @@ class MotionForesight:
         self._driven_radps = 0.0
 
     def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
-        """See `Foresight`."""
+        """Predict as `PathForesight` does."""
         pose = self._paths.at(agent, t_s)
         since = (t_s - self._begin_s) / TICK_S + 1e-6
         tick = np.clip(since.astype(np.intp), 0, self._turn_radps.shape[1] - 1)
@@ -167,7 +152,7 @@ class MotionForesight:
         return _go_on(pose, np.asarray(self._velocity[agent, tick] * turned * rate), turn * rate)
 
     def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
-        """See `Foresight`."""
+        """Predict as `PathForesight` does."""
         one = Pose(*(np.asarray(c)[agent : agent + 1] for c in pose))
         yaw = float(one.yaw_rad[0])
         if self._seen is None or not t_s > self._seen[0]:  # it begins, or begins again
@@ -180,7 +165,7 @@ class MotionForesight:
         return _go_on(one, one.speed_mps * np.exp(1j * one.yaw_rad), np.array([self._driven_radps]))
 
     def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
-        """See `Foresight`."""
+        """Predict as `PathForesight` does."""
         return self.expect(np.full(len(t_s), agent), t_s, np.ones(len(t_s)))
 
 
@@ -189,7 +174,8 @@ def _go_on(pose: Pose, velocity: NDArray[np.complex128], turn_radps: Array) -> P
     way = displacement(velocity[:, None], turn_radps[:, None], HORIZON_S)
     yaw = pose.yaw_rad[:, None] + turn_radps[:, None] * HORIZON_S
     speed = np.copysign(np.abs(velocity), pose.speed_mps)[:, None]
-    return pose.x_m[:, None] + way.real, pose.y_m[:, None] + way.imag, yaw, np.broadcast_to(speed, yaw.shape)
+    x, y = pose.x_m[:, None] + way.real, pose.y_m[:, None] + way.imag
+    return Prediction(x, y, yaw, np.broadcast_to(speed, yaw.shape))
 
 
 MIN_LOOKAHEAD_M = 10.0  # also at standstill
@@ -216,7 +202,7 @@ class TrafficState:
     rate: Array  # (A,) rate at which each agent passes its trajectory
     pose: Pose  # where the agents are, (A,)
     prediction: Prediction  # where they are expected to go, (A, H)
-    foresight: Foresight  # what expects it
+    foresight: PathForesight  # what expects it
 
     def reach_m(self, i: Index) -> Array:
         """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
@@ -277,8 +263,8 @@ def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_
     logged = m.paths.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
     starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
-    x, y, yaw, speed = (c[j] for c in m.prediction)
-    found = leaders(m.paths, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), MARGINS_NOW)
+    there = Prediction(*(c[j] for c in m.prediction))
+    found = leaders(m.paths, _corridor(m, i, pace, means), there, m.size_m[j], MARGINS_NOW)
     # Where two reactive agents meet, the one that was first in the scenario goes first; an obstacle already in the path is
     # waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
@@ -298,7 +284,7 @@ def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corri
     The nearer the other agent is than it was in the scenario, the less of the scenario's demand counts; at half the gap
     none.
     """
-    found = leaders(m.paths, corridor, _boxes(m, j, _predict_in_scenario(m, j, m.t_s[i])), MARGINS_IN_SCENARIO)
+    found = leaders(m.paths, corridor, _predict_in_scenario(m, j, m.t_s[i]), m.size_m[j], MARGINS_IN_SCENARIO)
     gap = found.gap_m - GAP_M
     taken = leader_demand(m.idm.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
     known = np.isfinite(gap)
@@ -313,10 +299,6 @@ def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> SweptC
     return SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
 
 
-def _boxes(m: TrafficState, j: Index, prediction: Prediction) -> PredictedBoxes:
-    return PredictedBoxes(*prediction, m.size_m[j, 0], m.size_m[j, 1])
-
-
 def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
     """Predict agents (P,) from the scenario at times (P,), by the same rules."""
     prediction = m.foresight.expect(j, t_s, np.ones(len(j)))
@@ -326,8 +308,7 @@ def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
 
 
 def _select(mask: NDArray[np.bool_], one: Prediction, other: Prediction) -> Prediction:
-    x, y, yaw, speed = (np.where(mask[:, None], a, b) for a, b in zip(one, other))
-    return x, y, yaw, speed
+    return Prediction(*(np.where(mask[:, None], a, b) for a, b in zip(one, other)))
 
 
 DEEP_OVERLAP_M = 0.5  # larger than the errors of boxes
@@ -395,7 +376,6 @@ class Traffic:
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
         self.paths = PathTable(trajectories)
-        self._foresight: Foresight
         self._foresight = MotionForesight(self.paths, agents) if foresight == "motion" else PathForesight(self.paths)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.idm = idm_parameters(agents)
@@ -435,11 +415,9 @@ class Traffic:
         # Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,).
         everyone = np.arange(len(tau))
         prediction = self._foresight.expect(everyone, tau, self.rate)
-        prediction = (
-            prediction
-            if self._driven < 0
-            else _select(everyone == self._driven, self._foresight.expect_driven(self._driven, t_s, pose), prediction)
-        )
+        if self._driven >= 0:
+            driven = self._foresight.expect_driven(self._driven, t_s, pose)
+            prediction = _select(everyone == self._driven, driven, prediction)
         moment = TrafficState(
             self.paths,
             self.idm,

@@ -31,7 +31,7 @@ from log2sim.synth.synthesis import synthesize
 
 LANE_M, LANES = 3.5, 3
 CAR, PERSON = (4.4, 1.8, 1.5), (0.6, 0.6, 1.7)
-LEAST = 0.3
+LEAST, EDGE_S = 0.3, 0.2
 WITHIN_S = 1.5  # of a tag's moment and the true one's
 FINE_S = 0.01
 WINDING = np.inf
@@ -46,6 +46,12 @@ class Event:
     other: str | None
     t_s: float
     sure: bool = True
+
+
+def maybe(tags: Sequence[str], one: str, two: str, times: Sequence[float]) -> list[Event]:
+    """List what may be called so, by either of two at any of some times."""
+    pairs = ((one, two), (two, one))
+    return [Event(tag, a, b, t, sure=False) for tag in tags for a, b in pairs for t in times]
 
 
 @dataclass
@@ -158,25 +164,16 @@ def _agent(id: str, x: np.ndarray, y: np.ndarray, t: np.ndarray, speed: np.ndarr
     moves = pace > 0.05
     yaw = np.interp(t, t[moves], yaw[moves]) if moves.any() else np.zeros(len(t))
     at = np.arange(0.0, t[-1] + 1e-9, 1.0 / rate_hz)
-    at = at[at >= begin_s]
+    n = len(at := at[at >= begin_s])
     columns = [np.interp(at, t, c) for c in (x, y, yaw, pace)]
-    n = len(at)
-    noise = [
-        noise_m * rng.standard_normal(n),
-        noise_m * rng.standard_normal(n),
-        0.02 * rng.standard_normal(n),
-        0.3 * rng.standard_normal(n),
-    ]
+    known = {}
     if noise_m:
-        columns = [c + e for c, e in zip(columns, noise)]
+        columns = [c + sigma * rng.standard_normal(n) for c, sigma in zip(columns, (noise_m, noise_m, 0.02, 0.3))]
+        known = {"sigma_yaw_rad": np.full(n, 0.02), "sigma_speed_mps": np.full(n, 0.3)}
     xs, ys, yaws, speeds = columns
-    sigma = np.full(n, noise_m)
-    known = {"sigma_yaw_rad": np.full(n, 0.02), "sigma_speed_mps": np.full(n, 0.3)} if noise_m else {}
-    w = Waypoints(
-        at, xs, ys, np.full(n, size[2] / 2), wrap_angle(yaws), np.maximum(speeds, 0.0), np.ones(n, bool), sigma, **known
-    )
-    static = bool(not moves.any())
-    return Agent(id, category, size, w, static=static)
+    height, sigma_m = np.full(n, size[2] / 2), np.full(n, noise_m)
+    w = Waypoints(at, xs, ys, height, wrap_angle(yaws), np.maximum(speeds, 0.0), np.ones(n, bool), sigma_m, **known)
+    return Agent(id, category, size, w, static=not moves.any())
 
 
 def route(points: Sequence[tuple[float, float]], radius_m: float) -> np.ndarray:
@@ -200,6 +197,11 @@ def route(points: Sequence[tuple[float, float]], radius_m: float) -> np.ndarray:
     return np.column_stack([line.real, line.imag])
 
 
+def along(line: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places x, y (K,) at stations of a route."""
+    return tuple(np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T)
+
+
 @dataclass
 class Stage:
     """A scripted scene: agents on routes with stations over time; mirrored for traffic on the left."""
@@ -220,9 +222,8 @@ class Stage:
         """Add an agent and return its stations; the route is long enough for it."""
         pace = np.broadcast_to(np.asarray(speed, dtype=float), self.t.shape)
         s = start_m + np.concatenate([[0.0], np.cumsum((pace[1:] + pace[:-1]) / 2) * FINE_S])
-        at = np.arange(len(line)) * 0.05
-        assert s[-1] <= at[-1] + 0.1, id
-        x, y = (np.interp(s, at, c) for c in line.T)
+        assert s[-1] <= (len(line) - 1) * 0.05 + 0.1, id
+        x, y = along(line, s)
         y = -y if self.mirrored else y
         agent = _agent(id, x, y, self.t, pace.copy(), self.rate_hz, self.noise_m, self.rng, category, size, begin_s)
         if not pace.any():
@@ -256,18 +257,18 @@ def turn_across(stage: Stage) -> World:
     line = route([(-80, -1.75), (1.75, -1.75), (1.75, 90)], 8.0)
     s = stage.add("ego", line, v, start_m=rng.uniform(20, 40))
     # Where the ego is in the oncoming lane: its center at y = 1.75.
-    xy = np.stack([np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T])
-    there = stage.t[np.argmax(xy[1] > 1.75)]
+    x, y = along(line, s)
+    there = stage.t[np.argmax(y > 1.75)]
     gap = rng.choice([-1.0, 1.0]) * rng.uniform(1.8, 3.5)  # when the oncoming one is there, later or earlier
-    x_there = xy[0][np.argmax(xy[1] > 1.75)]
-    begin = x_there + u * (there + gap)
+    begin = x[np.argmax(y > 1.75)] + u * (there + gap)
     stage.add("car-1", route([(250, 1.75), (-250, 1.75)], 5.0), u, start_m=250 - begin)
     last = there + max(gap, 0.0) < stage.t[-1] - 1.0
     first, second = ("ego", "car-1") if gap > 0 else ("car-1", "ego")
-    turned = stage.t[np.argmax(np.abs(s - (s[np.argmax(xy[1] > 0)])) < 0.2)]
+    turned = stage.t[np.argmax(np.abs(s - (s[np.argmax(y > 0)])) < 0.2)]
     events = [
-        Event("turning", "ego", None, turned), Event("turning_across", "ego", "car-1", there, sure=last), Event("crossing_path", first, second, there + min(gap, 0.0), sure=last),
-        Event("oncoming_in_lane", "car-1", "ego", there, sure=False), *(Event("near_miss", first, second, there + d, sure=False) for d in (0.0, gap)),
+        Event("turning", "ego", None, turned), Event("turning_across", "ego", "car-1", there, sure=last),
+        Event("crossing_path", first, second, there + min(gap, 0.0), sure=last),
+        *maybe(("oncoming_in_lane",), "car-1", "ego", (there,)), *maybe(("near_miss",), first, second, (there, there + gap)),
     ]  # fmt: skip
     return stage.world("turn across", events, JUNCTION_TAGS)
 
@@ -293,8 +294,7 @@ def merge(stage: Stage) -> World:
     line = route([(0, -60), (0, -1.75), (150, -1.75)], 7.0)
     start = rng.uniform(20.0, 35.0)
     s = stage.add("car-1", line, u, start_m=start)
-    xy = np.stack([np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T])
-    enters = stage.t[np.argmax(xy[1] > -3.5)]
+    enters = stage.t[np.argmax(along(line, s)[1] > -3.5)]
     turns = stage.t[np.argmax(s > 60 - 1.75 - 7.0 + 5.5)]
     behind = rng.uniform(14.0, 25.0)
     speed = ramp(stage.t, enters - 0.5, -rng.uniform(1.0, 2.0), u, v, v)
@@ -302,9 +302,8 @@ def merge(stage: Stage) -> World:
     stage.add("ego", route([(-200, -1.75), (300, -1.75)], 5.0), speed, start_m=200 - behind - way)
     events = [
         Event("merging", "car-1", "ego", enters), Event("turning", "car-1", None, turns),
-        *(Event(tag, "ego", "car-1", t, sure=False) for tag in ("following", "approaching") for t in (enters, enters + 2, enters + 4)),
-        Event("crossing_path", "car-1", "ego", enters, sure=False), Event("near_miss", "ego", "car-1", enters, sure=False),
-        Event("near_miss", "car-1", "ego", enters, sure=False),
+        *maybe(("following", "approaching"), "ego", "car-1", (enters, enters + 2, enters + 4)),
+        *maybe(("crossing_path", "near_miss"), "ego", "car-1", (enters,)),
     ]  # fmt: skip
     return stage.world("merge", events, JUNCTION_TAGS)
 
@@ -320,21 +319,10 @@ def step_out(stage: Stage) -> World:
     if hidden:
         for k in range(4):
             stage.add(f"parked-{k}", route([(-24.0 + 5.6 * k, -2.9), (0, -2.9)], 1.0), 0.0)
-    stage.add(
-        "pedestrian-1",
-        route([(0.2, -40), (0.2, 40)], 1.0),
-        walk,
-        start_m=40 - 1.75 - walk * enters,
-        category="pedestrian",
-        size=PERSON,
-    )
+    line, begin = route([(0.2, -40), (0.2, 40)], 1.0), 40 - 1.75 - walk * enters
+    stage.add("pedestrian-1", line, walk, start_m=begin, category="pedestrian", size=PERSON)
     events = [Event("stepping_out", "pedestrian-1", "ego", enters)] if hidden else []
-    events += [
-        Event(tag, a, b, enters + d, sure=False)
-        for tag in ("crossing_path", "near_miss")
-        for a, b in (("ego", "pedestrian-1"), ("pedestrian-1", "ego"))
-        for d in (0, 1.5)
-    ]
+    events += maybe(("crossing_path", "near_miss"), "ego", "pedestrian-1", (enters, enters + 1.5))
     return stage.world(f"step out, {'hidden' if hidden else 'seen'}", events, JUNCTION_TAGS)
 
 
@@ -374,12 +362,10 @@ def follow(stage: Stage) -> World:
     if nears:  # it brakes to the speed of the other when 10 m are left
         speed = ramp(stage.t, (gap - 18) / (v - u), -1.5, u, v, v)
     stage.add("ego", route([(0, 0), (600, 0)], 5.0), speed, start_m=100)
-    ttc = [Event("approaching", "ego", "car-1", t) for t in ((gap - 18) / (v - u),)] if nears else []
-    events = [
-        *ttc,
-        *(Event("following", "ego", "car-1", t, sure=not nears and t == 6.0) for t in (0.5, 3.0, 6.0, 9.0, 11.5)),
-    ]
-    if not nears:  # one event over all the time, whose moment may be any
+    if nears:
+        events = [Event("approaching", "ego", "car-1", (gap - 18) / (v - u))]
+        events += maybe(("following",), "ego", "car-1", (0.5, 3.0, 6.0, 9.0, 11.5))
+    else:  # one event over all the time, whose moment is that of the least headway
         events = [Event("following", "ego", "car-1", 0.0 if v < u else 12.0)]
     return stage.world(f"follow, {'nears' if nears else 'follows'}", events, JUNCTION_TAGS)
 
@@ -405,19 +391,21 @@ def oncoming(stage: Stage) -> World:
     beside = out_s + lasts + 1.0
     x0 = -v * beside + u * beside  # beside the slower one then
     x, y = x0 + s, -1.75 + d
-    stage.agents.append(
-        _agent("car-1", x, -y if stage.mirrored else y, stage.t, None, stage.rate_hz, stage.noise_m, stage.rng)
-    )
+    y = -y if stage.mirrored else y
+    stage.agents.append(_agent("car-1", x, y, stage.t, None, stage.rate_hz, stage.noise_m, stage.rng))
     stage.add("car-2", route([(0, -1.75), (400, -1.75)], 5.0), u, start_m=0.0)
     # The oncoming one meets it two to three seconds after it is back.
     meet = back + rng.uniform(1.5, 2.5)
     at = x0 + v * meet
     stage.add("ego", route([(at + w * meet, 1.75), (at - 300, 1.75)], 5.0), w)
-    closing = v + w
+    follows, times = (
+        ("cut_in", "cut_out", "approaching", "near_miss", "following"),
+        (1, 2, 3.25, beside, back - 1, back, back + 2),
+    )
     events = [
-        Event("overtaking", "car-1", "car-2", beside), Event("oncoming_in_lane", "car-1", "ego", back - 1.0, sure=closing * (meet - back) / closing < 4.0),
-        *(Event(tag, a, b, t, sure=False) for a, b in (("car-1", "ego"), ("ego", "car-1")) for tag in ("oncoming_in_lane", "near_miss", "crossing_path") for t in (beside, back, meet)),
-        *(Event(tag, a, b, t, sure=False) for a, b in (("car-1", "car-2"), ("car-2", "car-1")) for tag in ("cut_in", "cut_out", "approaching", "near_miss", "following") for t in (1.0, 2.0, 3.25, beside, back - 1, back, back + 2)),
+        Event("overtaking", "car-1", "car-2", beside), Event("oncoming_in_lane", "car-1", "ego", back - 1.0, sure=meet - back < 4.0),
+        *maybe(("oncoming_in_lane", "near_miss", "crossing_path"), "car-1", "ego", (beside, back, meet)),
+        *maybe(follows, "car-1", "car-2", times),
     ]  # fmt: skip
     return stage.world("oncoming", events, JUNCTION_TAGS)
 
@@ -451,14 +439,10 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
                 behind = [o for o in vehicles if o is not v and o.s[n] < v.s[n] and _in(o, lane, n, target)]
                 for k, o in enumerate(sorted(behind, key=lambda o: -o.s[n])):
                     headway = (v.s[n] - o.s[n] - CAR[0]) / o.speed[n]
-                    busy = any(
-                        abs(at - b) < 5.0 for b, *_ in o.changes
-                    )  # who changes lanes as well may be called either
-                    between = [
-                        b
-                        for b in vehicles
-                        if b not in (o, v) and o.s[n] < b.s[n] < v.s[n] + 5.0 and abs(b.d[n] - target * LANE_M) < LANE_M
-                    ]
+                    # Who changes lanes as well may be called either.
+                    busy = any(abs(at - b) < 5.0 for b, *_ in o.changes)
+                    near = [b for b in vehicles if b not in (o, v) and abs(b.d[n] - target * LANE_M) < LANE_M]
+                    between = any(o.s[n] < b.s[n] < v.s[n] + 5.0 for b in near)
                     if k == 0 and headway <= 4.0 * 1.1:
                         yield Event(tag, v.id, o.id, at, sure=not (_near(headway, 4.0) or busy or between))
                     elif headway < 4.4:
@@ -473,13 +457,8 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
                 beside = np.abs(a.d - b.d)[before[-1] : n].max()
                 middle = t[before[-1] + int(np.argmin(np.abs(ahead[before[-1] : n])))]
                 # Passing ends too near to the end of the log to be told from driving beside.
-                yield Event(
-                    "overtaking",
-                    a.id,
-                    b.id,
-                    middle,
-                    sure=beside < 2.1 * LANE_M and t[n] < t[-1] - 0.2 and t[before[-1]] > 0.2,
-                )
+                sure = beside < 2.1 * LANE_M and t[n] < t[-1] - 0.2 and t[before[-1]] > 0.2
+                yield Event("overtaking", a.id, b.id, middle, sure)
 
 
 def _in(o: Vehicle, lane: dict[str, np.ndarray], n: int, target: int) -> bool:
@@ -493,13 +472,8 @@ def score(worlds: Sequence[World], found: Sequence[Sequence[Tag]]) -> dict[str, 
     for world, tags in zip(worlds, found):
         left = list(world.events)
         for tag in (g for g in tags if g.tag in world.tags and g.probability >= 0.5):
-            fits = [
-                e
-                for e in left
-                if (e.tag, e.agent) == (tag.tag, tag.agent)
-                and e.other in (tag.other, None)
-                and abs(e.t_s - tag.t_s) <= WITHIN_S
-            ]
+            alike = [e for e in left if (e.tag, e.agent) == (tag.tag, tag.agent) and e.other in (tag.other, None)]
+            fits = [e for e in alike if abs(e.t_s - tag.t_s) <= WITHIN_S]
             row = counts[tag.tag]
             if fits:
                 best = min(fits, key=lambda e: (not e.sure, abs(e.t_s - tag.t_s)))
@@ -509,9 +483,7 @@ def score(worlds: Sequence[World], found: Sequence[Sequence[Tag]]) -> dict[str, 
                     row[3].append(abs(best.t_s - tag.t_s))
             else:
                 row[1] += 1
-                row[4].append(
-                    f"invented {world.scenario.name}: {tag.tag} {tag.agent} {tag.other} {tag.start_s}-{tag.t_s}-{tag.end_s} p {tag.probability} {dict(tag.quantities)}"
-                )
+                row[4].append(f"invented {world.scenario.name}: {describe(tag)}")
         for event in left:
             if event.sure:
                 counts[event.tag][2] += 1
@@ -532,38 +504,69 @@ def variants(count: int, noise_m: float, first: int = 0):
         yield traffic(seed, rate_hz=rate_hz, bend_1pm=bend, keeps_right=right, lanes=lanes, noise_m=noise_m)
 
 
-def compare(made: Scenario, truth: Scenario) -> dict[str, list[int]]:
-    """Count tags that a reconstruction shares with its truth, has alone, and lacks, by kind."""
+def describe(tag: Tag) -> str:
+    """Say a tag in a line."""
+    span = f"{tag.start_s}-{tag.t_s}-{tag.end_s}"
+    return f"{tag.tag} {tag.agent} {tag.other} {span} p {tag.probability} {dict(tag.quantities)}"
+
+
+def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
+    """List the tags that a reconstruction shares with its truth, has alone, and lacks, by kind, with why those are missed.
+
+    What begins or ends within `EDGE_S` of either end of the reconstruction counts neither way: whether it is whole there is decided by
+    centimeters.
+    """
     truth = truth.aligned_to(made)
     agents = [{a.id: a for a in s.agents} for s in (made, truth)]
-    ours, theirs = ([g for g in find_tags(s) if g.probability >= LEAST and g.tag != "in_lane"] for s in (made, truth))
+    last_s = min(made.duration_s, max(float(a.waypoints.t_s[-1]) for a in made.agents))
+    ours, theirs = ([g for g in find_tags(s) if g.tag != "in_lane"] for s in (made, truth))
 
-    def same(one: str | None, two: str | None, t_s: float) -> bool:
+    def apart_m(one: str | None, two: str | None, times: Sequence[float]) -> float:
+        """Median distance of an agent from a true one over times at which both are there, or nearly."""
         if one is None or two is None:
-            return one is two
+            return 0.0 if one is two else np.inf
         a, b = (
-            AgentTable.of([of[id]], np.array([t_s]), margin_s=UNSEEN_S).center_m[0, 0]
+            AgentTable.of([of[id]], np.unique(times), margin_s=UNSEEN_S).center_m[0]
             for of, id in zip(agents, (one, two))
         )
-        return bool(np.hypot(*(a - b)[:2]) < 3.0)
+        away = np.hypot(*(a - b)[:, :2].T)
+        return float(np.median(away[np.isfinite(away)])) if np.isfinite(away).any() else np.inf
 
-    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
-    for g in ours:
-        fits = (
-            e
-            for e in theirs
-            if e.tag == g.tag
-            and abs(e.t_s - g.t_s) <= WITHIN_S
-            and same(g.agent, e.agent, g.t_s)
-            and same(g.other, e.other, g.t_s)
+    def same(g: Tag, e: Tag) -> bool:
+        times = (g.start_s, g.t_s, g.end_s, e.t_s)
+        shared = (g.start_s <= e.end_s and g.end_s >= e.start_s) or abs(g.t_s - e.t_s) <= WITHIN_S
+        return (
+            g.tag == e.tag
+            and shared
+            and all(apart_m(*pair, times) < 3.0 for pair in ((g.agent, e.agent), (g.other, e.other)))
         )
-        found = next(fits, None)
-        counts[g.tag][0 if found else 1] += 1
+
+    def reason(e: Tag) -> str:
+        doubted = [g for g in ours if same(g, e)]
+        if doubted:
+            sure = [agents[0][id].confidence for id in (doubted[0].agent, doubted[0].other) if id]
+            return f"found with {doubted[0].probability}, confidences {sure}"
+        times = (e.start_s, e.t_s, e.end_s)
+        gone = [
+            id
+            for id in (e.agent, e.other)
+            if id and min((apart_m(k, id, times) for k in agents[0]), default=np.inf) >= 3.0
+        ]
+        return f"not reconstructed: {', '.join(gone)}" if gone else "other motion"
+
+    out: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
+    left = list(theirs)
+    for g in (g for g in ours if g.probability >= LEAST):
+        found = next((e for e in left if same(g, e)), None)
+        at_edge = min(g.t_s, last_s - g.t_s, last_s - g.end_s) < EDGE_S
+        if found is not None or not at_edge:
+            out[g.tag][0 if found else 1].append(describe(g))
         if found:
-            theirs.remove(found)
-    for e in theirs:
-        counts[e.tag][2] += 1
-    return counts
+            left.remove(found)
+    for e in left:
+        if e.probability >= LEAST and min(e.t_s, last_s - e.t_s, last_s - e.end_s) >= EDGE_S:
+            out[e.tag][2].append(f"{describe(e)}: {reason(e)}")
+    return out
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -574,21 +577,25 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of places, m")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--write", type=Path, metavar="FOLDER")
-    parser.add_argument(
-        "--pair", type=Path, nargs=2, action="append", default=[], metavar=("RECONSTRUCTION.json", "SCENE.toml")
-    )
+    pair = ("RECONSTRUCTION.json", "SCENE.toml")
+    parser.add_argument("--pair", type=Path, nargs=2, action="append", default=[], metavar=pair)
     parser.add_argument("--wrong", action="store_true", help="list what was wrong")
     asked = parser.parse_args(arguments)
     worlds = [*variants(asked.worlds, asked.noise, asked.first), *scripted(asked.scripted, asked.noise, asked.first)]
     if asked.write is not None:
         for k, world in enumerate(worlds):
             world.scenario.save(asked.write / f"{k:04}" / "scenario.json")
-    sums: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
     for made, scene in asked.pair:
-        for tag, counts in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
-            sums[tag] = [a + b for a, b in zip(sums[tag], counts)]
+        for tag, lists in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
+            sums[tag] = [[*a, *(f"{made.name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
     for tag, (true, invented, missed) in sorted(sums.items()):
-        print(f"{tag:22} {true:5} of the truth, {invented} alone, {missed} missed in reconstructions")
+        counts = len(true), len(invented), len(missed)
+        print(
+            f"{tag:22} {counts[0]:5} of the truth, {counts[1]} alone, {counts[2]} missed in reconstructions, F1 {f1(*counts):.3f}"
+        )
+        for line in [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed] if asked.wrong else ():
+            print("   ", line)
     begin = time.process_time()
     found = [find_tags(w.scenario) for w in worlds]
     spent = time.process_time() - begin

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO, STANDSTILL_MPS, Trajectory
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.files.plugins import nearest
-from log2sim.geometry import Array, rectangles_overlap, wrap_angle
+from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.corridors import PathTable
 from log2sim.simulation.groups import StepClock
 from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, BoxTracks, collisions
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
+from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.result import AgentReplay, Replay
 from log2sim.simulation.vehicles.parameters import WHEELED
 from log2sim.simulation.warnings import describe_warnings
@@ -211,14 +212,12 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     ego in the scenario.
     """
     table = PathTable([path])
-    gone_m = 0.0
-    for x, y in zip(ego.x_m.tolist(), ego.y_m.tolist()):
-        gone_m = table.progress_near(0, gone_m, x, y)
+    gone_m = table.progress(0, ego.x_m, ego.y_m)
     length_m = float(table.at(np.zeros(1, dtype=np.intp), np.array([path.t_s[-1]])).distance_m[0])
     steps_m = np.hypot(np.diff(ego.x_m), np.diff(ego.y_m))
     return {
         "driven_m": round(float(steps_m.sum()), 3),
-        "progress_m": round(gone_m, 3),
+        "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
         "path_m": round(length_m, 3),
         "min_gap": smallest_gap(boxes, index, t_s),
         "max_brake": hardest_brake(ego),
@@ -274,28 +273,10 @@ def _near_pairs(boxes: BoxTracks, index: int) -> tuple[NDArray[np.intp], NDArray
 
 def box_distances(boxes: BoxTracks, rows: NDArray[np.intp], others: NDArray[np.intp], index: int) -> Array:
     """Return the distances (P,), m, in plan between the box of an agent and those of others at rows; 0 where they overlap."""
-    a, b = np.full(len(rows), index), others
-    dx, dy = (c[rows, b] - c[rows, a] for c in (boxes.x_m, boxes.y_m))
-    yaw_a, yaw_b = boxes.yaw_rad[rows, a], boxes.yaw_rad[rows, b]
-    size_a, size_b = boxes.size_m[a], boxes.size_m[b]
-    # Of two rectangles that are apart, a corner of one is nearest to the other.
-    apart = np.minimum(
-        _corner_distance(dx, dy, yaw_a, yaw_b, size_a, size_b), _corner_distance(-dx, -dy, yaw_b, yaw_a, size_b, size_a)
-    )
-    return np.where(rectangles_overlap(dx, dy, yaw_a, yaw_b, size_a, size_b), 0.0, apart)
-
-
-def _corner_distance(dx: Array, dy: Array, yaw_a: Array, yaw_b: Array, size_a: Array, size_b: Array) -> Array:
-    """Return the distance (P,) of the nearest corner of rectangles b from rectangles a; `dx`, `dy` lead from a to b."""
-    cos, sin = np.cos(yaw_a), np.sin(yaw_a)
-    ahead, left, turn = dx * cos + dy * sin, dy * cos - dx * sin, yaw_b - yaw_a
-    least = np.full(len(dx), np.inf)
-    for front, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        u, v = front * size_b[:, 0] / 2, side * size_b[:, 1] / 2
-        x, y = ahead + u * np.cos(turn) - v * np.sin(turn), left + u * np.sin(turn) + v * np.cos(turn)
-        out_x, out_y = np.abs(x) - size_a[:, 0] / 2, np.abs(y) - size_a[:, 1] / 2
-        least = np.minimum(least, np.hypot(np.maximum(out_x, 0.0), np.maximum(out_y, 0.0)))
-    return least
+    away = boxes.x_m[rows, others] - boxes.x_m[rows, index] + 1j * (boxes.y_m[rows, others] - boxes.y_m[rows, index])
+    size = np.broadcast_to(boxes.size_m[index], (len(rows), 3))
+    yaws = boxes.yaw_rad[rows, index], boxes.yaw_rad[rows, others]
+    return np.maximum(signed_distance(away, *yaws, size, boxes.size_m[others]), 0.0)
 
 
 LOWER_LIMITS = ("min_ttc_s", "min_pet_s")

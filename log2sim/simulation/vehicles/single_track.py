@@ -10,8 +10,9 @@ As in `single_track`, each step solves for the slips at its end, in a form that 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,34 +118,13 @@ class Slips(NamedTuple):
     front: Array
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPair:
-    """Two linear equations for the slips of an agent, a and b above c and d, solved by Cramer's rule.
-
-    The unknowns are the slips in units of their own, which may be zero.
-    """
-
-    # a, b, c, d: (A,)
-    a: Array
-    b: Array
-    c: Array
-    d: Array
-    # rear_factor, front_factor: (A,) unit over determinant.
-    rear_factor: Array
-    front_factor: Array
-
-    @classmethod
-    def of(cls, a: Array, b: Array, c: Array, d: Array, unit: Slips | None = None) -> Self:
-        """Set up the equations, with the units of the slips."""
-        factor = 1 / (a * d - b * c)
-        rear, front = (factor, factor) if unit is None else (unit.rear * factor, unit.front * factor)
-        return cls(a, b, c, d, rear, front)
-
-    def solve(self, rear: Array, front: Array) -> Slips:
-        """Return the slips for right-hand sides (A,), (A,)."""
-        return Slips(
-            self.rear_factor * (self.d * rear - self.b * front), self.front_factor * (self.a * front - self.c * rear)
-        )
+def _solver(
+    a: Array, b: Array, c: Array, d: Array, rear_unit: Array | float = 1.0, front_unit: Array | float = 1.0
+) -> Callable[[Array, Array], Slips]:
+    """Return what solves two linear equations, a and b above c and d, for slips in units of their own, which may be zero."""
+    factor = 1 / (a * d - b * c)
+    rear_factor, front_factor = rear_unit * factor, front_unit * factor
+    return lambda rear, front: Slips(rear_factor * (d * rear - b * front), front_factor * (a * front - c * rear))
 
 
 def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chassis, h: float) -> Slips:
@@ -162,7 +142,7 @@ def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chass
     rear_turn = (p.cg_to_rear_m * gear * accel - pace * speed) / wheelbase
     front_turn = -(c.cg_to_front_m * gear * accel + pace * speed) / wheelbase
     tau, turned = GAMMA * h, m.steer1_rad - m.steer0_rad
-    system = LinearPair.of(
+    solve = _solver(
         pace + tau * (c.rear * by_rear + rear_turn),
         tau * (c.cross * by_front - rear_turn),
         tau * (c.cross * by_rear + front_turn),
@@ -171,7 +151,7 @@ def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chass
 
     def stage(rear: Array, front: Array, steer: Array) -> Slips:
         push = tau * steer
-        return system.solve(pace * rear + rear_turn * push, pace * (front - GAMMA * turned) + front_turn * push)
+        return solve(pace * rear + rear_turn * push, pace * (front - GAMMA * turned) + front_turn * push)
 
     rear, front = slips
     first = stage(rear, front, m.steer0_rad + GAMMA * turned)
@@ -224,7 +204,7 @@ def step_dynamic(
     count, h = inner_steps(dt_s)
     actuators, target, lag_s, max_rate = actuation(state, controls, p)
     grip = ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
-    body = BodyState(state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.lateral_mps, state.yaw_rate_radps)
+    body = state
     bend = np.tan(state.steer_rad)
     for _ in range(count):
         bend0 = bend
@@ -233,8 +213,7 @@ def step_dynamic(
         gear = engaged_gear(body.speed_mps, controls.reverse)
         drive = DriveInput(clamp(mean_pedal, -grip, grip), gear, bend0, np.tan(mean_steer), bend)
         body = step_body(body, drive, p, chassis, h)
-    b, (pedal, steer) = body, actuators
-    return VehicleState(b.x_m, b.y_m, b.yaw_rad, b.speed_mps, steer, pedal, b.lateral_mps, b.yaw_rate_radps)
+    return replace(body, pedal_mps2=actuators[0], steer_rad=actuators[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,20 +229,7 @@ class DriveInput:
     bend1: Array
 
 
-@dataclass(frozen=True, eq=False)
-class BodyState:
-    """State of the rear axle."""
-
-    # x_m, y_m, yaw_rad: (A,)
-    x_m: Array
-    y_m: Array
-    yaw_rad: Array
-    speed_mps: Array  # (A,) along the heading
-    lateral_mps: Array  # (A,) to the left of the heading
-    yaw_rate_radps: Array  # (A,)
-
-
-def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> BodyState:
+def step_body(body: VehicleState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> VehicleState:
     """Compute one step of the saturating model.
 
     The unknowns are the lateral velocities at which the axles slip. Tires act by their secant stiffness, so a step of any
@@ -277,8 +243,8 @@ def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chass
     speed1, _, accel = _longitudinal_step(speed, _slip_speed_gain(start, body.yaw_rate_radps, 0.0, d, p, h), d, h)
     mean_speed = (speed + speed1) / 2
     begin, end, swing = _rolling_slip_growth(speed, speed1, d, p, h)
-    system = _slip_equations(mean_speed, accel, start, d, p, c, h / 2)
-    middle = system.solve(rear + (begin + end) / 4, front + (begin + end) / 4 + swing / 2)
+    solve = _slip_equations(mean_speed, accel, start, d, p, c, h / 2)
+    middle = solve(rear + (begin + end) / 4, front + (begin + end) / 4 + swing / 2)
 
     # To the end of the step. The slips depend on the speed and the speed on the slips: it is predicted and then corrected.
     rate = (mean_speed * d.mean_bend + middle.front - middle.rear) / p.wheelbase_m
@@ -286,11 +252,11 @@ def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chass
         speed, _slip_speed_gain(middle, rate, 2 * (middle.rear - rear), d, p, h), d, h
     )
     begin, end, swing = _rolling_slip_growth(speed, speed1, d, p, h)
-    system = _slip_equations((speed + speed1) / 2, accel, middle, d, p, c, GAMMA * h)
+    solve = _slip_equations((speed + speed1) / 2, accel, middle, d, p, c, GAMMA * h)
     pull = GAMMA * (begin + GAMMA * (end - begin))
-    first = system.solve(rear + pull, front + pull + GAMMA * swing)
+    first = solve(rear + pull, front + pull + GAMMA * swing)
     pull = GAMMA * end
-    last = system.solve(
+    last = solve(
         rear + STAGE_WEIGHT * (first.rear - rear) + pull,
         front + STAGE_WEIGHT * (first.front - front) + pull + GAMMA * swing,
     )
@@ -303,7 +269,8 @@ def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chass
     ahead, aside = distance * shrink, h * (rear + last.rear) / 2 * shrink
     cos, sin = cos_sin(body.yaw_rad + turn / 2)
     x, y = body.x_m + ahead * cos - aside * sin, body.y_m + ahead * sin + aside * cos
-    return BodyState(x, y, body.yaw_rad + turn, speed1, last.rear, rate1)
+    moved = (x, y, body.yaw_rad + turn, speed1, body.steer_rad, body.pedal_mps2, last.rear, rate1)
+    return VehicleState(*moved)
 
 
 def _slip_speed_gain(
@@ -337,7 +304,7 @@ def _longitudinal_step(speed: Array, gain: Array, d: DriveInput, h: float) -> tu
 
 def _slip_equations(
     speed: Array, accel: Array, slips: Slips, d: DriveInput, p: VehicleParameters, c: Chassis, tau: float
-) -> LinearPair:
+) -> Callable[[Array, Array], Slips]:
     """Build the equations of an implicit step `tau` for slip velocities (m/s), linearized about `slips`.
 
     Secant stiffness is a force over a scale that vanishes at standstill; with the scales as units, nothing is divided
@@ -354,10 +321,11 @@ def _slip_equations(
     by_rear = p.rear_stiffness_1prad * rear_grip * ellipse
     by_front = p.front_stiffness_1prad * front_grip * ellipse * cos2 * np.sqrt(cos2)
     rear_turn, front_turn = (speed / p.wheelbase_m * scale for scale in (rear_scale, front_scale))
-    return LinearPair.of(
+    return _solver(
         rear_scale + tau * (c.rear * by_rear - rear_turn),
         tau * (c.cross * by_front + front_turn),
         tau * (c.cross * by_rear - rear_turn),
         front_scale + tau * (c.front * by_front + front_turn),
-        Slips(rear_scale, front_scale),
+        rear_scale,
+        front_scale,
     )
