@@ -230,6 +230,36 @@ def test_who_is_lost_from_sight_before_a_crossing_still_crosses_with_a_time_that
     assert not of("crossing_path", cut(3.5))  # too long ago
 
 
+def test_who_is_lost_while_it_passes_overtakes_with_a_probability_that_falls_with_the_time_out_of_sight() -> None:
+    stage = Stage(np.random.default_rng(5), 10.0, False, 0.1)
+    line = route([(-300, 0), (300, 0)], 5.0)
+    stage.add("ego", line, 10.0, start_m=200.0)
+    stage.add("car-1", line + np.array([0.0, 3.5]), 16.0, start_m=200.0 - 24.0)  # beside it at 4 s, past it at 4.7 s
+    whole = stage.world("passes", [], ()).scenario
+
+    def overtakes(until_s: float) -> list:
+        w = whole["car-1"].waypoints
+        lost = replace(whole["car-1"], waypoints=w.take(np.flatnonzero(w.t_s < until_s)))
+        return [g for g in find_tags(replace(whole, agents=(whole["ego"], lost))) if g.tag == "overtaking"]
+
+    (seen,), (lost,) = overtakes(12.0), overtakes(4.0)
+    assert (lost.agent, lost.other) == (seen.agent, seen.other) == ("car-1", "ego")
+    assert lost.t_s == pytest.approx(seen.t_s, abs=0.15)
+    assert lost.end_s == pytest.approx(seen.end_s, abs=0.25)
+    assert 0.5 < lost.probability <= seen.probability
+    assert not overtakes(2.5)  # 4.7 s are more than 2 s on
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.15, 0.5])
+def test_places_that_jitter_without_sigmas_are_as_uncertain_as_they_jitter(noise_m) -> None:
+    world = traffic(3, noise_m=noise_m).scenario
+    bare = [replace(a, waypoints=replace(a.waypoints, sigma_xy_m=0 * a.waypoints.sigma_xy_m)) for a in world.agents]
+    found = Traffic(replace(world, agents=tuple(bare))).sigma_m
+    assert np.nanmedian(found) == pytest.approx(noise_m, rel=0.1, abs=0.005)
+    told = Traffic(world).sigma_m  # sigmas that are told are believed
+    assert np.nanmedian(told) == pytest.approx(noise_m, abs=1e-9 if noise_m else 0.005)
+
+
 def test_speeds_and_headings_of_labels_that_jump_are_no_braking_and_no_turning_back() -> None:
     stage = Stage(np.random.default_rng(4), 10.0, False, 0.0)
     line = route([(-300, 0), (300, 0)], 5.0)

@@ -120,13 +120,17 @@ def _on_workers(scheduler: str) -> MapFiles:
 
     def run(work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
         with workers_of(scheduler) as workers:
-            from distributed import as_completed
-
-            futures = workers.client.map(work, [str(Path(n).resolve()) for n in names], pure=False)
-            for future in as_completed(futures):
-                yield future.result()
+            yield from map_on_workers(workers.client, work, names)
 
     return run
+
+
+def map_on_workers(client: Any, work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
+    """Yield what a function makes of files on the workers of a client, in any order; each result is freed once it was taken."""
+    from distributed import as_completed
+
+    for future in as_completed(client.map(work, [str(Path(n).resolve()) for n in names], pure=False)):
+        yield future.result()
 
 
 def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import STANDSTILL_MPS, MapLane, Scenario
+from log2sim.datatypes import STANDSTILL_MPS, Agent, MapLane, Scenario
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
 from log2sim.prediction.prediction import MOVING, drift_variance
@@ -160,9 +160,10 @@ class Traffic:
         heading = np.where(back, -heading, heading)
         # Of who hardly moves the box tells the course, of all others the velocity.
         self.course_rad = np.angle(np.where(self.speed_mps > 1.0, velocity, heading))
-        self.sigma_m = t.sigma_m
-        self.sigma_speed_mps = (
-            np.stack([_sigma_speed(t, k) for k in range(len(t.agents))]) if len(t.agents) else t.sigma_m
+        jitter = np.array([_jitter(a) for a in t.agents]).reshape(-1, 1)
+        self.sigma_m = np.where(t.sigma_m.any(axis=1, keepdims=True), t.sigma_m, jitter) if len(jitter) else t.sigma_m
+        self.sigma_speed_mps = np.array([_sigma_speed(t, k, s) for k, s in enumerate(self.sigma_m)]).reshape(
+            self.sigma_m.shape
         )
         self._paths: dict[int, Path | None] = {}
 
@@ -435,14 +436,26 @@ def probability_above(value: Array | float, limit: float, sigma: Array | float) 
     return float(np.min(np.where(normal, ndtr(z), np.where(np.isinf(sigma), 0.5, sure)))) if value.size else 0.0
 
 
-def _sigma_speed(table: MotionTable, k: int) -> Array:
+def _jitter(agent: Agent) -> float:
+    """Return the standard deviation of places on each axis that third differences show: labels and truth that do not tell any may have some.
+
+    Places at less than 4 Hz change by more than they jitter, and are left as they are.
+    """
+    w = agent.waypoints
+    if agent.static or len(w) < 8 or float(np.median(np.diff(w.t_s))) > 0.25:
+        return 0.0
+    # Of two axes with errors of sigma the median length is 1.177 sigma, and 1, -3, 3, -1 are 20 of one variance.
+    return float(np.median(np.abs(np.diff(w.x_m + 1j * w.y_m, 3)))) / (1.1774 * np.sqrt(20.0))
+
+
+def _sigma_speed(table: MotionTable, k: int, sigma_m: Array) -> Array:
     """Return the standard deviation (T,) of speeds; where the scenario has none, that of a slope over a second of places."""
     w = table.agents[k].waypoints
     if w.sigma_speed_mps is not None:
         return np.asarray(np.interp(table.t_s, w.t_s, w.sigma_speed_mps))
     interval_s = float(np.median(np.diff(w.t_s))) if len(w) > 1 else 1.0
     count = max(1.0 / interval_s, 2.0)
-    return np.asarray(table.sigma_m[k] * np.sqrt(12.0 / (count * (count**2 - 1.0))) / interval_s)
+    return np.asarray(sigma_m * np.sqrt(12.0 / (count * (count**2 - 1.0))) / interval_s)
 
 
 def _driven_of(place: Complex, course: Array, piece: Index) -> Driven | None:
