@@ -14,7 +14,8 @@ from command_line import run
 from log2sim.datatypes import EGO, Scenario
 from log2sim.errors import ConfigError
 from log2sim.scenarios import Base, ask, choose_base, fit, open_index
-from log2sim.scenarios.failure import Outcome, judge_run, parse_limits, report_page, search, with_ego
+from log2sim.scenarios.failure import LIMITS, Outcome, judge_run, report_page, search, with_ego
+from log2sim.simulation.metrics.all_metrics import parse_limits
 from log2sim.simulation.policy import Controls
 
 pytest.importorskip("duckdb")
@@ -107,15 +108,19 @@ def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("min_tt_s=1", "min_ttc_s"), ("min_ttc_s", "no number"), ("min_ttc_s=x", "no number")]
+    ("text", "said"),
+    [("min_tt_s=1", "min_ttc_s"), ("min_ttc_s", "expected a number"), ("min_ttc_s=x", "expected a number")],
 )
 def test_limits_that_are_none_are_refused(text, said) -> None:
     with pytest.raises(ConfigError, match=said):
-        parse_limits([text])
+        parse_limits([text], list(LIMITS))
 
 
 def test_outcomes_compare_by_their_margins() -> None:
-    assert parse_limits(["min_ttc_s=1.5", "max_brake_mps2=6"]) == {"min_ttc_s": 1.5, "max_brake_mps2": 6.0}
+    assert parse_limits(["min_ttc_s=1.5", "max_brake_mps2=6"], list(LIMITS)) == {
+        "min_ttc_s": 1.5,
+        "max_brake_mps2": 6.0,
+    }
     assert Outcome(-np.inf, {}, "x").margin < Outcome(-3.0, {}).margin < 0
 
 

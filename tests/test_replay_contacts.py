@@ -111,14 +111,13 @@ def random_motions(count, seed):
     place, way = rng.uniform(-9, 9, (2, count)), rng.normal(0, 6, (2, count))
     turn = rng.uniform(-0.6, 0.6, (2, count)) * (rng.uniform(size=count) < 0.7)
     zero = np.zeros(count)
-    return RelativeMotion(*place, zero, *way, zero, *rng.uniform(-np.pi, np.pi, (2, count)), *turn, size_a, size_b)
+    yaw = rng.uniform(-np.pi, np.pi, (2, count))
+    return RelativeMotion(np.stack([*place, zero]), np.stack([*way, zero]), yaw, turn, size_a, size_b)
 
 
 def overlapping(m, u):
-    return rectangles_overlap(
-        m.dx_m + u * m.vx_m, m.dy_m + u * m.vy_m, m.yaw_a_rad + u * m.turn_a_rad, m.yaw_b_rad + u * m.turn_b_rad,
-        m.size_a_m.T, m.size_b_m.T,
-    )  # fmt: skip
+    apart, yaw = m.apart_m + u * m.change_m, m.yaw_rad + u * m.turn_rad
+    return rectangles_overlap(*apart[:2], *yaw, m.size_a_m.T, m.size_b_m.T)
 
 
 def test_first_touches_are_those_of_a_thousand_moments():

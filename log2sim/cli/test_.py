@@ -50,6 +50,7 @@ def run_test(
     log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o late/ --latency 0.3:0.05 --noise 0.2
     """
     from dataclasses import asdict
+    from functools import partial
 
     import numpy as np
 
@@ -60,11 +61,11 @@ def run_test(
     from log2sim.files.outputs import replaced_folder
     from log2sim.files.processes import default_jobs, map_in_processes
     from log2sim.scenarios.failure import (
+        LIMITS,
         describe,
         drive,
-        parse_limits,
+        judge_run,
         report_page,
-        runner,
         say_estimate,
         search,
         with_ego,
@@ -72,12 +73,13 @@ def run_test(
     from log2sim.scenarios.index import open_index, write_rows
     from log2sim.scenarios.logical import Base, choose_base, fit
     from log2sim.scenarios.query import ask
+    from log2sim.simulation.metrics.all_metrics import parse_limits
     from log2sim.simulation.policy import load_policy
     from log2sim.simulation.sensing import DelayedPolicy, parse_sensing
     from log2sim.visualization.page.writer import write_page
 
     refuse_folder(out, overwrite=overwrite, holding="test.json", kind="folder of a test")
-    limits, driver = parse_limits(limit or ()), load_policy(policy)
+    limits, driver = parse_limits(limit or (), list(LIMITS)), load_policy(policy)
     sensing = parse_sensing(latency, noise)
     if sensing:
         driver = DelayedPolicy(driver, sensing)
@@ -88,7 +90,7 @@ def run_test(
     base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
     outcomes: list[Outcome] = []
     values: list[Array] = []
-    work = runner(base, logical, driver, limits, agents)
+    work = partial(judge_run, base, logical, driver, limits, agents)
     with progress(quiet=quiet) as report_progress:
 
         def margins(scores: Array) -> Array:

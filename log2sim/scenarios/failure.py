@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import html
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from log2sim.datatypes import EGO, Scenario
-from log2sim.errors import ConfigError
-from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
+from log2sim.scenarios.hits import page
 from log2sim.scenarios.logical import Base, Logical
 from log2sim.simulation.policy import Policy
 from log2sim.simulation.result import Replay
@@ -146,22 +142,6 @@ def judge_run(
     return Outcome(min(margin, 1e3), {**figures, **({"impact_mps": -margin} if hits else {})})
 
 
-def parse_limits(texts: Sequence[str]) -> dict[str, float]:
-    """Parse limits such as "min_ttc_s=1.5"; raise `ConfigError` for others."""
-    out = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        if name not in LIMITS:
-            raise ConfigError(
-                f"--limit {text}{nearest(name, list(LIMITS))}: expected NAME=VALUE with one of {', '.join(LIMITS)}"
-            )
-        try:
-            out[name] = float(value)
-        except ValueError:
-            raise ConfigError(f"--limit {text}: '{value}' is no number") from None
-    return out
-
-
 def with_ego(base: Base) -> Base:
     """Return a base whose ego is one of both agents: the one it is, else the other, whose path counts."""
     if any(a.id == EGO for a in base.scenario.agents):
@@ -174,10 +154,7 @@ def with_ego(base: Base) -> Base:
 
 
 STYLE = """
-:root { --paper: #FFFFFF; --ink: #1B2330; --muted: #667080; --grid: #E4E8ED; color-scheme: light dark; }
-@media (prefers-color-scheme: dark) { :root { --paper: #171C24; --ink: #E9EDF3; --muted: #97A2B2; --grid: #2A323D; } }
-body { padding: 16px 20px 40px; background: var(--paper); color: var(--ink); font: 13px/1.45 "DejaVu Sans", Verdana, system-ui, sans-serif; }
-h1 { font-size: 17px; } h2 { font-size: 14px; } small { color: var(--muted); } pre { overflow-x: auto; }
+h2 { font-size: 14px; } small { color: var(--muted); } pre { overflow-x: auto; }
 td, th { padding: 3px 12px 3px 0; text-align: right; border-bottom: 1px solid var(--grid); }
 svg { width: 320px; margin: 8px; background: var(--grid); border-radius: 4px; }
 circle { fill: #1565C0; fill-opacity: .5; } circle.failed { fill: #C62828; fill-opacity: 1; } text { fill: var(--ink); font-size: 9px; }
@@ -209,12 +186,11 @@ def report_page(
         rows.append(f"<tr><td>{run}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>")
     problems = sorted({o.problem for o in outcomes if o.problem})
     said = "".join(f"<pre>{html.escape(text)}</pre>" for text in problems[:3])
-    digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
-        f"style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'\"><title>{html.escape(title)}</title><style>{STYLE}</style></head>"
-        f"<body><h1>{html.escape(title)}</h1><p>Probability of failure {say_estimate(estimate)}; {failed.sum()} of {len(outcomes)} runs failed, "
-        f"most of which were drawn where it fails.</p>{''.join(plots)}<h2>Nearest to a failure</h2><table><tr>{head}</tr>{''.join(rows)}</table>{said}</body></html>\n"
+    return page(
+        title,
+        STYLE,
+        f"<h1>{html.escape(title)}</h1><p>Probability of failure {say_estimate(estimate)}; {failed.sum()} of {len(outcomes)} runs failed, "
+        f"most of which were drawn where it fails.</p>{''.join(plots)}<h2>Nearest to a failure</h2><table><tr>{head}</tr>{''.join(rows)}</table>{said}",
     )
 
 
@@ -233,13 +209,6 @@ def _scatter(names: Sequence[str], values: Array, failed: Array, i: int, j: int)
     )
     label = f"{html.escape(names[j])} {x0:.3g} to {x1:.3g}; {html.escape(names[i])} {y0:.3g} to {y1:.3g}"
     return f'<svg viewBox="0 0 310 215" role="img">{dots}<text x="10" y="208">{label}</text></svg>'
-
-
-def runner(
-    base: Base, logical: Logical, policy: Policy, limits: Mapping[str, float], agents: str
-) -> Callable[[Array], Outcome]:
-    """Return a function that judges the policy at parameters (D,), for processes."""
-    return partial(judge_run, base, logical, policy, limits, agents)
 
 
 def describe(

@@ -21,12 +21,15 @@ MAX_PICTURES = 200
 WINDOW_M = (90.0, 45.0)  # that a picture shows, along and across the heading of the agent that counts
 TRAIL_S = 3.0
 
-STYLE = """
+PAGE_STYLE = """
 :root { --paper: #FFFFFF; --ink: #1B2330; --muted: #667080; --grid: #E4E8ED; color-scheme: light dark; }
 @media (prefers-color-scheme: dark) { :root { --paper: #171C24; --ink: #E9EDF3; --muted: #97A2B2; --grid: #2A323D; } }
-* { box-sizing: border-box; margin: 0; }
 body { padding: 16px 20px 40px; background: var(--paper); color: var(--ink); font: 13px/1.45 "DejaVu Sans", Verdana, system-ui, sans-serif; }
-h1 { font-size: 17px; } code { overflow-wrap: anywhere; } p, small { color: var(--muted); }
+h1 { font-size: 17px; }
+"""
+
+STYLE = """
+* { box-sizing: border-box; margin: 0; } code { overflow-wrap: anywhere; } p, small { color: var(--muted); }
 main { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 16px; margin-top: 16px; }
 article { border: 1px solid var(--grid); border-radius: 8px; padding: 10px; overflow-wrap: anywhere; }
 svg { width: 100%; background: var(--grid); border-radius: 4px; display: block; margin-bottom: 6px; }
@@ -53,16 +56,22 @@ def write_hits(path: Path, index: Index, condition: str, rows: Sequence[Row]) ->
             f"<article>{picture}<b>{k + 1}. {html.escape(say_hit(row))}</b><br><small>{html.escape(row['file'])}</small><br>{html.escape(say_quantities(row))}</article>"
         )
     more = f" The first {MAX_PICTURES} are shown." if len(rows) > MAX_PICTURES else ""
-    digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
-    page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
-        f"style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'\">"
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{html.escape(condition)}</title><style>{STYLE}</style></head>'
-        f"<body><h1>{len(rows)} found in {index.scenarios} scenarios</h1><p><code>{html.escape(condition)}</code>.{more} Red: the agent; blue: the other; "
-        f"lines: {TRAIL_S:g} s before and after.</p><main>{''.join(cards)}</main></body></html>\n"
-    )
+    about = f"<code>{html.escape(condition)}</code>.{more} Red: the agent; blue: the other; lines: {TRAIL_S:g} s before and after."
+    head = f"<h1>{len(rows)} found in {index.scenarios} scenarios</h1><p>{about}</p>"
     with replaced(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page(condition, STYLE, f"{head}<main>{''.join(cards)}</main>"), encoding="utf-8")
+
+
+def page(title: str, style: str, body: str) -> str:
+    """Return a page that runs nothing and loads nothing, in the colors of all pages."""
+    style = PAGE_STYLE + style
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    policy = f"default-src 'none'; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{html.escape(title)}</title>'
+        f"<style>{style}</style></head><body>{body}</body></html>\n"
+    )
 
 
 def say_hit(row: Row) -> str:

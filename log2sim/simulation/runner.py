@@ -199,7 +199,11 @@ def replay_result(
             )
             moved = _moving_agent(agent, driver, choice, trajectory, flags, t_s, states)
             errors[agent.id] = agent_errors(trajectory, moved, follows=driver in SCENARIO_FOLLOWERS)
-            replayed = _add_errors(moved, errors[agent.id])
+            replayed = moved
+            if driver != "exact":  # who is placed on its trajectory has none
+                e = errors[agent.id]
+                across, along = (np.round(c, COMMAND_DIGITS) for c in (e.across_m, e.along_m))
+                replayed = replace(moved, cross_track_m=across, along_track_m=along)
         agents.append(replayed)
         stored.append(steps)
     trajectories = {k: trajectory for k, (_, trajectory, _) in source.items() if k in tracks}
@@ -251,14 +255,6 @@ def _moving_agent(
         agent.id, agent.category, agent.size_m, driver, choice.model, t_s, x, y, z, yaw, speed, steer, accel, flags,
         choice.reason, None if np.isnan(pedal).any() else commands,
     )  # fmt: skip
-
-
-def _add_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
-    """Add the tracking errors, unless the agent is placed on its trajectory."""
-    if agent.driver == "exact":
-        return agent
-    across, along = (np.round(c, COMMAND_DIGITS) for c in (errors.across_m, errors.along_m))
-    return replace(agent, cross_track_m=across, along_track_m=along)
 
 
 def _static_agent(agent: Agent, clock: StepClock) -> tuple[AgentReplay, NDArray[np.intp]]:
@@ -355,28 +351,21 @@ def replay(
     )  # fmt: skip
     if ego is not None:
         reset_policy(ego, scenario)
+    choices = world.choices
     if host is None:
         tracks = rollout(world, ego, progress)
-        result = replay_result(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
-        return replace(result, left_out=gone)
-    tracks = _rollout_externally(world, host, ego, progress)
-    choices = {k: ModelChoice(host.name, "the simulator's own") for k in world.choices}
-    result = replay_result(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
+    else:
+        if dt_s > host.max_dt_s:
+            raise ConfigError(f"dt: {dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
+        host.open(world.groups, world.clock, world.statics)
+        world.host, model = host, host.name
+        choices = {k: ModelChoice(host.name, "the simulator's own") for k in choices}
+        try:
+            tracks = rollout(world, ego, progress)
+        finally:
+            host.close()
+    result = replay_result(scenario, world.groups, tracks, world.clock, choices, mode, model)
     return replace(result, left_out=gone)
-
-
-def _rollout_externally(
-    world: World, host: ExternalSimulator, ego: Policy | None, progress: Progress | None
-) -> RecordedTracks:
-    """Let an external simulator run a world to its end; the simulator is restored in any case."""
-    if world.clock.dt_s > host.max_dt_s:
-        raise ConfigError(f"dt: {world.clock.dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
-    host.open(world.groups, world.clock, world.statics)
-    world.host = host
-    try:
-        return rollout(world, ego, progress)
-    finally:
-        host.close()
 
 
 def open_world(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO, ENDS, STANDSTILL_MPS, Agent, Scenario
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, box_corners_bev
+from log2sim.geometry import Array
 from log2sim.prediction.motion_table import TICK_S, Complex, table_of, tabulate
 from log2sim.simulation.expected_motion import (
     EgoPath,
@@ -28,6 +28,7 @@ from log2sim.simulation.expected_motion import (
     observed_spans,
 )
 from log2sim.simulation.follower import ControllerMemory, follow_vehicles
+from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.policy import Controls, EgoState, Observation
 from log2sim.simulation.reference import Reference, vehicle_reference_of
 from log2sim.simulation.result import CollisionWarning, Moment, Replay, Warnings, to_scenario
@@ -322,11 +323,8 @@ class _Drive(NamedTuple):
         x, y, _, yaw, _ = other.trajectory.at(np.array([t_s]))
         columns = (self.ego.x_m, self.ego.y_m, np.unwrap(self.ego.yaw_rad), self.ego.speed_mps)
         own_x, own_y, own_yaw, own_speed = (float(np.interp(t_s, self.t_s, c)) for c in columns)
-        a_m = box_corners_bev([[own_x, own_y]], size[0], size[1], own_yaw)
-        b_m = box_corners_bev([[x[0], y[0]]], other.size_m[0], other.size_m[1], yaw[0])
-        import shapely
-
-        gap_m = float(shapely.distance(shapely.polygons(a_m), shapely.polygons(b_m))[0])
+        away, sizes = x + 1j * y - complex(own_x, own_y), [np.array([s]) for s in (size, other.size_m)]
+        gap_m = max(float(signed_distance(away, np.array([own_yaw]), yaw, *sizes)[0]), 0.0)
         stopping_m = float(self.watch.settings.stopping_distance_m(np.array(own_speed)))
         return Moment(*(round(v, _DIGITS) for v in (t_s, gap_m, abs(own_speed), stopping_m)))
 

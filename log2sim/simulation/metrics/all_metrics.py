@@ -286,7 +286,7 @@ UPPER_LIMITS = (
 )  # fmt: skip
 
 
-def parse_limits(texts: Iterable[str]) -> dict[str, float]:
+def parse_limits(texts: Iterable[str], known: Sequence[str] = LOWER_LIMITS + UPPER_LIMITS) -> dict[str, float]:
     """Parse limits by name from texts "name=value".
 
     Raises `ConfigError` when a name is not known or a value is no finite number.
@@ -295,11 +295,8 @@ def parse_limits(texts: Iterable[str]) -> dict[str, float]:
     for text in texts:
         name, _, value = text.partition("=")
         name = name.strip()
-        if name not in LOWER_LIMITS + UPPER_LIMITS:
-            known = ", ".join(LOWER_LIMITS + UPPER_LIMITS)
-            raise ConfigError(
-                f"limit '{text}': no metric '{name}'{nearest(name, [*LOWER_LIMITS, *UPPER_LIMITS])}; known: {known}"
-            )
+        if name not in known:
+            raise ConfigError(f"limit '{text}': no metric '{name}'{nearest(name, known)}; known: {', '.join(known)}")
         try:
             limits[name] = float(value)
         except ValueError:

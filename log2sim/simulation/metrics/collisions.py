@@ -127,41 +127,22 @@ BISECTIONS = 8  # of the last step: 3 us of 50 ms
 class RelativeMotion(Columns):
     """Relative motion of N pairs of boxes over an interval."""
 
-    # dx_m, dy_m, dz_m: (N,) from box a to box b at the begin.
-    dx_m: Array
-    dy_m: Array
-    dz_m: Array
-    # vx_m, vy_m, vz_m: (N,) change of these over the interval.
-    vx_m: Array
-    vy_m: Array
-    vz_m: Array
-    # yaw_a_rad, yaw_b_rad: (N,) at the begin.
-    yaw_a_rad: Array
-    yaw_b_rad: Array
-    # turn_a_rad, turn_b_rad: (N,) change of these over the interval.
-    turn_a_rad: Array
-    turn_b_rad: Array
-    # size_a_m, size_b_m: (3, N)
-    size_a_m: Array
+    apart_m: Array  # (3, N) from box a to box b at the begin
+    change_m: Array  # (3, N) of that over the interval
+    yaw_rad: Array  # (2, N) of a and b at the begin
+    turn_rad: Array  # (2, N) change of these over the interval
+    size_a_m: Array  # (3, N)
     size_b_m: Array
 
     def reversed(self) -> RelativeMotion:
         """Return the motion from the end to the begin."""
-        return RelativeMotion(
-            self.dx_m + self.vx_m, self.dy_m + self.vy_m, self.dz_m + self.vz_m,
-            -self.vx_m, -self.vy_m, -self.vz_m,
-            self.yaw_a_rad + self.turn_a_rad, self.yaw_b_rad + self.turn_b_rad,
-            -self.turn_a_rad, -self.turn_b_rad, self.size_a_m, self.size_b_m,
-        )  # fmt: skip
+        yaw, apart = self.yaw_rad + self.turn_rad, self.apart_m + self.change_m
+        return RelativeMotion(apart, -self.change_m, yaw, -self.turn_rad, self.size_a_m, self.size_b_m)
 
     def may_touch(self) -> NDArray[np.bool_]:
         """Whether the circles around the footprints meet (N,)."""
-        square = self.vx_m**2 + self.vy_m**2
-        closing = -(self.dx_m * self.vx_m + self.dy_m * self.vy_m)
-        u = np.clip(np.divide(closing, square, out=np.zeros_like(square), where=square > 0), 0.0, 1.0)
         reach = (np.hypot(*self.size_a_m[:2]) + np.hypot(*self.size_b_m[:2])) / 2
-        meets: NDArray[np.bool_] = np.hypot(self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m) < reach
-        return meets
+        return circles_meet(*self.apart_m[:2], *self.change_m[:2], reach, 0.0, 1.0)
 
     def free_for(self, u: Array) -> Array:
         """Return the share of the interval (N,) for which boxes certainly stay apart after the shares `u` (N,); 0 in overlap.
@@ -170,22 +151,27 @@ class RelativeMotion(Columns):
         largest of these bounds, over the axes with a gap, is safe. Boxes that only touch return the smallest positive
         number.
         """
-        left = 1.0 - u
-        dx, dy = self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m
-        travel = np.hypot(self.vx_m, self.vy_m)
-        distance = np.hypot(dx, dy) + 2 * travel * left
-        yaw_a, yaw_b = self.yaw_a_rad + u * self.turn_a_rad, self.yaw_b_rad + u * self.turn_b_rad
-        spin_a, spin_b = np.abs(self.turn_a_rad), np.abs(self.turn_b_rad)
-        relative = np.abs(self.turn_b_rad - self.turn_a_rad) / 2
+        (vx, vy, vz), (dx, dy, dz) = self.change_m, self.apart_m + u * self.change_m
+        distance = np.hypot(dx, dy) + 2 * np.hypot(vx, vy) * (1.0 - u)
+        yaw_a, yaw_b = self.yaw_rad + u * self.turn_rad
+        spin_a, spin_b = np.abs(self.turn_rad)
+        relative = np.abs(self.turn_rad[1] - self.turn_rad[0]) / 2
         radius_a, radius_b = (np.hypot(*size[:2]) for size in (self.size_a_m, self.size_b_m))
-        free = _gap_duration(
-            np.abs(self.dz_m + u * self.vz_m) - (self.size_a_m[2] + self.size_b_m[2]) / 2, np.abs(self.vz_m)
-        )
+        free = _gap_duration(np.abs(dz) - (self.size_a_m[2] + self.size_b_m[2]) / 2, np.abs(vz))
         for nx, ny, reach, of_a in separating_axes(yaw_a, yaw_b, self.size_a_m.T, self.size_b_m.T):
             spin, radius = (spin_a, radius_b) if of_a else (spin_b, radius_a)
-            rate = np.abs(self.vx_m * nx + self.vy_m * ny) + spin * distance + relative * radius
+            rate = np.abs(vx * nx + vy * ny) + spin * distance + relative * radius
             free = np.maximum(free, _gap_duration(np.abs(dx * nx + dy * ny) - reach, rate))
         return free
+
+
+def circles_meet(
+    dx: Array, dy: Array, vx: Array, vy: Array, reach: Array, begin_s: float, end_s: float
+) -> NDArray[np.bool_]:
+    """Whether points that are dx, dy apart and move by vx, vy come nearer than `reach` (N,) between two times."""
+    square, closing = vx * vx + vy * vy, -(dx * vx + dy * vy)
+    t = np.clip(np.divide(closing, square, out=np.zeros_like(square), where=square > 0), begin_s, end_s)
+    return np.asarray((dx + t * vx) ** 2 + (dy + t * vy) ** 2 <= reach**2)
 
 
 def first_contact(motion: RelativeMotion) -> Array:
@@ -194,7 +180,7 @@ def first_contact(motion: RelativeMotion) -> Array:
     Conservative advancement (Mirtich, 1996) with separating axes in place of a distance: every step is as long as the
     boxes certainly stay apart, but at least 1 / `MAX_STEPS`; the last step is bisected.
     """
-    touch = np.full(len(motion.dx_m), np.nan)
+    touch = np.full(motion.apart_m.shape[1], np.nan)
     active = np.flatnonzero(motion.may_touch())
     before = u = np.zeros(len(active))
     while len(active):
@@ -313,13 +299,11 @@ def _contact_rows(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> tu
 def _relative_motion(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> RelativeMotion:
     """Return the motion of pairs (N,) from rows to the next; none where one of them does not move continuously."""
     after = np.where(boxes.moves_on[k, a] & boxes.moves_on[k, b], k + 1, k)
-    x, y, z = (c[k, b] - c[k, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
-    then_x, then_y, then_z = (c[after, b] - c[after, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
-    yaw_a, yaw_b = boxes.yaw_rad[k, a], boxes.yaw_rad[k, b]
-    turn_a, turn_b = wrap_angle(boxes.yaw_rad[after, a] - yaw_a), wrap_angle(boxes.yaw_rad[after, b] - yaw_b)
-    return RelativeMotion(
-        x, y, z, then_x - x, then_y - y, then_z - z, yaw_a, yaw_b, turn_a, turn_b, boxes.size_m[a].T, boxes.size_m[b].T
-    )
+    centers = (boxes.x_m, boxes.y_m, boxes.z_m)
+    apart, then = (np.stack([c[row, b] - c[row, a] for c in centers]) for row in (k, after))
+    yaw = np.stack([boxes.yaw_rad[k, a], boxes.yaw_rad[k, b]])
+    turn = wrap_angle(np.stack([boxes.yaw_rad[after, a], boxes.yaw_rad[after, b]]) - yaw)
+    return RelativeMotion(apart, then - apart, yaw, turn, boxes.size_m[a].T, boxes.size_m[b].T)
 
 
 def _overlapping_hulls(

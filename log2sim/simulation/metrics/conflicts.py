@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO
 from log2sim.geometry import Array, rectangles_overlap, separating_axes, wrap_angle
-from log2sim.simulation.metrics.collisions import REPLAY, BoxTracks, RowIndex, spacing_s
+from log2sim.simulation.metrics.collisions import REPLAY, BoxTracks, RowIndex, circles_meet, spacing_s
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0  # constant velocity is no prediction over a longer time
@@ -47,7 +47,7 @@ def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: fl
             k, i, j = k + begin, a[pair], b[pair]
             dx, dy = boxes.x_m[k, j] - boxes.x_m[k, i], boxes.y_m[k, j] - boxes.y_m[k, i]
             ux, uy = vx[k, j] - vx[k, i], vy[k, j] - vy[k, i]
-            near = _circles_meet(dx, dy, ux, uy, boxes.radius_m[i] + boxes.radius_m[j], 0.0, HORIZON_S)
+            near = circles_meet(dx, dy, ux, uy, boxes.radius_m[i] + boxes.radius_m[j], 0.0, HORIZON_S)
             k, i, j = k[near], i[near], j[near]
             time = time_to_touch(
                 dx[near], dy[near], ux[near], uy[near],
@@ -126,19 +126,10 @@ def _candidate_pairs(
         i, j = first + found["i"], found["j"]
         pair = (j > i) & (moves[here[i]] | moves[here[j]])
         i, j = i[pair], j[pair]
-        meet = _circles_meet(
+        meet = circles_meet(
             x[j] - x[i], y[j] - y[i], ux[j] - ux[i], uy[j] - uy[i], radius[i] + radius[j], t[0, 0], HORIZON_S + t[-1, 0]
         )
         yield here[i[meet]], here[j[meet]]
-
-
-def _circles_meet(
-    dx: Array, dy: Array, vx: Array, vy: Array, reach: Array, begin_s: float, end_s: float
-) -> NDArray[np.bool_]:
-    """Whether points come nearer than `reach` (N,) between two times."""
-    square, closing = vx * vx + vy * vy, -(dx * vx + dy * vy)
-    t = np.clip(np.divide(closing, square, out=np.zeros_like(square), where=square > 0), begin_s, end_s)
-    return (dx + t * vx) ** 2 + (dy + t * vy) ** 2 <= reach**2
 
 
 def _least_per_pair(found: Array) -> Array:
