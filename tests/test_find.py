@@ -143,6 +143,10 @@ def test_an_empty_result_says_what_was_closest() -> None:
     count = sum(r["tag"] == "cut_in" for r in rows)
     assert line.startswith(f"without 'ttc_s < 2' there are {count}, the nearest with ttc_s = {nearest:.4g}: cut_in of")
     assert ask(index_of(rows), "cut_in and ttc_s < 2 and ego.speed_mps > 20").closest[0].startswith("each alone:")
+    blank = [{k: v for k, v in r.items() if k != "ttc_s"} if r["tag"] == "cut_in" else r for r in rows]
+    assert ask(index_of(blank), "cut_in and ttc_s < 2").closest == (
+        f"without 'ttc_s < 2' there are {count}, of none of which ttc_s is known",
+    )
 
 
 def test_the_index_follows_its_files(tmp_path) -> None:

@@ -276,9 +276,10 @@ def _closest(connection: Any, condition: Condition, parts: list[ast.expr]) -> li
         left = count(rest) if rest or condition.main else 0
         if not left:
             continue
-        said = f"without '{_source(condition, part)}' there are {left}"
         nearest_value = _nearest_value(connection, condition, part, rest)
-        sentences.append(said + (f", the nearest with {nearest_value}" if nearest_value else ""))
+        sentences.append(
+            ", ".join(filter(None, (f"without '{_source(condition, part)}' there are {left}", nearest_value)))
+        )
     if sentences:
         return sentences
     alone = [f"'{_source(condition, part)}' {count([part])}" for part in parts]
@@ -304,8 +305,7 @@ def _nearest_value(connection: Any, condition: Condition, part: ast.expr, rest: 
         f"AND {one.text} IS NOT NULL ORDER BY abs({one.text} - {two.text}), e.row LIMIT 1",
     )
     row = connection.execute(query, [*one.values, *values, *one.values, *one.values, *two.values]).fetchone()
-    return (
-        ""
-        if row is None
-        else f"{ast.unparse(part.left)} = {row[0]:.4g}: {row[1]} of {row[2]} in {row[3]} at {row[4]:.1f} s"
-    )
+    name = ast.unparse(part.left)
+    if row is None:
+        return f"of none of which {name} is known"
+    return f"the nearest with {name} = {row[0]:.4g}: {row[1]} of {row[2]} in {row[3]} at {row[4]:.1f} s"
