@@ -167,7 +167,8 @@ def open_index(
     import_arrow()
     if path.is_file():
         return Index(path.parent, table_of_rows(rows_of(Scenario.load(path), path.name)), 1)
-    files = {str(p.relative_to(path)): _stamp(p) for p in find_scenarios(path)} if path.is_dir() else {}
+    found = {p: p.stat() for p in find_scenarios(path)} if path.is_dir() else {}
+    files = {str(p.relative_to(path)): [s.st_size, s.st_mtime_ns] for p, s in found.items()}
     if not files:
         raise ScenarioError(
             f"{path}: holds no scenario; expected a scenario.json, or a folder with some, such as that of log2sim batch"
@@ -177,7 +178,7 @@ def open_index(
     stamps = known.get("files", {})
     missing = [name for name, stamp in files.items() if stamps.get(name) != stamp]
     if not missing and set(stamps) == set(files) and old is not None:
-        return Index(path, old, len(files), _listed(problems))
+        return Index(path, old, len(files), tuple(problems[name] for name in sorted(problems)))
     kept = [] if old is None else [r for r in old.to_pylist() if r["file"] in files and r["file"] not in missing]
     rows = [{k: v for k, v in row.items() if v is not None} for row in kept]
     problems = {name: text for name, text in problems.items() if name in files and name not in missing}
@@ -195,16 +196,7 @@ def open_index(
     about = {"version": INDEX_VERSION, "tags": sorted(TAGS), "files": files, "problems": problems}
     table_with_files = table.replace_schema_metadata({KEY: json.dumps(about).encode()})
     _write(path / INDEX_FILE, table_with_files, row_group_size=20_000)
-    return Index(path, table, len(files), _listed(problems))
-
-
-def _stamp(path: Path) -> list[int]:
-    found = path.stat()
-    return [found.st_size, found.st_mtime_ns]
-
-
-def _listed(problems: dict[str, str]) -> tuple[str, ...]:
-    return tuple(problems[name] for name in sorted(problems))
+    return Index(path, table, len(files), tuple(problems[name] for name in sorted(problems)))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Any]:

@@ -19,10 +19,11 @@ from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_o
 from log2sim.scenarios.traffic import (
     SAME_WAY_RAD,
     SIDE_M,
-    UNSEEN_S,
     Beside,
+    Index,
     Traffic,
     latched,
+    out_of_sight,
     probability_above,
     runs,
     turned,
@@ -73,78 +74,51 @@ def pair_tags(traffic: Traffic) -> Iterator[Tag]:
     yield from _crossings(traffic)
 
 
-def _sigma_ttc(traffic: Traffic, gap_m: float, closing_mps: float, sigma_m: float, a: int, b: int, n: int) -> float:
-    """Return the standard deviation of gap / closing speed, by both their errors."""
-    sigma_mps = float(np.hypot(traffic.sigma_speed_mps[a, n], traffic.sigma_speed_mps[b, n]))
-    return float(np.hypot(sigma_m / closing_mps, gap_m * sigma_mps / closing_mps**2)) if closing_mps > 0 else np.inf
-
-
-def _lane_measures(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> dict[str, float]:
-    """Return gap, relative speed and measures of criticality of agent `r` behind `o` at a tick."""
+def lane_measures(traffic: Traffic, b: Beside, r: int, o: Index, n: Index) -> dict[str, Array]:
+    """Return gap, relative speed and measures of criticality (N,) of agent `r` behind others (N,) at ticks (N,)."""
     gap, own, speed = b.gap_m[o, n], traffic.speed_mps[r, n], traffic.speed_mps[o, n] * np.cos(b.turn_rad[o, n])
-    closing = own - speed
     return {
-        "gap_m": gap, "relative_speed_mps": -closing, "ttc_s": float(time_to_collision(gap, closing)),
-        "time_headway_s": float(time_headway(gap, own)), "drac_mps2": float(deceleration_to_avoid(gap, closing)),
+        "gap_m": gap, "relative_speed_mps": -(own - speed), "ttc_s": time_to_collision(gap, own - speed),
+        "time_headway_s": time_headway(gap, own), "drac_mps2": deceleration_to_avoid(gap, own - speed),
     }  # fmt: skip
+
+
+def _at(measures: dict[str, Array], n: int) -> dict[str, float]:
+    return {name: float(values[n]) for name, values in measures.items()}
 
 
 def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `r` follows or approaches `o`, and where that is a near miss."""
     if not (traffic.wheeled[o] and (b.leader == o).any()):
         return
-    own, speed = traffic.speed_mps[r], traffic.speed_mps[o] * np.cos(b.turn_rad[o])
-    closing, gap = own - speed, b.gap_m[o]
+    measures = lane_measures(traffic, b, r, np.full(len(b.leader), o), np.arange(len(b.leader)))
+    gap, relative, ttc, headway, drac = measures.values()
+    own, closing = traffic.speed_mps[r], -relative
     ahead = (b.leader == o) & (own >= MOVING_MPS) & (gap > 0)
-    ttc = time_to_collision(gap, closing)
-    headway = time_headway(gap, own)
-    for i, j in runs(
-        ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (speed > 1.0),
-        round(1.0 / TICK_S),
-        BREAK,
-    ):
-        n = i + int(np.argmin(headway[i : j + 1]))
-        sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
-        yield tag_of(
-            traffic,
-            "following",
-            r,
-            (i, n, j),
-            sure,
-            o,
-            duration_s=(j - i) * TICK_S,
-            **_lane_measures(traffic, b, r, o, n),
-        )
+    sigma_m, sigma_mps = (np.hypot(s[r], s[o]) for s in (traffic.sigma_m, traffic.sigma_speed_mps))
+
+    def within(half_m: float, n: int) -> float:
+        return probability_above(half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
+
+    follows = ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (own + relative > 1.0)
+    for i, j in runs(follows, round(1.0 / TICK_S), BREAK):
+        n, lasts_s = i + int(np.argmin(headway[i : j + 1])), (j - i) * TICK_S
+        yield tag_of(traffic, "following", r, (i, n, j), within(b.half_m, n), o, duration_s=lasts_s, **_at(measures, n))
     for i, j in runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(ttc[i : j + 1]))
-        sigma_mps = np.hypot(traffic.sigma_speed_mps[r, n], traffic.sigma_speed_mps[o, n])
-        sure = probability_above(b.half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]) * probability_above(
-            closing[n], 0.0, sigma_mps
-        )
-        yield tag_of(traffic, "approaching", r, (i, n, j), sure, o, **_lane_measures(traffic, b, r, o, n))
-    drac = deceleration_to_avoid(gap, closing)
-    on_course = np.abs(b.aside_m[o]) < (traffic.table.size_m[r, 1] + traffic.table.size_m[o, 1]) / 2
+        sure = within(b.half_m, n) * probability_above(closing[n], 0.0, sigma_mps[n])
+        yield tag_of(traffic, "approaching", r, (i, n, j), sure, o, **_at(measures, n))
+    width = traffic.table.size_m[[r, o], 1].sum() / 2
+    on_course = np.abs(b.aside_m[o]) < width
     near = ahead & on_course & (closing > 1.0) & ((ttc < NEAR_TTC_S) | (drac > NEAR_DRAC_MPS2))
     for i, j in runs(near, 2):
-        n = i + int(np.argmin(ttc[i : j + 1]))
-        sigma_m = np.hypot(traffic.sigma_m[r, n], traffic.sigma_m[o, n])
-        sigma_mps = np.hypot(traffic.sigma_speed_mps[r, n], traffic.sigma_speed_mps[o, n])
-        by_time = probability_above(-ttc[n], -NEAR_TTC_S, _sigma_ttc(traffic, gap[n], closing[n], sigma_m, r, o, n))
-        peak = i + int(np.argmax(drac[i : j + 1]))
-        sigma_drac = drac[peak] * np.hypot(2 * sigma_mps / closing[peak], sigma_m / max(gap[peak], 0.1))
-        sure = max(by_time, probability_above(drac[peak], NEAR_DRAC_MPS2, sigma_drac))
-        sure *= probability_above(
-            (traffic.table.size_m[[r, o], 1].sum()) / 2 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n]
-        )
-        yield tag_of(
-            traffic,
-            "near_miss",
-            r,
-            (i, n, j),
-            sure,
-            o,
-            **{**_lane_measures(traffic, b, r, o, n), "drac_mps2": drac[peak]},
-        )
+        n, peak = i + int(np.argmin(ttc[i : j + 1])), i + int(np.argmax(drac[i : j + 1]))
+        # Of gap / closing speed and of DRAC, by the errors of both.
+        sigma_ttc = np.hypot(sigma_m[n] / closing[n], gap[n] * sigma_mps[n] / closing[n] ** 2)
+        sigma_drac = drac[peak] * np.hypot(2 * sigma_mps[n] / closing[peak], sigma_m[n] / max(gap[peak], 0.1))
+        by_drac = probability_above(drac[peak], NEAR_DRAC_MPS2, sigma_drac)
+        sure = max(probability_above(-ttc[n], -NEAR_TTC_S, sigma_ttc), by_drac) * within(width, n)
+        yield tag_of(traffic, "near_miss", r, (i, n, j), sure, o, **{**_at(measures, n), "drac_mps2": drac[peak]})
 
 
 def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
@@ -165,12 +139,9 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
             last -= 1
         begin, end, lateral = lateral_extent(b.aside_m[o, first : last + 1], crossing - first)
         begin, end = first + begin, first + end
-        measures = _lane_measures(traffic, b, r, o, crossing)
-        led = (
-            b.leader[crossing - 1 : min(crossing + WINDOW, len(known))]
-            if enters
-            else b.leader[max(crossing - WINDOW, 0) : crossing + 1]
-        ) == o
+        measures = _at(lane_measures(traffic, b, r, np.array([o]), np.array([crossing])), 0)
+        span = slice(crossing - 1, crossing + WINDOW) if enters else slice(max(crossing - WINDOW, 0), crossing + 1)
+        led = b.leader[span] == o
         if min(traffic.speed_mps[r, crossing], traffic.speed_mps[o, crossing]) < MOVING_MPS or not led.any():
             continue
         if measures["time_headway_s"] > LEADING_S:
@@ -180,18 +151,12 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD and turn > JOINING_RAD
         if not joins and (turn > JOINING_RAD or not _is_change_of(traffic, b, r, o, crossing)):
             continue
-        outer, inner = (
-            (off[begin : crossing + 1], off[crossing : end + 1])
-            if enters
-            else (off[crossing : end + 1], off[begin : crossing + 1])
-        )
-        sigma = float(b.sigma_m[o, crossing])
-        sure = probability_above(np.nanmax(outer), b.half_m, sigma) * probability_above(
-            -np.nanmin(inner), -b.half_m, sigma
-        )
-        sure *= probability_above(
-            b.ahead_m[o, crossing], 0.0, np.hypot(traffic.sigma_m[r, crossing], traffic.sigma_m[o, crossing])
-        )
+        before, after = off[begin : crossing + 1], off[crossing : end + 1]
+        outer, inner = (before, after) if enters else (after, before)
+        sigma, sigma_ahead = float(b.sigma_m[o, crossing]), np.hypot(*traffic.sigma_m[[r, o], crossing])
+        sure = probability_above(np.nanmax(outer), b.half_m, sigma)
+        sure *= probability_above(-np.nanmin(inner), -b.half_m, sigma)
+        sure *= probability_above(b.ahead_m[o, crossing], 0.0, sigma_ahead)
         tag = "merging" if joins else "cut_in" if enters else "cut_out"
         yield tag_of(traffic, tag, o, (begin, crossing, end), sure, r, lateral_speed_mps=abs(lateral), duration_s=(end - begin) * TICK_S,
                      side=np.sign(-lateral if enters else lateral), **measures)  # fmt: skip
@@ -218,11 +183,7 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     ahead, aside, slower = b.ahead_m[o].copy(), b.aside_m[o].copy(), traffic.speed_mps[r].copy()
     same, sigma = b.same_way[o].copy(), np.hypot(traffic.sigma_m[r], traffic.sigma_m[o])
     drift = 2.0 * MOVING["vehicle"].along_mps2 ** 2
-    seen, unseen = np.flatnonzero(np.isfinite(ahead)), round(UNSEEN_S / TICK_S)
-    for edge, rows in (
-        (seen[0], np.arange(max(seen[0] - unseen, 0), seen[0])),
-        (seen[-1], np.arange(seen[-1] + 1, min(seen[-1] + 1 + unseen, len(ahead)))),
-    ):
+    for edge, rows in out_of_sight(np.isfinite(ahead)):
         lead_s = (rows - edge) * TICK_S
         ahead[rows], aside[rows] = ahead[edge] + faster[edge] * lead_s, aside[edge]
         same[rows], slower[rows] = same[edge], slower[edge]
@@ -249,12 +210,8 @@ def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     width = traffic.table.size_m[[r, o], 1].sum() / 2 - SIDE_M
     speed, own = traffic.speed_mps[o], traffic.speed_mps[r]
     ttc = time_to_collision(b.gap_m[o], own + speed)
-    state = (
-        (np.abs(b.turn_rad[o]) > ONCOMING_RAD)
-        & (np.abs(b.aside_m[o]) < width)
-        & (b.ahead_m[o] > 0)
-        & (ttc < CROSSING_S)
-    )
+    state = (np.abs(b.turn_rad[o]) > ONCOMING_RAD) & (np.abs(b.aside_m[o]) < width) & (b.ahead_m[o] > 0)
+    state &= ttc < CROSSING_S
     for i, j in runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S), BREAK):
         n = i + int(np.argmin(np.where(ttc[i : j + 1] > 0, ttc[i : j + 1], np.inf)))
         sure = probability_above(width - np.abs(b.aside_m[o, i : j + 1].min()), 0.0, b.sigma_m[o, n])
@@ -267,12 +224,8 @@ def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     for n in (np.flatnonzero(inside[1:] & ~inside[:-1]) + 1).tolist():
         speed = traffic.speed_mps[r, n]
         arrives_s = float(time_headway(b.ahead_m[o, n], speed))
-        if not (
-            np.isfinite(b.ahead_m[o, n - 1 : n + 1]).all()
-            and b.ahead_m[o, n] > 0
-            and speed >= MOVING_MPS
-            and arrives_s < CROSSING_S
-        ):
+        known = np.isfinite(b.ahead_m[o, n - 1 : n + 1]).all() and b.ahead_m[o, n] > 0
+        if not known or speed < MOVING_MPS or arrives_s >= CROSSING_S:
             continue
         ticks = np.arange(max(n - WINDOW, 0), n + 1)
         ticks = ticks[np.isfinite(traffic.place_m[r, ticks])]
@@ -320,19 +273,11 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
     height = t.center_m[..., 2].copy()
     for k in np.flatnonzero(t.present.any(axis=1)).tolist():
         height[k, ~t.present[k]] = np.median(height[k, t.present[k]])
-    boxes = BoxTracks(
-        on.place_m.real.T,
-        on.place_m.imag.T,
-        height.T,
-        on.yaw_rad.T,
-        np.where(t.present, t.speed_mps, on.speed_mps).T,
-        t.size_m,
-    )
-    found = post_encroachment_times(boxes, TICK_S)
+    speed = np.where(t.present, t.speed_mps, on.speed_mps)
+    columns = (on.place_m.real, on.place_m.imag, height, on.yaw_rad, speed)
+    found = post_encroachment_times(BoxTracks(*(c.T for c in columns), t.size_m), TICK_S)
     last = len(t.t_s) - 1
-    for a, c, left, came in zip(
-        found.first.tolist(), found.second.tolist(), found.left_row.tolist(), found.came_row.tolist()
-    ):
+    for a, c, left, came in zip(*(v.tolist() for v in (found.first, found.second, found.left_row, found.came_row))):
         pet = (came - left) * TICK_S
         i, j = min(int(left), last), min(int(np.ceil(came)), last)
         speed_a, speed_c = on.speed_mps[a, i], on.speed_mps[c, j]
@@ -353,10 +298,7 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
         for one, two, n in ((a, c, i), (c, a, j)):
             if traffic.wheeled[one] and traffic.wheeled[two] and _turns_across(traffic, one, two, n, begin):
                 yield tag_of(traffic, "turning_across", one, (min(begin, i), n, j), sure, two, **measures)
-        near = max(
-            probability_above(NEAR_PET_S - pet, 0.0, sigma_s),
-            probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s) if np.isfinite(ttc) else 0.0,
-        )
+        near = max(probability_above(NEAR_PET_S - pet, 0.0, sigma_s), probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s))
         if pet < NEAR_PET_S or ttc < NEAR_TTC_S:
             yield tag_of(traffic, "near_miss", a, (min(touch, i), i, j), near, c, **measures)
 

@@ -117,9 +117,8 @@ class Logical:
         scores = _normal(self.cdf(self.values))
         scores -= scores.mean(axis=0)
         spread = np.sqrt((scores**2).mean(axis=0))
-        scores = np.divide(
-            scores, spread, out=np.zeros_like(scores), where=spread > 1e-6
-        )  # one value for all goes with nothing
+        # One value for all goes with nothing.
+        scores = np.divide(scores, spread, out=np.zeros_like(scores), where=spread > 1e-6)
         found = scores.T @ scores
         np.fill_diagonal(found, len(scores))
         return np.asarray((found + np.eye(len(self.names))) / (len(scores) + 1))
@@ -143,11 +142,8 @@ class Logical:
             # A power of two is balanced; the first of them are nearly.
             u = qmc.Sobol(dimensions, rng=rng).random_base2(max(int(np.ceil(np.log2(max(count, 1)))), 0))[:count]
         else:
-            u = (
-                qmc.LatinHypercube(dimensions, rng=rng).random(count)
-                if sampler == "lhs"
-                else rng.random((count, dimensions))
-            )
+            shape = (count, dimensions)
+            u = qmc.LatinHypercube(dimensions, rng=rng).random(count) if sampler == "lhs" else rng.random(shape)
         return self.from_scores(_normal(u))
 
     def to_dict(self) -> dict[str, Any]:
@@ -288,10 +284,8 @@ def concrete(base: Base, logical: Logical, values: Array) -> Iterator[tuple[Scen
     for k, row in enumerate(values):
         made = base.varied(base.timings(logical, row), f"{base.scenario.name}, variation {k + 1}")
         problems = find_problems(source, made, made.agents)
-        same = any(
-            (g.tag, g.agent, g.other) == (base.row["tag"], base.row["agent"], base.row.get("other"))
-            for g in find_tags(made)
-        )
+        wanted = (base.row["tag"], base.row["agent"], base.row.get("other"))
+        same = any((g.tag, g.agent, g.other) == wanted for g in find_tags(made))
         yield made, (*problems, *([] if same else [f"is no {base.row['tag']} any more"]))
 
 
@@ -350,9 +344,8 @@ def write_openscenario(base: Base, timings: Sequence[Mapping[str, tuple[float, f
     element("FileHeader", distribution, **dict(header.attrib if header is not None else {}))
     values = element("ParameterValueDistribution", distribution)
     element("ScenarioFile", values, filepath=file.name)
-    sets = element(
-        "ValueSetDistribution", element("DeterministicMultiParameterDistribution", element("Deterministic", values))
-    )
+    several = element("DeterministicMultiParameterDistribution", element("Deterministic", values))
+    sets = element("ValueSetDistribution", several)
     for timing_of in timings:
         chosen = element("ParameterValueSet", sets)
         for id, pair in parameters.items():

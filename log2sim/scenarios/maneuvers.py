@@ -95,29 +95,23 @@ def _lanes(traffic: Traffic, k: int) -> Iterator[Tag]:
 
 
 def _are_beside(traffic: Traffic, one: int, two: int) -> bool:
+    """Return whether two lanes lie side by side, or one goes on where the other's neighbor ends."""
     a, b = traffic.lanes[one][0], traffic.lanes[two][0]
-    if b.id in (a.left_lane, a.right_lane, a.opposite) or a.id in (b.left_lane, b.right_lane, b.opposite):
+    besides = [{lane.left_lane, lane.right_lane, lane.opposite} for lane in (a, b)]
+    if b.id in besides[0] or a.id in besides[1]:
         return True
-    follows = b.id in a.successors or a.id in b.successors
-    if follows:
+    if b.id in a.successors or a.id in b.successors:
         return False
-    # One goes on where the other's neighbor ends.
-    beside = {a.left_lane, a.right_lane, a.opposite}
-    return bool(beside & {*b.predecessors, *b.successors}) or bool(
-        {b.left_lane, b.right_lane, b.opposite} & {*a.predecessors, *a.successors}
-    )
+    return any(beside & {*lane.predecessors, *lane.successors} for beside, lane in zip(besides, (b, a)))
 
 
 def _change_between(traffic: Traffic, k: int, one: int, two: int, edge: tuple[int, int]) -> Iterator[Tag]:
     """Describe a lane change: it begins and ends where the lateral speed does, and crosses where the center does."""
-    crossing = (edge[0] + edge[1] + 1) // 2
-    first, last = (
-        max(crossing - round(LANE_CHANGE_S / TICK_S), 0),
-        min(crossing + round(LANE_CHANGE_S / TICK_S), len(traffic.table.t_s) - 1),
-    )
+    crossing, reach = (edge[0] + edge[1] + 1) // 2, round(LANE_CHANGE_S / TICK_S)
+    first, last = max(crossing - reach, 0), min(crossing + reach, len(traffic.table.t_s) - 1)
     aside, _ = _in_lane(traffic, k, two, first, last)
     begin, end, lateral = lateral_extent(aside, crossing - first)
-    before = _in_lane(traffic, k, one, edge[0] - 5 if edge[0] >= 5 else 0, edge[0])
+    before = _in_lane(traffic, k, one, max(edge[0] - 5, 0), edge[0])
     after = _in_lane(traffic, k, two, edge[1], min(edge[1] + 5, len(traffic.table.t_s) - 1))
     sigma = traffic.sigma_m[k, crossing]
     certain = min(probability_above(np.max(half - np.abs(off)), 0.0, sigma) for off, half in (before, after))
@@ -227,12 +221,8 @@ def _turns(traffic: Traffic, k: int) -> Iterator[Tag]:
             angle = turned(course, max(i - 1, 0), j)
             way_m = float(speed[i : j + 1].sum() * TICK_S)
             radius_m = way_m / abs(angle) if angle else np.inf
-            if (
-                not np.isfinite(angle)
-                or radius_m < LEAST_RADIUS_M
-                or abs(angle) < TURN_RAD
-                or way_m > TURN_WITHIN_M * max(1.0, abs(angle) / (np.pi / 2))
-            ):
+            within_m = TURN_WITHIN_M * max(1.0, abs(angle) / (np.pi / 2))  # False where the angle is NaN
+            if not (radius_m >= LEAST_RADIUS_M and abs(angle) >= TURN_RAD and way_m <= within_m):
                 continue
             tag, limit = ("u_turn", BACK_RAD) if abs(angle) >= BACK_RAD else ("turning", TURN_RAD)
             sigma = np.sqrt(2.0) * np.median(traffic.sigma_m[k, i : j + 1]) / max(way_m / 2, 1.0)

@@ -246,7 +246,9 @@ def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
     if not re.search(r"\bprobability\b", text):
         parts.append(ast.parse(f"probability >= {float(min_probability)!r}", mode="eval").body)
     with duckdb.connect(":memory:", config={"enable_external_access": "false", "threads": "2"}) as connection:
-        numbered = index.table.append_column("row", import_range(index.table.num_rows))
+        import pyarrow as pa
+
+        numbered = index.table.append_column("row", pa.array(range(index.table.num_rows), pa.int64()))
         connection.register("tags", numbered)
         query, values = condition.select("DISTINCT e.*", parts, "ORDER BY e.probability DESC, e.file, e.t_s, e.row")
         cursor = connection.execute(query, values)
@@ -254,13 +256,6 @@ def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
         rows = tuple({k: v for k, v in zip(names, row) if v is not None and k != "row"} for row in cursor.fetchall())
         closest = () if rows else tuple(_closest(connection, condition, parts))
     return Found(rows, condition.main, closest)
-
-
-def import_range(count: int) -> Any:
-    """Return numbers of rows as a column of Arrow."""
-    import pyarrow as pa
-
-    return pa.array(range(count), pa.int64())
 
 
 def _closest(connection: Any, condition: Condition, parts: list[ast.expr]) -> list[str]:

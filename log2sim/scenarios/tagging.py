@@ -12,7 +12,7 @@ from log2sim.datatypes import Scenario, Tag
 from log2sim.files.documents import replaced
 from log2sim.geometry import Array
 from log2sim.scenarios import criticality as c
-from log2sim.scenarios.interactions import pair_tags
+from log2sim.scenarios.interactions import lane_measures, pair_tags
 from log2sim.scenarios.maneuvers import single_tags
 from log2sim.scenarios.traffic import Traffic, rate
 
@@ -39,30 +39,18 @@ def tag(scenario: Scenario) -> Scenario:
     return replace(scenario, tags=find_tags(scenario))
 
 
-MEASURES = (
-    "gap_m",
-    "relative_speed_mps",
-    "ttc_s",
-    "time_headway_s",
-    "drac_mps2",
-    "mdrac_mps2",
-    "braking_required_mps2",
-    "btn",
-    "stn",
-)
-"""Columns of `criticality_table` after agent, other and t_s; see `log2sim.scenarios.criticality`."""
-
-
 def criticality_table(scenario: Scenario) -> dict[str, Array]:
     """Measure how critical it is for each vehicle and the one ahead of it in its lane, at each tick of 0.1 s.
 
     Returns
     -------
     dict of str to (N,) array
-        `agent`, `other`, `t_s` and `MEASURES`, in SI units; what has no value, such as a TTC of who falls behind, is infinite.
+        `agent`, `other`, `t_s` and measures of `log2sim.scenarios.criticality`, in SI units; what has no value, such as a TTC of who falls behind, is infinite.
     """
     traffic = Traffic(scenario.active)
     ids = np.array(traffic.ids, dtype=object)
+    names = ("agent", "other", "t_s", "gap_m", "relative_speed_mps", "ttc_s", "time_headway_s", "drac_mps2",
+             "mdrac_mps2", "braking_required_mps2", "btn", "stn")  # fmt: skip
     parts = []
     for r in range(len(ids)):
         b = traffic.beside(r)
@@ -70,19 +58,18 @@ def criticality_table(scenario: Scenario) -> dict[str, Array]:
             continue
         n = np.flatnonzero(b.leader >= 0)
         o = b.leader[n]
-        lateral = rate(b.aside_m)[o, n]
-        gap, own = b.gap_m[o, n], traffic.speed_mps[r, n]
-        turn = np.cos(b.turn_rad[o, n])
-        closing, accel = own - traffic.speed_mps[o, n] * turn, traffic.accel_mps2[o, n] * turn
-        ttc = c.time_to_collision(gap, closing)
+        usual = lane_measures(traffic, b, r, o, n)
+        gap, closing, accel = (
+            usual["gap_m"],
+            -usual["relative_speed_mps"],
+            traffic.accel_mps2[o, n] * np.cos(b.turn_rad[o, n]),
+        )
         width = (traffic.table.size_m[r, 1] + traffic.table.size_m[o, 1]) / 2
-        columns = (
-            gap, -closing, ttc, c.time_headway(gap, own), c.deceleration_to_avoid(gap, closing), c.modified_deceleration(gap, closing),
+        parts.append((
+            np.full(len(n), ids[r], dtype=object), ids[o], traffic.table.t_s[n], *usual.values(), c.modified_deceleration(gap, closing),
             c.braking_required(gap, closing, accel), c.brake_threat_number(gap, closing, accel),
-            c.steer_threat_number(ttc, b.aside_m[o, n], lateral, width),
-        )  # fmt: skip
-        parts.append((np.full(len(n), ids[r], dtype=object), ids[o], traffic.table.t_s[n], *columns))
-    names = ("agent", "other", "t_s", *MEASURES)
+            c.steer_threat_number(usual["ttc_s"], b.aside_m[o, n], rate(b.aside_m)[o, n], width),
+        ))  # fmt: skip
     return {name: np.concatenate([p[k] for p in parts]) if parts else np.zeros(0) for k, name in enumerate(names)}
 
 
@@ -92,9 +79,5 @@ def write_criticality(path: Path, table: dict[str, Array]) -> None:
         writer = csv.writer(file)
         writer.writerow(table)
         for row in zip(*table.values()):
-            writer.writerow(
-                [
-                    f"{v:.6g}" if isinstance(v, float) and np.isfinite(v) else "" if isinstance(v, float) else v
-                    for v in row
-                ]
-            )
+            numbers = (f"{v:.6g}" if np.isfinite(v) else "" for v in row[2:])
+            writer.writerow([*row[:2], *numbers])

@@ -182,9 +182,8 @@ class Traffic:
     def _continued(self, k: int) -> Path:
         """Continue a path at both ends by `EXTENSION_M`: beside a lane or where others drove on, else on a circle."""
         ticks, line = self._driven[k]
-        guides = [line for _, line in self.lanes] + [
-            d.line for j, d in self._driven.items() if j != k and self.wheeled[j]
-        ]
+        guides = [line for _, line in self.lanes]
+        guides += [d.line for j, d in self._driven.items() if j != k and self.wheeled[j]]
         points, known_m = line.points_m[:, 0] + 1j * line.points_m[:, 1], []
         for sign in (1.0, -1.0):  # ahead, then back: the line is turned around for it
             reversed_ = points[::-1] if sign < 0 else points
@@ -219,12 +218,8 @@ class Traffic:
             ahead[a, n], aside[a, n], turn[a, n] = at.s_m[on] - station[n], at.aside_m[on], at.turn_rad[on]
             beyond = np.maximum(np.maximum(found.begin_m - at.s_m[on], at.s_m[on] - found.end_m), 0.0)
             heading_sigma = np.sqrt(2.0) * self.sigma_m[r, n] / FITTED_M  # of the line through its last places
-            sigma[a, n] = np.sqrt(
-                self.sigma_m[a, n] ** 2
-                + self.sigma_m[r, n] ** 2
-                + (heading_sigma * beyond) ** 2
-                + (BEND_SIGMA_1PM * beyond**2 / 2) ** 2
-            )
+            both, bend = self.sigma_m[a, n] ** 2 + self.sigma_m[r, n] ** 2, BEND_SIGMA_1PM * beyond**2 / 2
+            sigma[a, n] = np.sqrt(both + (heading_sigma * beyond) ** 2 + bend**2)
         length = self.table.size_m[:, 0]
         gap = np.abs(ahead) - ((length + length[r]) / 2)[:, None]
         return Beside(ahead, aside, turn, gap, sigma, self.half_lane_m(r))
@@ -232,18 +227,13 @@ class Traffic:
     @cached_property
     def continued(self) -> Continued:
         """Return where agents are, for `UNSEEN_S` before and after they were seen straight on at their speeds, but at no time without others."""
-        t, ticks = self.table, round(UNSEEN_S / TICK_S)
+        t = self.table
         place, course, speed = t.position_m.copy(), self.course_rad.copy(), self.speed_mps.copy()
         yaw, sigma = t.yaw_rad.copy(), self.sigma_m.copy()
-        for k in np.flatnonzero(
-            t.present.any(axis=1) & np.array([not a.static for a in t.agents], dtype=bool)
-        ).tolist():
-            there = np.flatnonzero(t.present[k])
+        moves = t.present.any(axis=1) & np.array([not a.static for a in t.agents], dtype=bool)
+        for k in np.flatnonzero(moves).tolist():
             along = MOVING[str(t.group[k])].along_mps2
-            for end, rows in (
-                (there[0], np.arange(max(there[0] - ticks, 0), there[0])),
-                (there[-1], np.arange(there[-1] + 1, min(there[-1] + 1 + ticks, len(t.t_s)))),
-            ):
+            for end, rows in out_of_sight(t.present[k]):
                 lead_s = (rows - end) * TICK_S
                 place[k, rows] = place[k, end] + speed[k, end] * np.exp(1j * course[k, end]) * lead_s
                 yaw[k, rows], course[k, rows], speed[k, rows] = yaw[k, end], course[k, end], speed[k, end]
@@ -288,27 +278,19 @@ class Traffic:
         turn = rate(np.unwrap(np.nan_to_num(self.course_rad), axis=1))
         for k in [k for k in self._driven if self.wheeled[k]]:
             ticks = self._driven[k].ticks
-            ticks = ticks[
-                np.unique(
-                    np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.place_m[k, ticks])))]) // 4.0,
-                    return_index=True,
-                )[1]
-            ]
+            way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.place_m[k, ticks])))])
+            ticks = ticks[np.unique(way // 4.0, return_index=True)[1]]
             place, speed = self.place_m[k, ticks], np.maximum(self.speed_mps[k, ticks], 1.0)
-            points.append(
-                np.column_stack(
-                    [place.real, place.imag, self.course_rad[k, ticks], turn[k, ticks] / speed, np.full(len(ticks), k)]
-                )
-            )
+            columns = (place.real, place.imag, self.course_rad[k, ticks], turn[k, ticks] / speed)
+            points.append(np.column_stack([*columns, np.full(len(ticks), k)]))
         x, y, heading, bend, who = np.concatenate(points).T
         a, n = np.nonzero(np.isfinite(self.course_rad) & self.wheeled[:, None] & (self.speed_mps > 1.0))
         count = min(48, len(x))
         if count < 2 or not len(a):
             return out
         place, course = self.place_m[a, n], self.course_rad[a, n]
-        distance, near = cKDTree(np.column_stack([x, y])).query(
-            np.column_stack([place.real, place.imag]), count, distance_upper_bound=12.0
-        )
+        tree, xy = cKDTree(np.column_stack([x, y])), np.column_stack([place.real, place.imag])
+        distance, near = tree.query(xy, count, distance_upper_bound=12.0)
         known = np.isfinite(distance)
         near = np.where(known, near, 0)
         along = ((place[:, None] - x[near] - 1j * y[near]) * np.exp(-1j * heading[near])).real
@@ -317,9 +299,8 @@ class Traffic:
         # One vote for each vehicle: of its points the nearest.
         order = np.argsort(np.where(known, who[near], np.inf), axis=1, kind="stable")
         sorted_who = np.take_along_axis(np.where(known, who[near], np.nan), order, axis=1)
-        first = np.concatenate(
-            [np.ones((len(a), 1), dtype=bool), sorted_who[:, 1:] != sorted_who[:, :-1]], axis=1
-        ) & np.isfinite(sorted_who)
+        first = np.isfinite(sorted_who)
+        first[:, 1:] &= sorted_who[:, 1:] != sorted_who[:, :-1]
         votes = np.where(first, np.take_along_axis(turn, order, axis=1), np.nan)
         enough = first.sum(axis=1) >= 2
         votes = np.concatenate([votes[enough], np.zeros((enough.sum(), 1))], axis=1)
@@ -378,18 +359,16 @@ def smoothed(table: MotionTable) -> tuple[Complex, Complex]:
             continue
         w = agent.waypoints
         sampled = w.speed_mps * np.exp(1j * w.yaw_rad)
-        jumps = (
-            np.abs(np.diff(sampled, 2)) / np.sqrt(6.0) / 1.18 if len(w) > 4 else np.zeros(1)
-        )  # the median of two axes' errors is 1.18 sigma
+        # The median of two axes' errors is 1.18 sigma.
+        jumps = np.abs(np.diff(sampled, 2)) / np.sqrt(6.0) / 1.18 if len(w) > 4 else np.zeros(1)
         interval_s = float(np.median(np.diff(w.t_s))) if len(w) > 1 else 0.0
         half_s = float(np.clip(np.median(jumps) ** 2 * interval_s / (2.0 * SMOOTH_TO_MPS**2), SMOOTH_S, SMOOTH_NOISY_S))
         for piece in np.unique(table.piece[k][table.present[k]]).tolist():
             rows = np.flatnonzero(table.piece[k] == piece)
             window = min(2 * round(half_s / TICK_S) + 1, len(rows) - (len(rows) + 1) % 2)
             if window > 3:
-                place[k, rows] = place[k, rows[0]] + _parabolas(
-                    place[k, rows] - place[k, rows[0]], window, savgol_filter
-                )
+                start = place[k, rows[0]]
+                place[k, rows] = start + _parabolas(place[k, rows] - start, window, savgol_filter)
                 velocity[k, rows] = _parabolas(velocity[k, rows], window, savgol_filter)
     return place, velocity
 
@@ -397,6 +376,15 @@ def smoothed(table: MotionTable) -> tuple[Complex, Complex]:
 def _parabolas(values: Complex, window: int, smooth: Callable[..., Array]) -> Complex:
     real, imaginary = smooth(np.stack([values.real, values.imag]), window, 2)
     return np.asarray(real + 1j * imaginary)
+
+
+def out_of_sight(seen: Mask) -> list[tuple[int, Index]]:
+    """Return the first and the last tick at which something was seen (T,), each with the ticks for `UNSEEN_S` before or after it."""
+    (first, last), ticks = np.flatnonzero(seen)[[0, -1]].tolist(), round(UNSEEN_S / TICK_S)
+    return [
+        (first, np.arange(max(first - ticks, 0), first)),
+        (last, np.arange(last + 1, min(last + 1 + ticks, len(seen)))),
+    ]
 
 
 def rate(values: Array) -> Array:
@@ -472,9 +460,8 @@ def _driven_of(place: Complex, course: Array, piece: Index) -> Driven | None:
     if len(kept) < 4:
         return None
     point = place[kept]
-    return Driven(
-        np.array(kept), Polyline.through(np.column_stack([point.real, point.imag, np.zeros(len(kept))]), STEP_M)
-    )
+    points = np.column_stack([point.real, point.imag, np.zeros(len(kept))])
+    return Driven(np.array(kept), Polyline.through(points, STEP_M))
 
 
 def _continuation(point: Complex, guides: Sequence[Polyline], sign: float) -> tuple[Complex, float]:
