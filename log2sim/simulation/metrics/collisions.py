@@ -142,7 +142,8 @@ class RelativeMotion(Columns):
     def may_touch(self) -> NDArray[np.bool_]:
         """Whether the circles around the footprints meet (N,)."""
         reach = (np.hypot(*self.size_a_m[:2]) + np.hypot(*self.size_b_m[:2])) / 2
-        return circles_meet(*self.apart_m[:2], *self.change_m[:2], reach, 0.0, 1.0)
+        (dx, dy, _), (vx, vy, _) = self.apart_m, self.change_m
+        return circles_meet(dx, dy, vx, vy, reach, 0.0, 1.0)
 
     def free_for(self, u: Array) -> Array:
         """Return the share of the interval (N,) for which boxes certainly stay apart after the shares `u` (N,); 0 in overlap.
