@@ -18,78 +18,10 @@ from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_poly
 from log2sim.synth.polytopes import Polytope
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel, ReturnModel, Weather, lidar_model
 from log2sim.synth.scene import Environment
+from log2sim.synth.terrain import Road, Surface
 from log2sim.synth.traffic_shapes import draw_user, own_car
 
 Mount = Literal["vehicle", "roadside"]
-
-
-@dataclass(frozen=True, eq=False)
-class Road:
-    """A road of constant curvature with its reference line in the middle."""
-
-    origin_m: Array  # (2,), m: point of the line at s = 0
-    yaw_rad: float  # direction of the line there
-    curvature_per_m: float
-    half_width_m: float  # half of the carriageway, m
-    lanes: int  # in all
-    keeps_right: bool = True
-    one_way: bool = False
-
-    def at(self, s: float, d: float) -> tuple[Array, float]:
-        """Position (2,) and direction of the line at s along it and d to its left, m."""
-        k, a = self.curvature_per_m, self.yaw_rad
-        turn = a + k * s
-        if abs(k) < 1e-6:
-            along = np.array([np.cos(a), np.sin(a)]) * s
-        else:
-            along = np.array([np.sin(turn) - np.sin(a), np.cos(a) - np.cos(turn)]) / k
-        return self.origin_m + along + d * np.array([-np.sin(turn), np.cos(turn)]), float(turn)
-
-    def offset(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Distance (N,) to the left of the line, m."""
-        k = self.curvature_per_m
-        normal = np.array([-np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
-        dx, dy = x - np.float32(self.origin_m[0]), y - np.float32(self.origin_m[1])
-        if abs(k) < 1e-6:
-            return np.asarray(dx * np.float32(normal[0]) + dy * np.float32(normal[1]))
-        center = normal / k
-        radius = np.hypot(dx - np.float32(center[0]), dy - np.float32(center[1]))
-        return np.asarray((np.float32(abs(1 / k)) - radius) * np.float32(np.sign(k)))
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Ground: a tilted and bent plane with waves, and kerbs beside the roads."""
-
-    coefficients: Array  # (5,): of x, y, x^2, x y, y^2
-    waves: Array  # (K, 4): amplitude in m, wave numbers along x and y in rad/m, phase
-    roads: tuple[Road, ...]
-    kerb_m: float  # height of the ground beside the roads
-
-    def height(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return heights (N,) without kerbs, m."""
-        a, b, c, d, e = self.coefficients.astype(np.float32)
-        return np.asarray(x * (a + c * x + d * y) + y * (b + e * y))
-
-    def elevation(self, position: Array) -> float:
-        """Return the height with waves and kerbs at one position (2,) or (3,), m."""
-        x, y = position[:1].astype(np.float32), position[1:2].astype(np.float32)
-        return float(self.height(x, y)[0] + self.relief(x, y)[0])
-
-    def slope(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return derivatives (N,), (N,) of the height."""
-        a, b, c, d, e = self.coefficients.astype(np.float32)
-        return np.asarray(a + 2 * c * x + d * y), np.asarray(b + 2 * e * y + d * x)
-
-    def relief(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return waves and kerbs (N,), m."""
-        beside = np.ones(len(x), bool)
-        for road in self.roads:
-            beside &= np.abs(road.offset(x, y)) > road.half_width_m
-        out = np.float32(self.kerb_m) * beside.astype(np.float32)
-        for amplitude, kx, ky, phase in self.waves.astype(np.float32):
-            out += amplitude * np.sin(kx * x + ky * y + phase)
-        return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
