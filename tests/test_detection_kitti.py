@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import ImageRegions, Log
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.evaluation import ClassBoxes, class_figures, precision_recall
+from log2sim.evaluation.detection.evaluation import BothBoxes, class_figures, precision_recall
 from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS, Criterion, candidate_pairs, match_detections
 from log2sim.evaluation.detection.truth import ImageViews, image_views
 from log2sim.geometry import Camera, transform
@@ -60,9 +60,8 @@ def test_each_difficulty_counts_the_labels_that_it_admits():
     truncation = [0.15, 0, 0, 0.16, 0, 0.5, 0, 0]
     truth = row_of(np.arange(8) * 10.0)
     found = row_of(np.arange(8) * 10.0, score=0.9)
-    boxes = ClassBoxes(
-        found, truth, none(found), none(found), views(height), views(height, truncation), occlusion.astype(np.int64)
-    )
+    sides = found, truth, none(found), np.zeros(8), np.full(8, ""), occlusion.astype(np.int64)
+    boxes = BothBoxes(*sides, views(height), views(height, truncation))
     assert [counts(figures(boxes, name))[:3] for name in NAMES] == [(1, 1, 0), (4, 4, 0), (6, 6, 0)]
     assert counts(figures(boxes, "all")) == (8, 8, 0, 0)
 

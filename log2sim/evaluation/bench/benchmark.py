@@ -45,6 +45,7 @@ from log2sim.evaluation.bench.settings import (
     short,
 )
 from log2sim.evaluation.metrics.evaluator import rounded_tree
+from log2sim.evaluation.road import cell
 from log2sim.files.documents import check, replaced
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.version import __version__
@@ -122,7 +123,7 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[Point
     whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
     points = {
         "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
-        "measure": [_measure_point(context, r) for r in by_stage["measure"]],
+        "measure": [_point(context, "measure", r) for r in by_stage["measure"]],
         "homography": homographies,
         "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
         "whole run": _add_placed_shares(whole, homographies),
@@ -138,25 +139,17 @@ def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) ->
     return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_mask(points)), recommendation)
 
 
-def _name(context: BenchContext, stage: str, run: BenchRun) -> str:
-    """Name a run within a stage; the present run belongs to every stage."""
-    return run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
-
-
 def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
+    """Make the point of a run in a stage; the present run belongs to every stage."""
+    name = run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
     ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
-    return _scored_point(_name(context, stage, run), run.setting.present, ms, run.score, _error(context, stage))
+    if stage == "measure" and context.truth is not None:
+        return _scored_point(name, run.setting.present, ms, run.measurement_score, "error_m")
+    return _scored_point(name, run.setting.present, ms, run.score, _error(context, stage))
 
 
 def _scored_point(name: str, present: bool, ms: float, score: Score, error: str) -> Point:
     return Point(name, present, ms, score.figures.get(error), score.figures, score.by_object.get(error, {}))
-
-
-def _measure_point(context: BenchContext, run: BenchRun) -> Point:
-    point = _point(context, "measure", run)
-    if context.truth is None:
-        return point
-    return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
 
 
 def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
@@ -173,13 +166,8 @@ def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> Poi
     present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
     name = present if run.setting.present else run.setting.key
     stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
-    point = _scored_point(
-        name,
-        run.setting.present and compared,
-        context.ms_per_tick(run.seconds),
-        run.score,
-        _error(context, "whole run"),
-    )
+    marked, ms = run.setting.present and compared, context.ms_per_tick(run.seconds)
+    point = _scored_point(name, marked, ms, run.score, _error(context, "whole run"))
     return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
 
 
@@ -589,13 +577,9 @@ def _rows(panel: Panel) -> list[str]:
             short(p.ms_per_tick),
             short(p.error),
             "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
-            *(_table_cell(p.figures.get(key), digits) for key, _, digits in columns),
+            *(cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)
     ]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     return ["  ".join(c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(r, widths))) for r in cells]
-
-
-def _table_cell(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
