@@ -201,10 +201,9 @@ def test_published_detections_of_pointrcnn_get_figures_like_the_published_ones()
         return replace(SceneBoxes.join(tables), scene=np.concatenate([t.scene for t in tables]))
 
     found_all, truth_all = joined(found), joined(truth).ignoring(kind == "Van")
-    boxes = ClassBoxes(
-        found_all, truth_all, none(found_all), none(found_all), level_views(np.concatenate(found_px)),
-        level_views(np.concatenate(true_px), np.array([0.0, 0.3, 0.5])[level[:, 0].astype(int)]), level[:, 1].astype(int),
-    )  # fmt: skip
+    views_of_truth = level_views(np.concatenate(true_px), np.array([0.0, 0.3, 0.5])[level[:, 0].astype(int)])
+    sides = found_all, truth_all, none(found_all), np.zeros(len(found_all)), kind, level[:, 1].astype(int)
+    boxes = BothBoxes(*sides, level_views(np.concatenate(found_px)), views_of_truth)
     # KITTI's validation set, R40: about 91, 80 and 78 in 3D, 95, 89 and 87 from above (PointRCNN, Shi et al. 2019, and later
     # evaluations of its weights). Here are other frames, some of which it was trained on, with occlusion and truncation by level.
     result = class_figures(boxes, CAR, 0.5)
