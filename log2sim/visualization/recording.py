@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes import AgentTable, Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import (
     NS_PER_S,
@@ -38,15 +38,20 @@ MARGIN_S = 0.05  # records this far outside the scenario are taken too: half a t
 BACK_RAD = np.radians(150.0)  # cameras that are turned farther from the front than this look back
 
 
+def require_cameras(log: Log, asked: Sequence[str]) -> None:
+    """Raise `ConfigError` for a camera that a log does not have."""
+    unknown = [name for name in asked if name not in log.cameras]
+    if unknown:
+        there = ", ".join(log.cameras) or "none"
+        raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
+
+
 def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Return the cameras to show, from left to right: those asked for, else those that the scenario was made with, else all.
 
     Raises `ConfigError` for a camera that the log does not have.
     """
-    unknown = [name for name in asked if name not in log.cameras]
-    if unknown:
-        there = ", ".join(log.cameras) or "none"
-        raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
+    require_cameras(log, asked)
     used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
     return tuple(sorted(asked or used or log.cameras, key=lambda name: _place(log.cameras[name])))
 
@@ -118,7 +123,6 @@ class OutlineProjector:
     def __init__(self, log: Log, scenario: Scenario) -> None:
         self.agents = scenario.others
         self._log, self._t0_ns = log, scenario.t0_ns
-        self._size_m = np.array([a.size_m for a in self.agents], dtype=np.float64).reshape(-1, 3)
 
     def outlines(self, camera: str, t_ns: int) -> list[list[int]]:
         """Project the agents into the frame of a camera at a stamp, the farthest first.
@@ -129,27 +133,16 @@ class OutlineProjector:
         view = view_of(self._log, camera, t_ns)
         if view is None or not self.agents:
             return []
-        # Centers (A, 3), m, yaws (A,) and whether each agent is present at a time.
-        agents = self.agents
-        t_s = (t_ns - self._t0_ns) / NS_PER_S
-        center, yaw, present = (
-            np.full((len(agents), 3), np.nan),
-            np.zeros(len(agents)),
-            np.zeros(len(agents), dtype=bool),
-        )
-        for k, agent in enumerate(agents):
-            at = agent.at(float(agent.waypoints.t_s[0]) if agent.is_permanent else t_s)
-            if at.valid[0]:
-                center[k], yaw[k], present[k] = (at.x_m[0], at.y_m[0], at.z_m[0]), at.yaw_rad[0], True
-        rows = np.flatnonzero(present)
-        found = project_boxes_in_view(view, center[rows], self._size_m[rows], yaw[rows])
+        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / NS_PER_S]), permanent=True)
+        center, yaw, rows = table.center_m[:, 0], table.yaw_rad[:, 0], np.flatnonzero(table.present[:, 0])
+        found = project_boxes_in_view(view, center[rows], table.size_m[rows], yaw[rows])
         height_px = found.box_px[:, 3] - found.box_px[:, 1]
         with np.errstate(invalid="ignore"):
             shown = np.flatnonzero(found.valid & (height_px >= MIN_SHARE * view.camera.height_px))
         out = []
         for i in shown[np.argsort(-found.range_m[shown], kind="stable")]:
             row = int(rows[i])
-            corners = box_corners(center[row], self._size_m[row], yaw[row])[0]
+            corners = box_corners(center[row], table.size_m[row], yaw[row])[0]
             middle_px = found.box_px[i].reshape(2, 2).mean(axis=0)[None]
             kind, coordinates = ground_outline(view.camera, apply(_cam_T_map(view, middle_px), corners))
             if len(coordinates):

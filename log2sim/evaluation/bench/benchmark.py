@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -46,20 +45,21 @@ from log2sim.evaluation.bench.settings import (
 )
 from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.evaluation.road import cell
-from log2sim.files.documents import check, replaced
+from log2sim.files.documents import check
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.version import __version__
 from log2sim.visualization.plot.style import (
     CROWD_COLOR,
     FONT,
-    FRAME,
-    GRID,
     INK,
     MUTED,
     PALETTE,
     PAPER,
     halo,
+    new_figure,
     printable_label,
+    save_png,
+    style_axes,
 )
 
 __all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
@@ -341,19 +341,16 @@ HEAD_IN = 0.62
 FRONT, CHOSEN = PALETTE[0], PALETTE[4]
 
 
-def write_picture(result: Benchmark, path: Path, *, dpi: int = 150) -> None:
+def write_picture(result: Benchmark, path: Path) -> None:
     """Write all panels into a PNG, atomically."""
-    figure = draw(result)
-    with replaced(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+    save_png(draw(result), path, 150)
 
 
 def draw(result: Benchmark) -> Figure:
     """Draw all panels; the last cell explains the marks and gives the recommendations."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
     width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
-    figure = Figure(figsize=(width, height), facecolor=PAPER)
-    FigureCanvasAgg(figure)
+    figure = new_figure(width, height)
     _title(figure, result)
     for k, panel in enumerate(result.panels):
         _draw_panel(figure.add_axes(_cell(k, rows, width, height)), panel)
@@ -393,12 +390,8 @@ def _title(figure: Figure, result: Benchmark) -> None:
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     shown = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
     ax.set_facecolor("#FBFCFD")
-    ax.set_axisbelow(True)
-    ax.grid(True, color=GRID, lw=0.7)
-    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
+    style_axes(ax)
     ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=MUTED, family=FONT)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
     style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
     ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
     label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
