@@ -88,19 +88,9 @@ def seen_ground(truth: Scenario, shift_m: Array) -> BaseGeometry | None:
 
 
 def sampled(points_m: Array) -> tuple[Array, Array, float]:
-    """Sample a line (N, 2 or 3) at steps of at most `STEP_M`.
+    """Sample a line (N, 2 or 3) at steps of at most `STEP_M`: places (S, 2), headings (S,), and the length that each stands for, m.
 
-    Returns
-    -------
-    xy : (S, 2) float64, m
-    heading : (S,) float64, rad
-    length_m : float, m
-        That each sample stands for.
-
-    Raises
-    ------
-    ScenarioError
-        When it is too long to be a line on a road.
+    Raises `ScenarioError` when it is too long to be a line on a road.
     """
     xy = np.asarray(points_m, dtype=np.float64)[:, :2]
     steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)

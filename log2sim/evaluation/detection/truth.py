@@ -71,15 +71,9 @@ class LabelTracks:
         return moment[order].astype(np.int64), track[order].astype(np.int64)
 
     def at(self, track: NDArray[np.int64], t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-        """Interpolate tracks (P,) at stamps (P,).
+        """Interpolate tracks (P,) at stamps (P,); return poses (P, 4), x, y, z, yaw, and the nearest labels (P,) in the log's.
 
-        Returns
-        -------
-        pose : (P, 4) float64
-            Center x, y, z and yaw, on the line through the labels before and after; beyond the ends, and next to a gap, on
-            the line through the two nearest ones.
-        row : (P,) int64
-            Index of the nearest label in the log's labels.
+        On the line through the labels before and after; beyond the ends, and next to a gap, through the two nearest ones.
         """
         pose, row = np.empty((len(track), 4)), np.empty(len(track), dtype=np.int64)
         for k in np.unique(track):

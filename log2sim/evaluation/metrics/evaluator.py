@@ -191,23 +191,12 @@ Move = Callable[[Array, Array], Array]
 
 
 def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str, Any]]:
-    """Bring a truth into the map of a scenario.
+    """Bring a truth into the map of a scenario; where both maps have the same projection it stays, `Scenario.shift_to` does the rest.
 
-    Returns
-    -------
-    truth : Scenario
-        Unchanged where both maps have the same projection; `Scenario.shift_to` does the rest.
-    placement : dict
-        "method", how both maps were brought together: "same_map", "projection" or "ego_path"; "ego_apart_m", the median
-        distance of the egos in the end, None where not both are known.
+    Returns also "method", how both maps were brought together: "same_map", "projection" or "ego_path", and "ego_apart_m", the
+    median distance of the egos in the end, None where not both are known. Raises `ConfigError` when positions have no
+    coordinates in the projection of the scenario.
 
-    Raises
-    ------
-    ConfigError
-        When positions have no coordinates in the projection of the scenario.
-
-    Notes
-    -----
     Two projections scale alike only to some tenths of a percent, 0.1 m at 50 m. What moves with time is therefore kept as it
     is around the true ego, and only the ego is reprojected. Where a georeference is missing and the egos are farther apart
     than matches may be, the truth is rotated about the vertical and shifted so that front and rear of the egos coincide best
@@ -438,20 +427,9 @@ def evaluate(
 def compare_scenarios(
     scenario: Scenario, truth: Scenario, selection: Selection
 ) -> tuple[Comparison, Array, StateTable | None]:
-    """Match the agents of a scenario with those of its truth, without the egos.
+    """Match the agents of a scenario with those of its truth; also the ticks (T,), s of the scenario, and the ego, one row.
 
-    Returns
-    -------
-    compared : Comparison
-    ticks_s : (T,) float64, s
-        Of the scenario.
-    ego : StateTable or None
-        One row.
-
-    Raises
-    ------
-    ConfigError, ScenarioError
-        As `evaluate`.
+    Raises `ConfigError` and `ScenarioError` as `evaluate`.
     """
     ticks_s = evaluation_ticks_s(scenario, truth)
     if len(ticks_s) == 0 and scenario.agents and truth.agents:

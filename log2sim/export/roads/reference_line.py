@@ -105,22 +105,10 @@ def joined_pieces(steps: Sequence[tuple[float, float, float, float, float]]) -> 
 
 
 def fit(xy_m: Array, start: Array | None = None, end: Array | None = None) -> tuple[ReferenceLine, Array]:
-    """Fit lines and arcs to points (N, 2), at least two, in order along the path.
+    """Fit lines and arcs to points (N, 2), m, at least two, in order along the path; return the line and the points' stations (N,).
 
-    Parameters
-    ----------
-    xy_m : (N, 2) float64, m
-    start, end : (3,) float64 or None
-        x, y, heading with which the line begins and ends exactly, next to the first and last point.
+    `start`, `end`: x, y, heading (3,) with which the line begins and ends exactly, next to the first and last point.
 
-    Returns
-    -------
-    line : ReferenceLine
-    s_m : (N,) float64
-        Stations of the points.
-
-    Notes
-    -----
     A smoothing spline removes millimeter noise, which would become curvature; then each stretch of it is replaced by the
     longest pair of arcs within `ARCS_M` of it, with continuous tangents (biarcs: Bolton 1975).
     Cost: a banded least-squares problem per spline, and O(N log N) for the arcs.

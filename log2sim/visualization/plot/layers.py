@@ -136,15 +136,7 @@ def warning_row() -> tuple[Line2D, str]:
 
 
 def new_collisions(replay: Any) -> tuple[Array, Array]:
-    """Find the collisions of a replay that its scenario does not have.
-
-    Returns
-    -------
-    t_s : (K,) float64
-        When each begins.
-    xy_m : (K, 2) float64
-        Midpoints between the centers of both boxes, map frame.
-    """
+    """Find when collisions of a replay begin (K,), s, that its scenario does not have, and the middles (K, 2) of both boxes, m."""
     if replay is None:
         return np.zeros(0), np.zeros((0, 2))
     events = [e for e in replay.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
