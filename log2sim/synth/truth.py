@@ -145,9 +145,8 @@ def map_features_of(scene: Scene) -> MapFeatures:
         lanes += _lanes(road, k, plan.keeps_right, tuple(zip(lines, own)), sides, crossed)
     markings += [_crosswalk(zebra, k) for k, zebra in enumerate(plan.zebras)]
     for k, stop in enumerate(plan.stop_lines):
-        markings.append(
-            Marking(f"stop_line_{k}", "stop_line", _on_ground(np.array(stop.line)), stop.width_m, stop.color)
-        )
+        line = _on_ground(np.array(stop.line))
+        markings.append(Marking(f"stop_line_{k}", "stop_line", line, stop.width_m, stop.color))
     for k, arrow in enumerate(plan.arrows):
         outline = arrow_outline(arrow)
         turn = np.deg2rad(arrow.yaw_deg)
@@ -259,23 +258,15 @@ def _lanes(
         for n, ((begin, end), inside) in enumerate(pieces):
             points = stretch(middle, begin, end)
             ends = names[max(n - 1, 0) : n], names[n + 1 : n + 2]
-            right, left = (
-                (None, None) if inside else (_beside(points, sides[lane][1]), _beside(points, sides[lane + 1][0]))
-            )
+            right, left = (None, None) if inside else [_beside(points, s) for s in (sides[lane][1], sides[lane + 1][0])]
             if not forward[lane]:
                 points, ends, right, left = points[::-1], ends[::-1], left, right
-            parts[-1].append(
-                MapLane(
-                    id=names[n],
-                    points_m=_on_ground(points),
-                    width_m=np.full(len(points), float(np.diff(at)[lane])),
-                    left=left,
-                    right=right,
-                    predecessors=tuple(ends[0]),
-                    successors=tuple(ends[1]),
-                    junction=f"junction_{number}_{n}" if inside else None,
-                )
+            width, junction = (
+                np.full(len(points), float(np.diff(at)[lane])),
+                f"junction_{number}_{n}" if inside else None,
             )
+            links: dict[str, Any] = {"predecessors": tuple(ends[0]), "successors": tuple(ends[1]), "junction": junction}
+            parts[-1].append(MapLane(names[n], _on_ground(points), width, left=left, right=right, **links))
     out = []
     for lane, own_parts in enumerate(parts):
         for n, piece in enumerate(own_parts):
