@@ -39,16 +39,18 @@ class ExportPlacement:
 
     def forward(self, states: Array) -> Array:
         """Convert states (N, 4) x, y, z, heading from the scenario to the export."""
+        origin: Array = np.array([*self.origin_m, 0.0])
         if self.target is not None:
             states = self._projected(states + np.array([*self.offset_m, 0.0]), self.projection, self.target)
-        return states - np.array([*self.origin_m, 0.0])
+        return states - origin
 
     def back(self, states: Array) -> Array:
         """Convert states (N, 4) from the export to the scenario."""
-        states = states + np.array([*self.origin_m, 0.0])
+        origin: Array = np.array([*self.origin_m, 0.0])
+        offset: Array = np.array([*self.offset_m, 0.0])
         if self.target is None:
-            return states
-        return self._projected(states, self.target, self.projection) - np.array([*self.offset_m, 0.0])
+            return states + origin
+        return self._projected(states + origin, self.target, self.projection) - offset
 
     @staticmethod
     def _projected(states: Array, source: str | None, target: str | None) -> Array:

@@ -242,7 +242,7 @@ def _cast_ground(model: LidarModel, sensor: SensorState, surface: Surface) -> Ra
     height = start[:, 2] - surface.height(start[:, 0], start[:, 1])
     limit = np.float32(model.range_m)
     t = np.minimum(height / np.maximum(-d[:, 2], np.float32(0.02)), limit)
-    t, error, rise = meet(surface, tuple(start.T), tuple(d.T), t, flattest=0.004, span=(0, 2 * limit))
+    t, error, rise = meet(surface, tuple(start.T), tuple(d.T), t, flattest=0.004, span=(0.0, 2.0 * model.range_m))
     facing = -rise
     ok = (np.abs(error) < MAX_GROUND_ERROR_M) & (t > MIN_RANGE_M) & (t < limit) & (facing > 0.005)
     x, y = start[:, 0] + t * d[:, 0], start[:, 1] + t * d[:, 1]

@@ -90,8 +90,8 @@ def draw_tracks(
     for leading in (False, True):
         same_rank = [r for r in roles.movers if r.leading is leading]
         _lines(ax, same_rank, alpha if leading else alpha * 0.5, leading)
-    leading = [role for role in roles.movers if role.leading]
-    heads = [(head, role.color) for role in leading for head in viewport.arrows(centers_xy(role.agent), view)]
+    shown = [role for role in roles.movers if role.leading]
+    heads = [(head, role.color) for role in shown for head in viewport.arrows(centers_xy(role.agent), view)]
     if heads and not faint:
         faces = [color for _, color in heads]
         add_polygons(ax, [h for h, _ in heads], facecolors=faces, edgecolors=PAPER, linewidths=0.5, zorder=MARK)
