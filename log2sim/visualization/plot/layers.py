@@ -174,9 +174,11 @@ class PredictedPaths:
         found, rows = self._found, self._rows[agent]
         table, ticks = found.table, found.tick[rows]
         k = int(np.searchsorted(table.t_s[ticks], t_s + 1e-6, side="right")) - 1
-        if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s or self._stands(rows[k]):
+        if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s:
             return None
         forecast, row = found.forecasts[DEFAULT_METHOD], rows[k]
+        if abs(table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS:
+            return None
         path = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
         along, across = forecast.sigma_m[row, -1]
         rim = path[-1] + forecast.course[row, -1] * (along * _CIRCLE.real + 1j * across * _CIRCLE.imag)
@@ -194,10 +196,6 @@ class PredictedPaths:
         h = self.horizon_s
         regular = np.arange(np.ceil(t[0] / h + 1e-6), np.floor(t[-1] / h) + 1) * h
         return np.append(regular[regular < t[-1] - h / 3], t[-1])
-
-    def _stands(self, row: int) -> bool:
-        found = self._found
-        return bool(abs(found.table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS)
 
 
 def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None:
@@ -322,7 +320,9 @@ def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[An
     doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
     rows: list[tuple[Any, str]] = []
     for agent, color in doubtful[:MAX_NAMED]:
-        rows.append((_hatched_patch(color), _wrapped(f"{agent.id} is doubtful: {explain_doubt(agent)}")))
+        text = printable_label(f"{agent.id} is doubtful: {explain_doubt(agent)}", LINE_LETTERS * MAX_LINES)
+        lines = textwrap.wrap(text, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …")
+        rows.append((_hatched_patch(color), "\n".join(lines)))
     if len(doubtful) > MAX_NAMED:
         rows.append((Patch(fc="none", ec="none"), f"and {len(doubtful) - MAX_NAMED} more doubtful"))
     if not doubtful and any(a.is_doubtful for a in roles.stationary):
@@ -332,11 +332,6 @@ def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[An
 
 def _hatched_patch(color: str) -> Patch:
     return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
-
-
-def _wrapped(text: str) -> str:
-    whole = printable_label(text, LINE_LETTERS * MAX_LINES)
-    return "\n".join(textwrap.wrap(whole, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …"))
 
 
 def _hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
