@@ -235,7 +235,7 @@ def test_files_that_are_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="0 bytes; expected an ONNX network"):
         network.load_network(path)
     path.write_bytes(b"not a network")
-    with pytest.raises(ConfigError, match="not a network that ONNX Runtime can load"):
+    with pytest.raises(ConfigError, match="not a network for clouds that ONNX Runtime can load"):
         network.load_network(path)
     monkeypatch.setattr(network, "MAX_FILE_BYTES", 5)
     with pytest.raises(ConfigError, match="13 bytes; expected an ONNX network for clouds of 1 to 5 bytes"):

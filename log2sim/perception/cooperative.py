@@ -24,7 +24,7 @@ from log2sim.datatypes import GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import oriented_covariance, rotate
-from log2sim.perception.detect3d.boxes import Rectangles, suppress
+from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure
@@ -328,8 +328,7 @@ def fuse_boxes(a: SeenBoxes, b: SeenBoxes, method: Method) -> SeenBoxes:
     out = join([part for part in parts if len(part)])
     names = tuple(GROUPS)
     group = np.array([names.index(GROUP_OF[str(c)]) for c in out.boxes.category], dtype=np.intp)
-    flat = Rectangles(out.boxes.center_m[:, :2], out.boxes.size_m[:, :2], out.boxes.yaw_rad)
-    return out.take(suppress(flat, out.boxes.score, group))
+    return out.take(suppress(out.rectangles, out.boxes.score, group))
 
 
 def join(parts: list[SeenBoxes]) -> SeenBoxes:
