@@ -26,17 +26,10 @@ REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """The ticks of a run.
+    """The ticks of a run."""
 
-    Attributes
-    ----------
-    t_ns : (T,) int64
-    t0_ns : int
-        Start of the scenario.
-    """
-
-    t_ns: NDArray[np.int64]
-    t0_ns: int
+    t_ns: NDArray[np.int64]  # (T,)
+    t0_ns: int  # start of the scenario
 
     def seconds(self, t_ns: NDArray[np.int64]) -> Array:
         """Convert stamps to seconds since the start."""
@@ -45,21 +38,13 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class AgentCandidate:
-    """An agent made of one track, with what it is made of.
-
-    Attributes
-    ----------
-    track : Track
-        Whose measurements, one at each of its ticks, the agent is made of.
-    geometry : TrackGeometry
-        Size of the track, and positions at its measurements.
-    followed : float
-        As many independent ticks as those at which points fit the predicted box at places without a detection, free at other times.
-    """
+    """An agent made of one track, with what it is made of."""
 
     agent: Agent
-    track: Track
-    geometry: TrackGeometry
+    track: Track  # whose measurements, one at each of its ticks, the agent is made of
+    geometry: TrackGeometry  # size of the track, and positions at its measurements
+    # As many independent ticks as those at which points fit the predicted box at places without a detection, free at other
+    # times
     followed: float = 0.0
 
     def doubted(self, doubts: Sequence[Finding]) -> Self:

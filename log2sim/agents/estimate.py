@@ -44,11 +44,7 @@ def estimate_agents(
 ) -> list[AgentCandidate]:
     """Make a candidate of every object that the tracks show, moving ones first.
 
-    Parameters
-    ----------
-    obstacles : T clouds, None at ticks without LiDAR
-    smooth : bool
-        Whether trajectories are smoothed.
+    `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed.
     """
     parts = [part for track in tracks for part in explain_track(track)]
     candidates = [moving_candidate(p.track, obstacles, timeline, smooth=smooth) for p in parts if not p.static]

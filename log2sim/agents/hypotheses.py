@@ -147,18 +147,11 @@ MAX_SPLITS = 24
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Measurements of one object.
-
-    Attributes
-    ----------
-    static : bool
-        Whether it stands.
-    at_place : Track, optional
-        The measurements that agree on the place of an object that stands; those of the track without any that do not.
-    """
+    """Measurements of one object."""
 
     track: Track
-    static: bool
+    static: bool  # whether it stands
+    # The measurements that agree on the place of an object that stands; those of the track without any that do not
     at_place: Track | None = None
 
 

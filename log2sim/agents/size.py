@@ -84,21 +84,12 @@ CLEAR_LOG_ODDS = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Ends of the points of an object along its length and width in n views.
+    """Ends of the points of an object along its length and width in n views."""
 
-    Attributes
-    ----------
-    low, high : (n, 2) float64, m
-    real : (n, 2, 2) int
-        Kinds of the ends, see `box_completion.real_ends`.
-    gap_m : (n, 2, 2) float64
-        Distances between rays there, see `box_completion.end_gaps`.
-    """
-
-    low: Array
+    low: Array  # `low`, `high`: (n, 2), m
     high: Array
-    real: NDArray[np.int64]
-    gap_m: Array
+    real: NDArray[np.int64]  # (n, 2, 2): kinds of the ends, see `boxes.real_ends`
+    gap_m: Array  # (n, 2, 2): distances between rays there, see `boxes.end_gaps`
 
     def take(self, rows: slice) -> Ends:
         """Return the ends of some of the views."""
@@ -185,12 +176,8 @@ def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: 
 
     Of an end that is seen from two viewpoints counts the better view.
 
-    Parameters
-    ----------
-    yaw_rad : (n,) float64
-        Of the object at each of them.
-    velocity_mps : (n, 2) float64
-        By which points are moved to where they were at the time of the measurement.
+    `yaw_rad`: (n,): of the object at each of them. `velocity_mps`: (n, 2): by which points are moved to where they were at the
+    time of the measurement.
     """
     views = track.measurements.views_of(rows)
     count, place = len(rows), {k: i for i, k in enumerate(rows.tolist())}
@@ -265,28 +252,14 @@ HIGHEST_TRUCK_M, HIGHEST_TRUCK_LENGTH_M = 4.0, 14.25
 
 @dataclass(frozen=True, eq=False)
 class TrackGeometry:
-    """Size of a track, and the center of its box at each of its n measurements.
+    """Size of a track, and the center of its box at each of its n measurements."""
 
-    Attributes
-    ----------
-    size_m : (3,) float64
-        Length, width, height.
-    xy_m : (n, 2) float64
-    covariance : (n, 2, 2) float64
-        Of `xy_m`, m2.
-    z_m : (n,) float64
-    yaw_rad : float, optional
-        Of a static track, up to half turns.
-    is_likely : bool
-        Whether the observed size is one of its category.
-    """
-
-    size_m: Array
-    xy_m: Array
-    covariance: Array
-    z_m: Array
-    yaw_rad: float | None = None
-    is_likely: bool = True
+    size_m: Array  # (3,): length, width, height
+    xy_m: Array  # (n, 2)
+    covariance: Array  # (n, 2, 2): of `xy_m`, m2
+    z_m: Array  # (n,)
+    yaw_rad: float | None = None  # of a static track, up to half turns
+    is_likely: bool = True  # whether the observed size is one of its category
 
 
 def static_geometry(track: Track) -> TrackGeometry:
@@ -329,13 +302,9 @@ def _with_size_error(sigma_m: Array | float, box_size_m: Array | None, size_m: A
 def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = None) -> TrackGeometry:
     """Estimate the size of a moving track, and its center at every measurement.
 
-    Parameters
-    ----------
-    yaw_rad : (n,) float64
-        Heading at every measurement.
-    velocity_mps : (n, 2) float64, optional
-        Velocity there, by which its points are moved to where they were at the time of the measurement: a LiDAR takes
-        20 ms to sweep over a truck beside it, in which that goes on by 0.6 m at 30 m/s. Without it they stay.
+    `yaw_rad`: (n,): heading at every measurement. `velocity_mps`: (n, 2): velocity there, by which its points are moved to
+    where they were at the time of the measurement: a LiDAR takes 20 ms to sweep over a truck beside it, in which that goes on
+    by 0.6 m at 30 m/s. Without it they stay.
     """
     m = track.measurements
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])

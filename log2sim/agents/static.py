@@ -59,50 +59,26 @@ LONG_WIDTHS = 1.5
 
 @dataclass(frozen=True, eq=False)
 class LidarMatch:
-    """A tracked box found in the LiDAR points of a tick.
-
-    Attributes
-    ----------
-    t_ns : int
-        Mean time of its points.
-    xy_m : (2,) float64
-        Center, map frame.
-    covariance : (2, 2) float64
-        Of the center, m2.
-    yaw_rad : float
-        Direction of its sides; the predicted one where its points do not show it.
-    """
+    """A tracked box found in the LiDAR points of a tick."""
 
     tick: int
-    t_ns: int
-    xy_m: Array
-    covariance: Array
-    yaw_rad: float
+    t_ns: int  # mean time of its points
+    xy_m: Array  # (2,): center, map frame
+    covariance: Array  # (2, 2): of the center, m2
+    yaw_rad: float  # direction of its sides; the predicted one where its points do not show it
     points: int
 
 
 @dataclass(frozen=True, eq=False)
 class BoxState:
-    """A box of known size and its motion at one time, in the map frame.
-
-    Attributes
-    ----------
-    xy_m : (2,) float64
-        Center.
-    velocity_mps : (2,) float64
-        Zero for a static box, which is expected at the same position at every tick.
-    size_m : (3,) float64
-        Length, width, height.
-    bottom_m : float
-        Height of its bottom face.
-    """
+    """A box of known size and its motion at one time, in the map frame."""
 
     t_ns: int
-    xy_m: Array
-    velocity_mps: Array
+    xy_m: Array  # (2,): center
+    velocity_mps: Array  # (2,): zero for a static box, which is expected at the same position at every tick
     yaw_rad: float
-    size_m: Array
-    bottom_m: float
+    size_m: Array  # (3,): length, width, height
+    bottom_m: float  # height of its bottom face
 
 
 def track_with_lidar(
@@ -113,13 +89,8 @@ def track_with_lidar(
     A moving box is predicted with constant velocity, corrected at every match, and lost after `MAX_MISSES` ticks without a
     match in a row.
 
-    Parameters
-    ----------
-    obstacles : T clouds, None at ticks without LiDAR
-    ticks : sequence of int
-        Forward or backward in time from the state.
-    t_ns : (T,) int64
-        Stamps of all ticks.
+    `obstacles`: T clouds, None at ticks without LiDAR. `ticks`: forward or backward in time from the state. `t_ns`: (T,):
+    stamps of all ticks.
     """
     matches: list[LidarMatch] = []
     state, misses, is_static = start, 0, not start.velocity_mps.any()
@@ -287,12 +258,8 @@ def _ends_by_rays(
 ) -> tuple[NDArray[np.int64], Array]:
     """Find the ends next to which rays (K, 3) pass the sides that face the sensor, between two levels (2,).
 
-    Returns
-    -------
-    real : (2, 2) int
-        Kinds of the ends of the points, with those that face the sensor, `real`.
-    gap_m : (2, 2) float64
-        How far beyond the points the first ray passes.
+    Returns `real`: (2, 2): kinds of the ends of the points, with those that face the sensor, `real`; `gap_m`: (2, 2): how far
+    beyond the points the first ray passes.
     """
     ends, gap_m = real.copy(), np.zeros((2, 2))
     for across, side in np.argwhere(real == FACING_END).tolist():

@@ -432,7 +432,7 @@ def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.
 
     An end seen from the side is up to one such distance beyond the outermost point. One that faces the sensor is hit.
 
-    `step_rad`: (...), rad: angle between neighboring rays, from `box_fitting.azimuth_step_rad`. `low`, `high`: (..., 2), m:
+    `step_rad`: (...), rad: angle between neighboring rays, from `azimuth_step_rad`. `low`, `high`: (..., 2), m:
     ends of the extents along the length and the width, relative to the sensor. `real`: (..., 2, 2): from `real_ends`.
 
     Notes

@@ -3,7 +3,7 @@
 A detector sees the near sides of an object and guesses where the far ones are. So the sides, not the center, have errors of
 their own; those of center and size follow.
 
-A box is four sides with errors of their own (`box_errors`). Besides, all sides of an object move on together between the times
+A box is four sides with errors of their own (`BoxErrors`). Besides, all sides of an object move on together between the times
 at which the ends saw it, and all sides of a box are off together where the pose of its sensor is. Generalized least squares
 with the covariance of all three gives the sides at one time: Aitken, "On least squares and linear combination of observations"
 (1935).

@@ -137,20 +137,11 @@ _Costs = tuple[Array, Array, NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Tracklet:
-    """Measurements assigned to one track.
+    """Measurements assigned to one track."""
 
-    Attributes
-    ----------
-    ticks : (n,) int64
-    rows : (n,) int64
-        Row of the measurement in its tick.
-    mean : (4,) float64
-        Last state: x, y, vx, vy in the map.
-    """
-
-    ticks: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    mean: Array
+    ticks: NDArray[np.int64]  # (n,)
+    rows: NDArray[np.int64]  # (n,): row of the measurement in its tick
+    mean: Array  # (4,): last state: x, y, vx, vy in the map
 
 
 def track_forward(
@@ -178,25 +169,11 @@ def track_forward(
 class ForwardTracker:
     """Active tracks, one row each; `step` is causal.
 
-    Attributes
-    ----------
-    number : (A,) intp
-        Index of the track in the order of births.
-    mean : (A, 4) float64
-        States x, y, vx, vy in the map at the last tick.
-    covariance : (A, 4, 4) float64
-    seen_ns : (A,) int64
-        Time of the last measurement.
-    hits : (A,) int64
-        Number of measurements.
-    standing : (A,) float64
-        Probability that the object stands; 0 once it surely moves.
-    place_m : (A, 2) float64
-        Where it stands if it does, with covariances `place_covariance` (A, 2, 2).
-    birth_score : float
-        Lowest score that can start a track.
-    whole_boxes : bool
-        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
+    `number`: (A,): index of the track in the order of births. `mean`: (A, 4): states x, y, vx, vy in the map at the last tick.
+    `covariance`: (A, 4, 4). `seen_ns`: (A,): time of the last measurement. `hits`: (A,): number of measurements. `standing`:
+    (A,): probability that the object stands; 0 once it surely moves. `place_m`: (A, 2): where it stands if it does, with
+    covariances `place_covariance` (A, 2, 2). `birth_score`: lowest score that can start a track. `whole_boxes`: whether the
+    measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
     """
 
     def __init__(self, *, birth_score: float, period_s: float, whole_boxes: bool = False) -> None:

@@ -113,25 +113,15 @@ _Costs = tuple[NDArray[np.intp], NDArray[np.intp], Array]
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """States of tracks at both ends, from one filter pass in each direction.
+    """States of tracks at both ends, from one filter pass in each direction."""
 
-    Attributes
-    ----------
-    first_ns : (A,) int64
-    last_ns : (A,) int64
-    first, last : (A, 4) float64
-        States.
-    first_covariance, last_covariance : (A, 4, 4) float64
-    group : (A,) str
-    """
-
-    first_ns: NDArray[np.int64]
-    last_ns: NDArray[np.int64]
-    first: Array
-    first_covariance: Array
+    first_ns: NDArray[np.int64]  # (A,)
+    last_ns: NDArray[np.int64]  # (A,)
+    first: Array  # `first`, `last`: (A, 4): states
+    first_covariance: Array  # `first_covariance`, `last_covariance`: (A, 4, 4)
     last: Array
     last_covariance: Array
-    group: NDArray[np.str_]
+    group: NDArray[np.str_]  # (A,)
 
     def join(self, other: _Ends) -> _Ends:
         return _Ends(*(np.concatenate(columns) for columns in zip(vars(self).values(), vars(other).values())))

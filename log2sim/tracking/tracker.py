@@ -27,10 +27,7 @@ SWEEPS = ""
 def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]]) -> list[Track]:
     """Return tracks that know at which ticks none of the sensors that measured them recorded, and how often pictures were searched.
 
-    Parameters
-    ----------
-    recorded : mapping of str to (T,) bool
-        Whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
+    `recorded`: (T,) each: whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
     """
     return [
         replace(track, unrecorded=_unrecorded(track, recorded), searched=_searched(track, recorded)) for track in tracks
@@ -66,17 +63,9 @@ def track(
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, sorted by their first tick.
 
-    Parameters
-    ----------
-    t_ns : (T,) int64
-    birth_score : float
-        Lowest score that can start a track.
-    max_gap_s : float
-        Longest occlusion that is bridged, s.
-    whole_boxes : bool
-        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
-    min_life_s : float
-        Shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
+    `t_ns`: (T,). `birth_score`: lowest score that can start a track. `max_gap_s`: longest occlusion that is bridged, s.
+    `whole_boxes`: whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the
+    motion. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     tracklets = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes)
     everything = Measurements.join(measurements)
@@ -110,13 +99,8 @@ RELATED = ({"pedestrian", "two_wheeler"},)
 def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
     """Track the measurements of each end on their own and merge the tracks.
 
-    Parameters
-    ----------
-    ends : sequence of sequences of T Measurements
-        Of each end, by tick; those of a single one are tracked and no more.
-    t_ns : (T,) int64
-    config : TrackConfig
-        As for `track`; what both ends have of an object counts as its life.
+    `ends`: of each end, by tick; those of a single one are tracked and no more. `t_ns`: (T,). `config`: as for `track`; what
+    both ends have of an object counts as its life.
     """
     birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
     if len(ends) == 1:
@@ -170,10 +154,7 @@ def _can_join(
 def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) -> float | None:
     """Return the median squared Mahalanobis distance of two tracks at their common ticks, less for many; None if they differ.
 
-    Parameters
-    ----------
-    velocity, velocity_other : (n, 2), (m, 2) float64
-        Velocities of the tracks at their measurements, m/s.
+    `velocity`, `velocity_other`: (n, 2), (m, 2): velocities of the tracks at their measurements, m/s.
     """
     groups = {GROUP_OF[one.category], GROUP_OF[other.category]}
     if len(groups) > 1 and groups not in RELATED:

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Frame, Log, Scenario, Sweep
-from log2sim.geometry import Array, apply, bev_iou, box_corners_bev, box_iou, inverse
+from log2sim.geometry import Array, apply, box_iou, inverse, rectangle_iou
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect.detectors import create_detector
@@ -110,10 +110,9 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World) -> li
         origin, ground_z = cloud_origin(log, int(log.streams[name].t_ns[i]))
         cloud = assemble_cloud(log, {name: sweep}, origin=origin, ground_z=ground_z, max_range_m=50.0)
         found = detector.detect(cloud)
-        corners = box_corners_bev(found.center_m[:, :2], found.size_m[:, 0], found.size_m[:, 1], found.yaw_rad)
         here = log.map_T_sensor(name, log.streams[name].t_ns[i])[0][0][:2, 3]
         sure = (found.score > 0.5) & (np.linalg.norm(found.center_m[:, :2] - here, axis=1) < 30)
-        return corners[sure]
+        return np.column_stack([found.center_m[:, :2], found.size_m[:, :2], found.yaw_rad])[sure]
 
     for i in range(EVERY // 2, len(log.streams[name].t_ns), EVERY):
         sweep = simulation.cast(
@@ -121,7 +120,7 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World) -> li
         )[0]
         recorded, simulated = boxes(i, log.streams[name].read(i)), boxes(i, sweep)
         a, b = np.broadcast_arrays(recorded[:, None], simulated[None])
-        out.append(found_again(bev_iou(a, b), 0.7))
+        out.append(found_again(rectangle_iou(a, b).reshape(a.shape[:2]), 0.7))
     return [("boxes in sweeps", shares(out))]
 
 

@@ -61,21 +61,11 @@ MAX_ROUNDS, NEIGHBORS = 12, 3
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Positions of a track.
+    """Positions of a track."""
 
-    Attributes
-    ----------
-    t_s : (n,) float64, s
-        In rising order.
-    xy_m : (n, 2) float64, m
-        Along any two axes.
-    variance : (n, 2) float64, m2
-        Of a position along each of them, changing views included.
-    """
-
-    t_s: Array
-    xy_m: Array
-    variance: Array
+    t_s: Array  # (n,), s: in rising order
+    xy_m: Array  # (n, 2), m: along any two axes
+    variance: Array  # (n, 2), m2: of a position along each of them, changing views included
 
     def __len__(self) -> int:
         """Return the number of positions."""
@@ -88,18 +78,10 @@ class Positions:
 
 @dataclass(frozen=True)
 class MotionPriorSigmas:
-    """How far an object is expected to move.
+    """How far an object is expected to move."""
 
-    Attributes
-    ----------
-    speed_mps : float
-        Standard deviation of each component of the velocity; 0 for one that stands.
-    acceleration_mps2 : float
-        Standard deviation of its change in 1 s.
-    """
-
-    speed_mps: float = 0.0
-    acceleration_mps2: float = 0.0
+    speed_mps: float = 0.0  # standard deviation of each component of the velocity; 0 for one that stands
+    acceleration_mps2: float = 0.0  # standard deviation of its change in 1 s
 
 
 STANDING = MotionPriorSigmas()
@@ -107,17 +89,10 @@ STANDING = MotionPriorSigmas()
 
 @dataclass(frozen=True, eq=False)
 class MarginalLikelihood:
-    """How well a hypothesis explains positions.
+    """How well a hypothesis explains positions."""
 
-    Attributes
-    ----------
-    log : float
-        Logarithm of the marginal likelihood, outliers included.
-    inlier : (n,) bool
-    """
-
-    log: float
-    inlier: NDArray[np.bool_]
+    log: float  # logarithm of the marginal likelihood, outliers included
+    inlier: NDArray[np.bool_]  # (n,)
 
 
 def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> MarginalLikelihood:
@@ -187,13 +162,7 @@ HELD_SIGMA_MPS, MAX_HOLDING_ROUNDS = 0.02, 4
 def backward_runs(state: Array, known: NDArray[np.bool_], heading_rad: float | None) -> list[NDArray[np.intp]]:
     """Return the knots of each short way backward of a vehicle.
 
-    Parameters
-    ----------
-    state : (K, 3, 2) float64
-    known : (K,) bool
-        Where the course is known.
-    heading_rad : float, optional
-        Heading where the motion does not give one.
+    `state`: (K, 3, 2). `known`: (K,): where the course is known. `heading_rad`: heading where the motion does not give one.
     """
     velocity = state[:, 1]
     if heading_rad is None and not known.any():
@@ -243,14 +212,8 @@ def zero_velocity_sigma(
 ) -> Array:
     """Detect standstill: standard deviation (K,) of the velocity in m/s around zero, infinite where the object moves.
 
-    Parameters
-    ----------
-    knots_s : (K,) float64, s
-    weight : (n,) float64
-        Weights of the observations.
-    state : (K, 3, 2) float64
-        Smoothed state without this constraint.
-    covariance : (K, 6, 6) float64
+    `knots_s`: (K,), s. `weight`: (n,): weights of the observations. `state`: (K, 3, 2): smoothed state without this constraint.
+    `covariance`: (K, 6, 6).
     """
     speed = np.hypot(*state[:, 1].T)
     sigma = np.sqrt(np.trace(covariance[:, 2:4, 2:4], axis1=1, axis2=2) / 2)
@@ -372,28 +335,15 @@ class _RobustFit:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """All terms as quadratic forms about `state` (K, 3, 2).
-
-    Attributes
-    ----------
-    state : (K, 3, 2) float64
-        Reference of the forms.
-    weight : (n,) float64
-    information : (n, 2, 2) float64
-        Inverse covariances of the observations.
-    jerk : (Quadratic, Quadratic)
-        Squared jerk along and across the path.
-    density : (float, float)
-        Jerk densities in m2/s5 along and across the path.
-    """
+    """All terms as quadratic forms about `state` (K, 3, 2)."""
 
     prior: MotionPrior
     measurement: MeasurementModel
-    state: Array
-    weight: Array
-    information: Array
-    jerk: tuple[Quadratic, Quadratic]
-    density: tuple[float, float]
+    state: Array  # (K, 3, 2): reference of the forms
+    weight: Array  # (n,)
+    information: Array  # (n, 2, 2): inverse covariances of the observations
+    jerk: tuple[Quadratic, Quadratic]  # squared jerk along and across the path
+    density: tuple[float, float]  # jerk densities in m2/s5 along and across the path
 
     def solve(self, constraints: Quadratic | None = None) -> tuple[Minimum, Array]:
         """Return the minimum and the state (K, 3, 2) there."""
@@ -424,10 +374,7 @@ class _Problem:
 def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionModel) -> Smoothed:
     """Estimate the most probable trajectory given the positions, under white jerk along and across the path.
 
-    Parameters
-    ----------
-    asked_s : (T,) float64, s
-        Times of the result.
+    `asked_s`: (T,), s: times of the result.
 
     Notes
     -----

@@ -308,13 +308,7 @@ def place_obstacle(
     `ground_H_image`: (3, 3). `box_px`: (4,). `category`: its typical size is used. `camera_xy`: (2,): position of the
     camera in the frame of the ground positions, m.
 
-    Returns
-    -------
-    center : (2,) float64
-        Center of the obstacle on the ground, m.
-    covariance : (2, 2) float64
-    or None
-        Above the horizon and beyond 60 m.
+    Returns its center (2,), m, on the ground and the covariance (2, 2); None above the horizon and beyond `MAX_RANGE_M`.
     """
     uv = undistorted_pixels(camera, np.array([[(box_px[0] + box_px[2]) / 2, box_px[3]]]))
     xy, below = apply_homography(ground_H_image, uv)
