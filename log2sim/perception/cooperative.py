@@ -30,6 +30,8 @@ from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
 from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
+from log2sim.tracking.stitch import choose_pairs
+from log2sim.tracking.tracker import POSE_SIGMA_M
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
 # Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
@@ -118,9 +120,8 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
 MIN_CLASS_IOU = 0.3
 # Road users do not share ground: boxes of one group that overlap by more are one object, whatever their errors.
 MIN_GROUP_IOU = 0.1
-# Standard deviation of where the road's sensors are after registration, m, and of how they are turned, rad.
-POSE_SIGMA_M, POSE_SIGMA_RAD = 0.1, np.deg2rad(0.3)
-NOT_ALLOWED = 1e6
+# Standard deviation of how the road's sensors are turned after registration, rad.
+POSE_SIGMA_RAD = np.deg2rad(0.3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,7 @@ def match_by_overlap(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     i, j = _touching(a, b)
     iou = rectangle_iou(a.take(i).rectangles, b.take(j).rectangles)
     allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[i] == b.boxes.category[j])
-    return _assign((len(a), len(b)), (i[allowed], j[allowed]), 1 - iou[allowed])
+    return choose_pairs(i[allowed], j[allowed], 1 - iou[allowed])
 
 
 def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -179,7 +180,7 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
     overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
     allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
-    return _assign((len(a), len(b)), (i[allowed], j[allowed]), np.minimum(squared, CHI2_2DOF_99)[allowed])
+    return choose_pairs(i[allowed], j[allowed], np.minimum(squared, CHI2_2DOF_99)[allowed])
 
 
 def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -217,17 +218,6 @@ def first_speeds(boxes: Boxes3D) -> Array:
 def is_walking(boxes: Boxes3D) -> NDArray[np.bool_]:
     """Mark the boxes (M,) of objects that move in any direction, and whose axes say little."""
     return np.array([GROUP_OF[str(c)] in ("pedestrian", "other") for c in boxes.category], dtype=bool)
-
-
-def _assign(shape: tuple[int, int], pairs: Pairs, cost: Array) -> Pairs:
-    """Choose of allowed pairs of M and N boxes those with the least sum of costs (P,)."""
-    from scipy.optimize import linear_sum_assignment
-
-    every = np.full(shape, NOT_ALLOWED)
-    every[pairs] = cost
-    i, j = linear_sum_assignment(every)
-    kept = every[i, j] < NOT_ALLOWED
-    return i[kept], j[kept]
 
 
 ROUNDS = 4

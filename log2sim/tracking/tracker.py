@@ -29,27 +29,15 @@ def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.b
 
     `recorded`: (T,) each: whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
     """
-    return [
-        replace(track, unrecorded=_unrecorded(track, recorded), searched=_searched(track, recorded)) for track in tracks
-    ]
-
-
-def _searched(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> float:
-    """Return at which share of its ticks any camera that measured a track was searched; 1 without a camera."""
-    cameras = {str(camera) for camera in track.measurements.camera} - {SWEEPS}
-    seen = [recorded[name] for name in cameras if name in recorded]
-    return float(np.any(seen, axis=0)[track.tick].mean()) if seen else 1.0
-
-
-def _unrecorded(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
-    m = track.measurements
-    sensors = {str(camera) for camera in m.camera} - {SWEEPS}
-    if np.isfinite(m.box_yaw_rad).any():
-        sensors.add(SWEEPS)
-    seen = [recorded[name] for name in sensors if name in recorded]
-    if not seen:
-        return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(~np.any(seen, axis=0))
+    marked = []
+    for one in tracks:
+        m = one.measurements
+        by_camera = [recorded[name] for name in {str(c) for c in m.camera} - {SWEEPS} if name in recorded]
+        by_any = by_camera + [recorded[SWEEPS]] * bool(SWEEPS in recorded and np.isfinite(m.box_yaw_rad).any())
+        unrecorded = np.flatnonzero(~np.any(by_any, axis=0)) if by_any else np.zeros(0, dtype=np.int64)
+        searched = float(np.any(by_camera, axis=0)[one.tick].mean()) if by_camera else 1.0
+        marked.append(replace(one, unrecorded=unrecorded, searched=searched))
+    return marked
 
 
 def track(
@@ -67,16 +55,18 @@ def track(
     `whole_boxes`: whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the
     motion. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
     """
-    tracklets = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes)
     everything = Measurements.join(measurements)
     first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
-    for t in tracklets:
-        rows = everything.take(first_row[t.ticks] + t.rows)
-        tracks.append(Track(decide_category(rows, whole_boxes=whole_boxes), t.ticks, rows))
-    joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-    required = min_hits(t_ns, min_life_s)
-    kept = [t for t in joined if len(t) >= required]
+    for ticks, rows in track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes):
+        found = everything.take(first_row[ticks] + rows)
+        tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
+    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes), t_ns, min_life_s)
+
+
+def _long_enough(tracks: Sequence[Track], t_ns: NDArray[np.int64], min_life_s: float) -> list[Track]:
+    """Return the tracks with enough measurements, sorted by their first tick."""
+    kept = [t for t in tracks if len(t) >= min_hits(t_ns, min_life_s)]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
@@ -109,9 +99,7 @@ def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], 
     for measurements in ends:
         found = track(measurements, t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=0.0)
         tracks = merge_tracks(tracks, found) if tracks else found
-    required = min_hits(t_ns, min_life_s)
-    kept = [t for t in stitch(tracks, t_ns, max_gap_s=max_gap_s) if len(t) >= required]
-    return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s), t_ns, min_life_s)
 
 
 def merge_tracks(a: Sequence[Track], b: Sequence[Track]) -> list[Track]:
@@ -120,32 +108,27 @@ def merge_tracks(a: Sequence[Track], b: Sequence[Track]) -> list[Track]:
     Pairs are taken in the order of how well they agree. Several tracks of one end may belong to one of the other, which followed
     the object through a gap.
     """
-    velocity_a, velocity_b = ([velocities(t) for t in tracks] for tracks in (a, b))
+    tracks, velocity = [*a, *b], [velocities(t) for t in (*a, *b)]
     costs = {
         (i, j): cost
-        for i, one in enumerate(a)
-        for j, other in enumerate(b)
-        if (cost := compare(one, other, velocity_a[i], velocity_b[j])) is not None
+        for i in range(len(a))
+        for j in range(len(a), len(tracks))
+        if (cost := compare(tracks[i], tracks[j], velocity[i], velocity[j])) is not None
     }
-    owner = {("a", i): i for i in range(len(a))} | {("b", j): len(a) + j for j in range(len(b))}
-    members = {number: [key] for key, number in owner.items()}
-    tracks = {("a", i): t for i, t in enumerate(a)} | {("b", j): t for j, t in enumerate(b)}
+    owner, members = list(range(len(tracks))), {k: [k] for k in range(len(tracks))}
     for i, j in sorted(costs, key=lambda pair: costs[pair]):
-        one, other = owner["a", i], owner["b", j]
-        if one != other and _can_join(members[one], members[other], tracks):
-            for key in members.pop(other):
-                owner[key] = one
-                members[one].append(key)
-    velocity = {("a", i): v for i, v in enumerate(velocity_a)} | {("b", j): v for j, v in enumerate(velocity_b)}
-    return [_merge([tracks[k] for k in keys], [velocity[k] for k in keys]) for keys in members.values()]
+        one, other = owner[i], owner[j]
+        if one != other and _can_join(members[one], members[other], tracks, len(a)):
+            for k in members[other]:
+                owner[k] = one
+            members[one] += members.pop(other)
+    return [_merge([tracks[k] for k in group], [velocity[k] for k in group]) for group in members.values()]
 
 
-def _can_join(
-    one: Sequence[tuple[str, int]], other: Sequence[tuple[str, int]], tracks: dict[tuple[str, int], Track]
-) -> bool:
-    """Return whether no end sees two of the tracks at the same ticks."""
-    for end in "ab":
-        mine, theirs = ([tracks[k].tick for k in keys if k[0] == end] for keys in (one, other))
+def _can_join(one: Sequence[int], other: Sequence[int], tracks: Sequence[Track], of_first: int) -> bool:
+    """Return whether neither end, the first of which has so many of the tracks, sees two of them at the same ticks."""
+    for first_end in (True, False):
+        mine, theirs = ([tracks[k].tick for k in group if (k < of_first) == first_end] for group in (one, other))
         if mine and theirs and len(np.intersect1d(np.concatenate(mine), np.concatenate(theirs))) > MAX_SHARED_TICKS:
             return False
     return True
