@@ -8,7 +8,7 @@ ends.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,9 +91,9 @@ class Ends:
     real: NDArray[np.int64]  # (n, 2, 2): kinds of the ends, see `boxes.real_ends`
     gap_m: Array  # (n, 2, 2): distances between rays there, see `boxes.end_gaps`
 
-    def take(self, rows: slice) -> Ends:
+    def take(self, rows: slice | NDArray[np.intp]) -> Ends:
         """Return the ends of some of the views."""
-        return Ends(self.low[rows], self.high[rows], self.real[rows], self.gap_m[rows])
+        return Ends(*(column[rows] for column in vars(self).values()))
 
     def swapped(self) -> Ends:
         """Return the ends along axes that are turned by a quarter turn."""
@@ -184,14 +184,14 @@ def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: 
     of = np.array([place[k] for k, _ in views], dtype=np.intp)
     seen = _ends_in_views([view for _, view in views], yaw_rad[of], velocity_mps[of], track.category)
     out = seen.take(slice(count))
-    if len(views) == count:
-        return out
-    parts = [out.take(slice(i, i + 1)) for i in range(count)]
-    for j, i in enumerate(of[count:].tolist(), start=count):
-        ends = seen.take(slice(j, j + 1))
-        apart = boxes.rotate((views[j][1].sensor_m - views[i][1].sensor_m)[:2], -yaw_rad[i])
-        parts[i] = _better_ends(parts[i], replace(ends, low=ends.low + apart, high=ends.high + apart))
-    return join_ends(parts)
+    if len(views) > count:
+        second, sensor = of[count:], np.array([view.sensor_m[:2] for _, view in views])
+        apart = boxes.rotate(sensor[count:] - sensor[second], -yaw_rad[second])
+        other = seen.take(slice(count, None))
+        better = _better_ends(out.take(second), replace(other, low=other.low + apart, high=other.high + apart))
+        for name, column in vars(out).items():
+            column[second] = getattr(better, name)
+    return out
 
 
 def _ends_in_views(views: list[OtherView], yaw_rad: Array, velocity_mps: Array, category: str) -> Ends:
@@ -224,11 +224,6 @@ def _better_ends(one: Ends, other: Ends) -> Ends:
 
 def _min_sine(category: str) -> float:
     return MIN_BOX_SIDE_SINE if category in BOXES else MIN_SIDE_SINE
-
-
-def join_ends(parts: list[Ends]) -> Ends:
-    """Join the ends of several views."""
-    return Ends(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Ends)))
 
 
 # Quantile of the lengths of fully observed sides that is taken for the size: stray points lengthen some, sparse points

@@ -31,13 +31,12 @@ from log2sim.agents.smooth.quadratic import (
     inlier_probability,
     min_density,
     minimize,
-    nearest_index,
     propagate,
     transition,
     weighted_sum,
     zero_motion,
 )
-from log2sim.geometry import Array
+from log2sim.geometry import Array, nearest_index
 from log2sim.tracking.forward import CHI2_2DOF_99
 
 __all__ = ["smooth_interval"]
@@ -157,38 +156,6 @@ def noise_of(p: Positions, axis: int = 0) -> Array:
 MAX_ROLL_M = 2.0
 # Standard deviation of the velocity of what is held, and rounds in which its neighbors may have to be held too.
 HELD_SIGMA_MPS, MAX_HOLDING_ROUNDS = 0.02, 4
-
-
-def backward_runs(state: Array, known: NDArray[np.bool_], heading_rad: float | None) -> list[NDArray[np.intp]]:
-    """Return the knots of each short way backward of a vehicle.
-
-    `state`: (K, 3, 2). `known`: (K,): where the course is known. `heading_rad`: heading where the motion does not give one.
-    """
-    velocity = state[:, 1]
-    if heading_rad is None and not known.any():
-        return []
-    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=heading_rad, known=known)
-    forward = velocity[:, 0] * np.cos(yaw) + velocity[:, 1] * np.sin(yaw)
-    runs = spans_of(forward < -2 * HELD_SIGMA_MPS)
-    return [run for run in runs if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() < MAX_ROLL_M]
-
-
-def max_misfit(observed: NoisyPositions) -> float:
-    """Return by how much the squared residuals in sigmas may grow where a vehicle is held.
-
-    A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile. Errors that repeat for
-    `VIEW_S` count once.
-    """
-    if not observed.correlated or len(observed.t_s) < 2:
-        return CHI2_2DOF_99
-    return CHI2_2DOF_99 * max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s))))
-
-
-def held_at(state: Array, rows: NDArray[np.intp]) -> Quadratic:
-    """Pseudo-measurements of zero velocity at some knots of a state (K, 3, 2)."""
-    information = np.zeros((len(state), 2, 2))
-    information[rows] = np.eye(2) / HELD_SIGMA_MPS**2
-    return zero_motion(state, information, np.zeros_like(information))
 
 
 # Candidates are spans in which the smoothed speed stays below this, plus as many of its standard deviations.
@@ -404,17 +371,27 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
 def _without_rolling_back(
     problem: _Problem, least: Minimum, state: Array, constraints: Quadratic | None, motion: MotionModel
 ) -> tuple[Minimum, Array]:
-    """Hold the vehicle where it seems to move backward and standing explains the positions as well."""
+    """Hold the vehicle where it seems to move a short way backward and standing explains the positions within the 99 % quantile."""
     observed = problem.measurement.observed
+    # Errors that repeat for `VIEW_S` count once.
+    repeated = observed.correlated and len(observed.t_s) >= 2
+    max_misfit = CHI2_2DOF_99 * (max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s)))) if repeated else 1.0)
     for _ in range(MAX_HOLDING_ROUNDS):
         before = least
-        covariance = least.covariance
-        known = _known_courses(state, covariance, motion, correlated=observed.correlated)
-        for run in backward_runs(state, known, motion.heading_rad):
-            hold = held_at(problem.state, run)
+        known = _known_courses(state, least.covariance, motion, correlated=observed.correlated)
+        if motion.heading_rad is None and not known.any():
+            break
+        yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, known=known)
+        forward = state[:, 1, 0] * np.cos(yaw) + state[:, 1, 1] * np.sin(yaw)
+        for run in spans_of(forward < -2 * HELD_SIGMA_MPS):
+            if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() >= MAX_ROLL_M:
+                continue
+            information = np.zeros((len(state), 2, 2))
+            information[run] = np.eye(2) / HELD_SIGMA_MPS**2
+            hold = zero_motion(problem.state, information, np.zeros_like(information))
             both = hold if constraints is None else weighted_sum([(1.0, constraints), (1.0, hold)])
             stands, its_state = problem.solve(both)
-            if problem.misfit(its_state) - problem.misfit(state) < max_misfit(observed):
+            if problem.misfit(its_state) - problem.misfit(state) < max_misfit:
                 constraints, least, state = both, stands, its_state
         if least is before:
             break

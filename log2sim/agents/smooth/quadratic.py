@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, nearest_index
 
 # A chain of at most as many states is inverted as a dense matrix.
 MAX_DENSE_STATES = 8
@@ -260,14 +260,6 @@ def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
         if not knots or t - knots[-1] >= step_s:
             knots.append(t)
     return np.array(knots)
-
-
-def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
-    """Index of the knot nearest to each time."""
-    if len(knots) == 1:
-        return np.zeros(len(t), dtype=np.intp)
-    i = np.clip(np.searchsorted(knots, t), 1, len(knots) - 1)
-    return np.where(np.abs(knots[i - 1] - t) <= np.abs(knots[i] - t), i - 1, i)
 
 
 # Information about position, velocity and acceleration of the first knot.
