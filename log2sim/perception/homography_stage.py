@@ -69,12 +69,10 @@ def fit_homographies(
     wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
     together, why_apart = _fit_together(log, observed, plan, options, rng) if wanted else ({}, {})
     apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}
-    apart = {c: replace(g, source=_source(g.source, why_apart.get(c, ""))) for c, g in apart.items()}
+    apart = {
+        c: replace(g, source=f"{g.source} (apart: {why_apart[c]})") if why_apart.get(c) else g for c, g in apart.items()
+    }
     return {c: together[c] if c in together else apart[c] for c in plan.cameras if c in wanted}
-
-
-def _source(source: str, why_apart: str) -> str:
-    return f"{source} (apart: {why_apart})" if why_apart else source
 
 
 def _fit_together(
