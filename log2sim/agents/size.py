@@ -124,7 +124,7 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     m = track.measurements
     axis = mean_box_axis(m)
     yaw = boxes.fit_yaw(xy)[0] if axis is None else boxes.corrected_yaw(xy, axis)
-    low, high = boxes.extents(xy, yaw, max_trim_m=boxes.MAX_TRIM_M)
+    low, high = boxes.extents(xy, yaw)
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
     if track.category in BOXES:
         low, high = _reached(low, high, [m.points_of(k)[:, :2] - origin for k in rows.tolist()], yaw)
@@ -151,7 +151,7 @@ def _reached(low: Array, high: Array, views: list[Array], yaw_rad: float) -> tup
     """
     if not views:
         return low, high
-    each = [boxes.extents(xy, yaw_rad, max_trim_m=boxes.MAX_TRIM_M) for xy in views]
+    each = [boxes.extents(xy, yaw_rad) for xy in views]
     lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
     enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(views)), 2), len(views))
     return np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
@@ -196,14 +196,12 @@ def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: 
 
 def _ends_in_views(views: list[OtherView], yaw_rad: Array, velocity_mps: Array, category: str) -> Ends:
     """Find the ends of the points of viewpoints (n,), relative to them, for yaws (n,) and velocities (n, 2)."""
-    low, high, step = np.zeros((len(views), 2)), np.zeros((len(views), 2)), np.zeros(len(views))
-    for k, view in enumerate(views):
-        xy = view.cluster[:, :2] - view.sensor_m[:2]
-        if view.cluster.shape[1] > 3:
-            xy = xy - view.cluster[:, 3:] * velocity_mps[k]
-        local = boxes.rotate(xy, -yaw_rad[k])
-        low[k], high[k] = boxes.extents_of_rotated(local, max_trim_m=boxes.MAX_TRIM_M)
-        step[k] = boxes.azimuth_step_rad(local)
+    moved = [
+        v.cluster[:, :2] - v.sensor_m[:2] - (v.cluster[:, 3:] * velocity if v.cluster.shape[1] > 3 else 0.0)
+        for v, velocity in zip(views, velocity_mps)
+    ]
+    low, high = boxes.extents_of_clusters(np.concatenate(moved), np.array([len(xy) for xy in moved]), yaw_rad)
+    step = np.array([boxes.azimuth_step_rad(boxes.rotate(xy, -yaw)) for xy, yaw in zip(moved, yaw_rad)])
     visible = np.array([view.ends_visible for view in views], dtype=bool).reshape(-1, 2)
     real = boxes.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(category))
     return Ends(low, high, real, boxes.end_gaps(step, low, high, real))

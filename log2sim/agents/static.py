@@ -17,13 +17,12 @@ from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, O
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import (
     FACING_END,
-    MAX_TRIM_M,
     SENSOR_SIGMA_M,
     SIDE_END,
     UNIFORM_SIGMA,
     complete_box,
     corrected_yaw,
-    extents_of_rotated,
+    extents,
     facing_ends,
     oriented_covariance,
     rotate,
@@ -184,7 +183,7 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     # The pose of what stands is known from all ticks.
     turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
     box = replace(box, yaw_rad=yaw_rad + turn_rad)
-    low, high = extents_of_rotated(rotate(local[inside], -turn_rad), max_trim_m=MAX_TRIM_M)
+    low, high = extents(local[inside], turn_rad)
     if np.any(high - low > size[:2] + 0.6):
         return None
     sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
