@@ -18,7 +18,7 @@ from log2sim.agents.candidate import (
 )
 from log2sim.agents.size import TrackGeometry, independent, independent_along, moving_geometry
 from log2sim.agents.smooth import motion_model
-from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel
+from log2sim.agents.smooth.motion_model import SIGNIFICANT_SIGMAS, UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.agents.static import BoxState, LidarMatch, left_free, track_with_lidar
 from log2sim.config import TrackConfig
@@ -145,8 +145,6 @@ def _placed(boxes: Boxes3D) -> Measurements:
 # Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`forward_log_odds`); out of a driveway or
 # to a better parking space it is some car lengths.
 MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
-# A speed counts as beyond a limit where it is by as many of its own standard deviations.
-SIGNIFICANT_SIGMAS = 2.0
 # A measurement is far from the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
 # outlier.
 MIN_BESIDE = 2

@@ -24,11 +24,10 @@ from log2sim.perception.homography.estimate import (
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.lidar.measure import BORDER_PX
 from log2sim.perception.observe_tick import base_pose
 from log2sim.plan import HomographyScope, Plan
 
-# A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
-FOOT_BORDER_PX = 3
 # A camera lower than this sees the ground under too flat an angle, m.
 MIN_CAMERA_HEIGHT_M = 0.2
 # Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
@@ -135,7 +134,7 @@ def _cameras_in_need(log: Log, observed: Observations) -> set[str]:
 
 def _has_foot(camera: Camera, box_px: Array) -> bool:
     """Return whether the obstacle in a box (4,) touches the ground inside the image."""
-    return bool(box_px[3] <= camera.height_px - FOOT_BORDER_PX)
+    return bool(box_px[3] <= camera.height_px - BORDER_PX)
 
 
 def _fit_one(

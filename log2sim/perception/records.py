@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding, Log, Sweep, Treatment
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import NS_PER_S, Array, Camera
+from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera
 from log2sim.logs.records import decode_image
 
 Motion = Literal["drives", "stands", "unclear"]
@@ -183,7 +183,6 @@ def _second_differences(thumbnail: Thumbnail) -> Array:
 # What is not ground is assumed as far away as this, so that no more motion is expected than there is at least; houses and
 # trees along a road are nearer.
 FAR_M = 50.0
-MIN_DEPTH_M = 0.1
 
 
 def expect_change(

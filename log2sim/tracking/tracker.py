@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from log2sim.config import TrackConfig
 from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
-from log2sim.tracking.forward import CHI2_2DOF_99, measurement_noise, track_forward
+from log2sim.tracking.forward import CHI2_2DOF_99, RELATED, measurement_noise, track_forward
 from log2sim.tracking.stitch import decide_category, stitch
 
 SWEEPS = ""
@@ -83,7 +83,6 @@ VELOCITY_WINDOW_S = 0.5
 POSE_SIGMA_M = 0.1
 # Tracks of one object may both be seen at so many of the ticks at which another track of it is, by a mistake of either tracker.
 MAX_SHARED_TICKS = 1
-RELATED = ({"pedestrian", "two_wheeler"},)
 
 
 def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
@@ -139,8 +138,8 @@ def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) ->
 
     `velocity`, `velocity_other`: (n, 2), (m, 2): velocities of the tracks at their measurements, m/s.
     """
-    groups = {GROUP_OF[one.category], GROUP_OF[other.category]}
-    if len(groups) > 1 and groups not in RELATED:
+    groups = GROUP_OF[one.category], GROUP_OF[other.category]
+    if groups[0] != groups[1] and groups not in RELATED:
         return None
     if one.tick[0] > other.tick[-1] or other.tick[0] > one.tick[-1]:
         return None
@@ -148,7 +147,7 @@ def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) ->
     if not len(i):
         return None
     m, n = one.measurements.take(i), other.measurements.take(j)
-    group = np.full(len(i), GROUP_OF[one.category])
+    group = np.full(len(i), groups[0])
     late_s = ((m.t_ns - n.t_ns) / NS_PER_S)[:, None]
     away = n.center_m[:, :2] + late_s * velocity_other[j] - m.center_m[:, :2]
     c = measurement_noise(m.covariance + n.covariance, group) + POSE_SIGMA_M**2 * np.eye(2)
