@@ -64,9 +64,10 @@ def fit_homographies(
     """
     if plan.homography is HomographyScope.NONE:
         return {}
-    options = EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=config.rig == "together")
+    options = EstimationOptions(config.method, hypotheses=config.hypotheses or None)
     wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
-    together, why_apart = _fit_together(log, observed, plan, options, rng) if wanted else ({}, {})
+    joins = bool(wanted) and config.rig == "together" and config.method in STREAM_METHODS
+    together, why_apart = _fit_together(log, observed, plan, options, rng) if joins else ({}, {})
     apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}
     apart = {
         c: replace(g, source=f"{g.source} (apart: {why_apart[c]})") if why_apart.get(c) else g for c, g in apart.items()
@@ -78,11 +79,8 @@ def _fit_together(
     log: Log, observed: Observations, plan: Plan, options: EstimationOptions, rng: np.random.Generator
 ) -> tuple[dict[str, CameraHomography], dict[str, str]]:
     """Fit the cameras of each rig together; returns their homographies, and why the others are fitted apart, by camera."""
-    if not options.together or options.method not in STREAM_METHODS:
-        return {}, {}
-    found, why_apart = {}, {}
-    rigs, left_out = list_rigs(log, plan.cameras)
-    why_apart.update(left_out)
+    found = {}
+    rigs, why_apart = list_rigs(log, plan.cameras)
     for names in rigs:
         rig = Rig.of({c: log.cameras[c] for c in names}, log.ground_z_ego_m)
         feet, ground = (

@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import CATEGORIES, Boxes3D, Detections, Frame, ImageLabels, Labels, Log
+from log2sim.datatypes import CATEGORIES, Boxes3D, Detections, Frame, Labels, Log
 from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT, require_members
@@ -37,8 +37,8 @@ class _WrongRows(PluginError):
 
 
 @dataclass(frozen=True, eq=False)
-class CheckedDetector:
-    """A detector of somebody else; what it raises and what it returns is checked."""
+class ForeignDetector:
+    """A detector of somebody else."""
 
     inner: Any
     source: str  # how messages name it
@@ -49,14 +49,18 @@ class CheckedDetector:
         return str(self.inner.name)
 
     @property
+    def cache_key(self) -> str | None:
+        """What its result depends on besides the record; None where it does not say, so that nothing of it is cached."""
+        return getattr(self.inner, "cache_key", None)
+
+
+class CheckedDetector(ForeignDetector):
+    """A detector of somebody else; what it raises and what it returns is checked."""
+
+    @property
     def default_min_score(self) -> float:
         """Score in [0, 1] below which boxes are more often wrong than useful."""
         return float(self.inner.default_min_score)
-
-    @property
-    def cache_key(self) -> str | None:
-        """What its result depends on besides the picture; None where it does not say, so that nothing of it is cached."""
-        return getattr(self.inner, "cache_key", None)
 
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame.
@@ -289,29 +293,6 @@ STAMP_TOLERANCE_NS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class FrameBoxes:
-    """2D labels of a camera that a detector could find, by frame."""
-
-    t_ns: NDArray[np.int64]  # (L,): never decreasing
-    boxes: Detections  # (L,), those of one stamp in the order of the labels
-
-    @classmethod
-    def of(cls, labels: ImageLabels) -> FrameBoxes:
-        """Sort the labels of a camera and leave out categories and boxes that no detector finds."""
-        large = np.all(labels.box_px[:, 2:] - labels.box_px[:, :2] >= MIN_SIDE_PX, axis=1)
-        rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & large)
-        rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
-        box = np.asarray(labels.box_px[rows], dtype=np.float64)
-        return cls(labels.t_ns[rows], Detections(box, np.ones(len(box)), labels.category[rows].astype("<U16")))
-
-    def at(self, t_ns: int) -> Detections:
-        """Return the boxes of the frame at a stamp."""
-        first = np.searchsorted(self.t_ns, t_ns - STAMP_TOLERANCE_NS, side="left")
-        end = np.searchsorted(self.t_ns, t_ns + STAMP_TOLERANCE_NS, side="right")
-        return self.boxes.take(np.arange(first, end))
-
-
-@dataclass(frozen=True, eq=False)
 class LabelDetector:
     """Detector that returns the labels of a log; it never decodes an image."""
 
@@ -324,7 +305,10 @@ class LabelDetector:
         """Return the labels of one frame with score 1, nearest first where they come from 3D labels."""
         labels = self.log.image_labels.get(frame.camera.name)
         if labels is not None:
-            return self._image_boxes[frame.camera.name].at(frame.t_ns)
+            t_ns, found = self._image_boxes[frame.camera.name]
+            first = np.searchsorted(t_ns, frame.t_ns - STAMP_TOLERANCE_NS, side="left")
+            end = np.searchsorted(t_ns, frame.t_ns + STAMP_TOLERANCE_NS, side="right")
+            return found.take(np.arange(first, end))
         boxes, window = self._boxes
         view = view_of(self.log, frame.camera.name, frame.t_ns)
         if not len(boxes.t_ns) or view is None:
@@ -332,9 +316,16 @@ class LabelDetector:
         return project_labels(interpolate_boxes(boxes, frame.t_ns, window), view)
 
     @cached_property
-    def _image_boxes(self) -> dict[str, FrameBoxes]:
-        """2D labels by camera; sorted once, since a search of all for each frame takes time that grows with the square of the log."""
-        return {camera: FrameBoxes.of(labels) for camera, labels in self.log.image_labels.items()}
+    def _image_boxes(self) -> dict[str, tuple[NDArray[np.int64], Detections]]:
+        """2D labels that a detector could find, by camera, sorted by their stamps, which a search for each frame needs."""
+        out = {}
+        for camera, labels in self.log.image_labels.items():
+            large = np.all(labels.box_px[:, 2:] - labels.box_px[:, :2] >= MIN_SIDE_PX, axis=1)
+            rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & large)
+            rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
+            box, category = np.asarray(labels.box_px[rows], dtype=np.float64), labels.category[rows].astype("<U16")
+            out[camera] = labels.t_ns[rows], Detections(box, np.ones(len(box)), category)
+        return out
 
     @cached_property
     def _boxes(self) -> tuple[Boxes3D, int]:

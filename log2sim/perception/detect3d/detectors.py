@@ -18,7 +18,7 @@ from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT_IN_CLOUD, require_members
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.detect.detectors import interpolate_boxes, road_users
+from log2sim.perception.detect.detectors import ForeignDetector, interpolate_boxes, road_users
 from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach, most_points, points_of_boxes
 from log2sim.perception.detect3d.boxes import MIN_SCORE, LevelBoxes, decode_centers, decode_votes, sigmoid, suppress
 from log2sim.perception.detect3d.network import (
@@ -313,22 +313,8 @@ def checked(detector: Any, source: str) -> LidarDetector:
     return CheckedLidarDetector(detector, source)
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedLidarDetector:
+class CheckedLidarDetector(ForeignDetector):
     """A detector of somebody else; what it raises and what it returns is checked."""
-
-    inner: LidarDetector
-    source: str
-
-    @property
-    def name(self) -> str:
-        """Name in the provenance of a scenario."""
-        return self.inner.name
-
-    @property
-    def cache_key(self) -> str | None:
-        """What its result depends on besides the clouds; None where it does not say, so that nothing of it is cached."""
-        return getattr(self.inner, "cache_key", None)
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud; `PluginError` when the detector raises something, or returns no `Boxes3D`."""

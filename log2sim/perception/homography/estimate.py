@@ -54,7 +54,6 @@ class EstimationOptions:
     pitch_roll: bool = False
     # Samples of four to draw, for the stream or for each frame; None for as many as the data need
     hypotheses: int | None = None
-    together: bool = False  # whether the cameras of a rig are fitted together, see `rig_fit`
     # `sigma_px`, `sigma_m`: assumed standard deviations of pixels and of ground positions; they are estimated anew from the
     # inliers, within a factor of 4
     sigma_px: float = 1.5
