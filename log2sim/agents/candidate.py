@@ -57,6 +57,13 @@ def candidate_of(
 ) -> AgentCandidate:
     """Make a candidate of a track, its geometry and waypoints; `quality` is added to that of the track."""
     length, width, height = (float(v) for v in geometry.size_m)
+    m = track.measurements
+    of_track = {
+        "detections": len(m),
+        "without_lidar": int((m.source != "lidar").sum()),
+        "points_median": float(np.median(m.points)),
+        "score_max": round(float(m.score.max()), 4),
+    }
     agent = Agent(
         id="",
         category=track.category,
@@ -64,19 +71,9 @@ def candidate_of(
         waypoints=waypoints,
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
-        quality=_quality_of(track) | quality,
+        quality=of_track | quality,
     )
     return AgentCandidate(agent, track, geometry)
-
-
-def _quality_of(track: Track) -> dict[str, Any]:
-    m = track.measurements
-    return {
-        "detections": len(m),
-        "without_lidar": int((m.source != "lidar").sum()),
-        "points_median": float(np.median(m.points)),
-        "score_max": round(float(m.score.max()), 4),
-    }
 
 
 def name_agents(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:

@@ -335,12 +335,11 @@ def find_rows(poses: Array, lengths_m: Array, stands: NDArray[np.int64]) -> list
     linked, label = beside | (in_line & ~lot & ~lot[:, None]), np.arange(len(poses))
     for i, j in zip(*np.nonzero(linked)):
         label[label == label[j]] = label[i]
-    return [_row(np.flatnonzero(label == k), poses, lot) for k in np.unique(label)]
-
-
-def _row(members: NDArray[np.int64], poses: Array, lot: NDArray[np.bool_]) -> Row:
-    toward = np.where(np.cos(poses[members, 2] - poses[members[0], 2]) > 0, 1.0, -1.0)
-    return Row(members, toward, ALIKE_ACROSS if lot[members].any() else ALIKE_ALONG)
+    rows = []
+    for members in (np.flatnonzero(label == k) for k in np.unique(label)):
+        toward = np.where(np.cos(poses[members, 2] - poses[members[0], 2]) > 0, 1.0, -1.0)
+        rows.append(Row(members, toward, ALIKE_ACROSS if lot[members].any() else ALIKE_ALONG))
+    return rows
 
 
 def headings_of(rows: Sequence[Row], own: Array, street: Array, right: float) -> Array:
@@ -412,7 +411,8 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     own = continued_log_odds([c.agent.waypoints for c in road_users], alone)
     paths = [_path_of(c, odds) for c, odds in zip(road_users, own.tolist())]
     road_users = [_along_street(c, [ego_path, *paths]) for c in road_users]
-    poses = np.array([_middle_pose(c.agent.waypoints) for c in road_users])
+    middle = [(c.agent.waypoints, len(c.agent.waypoints) // 2) for c in road_users]
+    poses = np.array([[w.x_m[k], w.y_m[k], w.yaw_rad[k]] for w, k in middle])
     street = np.zeros((2, len(of)))
     for k, pose in enumerate(poses):
         others = [ego_path, *paths[:k], *paths[k + 1 :]]
@@ -457,12 +457,6 @@ def _along_street(candidate: AgentCandidate, paths: Sequence[Array]) -> AgentCan
     n = len(w.t_s)
     w = replace(w, yaw_rad=np.full(n, wrap_angle(yaw)), sigma_yaw_rad=np.full(n, sigma))
     return replace(candidate, agent=replace(candidate.agent, waypoints=w))
-
-
-def _middle_pose(w: Waypoints) -> Array:
-    """Return x, y and yaw (3,) of the waypoint in the middle."""
-    k = len(w.t_s) // 2
-    return np.array([w.x_m[k], w.y_m[k], w.yaw_rad[k]])
 
 
 def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:

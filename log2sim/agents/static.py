@@ -13,7 +13,7 @@ from log2sim.agents.hypotheses import Part, main_place
 from log2sim.agents.rays import Ending, classify_rays
 from log2sim.agents.size import TrackGeometry, independent, static_geometry
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import (
     FACING_END,
@@ -297,47 +297,35 @@ def static_candidates(
     Their yaws are known up to half a turn.
     """
     geometries = [_geometry_of(part) for part in parts]
-    boxes = [_box_of(part.track, geometry, timeline) for part, geometry in zip(parts, geometries)]
+    boxes = []
+    for part, geometry in zip(parts, geometries):
+        yaw_rad = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
+        bottom_m = float(geometry.z_m[0]) - geometry.size_m[2] / 2
+        start_ns = int(timeline.t_ns[part.track.tick[0]])
+        boxes.append(BoxState(start_ns, geometry.xy_m[0], np.zeros(2), yaw_rad, geometry.size_m, bottom_m))
     matches = match_standing(obstacles, boxes, [part.track.tick for part in parts])
-    return [
-        _candidate(part.track, geometry, [m.tick for m in found], timeline)
-        for part, geometry, found in zip(parts, geometries, matches)
-    ]
-
-
-def _box_of(track: Track, geometry: TrackGeometry, timeline: Timeline) -> BoxState:
-    z = float(np.median(geometry.z_m))
-    start_ns = int(timeline.t_ns[track.tick[0]])
-    bottom_m = z - geometry.size_m[2] / 2
-    return BoxState(start_ns, geometry.xy_m[0], np.zeros(2), _yaw_of(geometry), geometry.size_m, bottom_m)
-
-
-def _yaw_of(geometry: TrackGeometry) -> float:
-    return 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
-
-
-def _candidate(track: Track, geometry: TrackGeometry, matched: Sequence[int], timeline: Timeline) -> AgentCandidate:
-    """Make an agent with one pose of a track that stands, whose box is matched at other ticks."""
-    xy, z, yaw = geometry.xy_m[0], float(np.median(geometry.z_m)), _yaw_of(geometry)
-    observed = np.union1d(track.tick, np.array(matched, dtype=np.int64))
-    life = np.unique(observed[[0, -1]])
-    n = len(life)
-    sigma = float(np.sqrt(np.trace(np.median(geometry.covariance, axis=0)) / 2))
-    waypoints = Waypoints(
-        t_s=timeline.seconds(timeline.t_ns[life]),
-        x_m=np.full(n, xy[0]),
-        y_m=np.full(n, xy[1]),
-        z_m=np.full(n, z),
-        yaw_rad=np.full(n, yaw),
-        speed_mps=np.zeros(n),
-        observed=np.ones(n, dtype=bool),
-        sigma_xy_m=np.full(n, sigma),
-        sigma_yaw_rad=np.full(n, yaw_sigma(track.measurements, geometry)),
-        sigma_speed_mps=np.full(n, standing_speed_sigma(track.measurements, CENTER_SIGMA_M[GROUP_OF[track.category]])),
-    )
-    share = len(observed) / (observed[-1] - observed[0] + 1)
-    quality = {"lidar_only": len(matched), "observed_share": round(float(share), 3)}
-    return candidate_of(track, geometry, waypoints, quality, static=True)
+    candidates = []
+    for part, geometry, box, found in zip(parts, geometries, boxes, matches):
+        track, m = part.track, part.track.measurements
+        observed = np.union1d(track.tick, np.array([match.tick for match in found], dtype=np.int64))
+        life = np.unique(observed[[0, -1]])
+        n = len(life)
+        waypoints = Waypoints(
+            t_s=timeline.seconds(timeline.t_ns[life]),
+            x_m=np.full(n, box.xy_m[0]),
+            y_m=np.full(n, box.xy_m[1]),
+            z_m=np.full(n, geometry.z_m[0]),
+            yaw_rad=np.full(n, box.yaw_rad),
+            speed_mps=np.zeros(n),
+            observed=np.ones(n, dtype=bool),
+            sigma_xy_m=np.full(n, np.sqrt(np.trace(geometry.covariance[0]) / 2)),
+            sigma_yaw_rad=np.full(n, yaw_sigma(m, geometry)),
+            sigma_speed_mps=np.full(n, standing_speed_sigma(m, CENTER_SIGMA_M[GROUP_OF[track.category]])),
+        )
+        share = len(observed) / (observed[-1] - observed[0] + 1)
+        quality = {"lidar_only": len(found), "observed_share": round(float(share), 3)}
+        candidates.append(candidate_of(track, geometry, waypoints, quality, static=True))
+    return candidates
 
 
 def _geometry_of(part: Part) -> TrackGeometry:

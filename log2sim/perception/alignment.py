@@ -62,7 +62,8 @@ def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     passed_s = np.maximum((b.t_ns[:, None] - a.t_ns) / NS_PER_S, 1.0 / NS_PER_S)
     distance = np.hypot(away[..., 0], away[..., 1])
     allowed = (distance <= MAX_SPEED_MPS * passed_s) & (b.category[:, None] == a.category)
-    i, j = choose_pairs(*np.nonzero(allowed), distance[allowed])
+    first, second = np.nonzero(allowed)
+    i, j = choose_pairs(first, second, distance[allowed])
     local = rotate(away[i, j], -b.yaw_rad[i])
     speed = local[:, 0] / passed_s[i, j]
     moves = (np.abs(speed) >= MIN_SPEED_MPS) & (np.abs(local[:, 1]) <= MAX_ACROSS_SHARE * np.abs(local[:, 0]))

@@ -20,7 +20,6 @@ from log2sim.geometry import Array
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll
 from log2sim.perception.homography.normalized import (
-    CHI2_2DOF_99,
     Linearization,
     NormalizedCorrespondences,
     linearize,
@@ -30,6 +29,7 @@ from log2sim.perception.homography.normalized import (
     scale_free_basis,
 )
 from log2sim.perception.homography.ransac import RobustFit
+from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Standard deviations of pitch, as a shift along v, and of roll, before they are estimated.
 PITCH_SIGMA_PX = 4.0

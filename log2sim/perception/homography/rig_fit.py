@@ -23,7 +23,7 @@ from log2sim.perception.homography.estimate import (
     MIN_TESTED_FEET,
 )
 from log2sim.perception.homography.fit import MIN_INLIER_SHARE, MIN_INLIERS, HomographyFit, PitchRoll, refused_fit
-from log2sim.perception.homography.normalized import CHI2_2DOF_99, MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
+from log2sim.perception.homography.normalized import MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
 from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, HeldOutErrors
 from log2sim.perception.homography.rig import (
     OF_CAMERA,
@@ -41,6 +41,7 @@ from log2sim.perception.homography.rig import (
     linearize_feet,
     tilt_of_ticks,
 )
+from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Standard deviations before anything is fitted. A box ends within some pixels of its object. Overhangs of cars are
 # 0.7 to 1 m, which is as much as 0.1 m in height where a camera 1.6 m high sees them 12 m away.
