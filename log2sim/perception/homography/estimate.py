@@ -138,7 +138,7 @@ def _fit_stream(data: NormalizedCorrespondences, options: EstimationOptions, rng
         return validated_fit(robust, image_K)
     moving, warps = fit_pitch_roll(data, robust.h, image_K)
     fit = validated_fit(moving, image_K)
-    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h)) if fit.ok else fit
+    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h)) if fit.ok and moving.h is not None else fit
 
 
 def _spread_to_all(
