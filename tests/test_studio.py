@@ -26,7 +26,8 @@ from log2sim.edit.corrections import load_corrections
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Camera, apply, inverse, project
 from log2sim.visualization.recording import Recorded
-from log2sim.visualization.studio import PAINTS, Studio
+from log2sim.visualization.page.document import PAINTS
+from log2sim.visualization.studio import Studio
 
 ROOT = Path(__file__).resolve().parents[1]
 

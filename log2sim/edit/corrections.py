@@ -35,6 +35,8 @@ from log2sim.geometry import NS_PER_S, Array, wrap_angle
 MAX_AWAY_M = 1.0
 # A later run may begin or end a track by some ticks.
 MAX_OUTSIDE_S = 1.0
+# No camera or LiDAR shows an object beyond this.
+MAX_BEYOND_M = 1000.0
 # What a trajectory has wrong it has wrong for about as long as the view of an object stays the same.
 CORRELATION_S = 2.0
 # Some pixels of a map in which a car fills a tenth of the screen.
@@ -97,6 +99,8 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     ------
     ConfigError
         When two corrections contradict each other, or one cannot be: a split outside of the life of an agent.
+    ScenarioError
+        When they are of another log: its name differs, and none of them finds what it is about.
     """
     draft = _Draft(scenario, corrections.get("map_offset_m"))
     unmatched, applied = [], []
@@ -106,6 +110,11 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
             unmatched.append(f"correction {number} ({entry['kind']}): {missing}")
         else:
             applied.append(dict(entry))
+    name = corrections.get("log", scenario.name)
+    if unmatched and not applied and name != scenario.name:
+        raise ScenarioError(
+            f"the corrections are of log '{name}', the scenario is of '{scenario.name}': none of them finds what it is about; {unmatched[0]}"
+        )
     history = [*scenario.provenance.get("corrections", []), {"source_digest": scenario.digest, "corrections": applied}]
     return Corrected(draft.result(history), tuple(unmatched))
 
@@ -136,6 +145,8 @@ class _Draft:
     def apply(self, number: int, entry: Mapping[str, Any]) -> str:
         """Apply one correction; return what it did not find, "" where it is done."""
         kind = entry["kind"]
+        if outside := self._outside(entry):
+            return outside
         if kind == "draw":
             self._draw(entry)
             return ""
@@ -183,6 +194,20 @@ class _Draft:
         else:
             self.agents[agent_id] = settled(_changed(agent, kind, entry), kind)
         return ""
+
+    def _outside(self, entry: Mapping[str, Any]) -> str:
+        """Say which place or time of a correction is outside of the map or the scenario; "" where none is."""
+        poses = self._poses(entry) if "poses" in entry else []
+        late_s = max((max(-p["t_s"], p["t_s"] - self.scenario.duration_s) for p in poses), default=0.0)
+        if late_s > MAX_OUTSIDE_S:
+            return f"a pose is {late_s:.1f} s before the beginning or after the end of the scenario"
+        points = [*(np.array(p[:2]) + self.shift[:2] for p in entry.get("points_m", ())), *([p["x_m"], p["y_m"]] for p in poses)]
+        known = [np.stack([a.waypoints.x_m, a.waypoints.y_m], axis=1) for a in self.agents.values()]
+        if not points or not known:
+            return ""
+        low, high = (f(np.concatenate(known), axis=0) for f in (np.min, np.max))
+        away_m = float(np.max([np.maximum(low - points, points - high)]))
+        return f"its path lies outside of the map, {away_m:.0f} m from all agents" if away_m > MAX_BEYOND_M else ""
 
     def _find(self, number: int, at: Mapping[str, Any]) -> str | None:
         """Return the id of the agent whose box is nearest to a place at a time; None where none is near enough."""
@@ -494,8 +519,9 @@ def added(category: str, size_m: Sequence[float], poses: Sequence[Mapping[str, f
     xyz, rate = spline(t_s), spline(t_s, 1)
     pace = np.hypot(rate[:, 0], rate[:, 1])
     course = np.unwrap(np.arctan2(rate[:, 1], rate[:, 0]))
-    # Where it stands it keeps the heading with which it came.
-    course = np.interp(t_s, t_s[pace > STANDSTILL_MPS], course[pace > STANDSTILL_MPS])
+    # Where it stands it keeps the heading with which it came; one that creeps all the time has that of its way.
+    moves = pace > min(STANDSTILL_MPS, pace.max() / 2)
+    course = np.interp(t_s, t_s[moves], course[moves])
     waypoints = Waypoints(
         t_s,
         xyz[:, 0],
