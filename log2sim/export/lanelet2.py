@@ -218,7 +218,8 @@ def _add_sign(draft: _Draft, stop: Marking, lane: MapLane) -> int:
     """Add the stop sign of a stop line as its lower edge, at the end of the line that is to the right of a lane."""
     heading = float(Polyline(lane.points_m).heading_rad[-1])
     right = np.array([np.sin(heading), -np.cos(heading), 0.0])
-    end = max(stop.points_m[[0, -1]], key=lambda point: float(point @ right)) + [0.0, 0.0, SIGN_BOTTOM_M]
+    end = stop.points_m[-1 if float((stop.points_m[-1] - stop.points_m[0]) @ right) > 0 else 0]
+    end = end + np.array([0.0, 0.0, SIGN_BOTTOM_M])
     tags = {"subtype": "stop_sign", "height": f"{SIGN_M:g}", "log2sim_assumed": "yes"}
     return draft.way(np.stack([end, end + SIGN_M * right]), type="traffic_sign", **tags)
 

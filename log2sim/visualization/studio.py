@@ -22,6 +22,7 @@ from log2sim.visualization.recording import Recorded
 MAX_BODY_BYTES = 32_000_000
 HOST = "127.0.0.1"
 
+
 class Studio:
     """A scenario with the corrections of a file, which every change of the page is written to.
 

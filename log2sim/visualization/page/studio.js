@@ -40,7 +40,7 @@ class Editor {
       "studio-line": () => (this.mode === "line" ? this.finish() : this.toggle("line")), "studio-erase": () => this.toggle("erase"),
     };
     for (const [id, run] of Object.entries(actions)) byId(id).addEventListener("click", run);
-    byId("studio-category").addEventListener("change", (event) => this.put("category", { category: event.target.value }));
+    byId("studio-category").addEventListener("change", ({ target }) => this.mode !== "add" && this.put("category", { category: target.value }));
     byId("studio-color").addEventListener("change", ({ target }) => target.value && this.put("color", { name: target.value, rgb: entry.paints[target.value] }));
     this.keys = {
       J: () => this.next(), K: actions["studio-confirm"], B: actions["studio-flip"], M: actions["studio-merge"], S: actions["studio-split"],
@@ -134,12 +134,12 @@ class Editor {
       const tile = pictures?.tiles.find(shows);
       if (tile) seek(tile.t[tile.shown]);
       chooseVisible(track);
-      if (!track.present) this.mode = null;
-      else this.pose = { ...this.boxOf(track), moved: false, turned: false, sized: false };
+      this.reference(track);  // where it is absent, it goes on from its nearest end
+      this.pose = { ...this.boxOf(track), moved: false, turned: false, sized: false };
     }
     const words = {
       move: "Drag the box, or its handles to turn and size it, in the map or a picture; arrows, [ and ] by steps; Enter when it is right.",
-      merge: "Click the agent that is the same object, in the map, a picture or the list.", add: "Click where it stands.",
+      merge: "Click the agent that is the same object, in the map, a picture or the list.", add: "Choose its category, and click where it stands.",
       line: "Click along the line; Enter when it is done.", erase: "Click a line or border.",
     };
     this.say(words[this.mode] ?? "");
@@ -469,6 +469,7 @@ const correctAlone = ({ kind, agent, other, category, size_m, poses, rgb, name }
   for (const { t_ns, x_m, y_m, yaw_rad } of kind === "move" ? poses : []) {
     const t = (t_ns - editor.entry.t0_ns) / 1e9;
     track.moveTo(t);
+    if (!track.present) continue;
     const shift = [x_m - track.px, y_m - track.py, yaw_rad === undefined ? 0 : yaw_rad - track.pyaw];
     const near = (k) => Math.exp(track.stationary ? 0 : -((track.t[k] - t) ** 2) / 2);
     ["x", "y", "yaw"].forEach((column, i) => { track[column] = track[column].map((value, k) => value + shift[i] * near(k)); });
