@@ -82,9 +82,11 @@ def steps_of(
             sure = [_step(scenario, agent, "confirm")] if agent.is_doubtful else []
             out.append([*sure, *_of_known(scenario, agent, same, row, (shift, later_s), rng)])
         gone.add(agent.id)
-    for row in found["agents"]:
-        if row["matched"] <= MAX_WRONG_SHARE * row["ticks"] and not row["matched_ids"].keys() & gone:
-            out.append(list(_of_missed(scenario, true[row["id"]], (shift, later_s), rng)))
+    out += [
+        list(_of_missed(scenario, true[row["id"]], (shift, later_s), rng))
+        for row in found["agents"]
+        if row["matched"] <= MAX_WRONG_SHARE * row["ticks"] and not row["matched_ids"].keys() & gone
+    ]
     return [own for own in out if own]
 
 
@@ -195,6 +197,10 @@ def on_the_page(scenario: Scenario, steps: list[list[Step]], folder: Path) -> tu
         def window(x_m: float, y_m: float) -> tuple[float, float]:
             script = "const r = document.getElementById('map').getBoundingClientRect(), p = log2sim.pixelOf(...arguments); return [p[0] + r.left, p[1] + r.top]"
             x, y = browser.run(script, x_m, y_m)
+            if not (30 < x < 850 and 90 < y < 640):  # the map is moved first
+                browser.run("log2sim.lookAt(...arguments)", x_m, y_m)
+                counts["drags"] += 1
+                x, y = browser.run(script, x_m, y_m)
             return float(x), float(y)
 
         begin, made = time.monotonic(), 0

@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import matplotlib.pyplot as plt
 import numpy as np
 from entry import parser_of
 from numpy.typing import NDArray
@@ -31,10 +30,11 @@ from log2sim.perception.detect3d.detectors import open_shipped
 from log2sim.perception.first_pass import cloud_origin
 from log2sim.perception.lidar.cloud import assemble_cloud
 from log2sim.resim.cameras import Pictures
-from log2sim.resim.rays import Shots, all_shots, angles_of, poses_of, recorded_shots
+from log2sim.resim.rays import Shots, all_shots, poses_of, recorded_shots
 from log2sim.resim.simulate import Simulation
 from log2sim.resim.world import World, build_world
 from log2sim.synth import load_scene, synthesize
+from log2sim.visualization.sensor_film import range_image, title_line, window_of
 
 EVERY = 5
 LIMIT_M = 40.0
@@ -173,20 +173,14 @@ def picture(log: Log, scenario: Scenario, name: str, index: int, without: str, p
     """Draw ranges of a recorded sweep, of the same simulated, and of the same without an agent."""
     world = build_world(log, scenario, [name], leave_out=lambda _, i: i == index)
     rest = replace(scenario, agents=tuple(a for a in scenario.agents if a.id != without))
-    figure, axes = plt.subplots(3, 1, figsize=(11, 5.4), sharex=True, layout="constrained")
-    titles = ("recorded", "simulated from the other sweeps", f"simulated without {without}")
     shots = Simulation(log, world, scenario).shots(name, index)
-    azimuth, elevation = (np.degrees(a) for a in angles_of(shots.direction))
-    for axis, title, what in zip(axes, titles, (None, scenario, rest), strict=True):
-        rows, distance = np.arange(len(azimuth)), shots.range_m
-        if what is not None:
-            simulation = Simulation(log, world, what)
-            sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(0))
-            distance = np.linalg.norm(sweep.xyz_m, axis=1)
-        axis.scatter(-azimuth[rows], elevation[rows], s=2.5, c=distance, cmap="turbo", vmin=3, vmax=40, linewidths=0)
-        axis.set(title=title, ylabel="elevation, deg", facecolor="black")
-    axes[-1].set(xlabel="azimuth, deg, to the right")
-    figure.savefig(path, dpi=90)
+    window = window_of(shots.direction)
+    parts = [title_line("recorded"), range_image(shots.direction, shots.range_m, window)]
+    for title, what in (("simulated from the other sweeps", scenario), (f"simulated without {without}", rest)):
+        sweep, rows = Simulation(log, world, what).cast(name, shots, log, 0, np.random.default_rng(0))
+        distance = np.linalg.norm(sweep.xyz_m, axis=1)
+        parts += [title_line(title), range_image(shots.direction[rows], distance, window)]
+    cv2.imwrite(str(path), np.vstack(parts))
 
 
 def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:

@@ -248,7 +248,7 @@ def page_document(
             "map_offset_m": list(m.offset_m),
             "log": scenario.name,
             "categories": list(CATEGORIES),
-            "paints": PAINTS,
+            "paints": {name: list(rgb) for name, rgb in PAINTS.items()},
             "corrections": [],
         },
     }

@@ -189,8 +189,8 @@ class Editor {
       return true;
     }
     const kind = this.mode, pose = { t_ns: this.stamp(), x_m: place[0], y_m: place[1], yaw_rad: 0 };
-    this.toggle(null);
     const entry = this.signed({ kind, ...(kind === "erase" ? { at: place } : { category: byId("studio-category").value || "car", poses: [pose] }) });
+    this.toggle(null);
     this.send((made) => [...made, entry]);
     return true;
   }
