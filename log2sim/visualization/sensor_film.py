@@ -36,7 +36,7 @@ def range_image(direction: Array, range_m: Array, window: Array) -> Image:
     gray = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
     near = 255 - 254 * np.clip(range_m[shown] / FULL_M, 0, 1)
     gray[row[shown].astype(int), column[shown].astype(int)] = near
-    gray = cv2.dilate(gray, np.ones((3, 2), np.uint8))
+    gray = cv2.dilate(gray, np.ones((3, 3), np.uint8))
     return np.where(gray[..., None] > 0, cv2.applyColorMap(255 - gray, cv2.COLORMAP_TURBO), 0).astype(np.uint8)
 
 
