@@ -51,7 +51,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "resimulate {sample} --log samples/crossing --replay {work}/without_bus.json --sensors lidar_top,front --out {work}/simulated "
         "--film {work}/sensors.webm",
     ),
-    "situations": ("plot {work}/motorway.json --agents ego,car-1,car-2 --start 1.7 --stop 5.1 --extent 50,-16,195,8 --size 900x420 --out {out}",),
+    "situations": (
+        "plot {work}/motorway.json --agents ego,car-1,car-2 --start 1.7 --stop 5.1 --extent 50,-16,195,8 --size 900x420 --out {out}",
+    ),
     "synthetic": ("inspect {work}/roadside --overlay {out}",),
 }
 

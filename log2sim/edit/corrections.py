@@ -424,8 +424,8 @@ def _extended(agent: Agent, poses: Sequence[Mapping[str, float]]) -> tuple[Agent
             path = sorted([end, *({"z_m": end["z_m"], **p} for p in outside)], key=lambda p: p["t_s"])
             ends = ((2, np.zeros(3)), (1, velocity)) if at == 0 else ((1, velocity), (2, np.zeros(3)))
             more = added(agent.category, agent.size_m, path, agent.id, ends).waypoints
-            more = more.take(more.t_s < end["t_s"] if at == 0 else more.t_s > end["t_s"]).columns()
-            parts = [w.columns(), more] if at else [more, w.columns()]
+            more = more.take(more.t_s < end["t_s"] if at == 0 else more.t_s > end["t_s"])
+            parts = [p.columns() for p in ((w, more) if at else (more, w))]
             w = Waypoints(**{k: np.concatenate([part[k] for part in parts]) for k in parts[0] if k in parts[1]})
     return replace(agent, waypoints=w), [p for p in poses if p not in early and p not in late]
 

@@ -61,7 +61,7 @@ class Lanelet2:
             for lane in ahead:
                 rules[lane.id].append(rule)
         for stop, number in stops:
-            ahead = () if number in lit else [lane for lane in roads if _ends_at(lane, stop)]
+            ahead = [lane for lane in roads if number not in lit and _ends_at(lane, stop)]
             if ahead:
                 members = [("way", _add_sign(draft, stop, ahead[0]), "refers"), ("way", number, "ref_line")]
                 rule = draft.relation(members, type="regulatory_element", subtype="traffic_sign", log2sim_assumed="yes")

@@ -8,10 +8,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.datatypes import Scenario
 from log2sim.files.documents import replaced
-from log2sim.geometry import NS_PER_S, Array, period_of
+from log2sim.geometry import NS_PER_S, period_of
 from log2sim.perception.records import RecordSource
 from log2sim.resim.rays import angles_of
 from log2sim.resim.simulate import Simulation
@@ -21,12 +22,12 @@ WIDTH_PX, HEIGHT_PX, TITLE_PX = 960, 120, 18  # of a sweep, and of the line abov
 FULL_M = 40.0  # whose color is the last
 
 
-def window_of(direction: Array) -> Array:
+def window_of(direction: NDArray[Any]) -> NDArray[Any]:
     """Return the least and greatest azimuth and elevation, rad (2, 2), of nearly all rays (N, 3)."""
     return np.asarray(np.quantile(np.stack(angles_of(direction), axis=1), (0.002, 0.998), axis=0).T)
 
 
-def range_image(direction: Array, range_m: Array, window: Array) -> Image:
+def range_image(direction: NDArray[Any], range_m: NDArray[Any], window: NDArray[Any]) -> Image:
     """Draw ranges (N,), m, of rays (N, 3) within a window as (HEIGHT_PX, WIDTH_PX, 3) BGR: left is left, nearer ones on top."""
     low, high = window[:, 0], np.maximum(window[:, 1], window[:, 0] + 1e-6)
     column, row = ((high - np.stack(angles_of(direction), axis=1)) / (high - low) * (WIDTH_PX - 1, HEIGHT_PX - 1)).T
@@ -36,7 +37,7 @@ def range_image(direction: Array, range_m: Array, window: Array) -> Image:
     gray = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
     near = 255 - 254 * np.clip(range_m[shown] / FULL_M, 0, 1)
     gray[row[shown].astype(int), column[shown].astype(int)] = near
-    gray = cv2.dilate(gray, np.ones((3, 3), np.uint8))
+    gray = np.asarray(cv2.dilate(gray, np.ones((3, 3), np.uint8)), np.uint8)
     return np.where(gray[..., None] > 0, cv2.applyColorMap(255 - gray, cv2.COLORMAP_TURBO), 0).astype(np.uint8)
 
 
