@@ -1,9 +1,8 @@
-"""tools/profile_ticks.py: to whom time is given, which records are the floor, and its figures."""
+"""tools/profile_ticks.py: its figures."""
 
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from pathlib import Path
 
 from log2sim.datatypes import Log
@@ -15,9 +14,8 @@ from profile_ticks import Measured, Times
 
 def test_figures_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread() -> None:
     def run(cpu_s: float) -> Measured:
-        parts = Counter({"perception.detect": 0.25 * cpu_s, "libraries": 0.25 * cpu_s, "tracking": 0.5 * cpu_s})
         stages = {"poses": Times(0.1, 0.1 * cpu_s), "detect": Times(1.0, 0.5 * cpu_s), "lanes": Times(0.1, 0.2 * cpu_s)}
-        return Measured(Times(cpu_s / 2, cpu_s), 10, 40.0, stages, parts, parts)
+        return Measured(Times(cpu_s / 2, cpu_s), 10, 40.0, stages)
 
     log = Log("some", "test", {}, {}, {})
     found = profile_ticks.figures(
@@ -29,5 +27,5 @@ def test_figures_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread() -> N
     assert found["stages_ms"]["detect"] == {"wall": 100.0, "cpu": 100.0}
     # Of 2 s, half go to ticks, a fifth to 40 m of way, the rest to the log as a whole.
     assert (found["cpu_of_log_s"], found["cpu_of_tick_ms"], found["cpu_of_100_m_s"]) == (0.6, 100.0, 1.0)
-    text = profile_ticks.show([found], 5)
+    text = profile_ticks.show([found])
     assert "| some | `labels` | 10 | 10.00 | 100 | 200 | 0.60 | 100 | 1.0 | 100 | 50 | 30 | 4.00 | 2.00 |" in text
