@@ -28,8 +28,8 @@ def torch() -> Any:
     return torch
 
 
-def test_a_toy_learns_to_find_vehicles(tmp_path: Path) -> None:
-    """Half a minute from nothing: what it finds on fresh scenes is mostly right."""
+def test_a_toy_learns_to_find_riders(tmp_path: Path) -> None:
+    """Half a minute from nothing: centers of riders on fresh scenes are found first; chance finds one in hundreds."""
     import train_lidar
 
     rounds = [train_lidar.Round(5, 100, 200)]
@@ -37,7 +37,7 @@ def test_a_toy_learns_to_find_vehicles(tmp_path: Path) -> None:
     train_lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
     train_lidar.finish("roadside", tmp_path, rounds, examples=8)
     card = json.loads((tmp_path / "roadside.json").read_text())
-    assert card["simulated"]["vehicle"]["average_precision"] > 0.05
+    assert card["simulated"]["two_wheeler"]["average_precision"] > 0.08
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000
 
 
