@@ -14,7 +14,11 @@ from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
+from hypothesis import settings
 
+# A slow or busy machine is no failure, and half of the usual examples do.
+settings.register_profile("suite", max_examples=50, deadline=None)
+settings.load_profile("suite")
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
 # Many tests start processes, which would compile the package each for itself.
