@@ -309,12 +309,8 @@ def row(f: Figures) -> list[str]:
 
 
 HEAD = (
-    "kind",
-    "pose",
-    "vehicle",
-    "recall",
-    *"position m,yaw deg,length m,width m,speed m/s,backwards,extra".split(","),
-)
+    "kind", "pose", "vehicle", "recall", "position m", "yaw deg", "length m", "width m", "speed m/s", "backwards", "extra",
+)  # fmt: skip
 
 
 def totals(rows: Sequence[Figures]) -> str:
