@@ -136,8 +136,8 @@ def replay(
     from log2sim.simulation.expected_motion import WarningSettings
     from log2sim.simulation.metrics.all_metrics import MAX_LISTED, check_limits, parse_limits, require_strict, summarize
     from log2sim.simulation.policy import load_policy
+    from log2sim.simulation.runner import external_simulator
     from log2sim.simulation.runner import replay as run
-    from log2sim.simulation.simulators import external_simulator
     from log2sim.simulation.warnings import BrakeWhenWarned, warnable
     from log2sim.simulation.warnings import warn as find_warnings
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -277,9 +278,33 @@ def _static_agent(agent: Agent, clock: StepClock) -> tuple[AgentReplay, NDArray[
     return replayed, steps
 
 
+SIMULATORS = ("own", "carla")
 MODES = ("pid", "exact")
 DT_RANGE_S = (0.0005, 1.0)
 MAX_STEPS = 20_000_000
+
+
+def external_simulator(name: str, address: str | None, port: int | None, map: str | None) -> ExternalSimulator | None:
+    """Return the simulator of a name, with an address, port and world (town or OpenDRIVE file); None for the embedded one.
+
+    Raises `ConfigError` for an unknown name, options that it does not use, or a missing file.
+    """
+    if name not in SIMULATORS:
+        raise ConfigError(
+            f"unknown simulator '{name}'{nearest(name, list(SIMULATORS))}; known: {', '.join(SIMULATORS)}"
+        )
+    if name == "own":
+        if address is not None or port is not None or map is not None:
+            raise ConfigError("--host, --port and --map are for --simulator carla; add it, or leave them out")
+        return None
+    from log2sim.simulation.carla.simulator import CarlaServer, CarlaSimulator
+
+    opendrive = Path(map) if map is not None and map.endswith(".xodr") else None
+    if opendrive is not None and not opendrive.is_file():
+        raise ConfigError(f"--map: {opendrive}: no such file")
+    own = CarlaServer()
+    town = None if opendrive else map
+    return CarlaSimulator(CarlaServer(address or own.host, port or own.port, town=town, opendrive=opendrive))
 
 
 def replay(
