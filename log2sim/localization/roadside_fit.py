@@ -599,9 +599,9 @@ def link_boxes(boxes: Sequence[SeenBoxes], site_m: Array, start_ns: int) -> list
 def _rows_of(seen: SeenBoxes, site_m: Array, start_ns: int) -> Array:
     """Return rows (M, 13) of group, time, and box as in `ObjectTrack`."""
     boxes, group = seen.boxes, [GROUPS.get(str(category), -1) for category in seen.boxes.category]
-    sides = seen.errors.side_m.reshape(-1, 4)
+    sides = seen.sigma_m.reshape(-1, 4)
     at = np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, boxes.size_m[:, :2] / 2])
-    return np.column_stack([group, at, sides, boxes.yaw_rad, seen.errors.yaw_rad])
+    return np.column_stack([group, at, sides, boxes.yaw_rad, seen.sigma_rad])
 
 
 def _costs(track: list[Array], rows: Array) -> Array:
