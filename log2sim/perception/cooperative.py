@@ -528,7 +528,7 @@ class EndsDetector:
 
     def _search(self, view: Cloud, earlier: Sequence[Cloud]) -> SeenBoxes:
         """Search the cloud of one viewpoint."""
-        detector = self.road if view.end == ROAD else self.vehicle
+        detector = (self.road if view.end == ROAD else None) or self.vehicle
         before = [other for cloud in earlier for other in cloud.views if _is_same_view(view, other)]
         found = detector.detect(view, before)
         if self.method is not None and self.method.refines:
