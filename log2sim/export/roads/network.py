@@ -78,7 +78,8 @@ class MarkFinder:
 
     def __init__(self, scenario: Scenario) -> None:
         features = scenario.map_features or MapFeatures()
-        self.items: dict[str | None, Marking | RoadBorder] = {i.id: i for i in (*features.markings, *features.borders)}
+        items: list[Marking | RoadBorder] = [*features.markings, *features.borders]
+        self.items: dict[str | None, Marking | RoadBorder] = {item.id: item for item in items}
 
     def mark(self, name: str | None) -> RoadMark:
         """Return the mark that the item of that id is; "none" where there is no such item."""
