@@ -709,7 +709,8 @@ def _best_match(
     seen: ObjectTrack, road: Sequence[ObjectTrack], correction: Array, delay_s: float, within_m: float
 ) -> Match | None:
     """Find the track of the road whose boxes lie on those of a vehicle's track best."""
-    best, best_gain = None, 0.0
+    best: Match | None = None
+    best_gain = 0.0
     for other in road:
         box, velocity, known = other.at(seen.t_s + delay_s)
         known &= np.hypot(*(velocity - seen.velocity_mps).T) < MAX_VELOCITY_APART_MPS
@@ -724,7 +725,8 @@ def _best_match(
         if gain > best_gain and known.sum() >= min(MIN_BOXES, len(known)):
             cos, sin = np.cos(seen.box[:, YAW]), np.sin(seen.box[:, YAW])
             axes = np.stack([cos, sin, -sin, cos], axis=1).reshape(-1, 2, 2)
-            best, best_gain = tuple(c[known] for c in (axes, box[:, :3], velocity, off, sigma)), gain
+            best = axes[known], box[known, :3], velocity[known], off[known], sigma[known]
+            best_gain = gain
     return best
 
 
