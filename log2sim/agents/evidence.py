@@ -58,7 +58,7 @@ class Recording:
 SIGNS = {
     "sweep": 1, "weak_sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "through_gaps": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "continued": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
@@ -80,6 +80,8 @@ SIGNS = {
 - sigma_speed: logarithm of the standard deviation of the speed of what moves, in units of 0.3 m/s.
 - through, through_gaps: share of the rays toward its solid part that go on behind it, of vehicles and of what has gaps, as people
   and bicycles have; 0 with few.
+- continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
+  fences go on there, vehicles end.
 - pointless: 1 where the LiDAR looks toward it and none of its detections has a point.
 - nearer: 1 where its points are those of something nearer, which the heights of its image boxes tell.
 - missing: nats against it by the images that show its place well and in which it is not detected.
@@ -266,7 +268,8 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     seen = (met > 0) & (met >= before)
     sums = [np.where(seen, rays, 0).sum(axis=1) for rays in (met, through)]
     known = (sums[0] >= MIN_LOOKING_RAYS) & (seen.sum(axis=1) >= MIN_SEEN_TICKS)
-    shown = shown_in_images(AgentTable.of(agents, recording.t_s), recording) & seen & (met >= MIN_TICK_RAYS)
+    boxes = AgentTable.of(agents, recording.t_s)
+    shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
     through_share = np.where(known, sums[1] / np.maximum(sums[0], 1), 0.0)
@@ -274,11 +277,47 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     return {
         "through": np.where(solid, through_share, 0.0),
         "through_gaps": np.where(solid, 0.0, through_share),
+        "continued": continued(boxes, recording.clouds) * solid,
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
         "nearer": np.array([_height_share(m) < MIN_HEIGHT_SHARE for m in of], dtype=np.float64),
         "shown_ticks": shown.sum(axis=1).astype(np.float64),
         "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
     }  # fmt: skip
+
+
+# Points so near a side of a box, m, are compared with those as far beyond it, but for the error of a side; so high above its floor,
+# where curbs and low plants end. Of fewer points no density is known. So many ticks of each agent suffice.
+SIDE_M, SIDE_ERROR_M, ABOVE_FLOOR_M, MIN_SIDE_POINTS, SIDE_TICKS = 0.5, 0.1, 0.4, 5, 8
+
+
+def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
+    """Return the densities of points just beyond the sides and tops of boxes over those just inside (A,), means of at most 1 each.
+
+    Only where the points inside are, which is where rays arrive: beyond a side of a vehicle whose end they show is nothing.
+    """
+    inside, beyond = np.zeros((len(boxes.present), 5)), np.zeros((len(boxes.present), 5))
+    recorded = np.array([cloud is not None for cloud in clouds], dtype=bool)
+    for k, present in enumerate(boxes.present):
+        ticks = np.flatnonzero(present & recorded)
+        for tick in ticks[:: -(-len(ticks) // SIDE_TICKS) or 1].tolist():
+            cloud, center, half = clouds[tick], boxes.center_m[k, tick], boxes.size_m[k] / 2
+            assert cloud is not None
+            near = cloud.xyz[cloud.near(center[:2], float(np.hypot(*half[:2])) + SIDE_M)] - (center - cloud.origin)
+            c, s = np.cos(boxes.yaw_rad[k, tick]), np.sin(boxes.yaw_rad[k, tick])
+            local = np.stack([c * near[:, 0] + s * near[:, 1], c * near[:, 1] - s * near[:, 0], near[:, 2]], axis=1)
+            local = local[local[:, 2] > ABOVE_FLOOR_M - half[2]]
+            within = np.abs(local) < half + SIDE_ERROR_M / 2
+            for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
+                depth, across = sign * local[:, axis] - half[axis], [a for a in range(3) if a != axis]
+                own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[:, across].all(axis=1)
+                if own.sum() < MIN_SIDE_POINTS:
+                    continue
+                low, high = np.quantile(local[own][:, across], (0.1, 0.9), axis=0)
+                level = ((local[:, across] >= low) & (local[:, across] <= high)).all(axis=1)
+                inside[k, side] += (own & level).sum()
+                beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
+    share = np.minimum(beyond / np.maximum(inside, 1), 1)
+    return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
 
 
 def _height_share(m: Measurements) -> float:
