@@ -78,8 +78,8 @@ SIGNS = {
 - other_category: share of its measurements of another category.
 - impossible: 1 where its motion is doubted.
 - sigma_speed: logarithm of the standard deviation of the speed of what moves, in units of 0.3 m/s.
-- through, through_gaps: share of the rays toward its solid part that go on behind it, of vehicles and of what has gaps, as people
-  and bicycles have; 0 with few.
+- through, through_gaps: logarithm of the rays toward its solid part over those that end in it, of vehicles and of what has gaps, as
+  people and bicycles have: all others go on behind it; 0 with few.
 - continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
   fences go on there, vehicles end.
 - pointless: 1 where the LiDAR looks toward it and none of its detections has a point.
@@ -252,6 +252,8 @@ def _odd_height(candidate: AgentCandidate) -> float:
 MAX_CELLS = 400_000
 # Rays toward a place before it is said that the LiDAR looks there, and at a tick before they say anything.
 MIN_LOOKING_RAYS, MIN_TICK_RAYS = 30, 8
+# One ray of thirty ends in anything by chance.
+MAX_GONE_NATS = float(np.log(30.0))
 # Rays of fewer ticks may all have gone through a window or past a corner.
 MIN_SEEN_TICKS = 3
 # Fewer image boxes with points may each be wrong. The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5
@@ -272,11 +274,11 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
-    through_share = np.where(known, sums[1] / np.maximum(sums[0], 1), 0.0)
+    gone = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_GONE_NATS)
     solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
     return {
-        "through": np.where(solid, through_share, 0.0),
-        "through_gaps": np.where(solid, 0.0, through_share),
+        "through": np.where(solid, gone, 0.0),
+        "through_gaps": np.where(solid, 0.0, gone),
         "continued": continued(boxes, recording.clouds) * solid,
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
         "nearer": np.array([_height_share(m) < MIN_HEIGHT_SHARE for m in of], dtype=np.float64),

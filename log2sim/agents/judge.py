@@ -80,7 +80,7 @@ def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: 
         return None
     counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
     reasons = {
-        "through": Finding("empty", values={"through_share": evidence["through"]}),
+        "through": Finding("empty", values={"through_share": 1 - float(np.exp(-evidence["through"]))}),
         "pointless": Finding("hardly_observed", case="no_points"),
         "missing": Finding("hardly_observed", case="images", values=counts),
     }
