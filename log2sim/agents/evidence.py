@@ -22,7 +22,6 @@ from log2sim.datatypes import (
     Agent,
     AgentTable,
     Log,
-    Measurements,
     Obstacles,
     Track,
 )
@@ -56,18 +55,17 @@ class Recording:
 
 
 SIGNS = {
-    "sweep": 1, "weak_sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
+    "sweep": 1, "weak_sweep": 1, "image": 1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "through_gaps": -1, "continued": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "continued": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
 - sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
   where negative; and of its detections in images. 0 without any.
-- no_sweep, no_image: 1 without any detection in a sweep, in an image, where others have some.
+- no_image: 1 without any detection in an image, where others have some.
 - travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
-- range: logarithm of the median distance, in units of 20 m.
 - scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
 - sigma: logarithm of the standard deviation of its position, in units of 0.1 m.
 - unlikely_size: 1 where the observed size is none of its category.
@@ -82,29 +80,26 @@ SIGNS = {
   people and bicycles have: all others go on behind it; 0 with few.
 - continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
   fences go on there, vehicles end.
-- pointless: 1 where the LiDAR looks toward it and none of its detections has a point.
-- nearer: 1 where its points are those of something nearer, which the heights of its image boxes tell.
 - missing: nats against it by the images that show its place well and in which it is not detected.
 - moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
 """
 
 # Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, `confirmed`, 1
-# where the detections suffice, and `shown_ticks` and `image_ticks`:
-# the ticks at which a searched image shows a candidate well, and at which it is detected in one of these.
+# where the detections suffice, `pointless`, 1 where the LiDAR looks toward it and none of its detections has a point, and
+# `shown_ticks` and `image_ticks`: the ticks at which a searched image shows a candidate well, and at which it is detected in one.
 Table = dict[str, Array]
 
 
 def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
     """Gather the evidence for and against each of C candidates."""
     if not candidates:
-        return {name: np.zeros(0) for name in ("bias", "confirmed", *SIGNS, "shown_ticks", "image_ticks")}
+        return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
     rows = [_own_columns(c, recording.timeline) for c in candidates]
     most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
     parts = [_sensed_columns(candidates[k : k + most], recording) for k in range(0, len(rows), most)]
     table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    for name in ("no_sweep", "no_image"):
-        table[name] *= table[name].min() == 0
+    table["no_image"] *= table["no_image"].min() == 0
     return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
 
 
@@ -115,7 +110,7 @@ MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), 4.6
 
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
 LIMITS: dict[str, tuple[float, float]] = {
-    "range": (np.log(0.1), np.log(5.0)), "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
+    "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
     "odd_height": (0.0, np.log(2.0)), "heading": (-MAX_LOG_ODDS, MAX_LOG_ODDS), "sigma_speed": (np.log(0.07), np.log(17.0)),
 }  # fmt: skip
 
@@ -134,12 +129,10 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
         "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
-        "no_sweep": float(not in_sweep.any()),
         "no_image": float(not in_image.any()),
         "travel": travel,
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
-        "range": np.log(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)) / 20.0 + 1e-3),
         "scatter": np.log1p(_scatter(candidate, timeline)),
         "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
         "unlikely_size": float(not candidate.geometry.is_likely),
@@ -256,9 +249,6 @@ MIN_LOOKING_RAYS, MIN_TICK_RAYS = 30, 8
 MAX_GONE_NATS = float(np.log(30.0))
 # Rays of fewer ticks may all have gone through a window or past a corner.
 MIN_SEEN_TICKS = 3
-# Fewer image boxes with points may each be wrong. The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5
-# is three standard deviations low. Then the points are not those of what the image shows, but of something nearer that hides it.
-MIN_HEIGHTS, MIN_HEIGHT_SHARE = 3, 0.5
 
 
 def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
@@ -281,7 +271,6 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
         "through_gaps": np.where(solid, 0.0, gone),
         "continued": continued(boxes, recording.clouds) * solid,
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
-        "nearer": np.array([_height_share(m) < MIN_HEIGHT_SHARE for m in of], dtype=np.float64),
         "shown_ticks": shown.sum(axis=1).astype(np.float64),
         "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
     }  # fmt: skip
@@ -320,12 +309,6 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
                 beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
     share = np.minimum(beyond / np.maximum(inside, 1), 1)
     return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
-
-
-def _height_share(m: Measurements) -> float:
-    """Return the median height of the image boxes of a track at its distance over that of its points; 1 with few of both."""
-    rows = ~m.truncated & (m.points > 0) & (m.top_m > m.bottom_m) & np.isfinite(m.height_px_m)
-    return float(np.median(m.height_px_m[rows] / (m.top_m - m.bottom_m)[rows])) if rows.sum() >= MIN_HEIGHTS else 1.0
 
 
 # Smaller objects are "small" in COCO (Lin et al., ECCV 2014), where detectors find less than half of them.
