@@ -304,7 +304,7 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
                 if own.sum() < MIN_SIDE_POINTS:
                     continue
                 low, high = np.quantile(local[own][:, across], (0.1, 0.9), axis=0)
-                level = ((local[:, across] >= low) & (local[:, across] <= high)).all(axis=1)
+                level = ((local[:, across] > low - SIDE_ERROR_M) & (local[:, across] < high + SIDE_ERROR_M)).all(axis=1)
                 inside[k, side] += (own & level).sum()
                 beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
     share = np.minimum(beyond / np.maximum(inside, 1), 1)
