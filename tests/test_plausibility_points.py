@@ -116,7 +116,7 @@ VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0
         (VAN, [0, 0, 0, 0, 0], True, 0.0),
         (VAN, [0, 0, 0, 30, 0], False, 0.0),
         # Of some rays that reach its place most go on.
-        (CORNER, [0, 0, 0, 0, 0], True, -np.log(0.3)),
+        (CORNER, [0, 0, 0, 0, 0], True, -np.log(0.2)),
         # Its points are those of what stands beside it, but rays end in it.
         (BACK, [0, 0, 0, 0, 0], True, 0.0),
         (BACK, [9, 9, 9, 9, 9], False, 0.0),
@@ -142,7 +142,7 @@ def test_where_the_lidar_looks_an_object_has_points(thing, points, pointless, th
     [((-2.2, 0.0), (2.2, 1.5), 0.0), ((-9.0, 0.0), (9.0, 1.5), 2 / 3), ((-2.2, 0.0), (9.0, 3.0), 2 / 3)],
 )
 def test_walls_go_on_beyond_a_box_and_vehicles_end(low_m, high_m, share):
-    x, z = (a.ravel() for a in np.meshgrid(np.arange(low_m[0], high_m[0], 0.1), np.arange(low_m[1], high_m[1], 0.1)))
+    x, z = (a.ravel() for a in np.meshgrid(np.arange(low_m[0], high_m[0], 0.03), np.arange(low_m[1], high_m[1], 0.03)))
     side = np.column_stack([x, np.full(len(x), -0.9), z])
     yaw = 0.4
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
