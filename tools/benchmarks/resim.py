@@ -27,7 +27,7 @@ from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import count_points
-from log2sim.geometry import Array, apply, bev_iou, box_corners_bev, box_iou, inverse
+from log2sim.geometry import Array, apply, box_iou, inverse, rectangle_iou
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect.detectors import create_detector
@@ -121,10 +121,9 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World) -> li
         cloud = assemble_cloud(log, {name: sweep}, origin=origin, ground_z=ground_z, max_range_m=50.0)
         found = detector.detect(cloud)
         kept.append(found)
-        corners = box_corners_bev(found.center_m[:, :2], found.size_m[:, 0], found.size_m[:, 1], found.yaw_rad)
         here = log.map_T_sensor(name, log.streams[name].t_ns[i])[0][0][:2, 3]
         sure = (found.score > 0.5) & (np.linalg.norm(found.center_m[:, :2] - here, axis=1) < 30)
-        return corners[sure]
+        return np.column_stack([found.center_m[:, :2], found.size_m[:, :2], found.yaw_rad])[sure]
 
     for i in chosen.tolist():
         sweep = simulation.cast(
@@ -132,7 +131,7 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World) -> li
         )[0]
         recorded, simulated = boxes(i, log.streams[name].read(i), all_found[0]), boxes(i, sweep, all_found[1])
         a, b = np.broadcast_arrays(recorded[:, None], simulated[None])
-        out.append(found_again(bev_iou(a, b), 0.7))
+        out.append(found_again(rectangle_iou(a, b).reshape(a.shape[:2]), 0.7))
     rows = [("boxes in sweeps", shares(out))]
     for title, found in zip(("recorded sweeps", "simulated sweeps"), all_found):
         if log.labels is not None:
