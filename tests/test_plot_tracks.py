@@ -286,7 +286,7 @@ def meeting() -> Scenario:
 @pytest.mark.parametrize("scenario", [many(40), meeting()], ids=["spread", "meeting"])
 def test_labels_do_not_overlap(scenario: Scenario) -> None:
     sheet = draw(scenario)
-    sheet.canvas.draw()
+    sheet.figure.canvas.draw()
     labels = [t for t in sheet.ax.texts if t.get_fontweight() == "bold"]
     assert len(labels) > 6
     boxes = [t.get_window_extent() for t in labels]
