@@ -89,9 +89,10 @@ class CommonRoad:
         roads = lanes(scenario)
         number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
         lights = [{lane.id for lane in signal_lanes(signal, roads)} for signal in scenario.signals]
+        marks = MarkFinder(scenario)
         for lane in roads:
             own = [len(roads) + k for k, names in enumerate(lights, start=1) if lane.id in names]
-            root.append(_lanelet(lane, number_of, MarkFinder.of(scenario), own))
+            root.append(_lanelet(lane, number_of, marks, own))
         root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
         first = len(roads) + len(scenario.signals) + 1
         table = [
@@ -137,7 +138,7 @@ def _point(parent: Element, xyz: Array) -> None:
 def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder, lights: Sequence[int]) -> Element:
     """Return a lane with its edges, the lanes before, behind and beside it, and the traffic lights for it."""
     lanelet = element("lanelet", id=str(number_of[lane.id]))
-    sides = ("leftBound", "rightBound"), edges_of(lane), (marks.left_of(lane), marks.right_of(lane))
+    sides = ("leftBound", "rightBound"), edges_of(lane), map(marks.mark, (lane.left, lane.right))
     for tag, bound, mark in zip(*sides):
         parent = element(tag, lanelet)
         for point in bound:

@@ -43,12 +43,12 @@ class StaticMap:
 def static_map(osi: Any, scenario: Scenario, first: int) -> StaticMap:
     """Return the lanes of a scenario with their boundaries, and markings that are no lines, numbered from `first` on."""
     found = lanes(scenario)
-    marks = MarkFinder.of(scenario)
+    marks = MarkFinder(scenario)
     number_of = {lane.id: first + k for k, lane in enumerate(found)}
     boundaries, messages = [], []
     for k, lane in enumerate(found):
         sides = [first + len(found) + 2 * k + side for side in (0, 1)]
-        for number, points, mark in zip(sides, edges_of(lane), (marks.left_of(lane), marks.right_of(lane))):
+        for number, points, mark in zip(sides, edges_of(lane), map(marks.mark, (lane.left, lane.right))):
             boundaries.append(_boundary(osi, number, points, mark))
         messages.append(_lane(osi, lane, number_of, sides))
     free = first + 3 * len(found)

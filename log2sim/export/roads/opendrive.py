@@ -309,7 +309,7 @@ def opendrive_document(scenario: Scenario, placement: ExportPlacement) -> Elemen
     x, y, z = (float(a + b) for a, b in zip(scenario.map.offset_m, placement.origin_m))
     if (x, y, z) != (0.0, 0.0, 0.0):
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
-    marks, objects = MarkFinder.of(scenario), RoadObjects.of(scenario, network.roads)
+    marks, objects = MarkFinder(scenario), RoadObjects.of(scenario, network.roads)
     for road in network.roads:
         node = _add_road(root, road, placement, marks)
         # Add the crosswalks of a road.
@@ -364,7 +364,7 @@ def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
         for row in reversed(range(len(road.opposite))):
             _add_lane(left, road, 1 + row, road.opposite[row], road.opposite_widths[row], marks)
     middle = element("lane", element("center", section), id="0", type="none", level="false")
-    _add_mark(middle, marks.left_of(road.lanes[0]))
+    _add_mark(middle, marks.mark(road.lanes[0].left))
     right = element("right", section)
     for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
         _add_lane(right, road, -1 - row, lane, widths, marks)
@@ -378,7 +378,7 @@ def _add_lane(parent: Element, road: Road, id: int, lane: MapLane, widths: Array
             element(tag, links, id=str(link.lanes[id]))
     for s, *rest in widths:
         _add_cubic(node, "width", "sOffset", s, rest)
-    _add_mark(node, marks.right_of(lane))
+    _add_mark(node, marks.mark(lane.right))
 
 
 def _add_mark(lane: Element, mark: RoadMark) -> None:
