@@ -274,8 +274,8 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
     for k in np.flatnonzero(t.present.any(axis=1)).tolist():
         height[k, ~t.present[k]] = np.median(height[k, t.present[k]])
     speed = np.where(t.present, t.speed_mps, on.speed_mps)
-    columns = (on.place_m.real, on.place_m.imag, height, on.yaw_rad, speed)
-    found = post_encroachment_times(BoxTracks(*(c.T for c in columns), t.size_m), TICK_S)
+    x, y, z, yaw, pace = (c.T for c in (on.place_m.real, on.place_m.imag, height, on.yaw_rad, speed))
+    found = post_encroachment_times(BoxTracks(x, y, z, yaw, pace, t.size_m), TICK_S)
     last = len(t.t_s) - 1
     for a, c, left, came in zip(*(v.tolist() for v in (found.first, found.second, found.left_row, found.came_row))):
         pet = (came - left) * TICK_S

@@ -433,7 +433,7 @@ def _jitter(agent: Agent) -> float:
     if agent.static or len(w) < 8 or float(np.median(np.diff(w.t_s))) > 0.25:
         return 0.0
     # Of two axes with errors of sigma the median length is 1.177 sigma, and 1, -3, 3, -1 are 20 of one variance.
-    return float(np.median(np.abs(np.diff(w.x_m + 1j * w.y_m, 3)))) / (1.1774 * np.sqrt(20.0))
+    return float(np.median(np.abs(np.diff(w.x_m + 1j * w.y_m, 3))) / (1.1774 * np.sqrt(20.0)))
 
 
 def _sigma_speed(table: MotionTable, k: int, sigma_m: Array) -> Array:

@@ -71,8 +71,11 @@ class CarlaSimulator:
         self._vehicle_groups = [g for g in groups if isinstance(g, VehicleGroup)]
         self._pedestrian_groups = [g for g in groups if isinstance(g, PedestrianGroup)]
         self._delayed = [g for g in log_groups if not g.follows_scenario_time]
-        for group in (*self._vehicle_groups, *self._pedestrian_groups):
-            group.move = lambda state, *_: state  # a tick moves all groups at once
+        # A tick moves all groups at once.
+        for vehicles in self._vehicle_groups:
+            vehicles.move = lambda state, *_: state
+        for points in self._pedestrian_groups:
+            setattr(points, "move", lambda state, *_: state)  # noqa: B010
         with _translated_errors():
             self.session.__enter__()
 

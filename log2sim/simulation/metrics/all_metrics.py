@@ -296,7 +296,9 @@ def parse_limits(texts: Iterable[str], known: Sequence[str] = LOWER_LIMITS + UPP
         name, _, value = text.partition("=")
         name = name.strip()
         if name not in known:
-            raise ConfigError(f"limit '{text}': no metric '{name}'{nearest(name, known)}; known: {', '.join(known)}")
+            raise ConfigError(
+                f"limit '{text}': no metric '{name}'{nearest(name, list(known))}; known: {', '.join(known)}"
+            )
         try:
             limits[name] = float(value)
         except ValueError:
