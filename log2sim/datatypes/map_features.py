@@ -23,36 +23,19 @@ LANE_ORIGINS = ("markings", "paths", "both")
 
 @dataclass(frozen=True, eq=False)
 class Marking:
-    """Paint on the ground.
-
-    Attributes
-    ----------
-    id : str
-        Unique among markings and borders.
-    kind : str
-        One of `MARKING_KINDS`.
-    points_m : (N, 3) float64, m
-        Map frame. Of lines, dashed ones included, the middle from end to end; of crosswalks and others the outline, whose
-        first point is not repeated.
-    width_m : float, m
-        Of the line; of a crosswalk its extent along the road.
-    color : str or None
-        "white" or "yellow", None where unknown.
-    confidence : float
-        Probability that it is there, in [0, 1].
-    sources : tuple of str
-        What shows it: "camera", "lidar".
-    """
+    """Paint on the ground."""
 
     __repr__ = short_repr
 
-    id: str
-    kind: str
+    id: str  # unique among markings and borders
+    kind: str  # one of `MARKING_KINDS`
+    # (N, 3), m: map frame. Of lines, dashed ones included, the middle from end to end; of crosswalks and others the outline, whose
+    # first point is not repeated.
     points_m: Array
-    width_m: float
-    color: str | None = None
-    confidence: float = 1.0
-    sources: tuple[str, ...] = ()
+    width_m: float  # m: of the line; of a crosswalk its extent along the road
+    color: str | None = None  # "white" or "yellow", None where unknown
+    confidence: float = 1.0  # probability that it is there, in [0, 1]
+    sources: tuple[str, ...] = ()  # what shows it: "camera", "lidar"
 
     @property
     def is_lane_line(self) -> bool:
@@ -87,29 +70,15 @@ class Marking:
 
 @dataclass(frozen=True, eq=False)
 class RoadBorder:
-    """Where a road ends at its side.
-
-    Attributes
-    ----------
-    id : str
-        Unique among markings and borders.
-    kind : str
-        One of `BORDER_KINDS`.
-    points_m : (N, 3) float64, m
-        Map frame.
-    confidence : float
-        Probability that it is there, in [0, 1].
-    sources : tuple of str
-        What shows it: "camera", "lidar".
-    """
+    """Where a road ends at its side."""
 
     __repr__ = short_repr
 
-    id: str
-    kind: str
-    points_m: Array
-    confidence: float = 1.0
-    sources: tuple[str, ...] = ()
+    id: str  # unique among markings and borders
+    kind: str  # one of `BORDER_KINDS`
+    points_m: Array  # (N, 3), m: map frame
+    confidence: float = 1.0  # probability that it is there, in [0, 1]
+    sources: tuple[str, ...] = ()  # what shows it: "camera", "lidar"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry in a document of `schemas/scenario-1.json`."""
@@ -130,46 +99,23 @@ class RoadBorder:
 
 @dataclass(frozen=True, eq=False)
 class MapLane:
-    """A lane in its driving direction.
-
-    Attributes
-    ----------
-    id : str
-        Unique among lanes.
-    points_m : (N, 3) float64, m
-        Center line, map frame.
-    width_m : (N,) float64, m
-    left, right : str or None
-        Marking or border on that side.
-    predecessors, successors : tuple of str
-        Lanes before and behind it.
-    left_lane, right_lane : str or None
-        Lanes beside it in the same direction.
-    opposite : str or None
-        Lane beside it in the other direction.
-    junction : str or None
-        Junction that it crosses.
-    inferred_from : str
-        One of `LANE_ORIGINS`.
-    confidence : float
-        Probability that it is a lane, in this direction, in [0, 1].
-    """
+    """A lane in its driving direction."""
 
     __repr__ = short_repr
 
-    id: str
-    points_m: Array
-    width_m: Array
-    left: str | None = None
+    id: str  # unique among lanes
+    points_m: Array  # (N, 3), m: center line, map frame
+    width_m: Array  # (N,), m
+    left: str | None = None  # marking or border on that side
     right: str | None = None
     predecessors: tuple[str, ...] = ()
     successors: tuple[str, ...] = ()
-    left_lane: str | None = None
+    left_lane: str | None = None  # lanes beside it in the same direction
     right_lane: str | None = None
-    opposite: str | None = None
-    junction: str | None = None
-    inferred_from: str = "markings"
-    confidence: float = 1.0
+    opposite: str | None = None  # lane beside it in the other direction
+    junction: str | None = None  # junction that it crosses
+    inferred_from: str = "markings"  # one of `LANE_ORIGINS`
+    confidence: float = 1.0  # probability that it is a lane, in this direction, in [0, 1]
 
     @property
     def neighbors(self) -> tuple[str, ...]:
@@ -199,10 +145,7 @@ class MapLane:
     def from_dict(cls, entry: Mapping[str, Any]) -> MapLane:
         """Read an entry that keeps the schema.
 
-        Raises
-        ------
-        ScenarioError
-            When it has not one width for each point.
+        Raises `ScenarioError` when it has not one width for each point.
         """
         points_m, width_m = (np.array(entry[key], dtype=np.float64) for key in ("points_m", "width_m"))
         if len(points_m) != len(width_m):
@@ -223,20 +166,14 @@ class MapLane:
 
 @dataclass(frozen=True, eq=False)
 class MapFeatures:
-    """What the ground shows, and the lanes on it.
-
-    Attributes
-    ----------
-    notes : tuple of str
-        What is not there, and why.
-    """
+    """What the ground shows, and the lanes on it."""
 
     __repr__ = short_repr
 
     markings: tuple[Marking, ...] = ()
     borders: tuple[RoadBorder, ...] = ()
     lanes: tuple[MapLane, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what is not there, and why
 
     def __bool__(self) -> bool:
         """Whether there is any feature."""
@@ -263,10 +200,7 @@ class MapFeatures:
     def from_dict(cls, document: Mapping[str, Any]) -> MapFeatures:
         """Build them from a part of a document that keeps the schema.
 
-        Raises
-        ------
-        ScenarioError
-            When an id occurs twice, or a lane names a lane, marking or border that is not there.
+        Raises `ScenarioError` when an id occurs twice, or a lane names a lane, marking or border that is not there.
         """
         features = cls(
             tuple(Marking.from_dict(entry) for entry in document["markings"]),

@@ -34,35 +34,19 @@ TAGS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Tag:
-    """What an agent does during a time.
+    """What an agent does during a time."""
 
-    Attributes
-    ----------
-    tag : str
-        One of `TAGS`.
-    agent : str
-        Id of who does it.
-    start_s, t_s, end_s : float, s
-        From when to when, and the moment that `quantities` are of.
-    probability : float
-        That it is so, by the standard deviations and the confidence of the agents, in [0, 1].
-    other : str or None
-        Id of the agent that it is done to.
-    lane : str or None
-        The lane that the agent is in then, or changes to.
-    quantities : mapping of str to float
-        What defines it, in SI units, which the names end with.
-    """
-
-    tag: str
-    agent: str
+    tag: str  # one of `TAGS`
+    agent: str  # id of who does it
     start_s: float
-    t_s: float
+    t_s: float  # the moment that `quantities` are of
     end_s: float
-    probability: float
-    other: str | None = None
-    lane: str | None = None
-    quantities: Mapping[str, float] = field(default_factory=dict)
+    probability: float  # that it is so, by the standard deviations and the confidence of the agents, in [0, 1]
+    other: str | None = None  # id of the agent that it is done to
+    lane: str | None = None  # the lane that the agent is in then, or changes to
+    quantities: Mapping[str, float] = field(
+        default_factory=dict
+    )  # what defines it, in SI units, which the names end with
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry in a document of `schemas/scenario-1.json`."""
