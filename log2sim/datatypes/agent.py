@@ -324,13 +324,8 @@ class Agent:
     def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = MARGIN_S) -> AgentStates:
         """Evaluate the trajectory at times: positions by cubics with the logged velocities, yaw along the shorter arc.
 
-        Parameters
-        ----------
-        t_s : float or (T,), s
-        max_gap_s : float, s
-            Times inside a longer gap between waypoints are not valid.
-        margin_s : float, s
-            Times up to this far outside the trajectory take its nearest end.
+        `t_s`: s, one or (T,). `max_gap_s`: times inside a longer gap between waypoints are not valid. `margin_s`: times up to this
+        far outside the trajectory take its nearest end.
         """
         t, w = np.atleast_1d(np.asarray(t_s, dtype=np.float64)), self.waypoints
         valid = (t >= w.t_s[0] - margin_s) & (t <= w.t_s[-1] + margin_s)

@@ -32,12 +32,8 @@ class AgentTable:
     def of(cls, agents: Sequence[Agent], t_s: Array, *, margin_s: float = MARGIN_S, permanent: bool = False) -> Self:
         """Evaluate agents at times (T,).
 
-        Parameters
-        ----------
-        margin_s : float, s
-            Up to this far before and after its life an agent moves on as it starts and ends.
-        permanent : bool
-            Whether agents with `is_permanent` are there at all times.
+        Up to `margin_s` before and after its life an agent moves on as it starts and ends. `permanent`: whether agents with
+        `is_permanent` are there at all times.
         """
         columns = np.full((5, len(agents), len(t_s)), np.nan)
         for k, agent in enumerate(agents):

@@ -101,20 +101,28 @@ class IgnoreRegions:
         return cls(views, bool(document["outside_views"]), tuple(document.get("categories", ())))
 
 
-def _view_to_dict(view: LabelView) -> dict[str, Any]:
-    c = view.camera
+def intrinsics_to_dict(camera: Camera) -> dict[str, Any]:
+    """Return size, camera matrix and lens of a camera as an entry of a document."""
+    K = camera.K
     return {
-        "camera": c.name,
-        "intrinsics": {
-            "width_px": int(c.width_px),
-            "height_px": int(c.height_px),
-            "fx_px": float(c.K[0, 0]),
-            "fy_px": float(c.K[1, 1]),
-            "cx_px": float(c.K[0, 2]),
-            "cy_px": float(c.K[1, 2]),
-            "distortion_model": c.distortion_model,
-            "distortion": [float(d) for d in c.distortion],
-        },
+        "width_px": int(camera.width_px), "height_px": int(camera.height_px), "fx_px": float(K[0, 0]), "fy_px": float(K[1, 1]),
+        "cx_px": float(K[0, 2]), "cy_px": float(K[1, 2]), "distortion_model": camera.distortion_model,
+        "distortion": [float(d) for d in camera.distortion],
+    }  # fmt: skip
+
+
+def camera_of(name: str, intrinsics: Mapping[str, Any], mount: Mount, mount_T_cam: Array) -> Camera:
+    """Return the camera of such an entry."""
+    i, model = intrinsics, intrinsics.get("distortion_model", "none")
+    K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
+    lens = tuple(float(d) for d in i.get("distortion", ()))
+    return Camera(name, i["width_px"], i["height_px"], K, mount, mount_T_cam, model, lens)
+
+
+def _view_to_dict(view: LabelView) -> dict[str, Any]:
+    return {
+        "camera": view.camera.name,
+        "intrinsics": intrinsics_to_dict(view.camera),
         "t_s": view.t_s.tolist(),
         "translation_m": view.translation_m.tolist(),
         "rotation_wxyz": view.rotation_wxyz.tolist(),
@@ -124,10 +132,7 @@ def _view_to_dict(view: LabelView) -> dict[str, Any]:
 
 
 def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
-    i = entry["intrinsics"]
-    K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
-    model, lens = i.get("distortion_model", "none"), tuple(float(d) for d in i.get("distortion", ()))
-    camera = Camera(entry["camera"], i["width_px"], i["height_px"], K, "map", np.eye(4), model, lens)
+    camera = camera_of(entry["camera"], entry["intrinsics"], "map", np.eye(4))
     t_s = np.array(entry["t_s"], dtype=np.float64)
     position = np.array(entry["translation_m"], dtype=np.float64).reshape(-1, 3)
     q = np.array(entry["rotation_wxyz"], dtype=np.float64).reshape(-1, 4)
@@ -361,13 +366,7 @@ class Log:
     ) -> Sequence[Tick]:
         """Return the synchronized moments of the log; their pictures and sweeps are read when they are asked for.
 
-        Parameters
-        ----------
-        cameras : sequence of str
-            All of the log where it is empty.
-        start_s, stop_s : float, optional
-            Keeps the ticks in [start, stop] seconds after the first one.
-
+        `cameras`: all of the log where it is empty. `start_s`, `stop_s`: keep the ticks in between, s after the first one.
         Raises `ConfigError` for an unknown camera, and where no tick is left; `LogError` for a log without cameras and LiDARs,
         or with stamps that do not increase.
 
@@ -382,15 +381,7 @@ class Log:
     def truth(self, cameras: Sequence[str] = ()) -> Any:
         """Return the labeled objects and the ego as a scenario, for `evaluate`, `plot` and a first look.
 
-        Parameters
-        ----------
-        cameras : sequence of str
-            Cameras that were used: what they show counts as visible; all of the log where it is empty.
-
-        Returns
-        -------
-        log2sim.Scenario
-
+        `cameras`: that were used, what they show counts as visible; all of the log where it is empty. Returns a `Scenario`.
         Raises `LogError` for a log without labels.
         """
         return plugins.call("truth_of", self, cameras=tuple(cameras) or None)
@@ -398,19 +389,9 @@ class Log:
     def show(self, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Any = None) -> Any:
         """Draw boxes and LiDAR points on the pictures of one moment.
 
-        Parameters
-        ----------
-        when : float or Tick, optional
-            Seconds after the first tick, or a tick of `ticks`; by default a moment in the middle.
-        camera : str or sequence of str
-            One camera or several; all where it is empty.
-        scenario : Scenario, optional
-            Its agents are drawn in place of the labels of the log.
-
-        Returns
-        -------
-        log2sim.visualization.notebook.Picture
-            A notebook shows it; `save` writes it, `figure` is the figure.
+        `when`: seconds after the first tick, or a tick of `ticks`; by default a moment in the middle. `camera`: one or several;
+        all where it is empty. `scenario`: its agents are drawn in place of the labels of the log. Returns a
+        `log2sim.visualization.notebook.Picture`, which a notebook shows, `save` writes, and whose `figure` is the figure.
 
         Raises `ConfigError` for an unknown camera, and for a time outside the log.
         """
@@ -432,20 +413,9 @@ class Log:
         return np.asarray(center[:, :3])
 
     def map_T_sensor(self, name: str, t_ns: Any) -> tuple[Array, NDArray[np.bool_]]:
-        """Interpolate the pose of a sensor.
+        """Interpolate the poses (N, 4, 4) of a camera or LiDAR at absolute stamps (N,), and whether they are known (N,).
 
-        Parameters
-        ----------
-        name : str
-            A camera or LiDAR of this log.
-        t_ns : int or (N,) int64
-            Absolute stamps.
-
-        Returns
-        -------
-        map_T_sensor : (N, 4, 4) float64
-        valid : (N,) bool
-            Whether the ego pose is known there; always True for a sensor fixed in the map.
+        They always are for a sensor fixed in the map.
         """
         sensor = self.cameras.get(name) or self.lidars[name]
         mount_T_sensor = sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar

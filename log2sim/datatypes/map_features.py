@@ -6,10 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from log2sim.errors import ScenarioError
-from log2sim.files.documents import short_repr
+from log2sim.files.documents import from_entry, short_repr, to_entry
 from log2sim.geometry import Array
 
 MARKING_KINDS = ("solid", "dashed", "stop_line", "crosswalk", "other")
@@ -42,31 +40,6 @@ class Marking:
         """Whether it runs along lanes."""
         return self.kind in LANE_LINE_KINDS
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "points_m": self.points_m.tolist(),
-            "width_m": float(self.width_m),
-            "color": self.color,
-            "confidence": float(self.confidence),
-            "sources": list(self.sources),
-        }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Marking:
-        """Read an entry that keeps the schema."""
-        return cls(
-            entry["id"],
-            entry["kind"],
-            np.array(entry["points_m"], dtype=np.float64),
-            float(entry["width_m"]),
-            entry["color"],
-            float(entry["confidence"]),
-            tuple(entry["sources"]),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class RoadBorder:
@@ -79,22 +52,6 @@ class RoadBorder:
     points_m: Array  # (N, 3), m: map frame
     confidence: float = 1.0  # probability that it is there, in [0, 1]
     sources: tuple[str, ...] = ()  # what shows it: "camera", "lidar"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "points_m": self.points_m.tolist(),
-            "confidence": float(self.confidence),
-            "sources": list(self.sources),
-        }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> RoadBorder:
-        """Read an entry that keeps the schema."""
-        points_m = np.array(entry["points_m"], dtype=np.float64)
-        return cls(entry["id"], entry["kind"], points_m, float(entry["confidence"]), tuple(entry["sources"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,46 +80,6 @@ class MapLane:
         beside = (self.left_lane, self.right_lane, self.opposite)
         return (*self.predecessors, *self.successors, *(lane for lane in beside if lane is not None))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "id": self.id,
-            "points_m": self.points_m.tolist(),
-            "width_m": self.width_m.tolist(),
-            "left": self.left,
-            "right": self.right,
-            "predecessors": list(self.predecessors),
-            "successors": list(self.successors),
-            "left_lane": self.left_lane,
-            "right_lane": self.right_lane,
-            "opposite": self.opposite,
-            "junction": self.junction,
-            "inferred_from": self.inferred_from,
-            "confidence": float(self.confidence),
-        }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> MapLane:
-        """Read an entry that keeps the schema.
-
-        Raises `ScenarioError` when it has not one width for each point.
-        """
-        points_m, width_m = (np.array(entry[key], dtype=np.float64) for key in ("points_m", "width_m"))
-        if len(points_m) != len(width_m):
-            raise ScenarioError(
-                f"lane '{entry['id']}': width_m has {len(width_m)} values for {len(points_m)} points, expected equal"
-            )
-        return cls(
-            entry["id"],
-            points_m,
-            width_m,
-            predecessors=tuple(entry["predecessors"]),
-            successors=tuple(entry["successors"]),
-            inferred_from=entry["inferred_from"],
-            confidence=float(entry["confidence"]),
-            **{key: entry[key] for key in ("left", "right", "left_lane", "right_lane", "opposite", "junction")},
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class MapFeatures:
@@ -190,9 +107,7 @@ class MapFeatures:
     def to_dict(self) -> dict[str, Any]:
         """Return the part `map_features` of a document of `schemas/scenario-1.json`."""
         return {
-            "markings": [marking.to_dict() for marking in self.markings],
-            "borders": [border.to_dict() for border in self.borders],
-            "lanes": [lane.to_dict() for lane in self.lanes],
+            **{name: [to_entry(item) for item in getattr(self, name)] for name in ("markings", "borders", "lanes")},
             "notes": list(self.notes),
         }
 
@@ -200,30 +115,32 @@ class MapFeatures:
     def from_dict(cls, document: Mapping[str, Any]) -> MapFeatures:
         """Build them from a part of a document that keeps the schema.
 
-        Raises `ScenarioError` when an id occurs twice, or a lane names a lane, marking or border that is not there.
+        Raises `ScenarioError` when an id occurs twice, or a lane has not one width for each point or names a lane, marking or border that is not there.
         """
         features = cls(
-            tuple(Marking.from_dict(entry) for entry in document["markings"]),
-            tuple(RoadBorder.from_dict(entry) for entry in document["borders"]),
-            tuple(MapLane.from_dict(entry) for entry in document["lanes"]),
+            tuple(from_entry(Marking, entry) for entry in document["markings"]),
+            tuple(from_entry(RoadBorder, entry) for entry in document["borders"]),
+            tuple(from_entry(MapLane, entry) for entry in document["lanes"]),
             tuple(document["notes"]),
         )
-        features._require_known_ids()
-        return features
-
-    def _require_known_ids(self) -> None:
-        sides = _unique_ids("marking or border", (*self.markings, *self.borders))
-        lanes = _unique_ids("lane", self.lanes)
-        for lane in self.lanes:
+        sides = unique_ids("marking or border", (*features.markings, *features.borders))
+        lanes = unique_ids("lane", features.lanes)
+        for lane in features.lanes:
+            if len(lane.points_m) != len(lane.width_m):
+                raise ScenarioError(
+                    f"lane '{lane.id}': width_m has {len(lane.width_m)} values for {len(lane.points_m)} points, expected equal"
+                )
             for name, known, what in (
                 *((name, lanes, "lane") for name in lane.neighbors),
                 *((name, sides, "marking or border") for name in (lane.left, lane.right) if name is not None),
             ):
                 if name not in known:
                     raise ScenarioError(f"lane '{lane.id}': names the {what} '{name}', which is not there")
+        return features
 
 
-def _unique_ids(what: str, items: Sequence[Any]) -> set[str]:
+def unique_ids(what: str, items: Sequence[Any]) -> set[str]:
+    """Return the ids of items; raises `ScenarioError` for one that occurs twice."""
     seen: set[str] = set()
     for item in items:
         if item.id in seen:

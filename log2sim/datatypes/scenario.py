@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.log import IgnoreRegions, MapFrame
-from log2sim.datatypes.map_features import MapFeatures
+from log2sim.datatypes.map_features import MapFeatures, unique_ids
 from log2sim.datatypes.tag import Tag
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.files import plugins
-from log2sim.files.documents import check, read_json, replaced, short_repr, write_json
+from log2sim.files.documents import check, from_entry, read_json, replaced, short_repr, to_entry, write_json
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array
 
@@ -45,41 +45,6 @@ class Signal:
         """Return its states (T,) at times (T,); unknown before its first time."""
         k = np.searchsorted(self.t_s, np.atleast_1d(np.asarray(t_s, dtype=np.float64)), side="right") - 1
         return np.asarray(np.where(k >= 0, self.state[np.maximum(k, 0)], "unknown"))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "id": self.id,
-            "position_m": self.position_m.tolist(),
-            "heading_rad": None if self.heading_rad is None else float(self.heading_rad),
-            "t_s": self.t_s.tolist(),
-            "state": [str(state) for state in self.state],
-            "sigma_m": float(self.sigma_m),
-            "confidence": float(self.confidence),
-            "cameras": list(self.cameras),
-        }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Signal:
-        """Read an entry that keeps the schema.
-
-        Raises `ScenarioError` when it has not one state for each time, or its times do not increase.
-        """
-        t_s, state = np.array(entry["t_s"], dtype=np.float64), np.array(entry["state"], dtype=str)
-        if len(t_s) != len(state):
-            raise ScenarioError(f"signal '{entry['id']}': {len(t_s)} times, {len(state)} states; expected equal")
-        if np.any(np.diff(t_s) <= 0):
-            raise ScenarioError(f"signal '{entry['id']}': t_s does not increase")
-        return cls(
-            entry["id"],
-            np.array(entry["position_m"], dtype=np.float64),
-            entry["heading_rad"],
-            t_s,
-            state,
-            float(entry["sigma_m"]),
-            float(entry["confidence"]),
-            tuple(entry["cameras"]),
-        )
 
 
 COLUMNS: dict[str, tuple[str, str]] = {
@@ -430,11 +395,11 @@ class Scenario:
         if self.map_features is not None:
             document["map_features"] = self.map_features.to_dict()
         if self.signals:
-            document["signals"] = [signal.to_dict() for signal in self.signals]
+            document["signals"] = [to_entry(signal) for signal in self.signals]
         if self.sensors:
             document["sensors"] = [dict(sensor) for sensor in self.sensors]
         if self.tags is not None:
-            document["tags"] = [tag.to_dict() for tag in self.tags]
+            document["tags"] = [to_entry(tag) for tag in self.tags]
         return document
 
     @classmethod
@@ -464,16 +429,19 @@ class Scenario:
             provenance=document["provenance"],
             ignore_regions=IgnoreRegions.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
-            signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
+            signals=tuple(from_entry(Signal, entry) for entry in document.get("signals", ())),
             sensors=tuple(document.get("sensors", ())),
-            tags=tuple(Tag.from_dict(entry) for entry in document["tags"]) if "tags" in document else None,
+            tags=tuple(Tag(**entry) for entry in document["tags"]) if "tags" in document else None,
         )
-        for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
-            seen: set[str] = set()
-            for item in items:
-                if item.id in seen:
-                    raise ScenarioError(f"{what} '{item.id}': the id occurs twice; ids must be unique")
-                seen.add(item.id)
+        for signal in scenario.signals:
+            if len(signal.t_s) != len(signal.state):
+                raise ScenarioError(
+                    f"signal '{signal.id}': {len(signal.t_s)} times, {len(signal.state)} states; expected equal"
+                )
+            if np.any(np.diff(signal.t_s) <= 0):
+                raise ScenarioError(f"signal '{signal.id}': t_s does not increase")
+        unique_ids("agent", scenario.agents)
+        unique_ids("signal", scenario.signals)
         return scenario
 
 

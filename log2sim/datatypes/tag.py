@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 TAGS: Mapping[str, str] = {
     "in_lane": "is in a lane of the map",
@@ -47,16 +46,3 @@ class Tag:
     quantities: Mapping[str, float] = field(
         default_factory=dict
     )  # what defines it, in SI units, which the names end with
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "tag": self.tag, "agent": self.agent, "other": self.other, "lane": self.lane,
-            "start_s": self.start_s, "t_s": self.t_s, "end_s": self.end_s, "probability": self.probability,
-            "quantities": dict(self.quantities),
-        }  # fmt: skip
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Tag:
-        """Read an entry that keeps the schema."""
-        return cls(**entry)
