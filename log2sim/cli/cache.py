@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import AsJson, counted, say
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.files.cache import DiskCache
@@ -25,7 +25,7 @@ def cache(
             show_default="as it is",
         ),
     ] = None,
-    as_json: AsJson = False,
+    as_json: opt.AsJson = False,
 ) -> None:
     """Show what is kept of earlier runs, so that nothing is detected and measured twice; limit it or remove it.
 
@@ -45,11 +45,11 @@ def cache(
         store.set_limit(max_mb)
     removed = store.clear() if clear else None
     if as_json:
-        say(json.dumps(summarize_cache(store), indent=2))
+        opt.say(json.dumps(summarize_cache(store), indent=2))
     elif removed is not None:
-        say(f"{store.folder}: {counted(removed, 'part')} removed")
+        opt.say(f"{store.folder}: {opt.counted(removed, 'part')} removed")
     else:
-        say("\n".join(describe_cache(summarize_cache(store))))
+        opt.say("\n".join(describe_cache(summarize_cache(store))))
 
 
 def summarize_cache(store: DiskCache) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def describe_cache(found: dict[str, Any]) -> list[str]:
     ]
     last = found["last_run"]
     if last is not None:
-        rows.append(("last run", f"{counted(last['found'], 'tick')} known, {last['kept']} kept"))
+        rows.append(("last run", f"{opt.counted(last['found'], 'tick')} known, {last['kept']} kept"))
     return list(format_rows(rows))
 
 

@@ -7,17 +7,17 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, counted, say, write_to
+from log2sim.cli import options as opt
 
 
 def correct(
-    scenario: ScenarioPath,
+    scenario: opt.ScenarioPath,
     corrections: Annotated[
         Path, typer.Argument(metavar="CORRECTIONS", help="File of corrections, see schemas/corrections-1.json.")
     ],
-    out: Annotated[Path, write_to("FILE", "Scenario file to write.")],
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Apply corrections that a person made: merged, split, moved and deleted agents, categories, fronts, sizes, colors, lines.
 
@@ -37,8 +37,7 @@ def correct(
     document = load_corrections(corrections)
     result = run(Scenario.load(scenario), document)
     result.scenario.save(out)
-    for line in result.unmatched:
-        say(f"warning: {line}", quiet=quiet)
+    opt.say_all("warning", result.unmatched, quiet=quiet)
     done = len(document["corrections"]) - len(result.unmatched)
     lost = f", {len(result.unmatched)} without its agent" if result.unmatched else ""
-    say(f"{out}: {counted(done, 'correction')} applied{lost}", quiet=quiet)
+    opt.say(f"{out}: {opt.counted(done, 'correction')} applied{lost}", quiet=quiet)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from packaging.requirements import InvalidRequirement, Requirement
 
-from log2sim.cli.options import AsJson, fail, say
+from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
 from log2sim.errors import Log2SimError, install_command
 from log2sim.version import __version__
@@ -191,7 +191,7 @@ def _find_models(cache: Path, broken: list[str]) -> dict[str, str]:
     return models | {"ssd-mobilenet-v2": state}
 
 
-def doctor(as_json: AsJson = False) -> None:
+def doctor(as_json: opt.AsJson = False) -> None:
     """Show versions, extras, models, cache and processors, and what is missing with the line that installs it.
 
     Exits with 0, or with 5 when something is broken that every command needs; a missing extra is not.
@@ -202,9 +202,9 @@ def doctor(as_json: AsJson = False) -> None:
     log2sim doctor --json
     """
     found = examine()
-    say(json.dumps(asdict(found), indent=2) if as_json else "\n".join(_describe(found)))
+    opt.say(json.dumps(asdict(found), indent=2) if as_json else "\n".join(_describe(found)))
     if found.broken:
-        fail("; ".join(found.broken), BROKEN_CODE)
+        opt.fail("; ".join(found.broken), BROKEN_CODE)
 
 
 def _describe(found: Installation) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, counted, option, say, write_to
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -16,35 +16,39 @@ Changes = list[str] | None
 
 
 def edit(
-    scenario: ScenarioPath,
-    out: Annotated[Path, write_to("FILE", "Scenario file to write.")],
-    shift: Annotated[Changes, option("Delay an agent; negative: advance it.", "AGENT=SECONDS")] = None,
-    speed: Annotated[Changes, option("Multiply the speed of an agent.", "AGENT=FACTOR")] = None,
-    lateral: Annotated[Changes, option("Move an agent to its left; negative: to its right.", "AGENT=METERS")] = None,
+    scenario: opt.ScenarioPath,
+    out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
+    shift: Annotated[Changes, opt.option("Delay an agent; negative: advance it.", "AGENT=SECONDS")] = None,
+    speed: Annotated[Changes, opt.option("Multiply the speed of an agent.", "AGENT=FACTOR")] = None,
+    lateral: Annotated[
+        Changes, opt.option("Move an agent to its left; negative: to its right.", "AGENT=METERS")
+    ] = None,
     begin: Annotated[
-        float | None, option("Change speed and lateral position from this time on, within --over.", "S", "--from")
+        float | None, opt.option("Change speed and lateral position from this time on, within --over.", "S", "--from")
     ] = None,
-    over: Annotated[float | None, option("Seconds that the change takes, with --from; 3 if not given.", "S")] = None,
+    over: Annotated[
+        float | None, opt.option("Seconds that the change takes, with --from; 3 if not given.", "S")
+    ] = None,
     cut_in: Annotated[
-        Changes, option("At --from, bring an agent onto the ego's path, GAP meters ahead.", "AGENT[=GAP]")
+        Changes, opt.option("At --from, bring an agent onto the ego's path, GAP meters ahead.", "AGENT[=GAP]")
     ] = None,
-    add: Annotated[Changes, option("Add an agent, at the place that --at gives.", "CATEGORY")] = None,
+    add: Annotated[Changes, opt.option("Add an agent, at the place that --at gives.", "CATEGORY")] = None,
     at: Annotated[
         Changes,
-        option(
+        opt.option(
             "Place of --add in the map, its heading and speed; or meters ahead of an agent, at its pace.",
             "X,Y[,DEG[,MPS]]|AGENT+M",
         ),
     ] = None,
     replace: Annotated[
-        Changes, option("Replace an agent by one of another category and size.", "AGENT=CATEGORY")
+        Changes, opt.option("Replace an agent by one of another category and size.", "AGENT=CATEGORY")
     ] = None,
-    remove: Annotated[Changes, option("Remove agents.", "A,B")] = None,
-    only: Annotated[Changes, option("Keep only these agents; the ego is 'ego'.", "A,B")] = None,
-    drop_doubtful: DropDoubtful = False,
-    strict: Annotated[bool, option("Exit 6 when a check fails.", None, "--strict")] = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    remove: Annotated[Changes, opt.option("Remove agents.", "A,B")] = None,
+    only: Annotated[Changes, opt.option("Keep only these agents; the ego is 'ego'.", "A,B")] = None,
+    drop_doubtful: opt.DropDoubtful = False,
+    strict: Annotated[bool, opt.option("Exit 6 when a check fails.", None, "--strict")] = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Edit the agents of a scenario: their presence, category, timing, speed and lateral position.
 
@@ -80,12 +84,11 @@ def edit(
     if drop_doubtful:
         kept = {a.id for a in edited.agents}
         gone = [a for a in loaded.doubtful if a.id not in kept]
-        say(f"left out as doubtful: {list_doubtful(gone) or 'none'}", quiet=quiet)
-    for warning in result.warnings:
-        say(f"warning: {warning}", quiet=quiet)
-    say(
-        f"{out}: {counted(len(edits), 'edit')}, {count_agents(a.id for a in edited.agents)} over {edited.duration_s:.1f} s, "
-        f"{counted(len(result.warnings), 'warning')}",
+        opt.say(f"left out as doubtful: {list_doubtful(gone) or 'none'}", quiet=quiet)
+    opt.say_all("warning", result.warnings, quiet=quiet)
+    opt.say(
+        f"{out}: {opt.counted(len(edits), 'edit')}, {count_agents(a.id for a in edited.agents)} over {edited.duration_s:.1f} s, "
+        f"{opt.counted(len(result.warnings), 'warning')}",
         quiet=quiet,
     )
     if strict:

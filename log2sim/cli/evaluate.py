@@ -10,19 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import (
-    LabelFile,
-    Overwrite,
-    Poses,
-    Quiet,
-    SequenceName,
-    Verbose,
-    complete,
-    option,
-    report_written,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -40,36 +28,36 @@ def evaluate(
     ],
     truth: Annotated[
         Path,
-        option(
+        opt.option(
             "Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
             "TRUTH",
         ),
     ],
-    labels: LabelFile = None,
-    sequence: SequenceName = None,
-    poses: Poses = None,
-    range: Annotated[
-        float | None, option("Compare agents or boxes up to this distance from the ego, in m.", "M")
-    ] = None,
-    categories: Annotated[str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B")] = None,
+    labels: opt.LabelFile = None,
+    sequence: opt.SequenceName = None,
+    poses: opt.Poses = None,
+    range: opt.Range = None,
+    categories: opt.Categories = None,
     protocol: Annotated[
         str | None,
-        option(
+        opt.option(
             "Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
             "(nuScenes).",
             "kitti|dair|center",
-            completes=complete("kitti", "dair", "center"),
+            completes=opt.complete("kitti", "dair", "center"),
             default=PROTOCOL,
         ),
     ] = None,
     score: Annotated[
-        float | None, option("Of boxes: score from which precision and recall count them.", "S", default="0.5")
+        float | None, opt.option("Of boxes: score from which precision and recall count them.", "S", default="0.5")
     ] = None,
-    plot: Annotated[Path | None, option("Reliability diagram of confidences or scores to write.", "FILE.png")] = None,
-    out: Annotated[Path | None, write_to("FILE", "Metrics file to write.")] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    plot: Annotated[
+        Path | None, opt.option("Reliability diagram of confidences or scores to write.", "FILE.png")
+    ] = None,
+    out: Annotated[Path | None, opt.write_to("FILE", "Metrics file to write.")] = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Compare a scenario, or detected boxes, with the ground truth.
 
@@ -89,7 +77,7 @@ def evaluate(
     from log2sim.files.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
-    wanted = [c.strip() for c in categories.split(",")] if categories else None
+    wanted = list(opt.split_names(categories)) or None
     only_boxes = {"--protocol": protocol, "--score": score}
     if path.is_dir():
         only_files = {**only_boxes, "--sequence": sequence, "--poses": poses, "--plot": plot, "--labels": labels}
@@ -98,8 +86,8 @@ def evaluate(
         result, table = _batch_figures(path, truth, range, wanted, quiet=quiet, verbose=verbose)
         if out is not None:
             write_json(out, result)
-        say(table, quiet=quiet)
-        report_written(out, quiet=quiet)
+        opt.say(table, quiet=quiet)
+        opt.report_written(out, quiet=quiet)
         return
     document = read_json(path, ScenarioError)
     if is_boxes_document(document):
@@ -125,19 +113,18 @@ def evaluate(
                 truth, scenario, sequence=sequence, labels=labels, points=True,
                 progress=partial(report_progress, "count points"),
             )  # fmt: skip
-        for note in known.provenance.get("notes", ()) if labels is not None else ():
-            say(f"note: {note}", quiet=quiet)
+        opt.say_all("note", known.provenance.get("notes", ()) if labels is not None else (), quiet=quiet)
         result = run(scenario, known, max_range_m=range, categories=wanted)
         if result["placement"]["method"] == "same_map" and (note := _other_map(scenario, truth)) is not None:
-            say(f"note: {note}", quiet=quiet)
+            opt.say(f"note: {note}", quiet=quiet)
         table = format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
     with together():
         if out is not None:
             write_json(out, result)
         if plot is not None:
             _plot_reliability(result, plot)
-    say(table, quiet=quiet)
-    report_written(out, plot, quiet=quiet)
+    opt.say(table, quiet=quiet)
+    opt.report_written(out, plot, quiet=quiet)
 
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:

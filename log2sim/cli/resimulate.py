@@ -5,27 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, report_written, say, write_to
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
 
 
 def resimulate(
-    scenario: ScenarioPath,
-    log: Annotated[Path, option("Log that the scenario was reconstructed from.", "LOG")],
-    out: Annotated[Path, write_to("DIR", "Log folder to write.")],
+    scenario: opt.ScenarioPath,
+    log: Annotated[Path, opt.option("Log that the scenario was reconstructed from.", "LOG")],
+    out: Annotated[Path, opt.write_to("DIR", "Log folder to write.")],
     replay: Annotated[
-        Path | None, option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE")
+        Path | None,
+        opt.option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE"),
     ] = None,
     sensors: Annotated[
-        str | None, option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
+        str | None, opt.option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
     ] = None,
-    cameras: Annotated[bool, option("All cameras, too.", None, "--cameras")] = False,
-    sequence: Annotated[str | None, option("Sequence of a log with several.", "NAME")] = None,
-    seed: Annotated[int, option("Seed of noise and lost returns.", min=0)] = 0,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    cameras: Annotated[bool, opt.option("All cameras, too.", None, "--cameras")] = False,
+    sequence: Annotated[str | None, opt.option("Sequence of a log with several.", "NAME")] = None,
+    seed: Annotated[int, opt.option("Seed of noise and lost returns.", min=0)] = 0,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Write what the LiDARs and cameras of a log would have recorded from where the ego drives now, among its agents.
 
@@ -45,15 +46,21 @@ def resimulate(
     refuse_target(out, overwrite=overwrite)
     source = Scenario.load(scenario)
     now = source if replay is None else _happening(replay, source)
-    names = tuple(name.strip() for name in sensors.split(",")) if sensors else ()
     with progress(quiet=quiet) as report:
         recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
         notes = run(
-            recorded, source, now, out, sensors=names, cameras=cameras, seed=seed, overwrite=overwrite, progress=report
+            recorded,
+            source,
+            now,
+            out,
+            sensors=opt.split_names(sensors),
+            cameras=cameras,
+            seed=seed,
+            overwrite=overwrite,
+            progress=report,
         )
-    for note in notes:
-        say(f"note: {note}", quiet=quiet)
-    report_written(out, quiet=quiet)
+    opt.say_all("note", notes, quiet=quiet)
+    opt.report_written(out, quiet=quiet)
 
 
 def _happening(path: Path, source: Scenario) -> Scenario:

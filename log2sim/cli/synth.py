@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, option, report_written, write_to
+from log2sim.cli import options as opt
 from log2sim.errors import ConfigError
 
 
@@ -45,33 +45,35 @@ class WeatherName(StrEnum):
 
 
 def synth(
-    out: Annotated[Path, write_to("DIR", "Folder to write.")],
+    out: Annotated[Path, opt.write_to("DIR", "Folder to write.")],
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
     traffic: Annotated[
         SceneTraffic | None,
-        option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
+        opt.option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
     ] = None,
-    scenes: Annotated[int, option("Number of random scenes.", min=1, max=1_000_000)] = 10,
+    scenes: Annotated[int, opt.option("Number of random scenes.", min=1, max=1_000_000)] = 10,
     sensor: Annotated[
         str | None,
-        option("LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"),
+        opt.option(
+            "LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"
+        ),
     ] = None,
     layout: Annotated[
         SceneLayout | None,
-        option(
+        opt.option(
             "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
             "pictures]"
         ),
     ] = None,
-    duration: Annotated[float, option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
-    light: Annotated[LightName | None, option("Light; random scenes draw it otherwise.")] = None,
-    weather: Annotated[WeatherName | None, option("Weather; random scenes draw it otherwise.")] = None,
+    duration: Annotated[float, opt.option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
+    light: Annotated[LightName | None, opt.option("Light; random scenes draw it otherwise.")] = None,
+    weather: Annotated[WeatherName | None, opt.option("Weather; random scenes draw it otherwise.")] = None,
     no_pictures: Annotated[
-        bool, option("Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")
+        bool, opt.option("Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")
     ] = False,
-    seed: Annotated[int, option("Seed of all random numbers.", min=0)] = 0,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    seed: Annotated[int, opt.option("Seed of all random numbers.", min=0)] = 0,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Generate a synthetic log with exact ground truth, or random traffic for training and tests.
 
@@ -112,4 +114,4 @@ def synth(
                 pictures=not no_pictures,
             )  # fmt: skip
             write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
-    report_written(out, quiet=quiet)
+    opt.report_written(out, quiet=quiet)
