@@ -17,14 +17,12 @@ def export(
     out: Annotated[Path, opt.write_to("DIR", "Folder to write into.")],
     revision: Annotated[
         str | None,
-        opt.choose("--revision", "1.0", "1.1", "1.2", help="openscenario: its version.", default="the newest"),
+        opt.choose("--revision", "1.0|1.1|1.2", "openscenario: its version.", default="the newest"),
     ] = None,
     map: Annotated[
         Path | None, opt.option("openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")
     ] = None,
-    mode: Annotated[
-        str | None, opt.choose("--mode", "exact", "pid", help="carla: how agents move.", default="exact")
-    ] = None,
+    mode: Annotated[str | None, opt.choose("--mode", "exact|pid", "carla: how agents move.", default="exact")] = None,
     log: Annotated[
         Path | None,
         opt.option(
@@ -42,10 +40,8 @@ def export(
         str,
         opt.choose(
             "--doubtful",
-            "keep",
-            "drop",
-            "all",
-            help="Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
+            "keep|drop|all",
+            "Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
         ),
     ] = "keep",
     overwrite: opt.Overwrite = False,

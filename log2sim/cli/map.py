@@ -19,7 +19,7 @@ def map_(
     ] = None,
     layer: Annotated[
         str,
-        opt.choose("--layer", "color", "intensity", "height", help="What is written; intensity is that of the LiDAR."),
+        opt.choose("--layer", "color|intensity|height", "What is written; intensity is that of the LiDAR."),
     ] = "color",
     cell: Annotated[float, opt.option("Edge of a cell, in m.", "M")] = 0.05,
     format: opt.Format = "auto",

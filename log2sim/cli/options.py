@@ -19,8 +19,6 @@ from log2sim.files.plugins import BUILT_IN
 if TYPE_CHECKING:
     from log2sim.config import Config
 
-POSES = ("given", "lidar", "camera", "auto")
-
 
 def complete(*choices: str) -> Callable[[str], list[str]]:
     """Return a function by which a shell completes one of the choices."""
@@ -46,9 +44,9 @@ def option(
     return typer.Option(*flags, metavar=metavar, help=help, show_default=default, autocompletion=completes, **more)
 
 
-def choose(flag: str, *choices: str, help: str, default: Any = True) -> Any:
-    """Make an option that takes one of a few words: `help` lists them, and a shell completes them."""
-    return option(help, "|".join(choices), flag, completes=complete(*choices), default=default)
+def choose(flag: str, choices: str, help: str, *, default: Any = True) -> Any:
+    """Make an option that takes one of a few words, "a|b", which a shell completes."""
+    return option(help, choices, flag, completes=complete(*choices.split("|")), default=default)
 
 
 def write_to(metavar: str, help: str) -> Any:
@@ -105,9 +103,8 @@ Poses = Annotated[
     str | None,
     choose(
         "--poses",
-        *POSES,
-        help="Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the "
-        "sensors best.",
+        "given|lidar|camera|auto",
+        "Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the sensors best.",
         default="the log's own; what fits best for a log without any",
     ),
 ]

@@ -155,16 +155,18 @@ def reconstruct(
     ends: Annotated[
         str | None,
         opt.choose(
-            *("--ends", "both", "vehicle", "road"),
-            help="Use only the sensors on the vehicle, or only those at the road.",
+            "--ends",
+            "both|vehicle|road",
+            "Use only the sensors on the vehicle, or only those at the road.",
             default="both",
         ),
     ] = None,
     fusion: Annotated[
         str | None,
         opt.choose(
-            *("--fusion", "points", "boxes", "tracks"),
-            help="What of the vehicle's and the road's LiDARs is joined.",
+            "--fusion",
+            "points|boxes|tracks",
+            "What of the vehicle's and the road's LiDARs is joined.",
             default="see log2sim config",
         ),
     ] = None,

@@ -18,21 +18,15 @@ def replay(
     mode: Annotated[
         str,
         opt.choose(
-            "--mode",
-            "pid",
-            "exact",
-            help="pid: vehicles follow their trajectories by a controller; exact: no controller.",
+            "--mode", "pid|exact", "pid: vehicles follow their trajectories by a controller; exact: no controller."
         ),
     ] = "pid",
     model: Annotated[
         str,
         opt.choose(
             "--model",
-            "auto",
-            "kinematic",
-            "dynamic",
-            "single-track",
-            help="Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
+            "auto|kinematic|dynamic|single-track",
+            "Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
         ),
     ] = "auto",
     dt: Annotated[float, opt.option("Time step in s, from 0.0005 to 1.", "S")] = 0.01,
@@ -56,10 +50,8 @@ def replay(
         str | None,
         opt.choose(
             "--warn",
-            "vehicle",
-            "road",
-            "both",
-            help="Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
+            "vehicle|road|both",
+            "Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
         ),
     ] = None,
     brake: Annotated[bool, opt.option("With --warn: the ego brakes when it is warned.", None, "--brake")] = False,
@@ -70,9 +62,8 @@ def replay(
         str,
         opt.choose(
             "--agents",
-            "scenario",
-            "reactive",
-            help="Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
+            "scenario|reactive",
+            "Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
         ),
     ] = "scenario",
     react: Annotated[str | None, opt.option("Make only these agents reactive.", "ID,ID")] = None,
@@ -80,9 +71,8 @@ def replay(
         str,
         opt.choose(
             "--foresight",
-            "path",
-            "motion",
-            help="What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.",
+            "path|motion",
+            "What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.",
         ),
     ] = "path",
     confidence: Annotated[
@@ -93,7 +83,7 @@ def replay(
     ] = None,
     drop_doubtful: opt.DropDoubtful = False,
     simulator: Annotated[
-        str, opt.choose("--simulator", "own", "carla", help="own, or carla: agents move in a CARLA server.")
+        str, opt.choose("--simulator", "own|carla", "own, or carla: agents move in a CARLA server.")
     ] = "own",
     host: Annotated[str | None, opt.option("carla: address of the server.", "NAME", default="127.0.0.1")] = None,
     port: Annotated[int | None, opt.option("carla: port of the server.", "N", min=1, max=65535, default="2000")] = None,

@@ -24,9 +24,7 @@ def run_test(
         list[str] | None,
         opt.option("A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE"),
     ] = None,
-    agents: Annotated[
-        str, opt.choose("--agents", "scenario", "reactive", help="Behavior of the other agent.")
-    ] = "scenario",
+    agents: Annotated[str, opt.choose("--agents", "scenario|reactive", "Behavior of the other agent.")] = "scenario",
     latency: Annotated[
         str, opt.option("How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")
     ] = "0",

@@ -16,9 +16,7 @@ def vary(
     condition: Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")],
     out: Annotated[Path, opt.write_to("DIR", "Folder for the concrete scenarios, their table and the distribution.")],
     count: Annotated[int, opt.option("Concrete scenarios to draw.", "N", min=1, max=100_000)] = 64,
-    sampler: Annotated[
-        str, opt.choose("--sampler", "sobol", "lhs", "random", help="How parameters are drawn.")
-    ] = "sobol",
+    sampler: Annotated[str, opt.choose("--sampler", "sobol|lhs|random", "How parameters are drawn.")] = "sobol",
     seed: Annotated[int, opt.option("Seed of the draw.", min=0)] = 0,
     probability: Annotated[
         float, opt.option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
