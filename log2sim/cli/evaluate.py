@@ -188,7 +188,7 @@ def _batch_figures(
     path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
     """Compare all scenarios of a batch with the labels of their logs."""
-    from log2sim.batch.evaluation import Scope, evaluate_batch, format_batch_table, format_batch_verdict
+    from log2sim.batch.evaluation import evaluate_batch, format_batch_table, format_batch_verdict
     from log2sim.batch.folder import BatchFolder, is_batch
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
@@ -203,7 +203,8 @@ def _batch_figures(
             BatchFolder.load(path),
             truth,
             lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
-            Scope(max_range_m, categories),
+            max_range_m=max_range_m,
+            categories=categories,
             progress=partial(report_progress, "logs"),
         )
     table = f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
