@@ -68,6 +68,7 @@ def evaluate(
     log2sim evaluate boxes.json --truth kitti_tracking/ --sequence 0000 --protocol kitti
     """
     from log2sim.cli.progress import progress
+    from log2sim.datatypes import Scenario
     from log2sim.errors import ConfigError, ScenarioError
     from log2sim.evaluation.detection.boxes import is_boxes_document
     from log2sim.evaluation.metrics.evaluator import evaluate as run
@@ -84,27 +85,16 @@ def evaluate(
         for name in (name for name, value in only_files.items() if value is not None):
             raise ConfigError(f"{name}: is for single files; {path} is a folder, so leave it out")
         result, table = _batch_figures(path, truth, range, wanted, quiet=quiet, verbose=verbose)
-        if out is not None:
-            write_json(out, result)
-        opt.say(table, quiet=quiet)
-        opt.report_written(out, quiet=quiet)
-        return
-    document = read_json(path, ScenarioError)
-    if is_boxes_document(document):
+    elif is_boxes_document(document := read_json(path, ScenarioError)):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
         options |= {} if score is None else {"min_score": score}
-        result, table = _boxes_figures(
-            path,
-            document,
-            _log_of(truth, sequence, labels, _stated(document.get("poses"), poses)),
-            options,
-            quiet=quiet,
-            verbose=verbose,
-        )
+        provenance = _stated(document.get("poses"), poses)
+        opened = partial(_open_truth, truth, sequence, labels, provenance)
+        result, table = _boxes_figures(path, document, options, opened, quiet=quiet, verbose=verbose)
     else:
         for name in (name for name, value in only_boxes.items() if value is not None):
             raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
-        scenario = _scenario(path, document)
+        scenario = Scenario.load(path)
         if poses is not None:
             stated = _stated(scenario.provenance.get("poses"), poses)
             scenario = replace(scenario, provenance={**scenario.provenance, **stated})
@@ -174,16 +164,6 @@ def _plot_reliability(result: dict[str, Any], path: Path) -> None:
     write_reliability(diagrams, path)
 
 
-def _scenario(path: Path, document: Any) -> Scenario:
-    from log2sim.datatypes import Scenario
-    from log2sim.errors import ScenarioError
-
-    try:
-        return Scenario.from_dict(document)
-    except ScenarioError as error:
-        raise ScenarioError(f"{path}: {error}") from None
-
-
 def _batch_figures(
     path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
@@ -211,23 +191,19 @@ def _batch_figures(
     return result, format_batch_verdict(result) + table
 
 
-def _log_of(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Callable[[], Log]:
-    """Return a function that opens the log with the true boxes, once everything else is known to be right."""
+def _open_truth(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Log:
+    """Open the log with the true boxes."""
+    from log2sim.errors import LogError
+    from log2sim.localization.choice import localize_like
+    from log2sim.logs.opening import is_log_file, open_log
 
-    def opened() -> Log:
-        from log2sim.errors import LogError
-        from log2sim.localization.choice import localize_like
-        from log2sim.logs.opening import is_log_file, open_log
-
-        if path.is_file() and not is_log_file(path):
-            raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
-        return localize_like(open_log(path, sequence=sequence, labels=labels), provenance)
-
-    return opened
+    if path.is_file() and not is_log_file(path):
+        raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
+    return localize_like(open_log(path, sequence=sequence, labels=labels), provenance)
 
 
 def _boxes_figures(
-    path: Path, document: Any, truth: Callable[[], Log], options: dict[str, Any], *, quiet: bool, verbose: bool
+    path: Path, document: Any, options: dict[str, Any], truth: Callable[[], Log], *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
