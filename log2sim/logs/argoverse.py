@@ -24,15 +24,14 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.inputs import is_present, read_file, require_links_inside
-from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, rotation_from_quaternion, shift_poses, transform
+from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, shift_poses
 from log2sim.logs.arrow import LIMITS, Kind, TableLimits, read_columns
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import (
     MAX_IMAGE_PX,
-    MAX_POSITION_M,
     MAX_SWEEP_BYTES,
     MAX_SWEEP_POINTS,
-    find_not_unit,
+    checked_poses,
     image_stream,
     list_files,
     list_numbered_files,
@@ -106,21 +105,11 @@ def read_mounts(path: Path) -> dict[str, Array]:
 
 
 def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
-    """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,).
-
-    Raises `LogError` when one is not finite or absurdly far away, or its quaternion no unit quaternion; names file and
-    row.
-    """
-    q = np.stack([columns[k].astype(np.float64) for k in QUATERNION], axis=1)
-    position = np.stack([columns[k].astype(np.float64) for k in TRANSLATION], axis=1)
-    bad = np.union1d(find_not_unit(q), np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1)))
-    if len(bad):
-        k = int(bad[0])
-        raise LogError(
-            f"{path}, row {k}: quaternion {q[k].tolist()}, translation {position[k].tolist()}, expected finite numbers "
-            f"up to {MAX_POSITION_M:g} and a unit quaternion"
-        )
-    return transform(rotation_from_quaternion(q), position)
+    """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,); `LogError` for an impossible one."""
+    q, position = (
+        np.stack([columns[k].astype(np.float64) for k in names], axis=1) for names in (QUATERNION, TRANSLATION)
+    )
+    return checked_poses(q, position, lambda row: f"{path}, row {row}")
 
 
 # First laser number of each LiDAR. On the sample log the elevations of a laser's points, computed from the position

@@ -21,7 +21,7 @@ from log2sim.logs.excerpt import digest_of
 from log2sim.logs.kitti import labels as drive
 from log2sim.logs.kitti.labels import CAMERA as LABELED_CAMERA
 from log2sim.logs.kitti.labels import DriveLabels, read_labels
-from log2sim.logs.records import first_image_size, image_stream, list_numbered_files
+from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_numbered_files
 from log2sim.logs.stamps import strictly_increasing
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
@@ -34,30 +34,22 @@ _NOT_A_TIME = np.iinfo(np.int64).min
 _TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?")
 
 
-class KittiRawReader:
+class KittiRawReader(FolderReader):
     """Reader of KITTI raw drives; the root is a drive, its date folder or the parent of date folders."""
 
     name = "kitti"
     looks_for = (
         "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
     )
-    suffixes = ()
-
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a sequence of this layout."""
-        return bool(self._drives(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
-        return sorted(self._drives(path))
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
-        drive = self._drives(path)[sequence]
+        drive = self.find(path)[sequence]
         require_links_inside(drive, drive.parent, path, files=[drive.parent / name for name in CALIBRATION])
         return _Drive(drive).log()
 
-    def _drives(self, path: Path) -> dict[str, Path]:
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the drives at a folder by name."""
         # A drive given as "." has its name only once it is resolved.
         path = path.resolve()
         places = [path, *path.glob(PATTERN), *path.glob(f"*/{PATTERN}")]
@@ -216,21 +208,16 @@ CAMERA_NUMBERS = (2, 3)
 NO_STAMPS = "this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"
 
 
-class KittiTrackingReader:
+class KittiTrackingReader(FolderReader):
     """Reader of the tracking layout; the root is the folder "training" or its parent."""
 
     name = "kitti-tracking"
     looks_for = "a folder training/ (or that folder) with calib/NNNN.txt and image_02/NNNN/"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a sequence of this layout."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the calibrations of sequences at a folder by name."""
         base = _base(path)
-        return sorted(p.stem for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir())
+        return {p.stem: p for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir()}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""

@@ -40,7 +40,7 @@ from log2sim.geometry import (
     shift_poses,
     transform,
 )
-from log2sim.logs.records import QUATERNION_TOLERANCE, find_not_unit, image_stream, read_sweep
+from log2sim.logs.records import QUATERNION_TOLERANCE, FolderReader, checked_poses, image_stream, read_sweep
 from log2sim.logs.stamps import map_frame_of, note_damaged_rows, poses_from_geodetic, strictly_increasing
 
 MAX_TABLE_BYTES = 256 * 1024 * 1024
@@ -251,22 +251,17 @@ GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch
 GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
 
 
-class NativeReader:
+class NativeReader(FolderReader):
     """Reader of log2sim's own log folders."""
 
     name = "log2sim"
     looks_for = f"a folder with {MANIFEST}"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a sequence of this layout."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the folders of logs at a folder by name."""
         if _is_manifest(path / MANIFEST):
-            return [path.resolve().name]
-        return sorted(p.parent.name for p in path.glob(f"*/{MANIFEST}") if _is_manifest(p))
+            return {path.resolve().name: path}
+        return {p.parent.name: p.parent for p in path.glob(f"*/{MANIFEST}") if _is_manifest(p)}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
@@ -374,12 +369,8 @@ class _Folder:
             return map_frame, None
         if "poses" in ego:
             table = self.table(ego["poses"], "ego.poses", POSE_COLUMNS)
-            q = table.stack("qw", "qx", "qy", "qz")
-            bad = find_not_unit(q)
-            if len(bad):
-                norm = float(np.linalg.norm(q[bad[0]]))
-                raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm:.6g}, expected a unit quaternion")
-            poses = transform(rotation_from_quaternion(q), table.stack("x_m", "y_m", "z_m"))
+            q, position = table.stack("qw", "qx", "qy", "qz"), table.stack("x_m", "y_m", "z_m")
+            poses = checked_poses(q, position, lambda row: table.where(row, "qw,qx,qy,qz"))
         else:
             table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
             for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):

@@ -32,7 +32,6 @@ from log2sim.geometry import (
     apply,
     inverse,
     nearest_rotation,
-    rotation_from_quaternion,
     transform,
     wrap_angle,
 )
@@ -41,7 +40,8 @@ from log2sim.logs.excerpt import digest_of
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
 from log2sim.logs.records import (
     MAX_POSITION_M,
-    find_not_unit,
+    FolderReader,
+    checked_poses,
     first_image_size,
     image_stream,
     list_folders,
@@ -314,22 +314,17 @@ MIN_GNSS_TRACK_M = 20.0
 MAX_GNSS_ANGLE_RAD = np.radians(1.0)
 
 
-class PandaSetReader:
+class PandaSetReader(FolderReader):
     """Reader of PandaSet sequences; the root is a sequence or a folder of sequences."""
 
     name = "pandaset"
     looks_for = "a folder with lidar/poses.json and camera/, or a folder of such folders"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder is a sequence or holds some."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the sequences at a folder by name."""
         if _is_sequence(path):
-            return [path.resolve().name]
-        return [p.name for p in list_folders(path) if _is_sequence(p)]
+            return {path.resolve().name: path}
+        return {p.name: p for p in list_folders(path) if _is_sequence(p)}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence; no sweep and no cuboid is read."""
@@ -488,18 +483,8 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
         raise LogError(
             f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
         ) from None
-    wrong = np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1))
-    if len(wrong):
-        raise LogError(
-            f"{folder}/poses.json: record {wrong[0]}: position {position[wrong[0]].tolist()}, expected finite numbers up to "
-            f"{MAX_POSITION_M:g} m"
-        )
-    bad = find_not_unit(q)
-    if len(bad):
-        raise LogError(
-            f"{folder}/poses.json: record {bad[0]}: heading {q[bad[0]].tolist()}, expected a unit quaternion"
-        )
-    return _stamps_ns(stamps, folder / "timestamps.json"), transform(rotation_from_quaternion(q), position)
+    sensor_poses = checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
+    return _stamps_ns(stamps, folder / "timestamps.json"), sensor_poses
 
 
 def _stamps_ns(stamps: list[Any], path: Path) -> NDArray[np.int64]:

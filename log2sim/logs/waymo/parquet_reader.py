@@ -23,6 +23,7 @@ from log2sim.files.inputs import is_present, require_links_inside
 from log2sim.geometry import Array
 from log2sim.logs.arrow import Kind, ParquetRows, Row, read_columns
 from log2sim.logs.excerpt import digest_of
+from log2sim.logs.records import FolderReader
 from log2sim.logs.stamps import MAX_TIME_S
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.range_images import checked, shaped
@@ -247,23 +248,18 @@ POSES = "vehicle_pose"
 STATISTICS = ("time_of_day", "location", "weather")
 
 
-class WaymoParquetReader:
+class WaymoParquetReader(FolderReader):
     """Reader of segments of version 2; the root holds a folder for each component."""
 
     name = "waymo-parquet"
     looks_for = "a folder with vehicle_pose/SEGMENT.parquet and further components of the Waymo Open Dataset, version 2"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds vehicle poses of segments."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the segments, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the poses of segments at a folder by name."""
         try:
-            return sorted(file.stem for file in (path / POSES).glob("*.parquet") if file.is_file())
+            return {file.stem: file for file in (path / POSES).glob("*.parquet") if file.is_file()}
         except OSError:
-            return []
+            return {}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a segment; no picture, range image or label is read."""
