@@ -16,8 +16,7 @@ def export(
     to: Annotated[str, opt.option(f"One of {FORMATS}.", "FORMAT", "--to", completes=opt.complete_plugins("export"))],
     out: Annotated[Path, opt.write_to("DIR", "Folder to write into.")],
     revision: Annotated[
-        str | None,
-        opt.choose("--revision", "1.0|1.1|1.2", "openscenario: its version.", default="the newest"),
+        str | None, opt.choose("--revision", "1.0|1.1|1.2", "openscenario: its version.", default="the newest")
     ] = None,
     map: Annotated[
         Path | None, opt.option("openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")

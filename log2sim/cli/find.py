@@ -92,10 +92,7 @@ def find(
 
         opt.say(json.dumps(list(found.rows), ensure_ascii=False))
     for k, row in enumerate(found.rows[:MAX_LISTED]):
-        opt.say(
-            f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}",
-            quiet=quiet,
-        )
+        opt.say(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}", quiet=quiet)
     more = len(found.rows) - MAX_LISTED
     if more > 0:
         opt.say(f"and {more} more; --out and --table have all", quiet=quiet)

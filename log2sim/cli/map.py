@@ -18,8 +18,7 @@ def map_(
         Path | None, opt.option("Scenario of the log; its agents are left out of the map.", "SCENARIO")
     ] = None,
     layer: Annotated[
-        str,
-        opt.choose("--layer", "color|intensity|height", "What is written; intensity is that of the LiDAR."),
+        str, opt.choose("--layer", "color|intensity|height", "What is written; intensity is that of the LiDAR.")
     ] = "color",
     cell: Annotated[float, opt.option("Edge of a cell, in m.", "M")] = 0.05,
     format: opt.Format = "auto",

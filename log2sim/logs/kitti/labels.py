@@ -248,11 +248,7 @@ class LabelRows:
 
 
 def read_labels(
-    path: Path,
-    rig: Rig,
-    track: PoseTrack,
-    stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
-    notes: list[str],
+    path: Path, rig: Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]], notes: list[str]
 ) -> DriveLabels:
     """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,), `notes` takes what was left out.
 

@@ -24,17 +24,7 @@ from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, 
 from log2sim.errors import LogError, RecordError
 from log2sim.files.documents import JSON_LIMIT_BYTES, read_json
 from log2sim.files.inputs import is_present, read_text, require_links_inside
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    PoseTrack,
-    apply,
-    inverse,
-    nearest_rotation,
-    transform,
-    wrap_angle,
-)
+from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, nearest_rotation, transform, wrap_angle
 from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table

@@ -10,15 +10,7 @@ import numpy as np
 
 from log2sim.errors import LogError
 from log2sim.logs.records import PARSER_ERRORS
-from log2sim.logs.ros.containers import (
-    Channel,
-    Chunk,
-    ChunkedFile,
-    checked_size,
-    normalized_type,
-    one_line,
-    printable,
-)
+from log2sim.logs.ros.containers import Channel, Chunk, ChunkedFile, checked_size, normalized_type, one_line, printable
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES = 1024 * 1024
