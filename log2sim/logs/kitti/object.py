@@ -203,7 +203,9 @@ class _Split:
             *(np.concatenate([getattr(p, k) for p in parts]) for k in ("frame", "track_id", "type", "values"))
         )
         note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
-        found = labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
+        found = labels_of_rows(
+            rows, drive.poses_of_rect(ego, first.ego_T_rect), lambda frame: frame * PERIOD_NS, "\n".join(texts)
+        )
         assert found.boxes_3d is not None
         return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=np.array(labeled, dtype=np.int64)))
 
