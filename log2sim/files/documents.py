@@ -36,20 +36,14 @@ def is_plain(text: str) -> bool:
 
 
 def parse_float(text: str) -> float:
-    """Parse a number; it may be infinite or NaN.
-
-    Raises `ValueError` for any other text.
-    """
+    """Parse a number, which may be infinite or NaN; `ValueError` for any other text."""
     if not is_plain(text):
         raise ValueError(f"could not convert string to float: {text[:40]!a}")
     return float(text)
 
 
 def parse_int(text: str) -> int:
-    """Parse a whole number.
-
-    Raises `ValueError` for any other text.
-    """
+    """Parse a whole number; `ValueError` for any other text."""
     if not is_plain(text):
         raise ValueError(f"invalid whole number: {text[:40]!a}")
     return int(text)
