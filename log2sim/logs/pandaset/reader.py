@@ -260,9 +260,11 @@ def _checked(table: Columns, path: Path) -> Columns:
 
 def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: list[str]) -> tuple[NDArray[Any], ...]:
     """Stamps, track ids, categories, centers, sizes and yaws of one sweep's cuboids; `left_out` takes the kinds of others."""
-    category = np.array(
-        [_category(str(k), str(r)) for k, r in zip(c["label"], c["attributes.rider_status"])], dtype="<U16"
-    )
+    words = [
+        RIDER.get(str(rider), UNKNOWN_RIDER) if kind == "Bicycle" else CATEGORY_OF.get(str(kind), "")
+        for kind, rider in zip(c["label"], c["attributes.rider_status"])
+    ]
+    category = np.array(words, dtype="<U16")
     left_out += [str(kind) for kind in c["label"][category == ""]]
     uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
     of_gt = c["cuboids.sensor_id"] == GT_SENSOR
@@ -280,12 +282,6 @@ def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: li
 def _sizes(c: Columns) -> Array:
     """Length, width and height (M, 3) of cuboids; the data set's x is the width and its y the length, a yaw of 0 faces +y."""
     return np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
-
-
-def _category(label: str, rider: str) -> str:
-    if label == "Bicycle":
-        return RIDER.get(rider, UNKNOWN_RIDER)
-    return CATEGORY_OF.get(label, "")
 
 
 TABLE = ".pkl.gz"
@@ -356,6 +352,7 @@ class _Sequence:
         def labels() -> Labels | None:
             return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
 
+        index = read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)
         return Log(
             name=f"pandaset-{self.path.resolve().name}",
             format=READER.name,
@@ -367,15 +364,10 @@ class _Sequence:
             map=self._map_frame(map_T_pose, notes),
             labels=labels,
             reference_camera="front_camera" if "front_camera" in cameras else None,
-            digest=digest_of(
-                [read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)], self._records()
-            ),
+            digest=digest_of([index], sorted(self.path.glob(f"*/*{TABLE}")) + sorted(self.path.glob("*/*/*.*"))),
             calibrations={n: f"{self.path}/camera/{n}/intrinsics.json" for n in cameras},
             notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
         )
-
-    def _records(self) -> list[Path]:
-        return sorted(self.path.glob(f"*/*{TABLE}")) + sorted(self.path.glob("*/*/*.*"))
 
     def _files(self, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
         """Find the records of a sensor by their number and note missing ones: they are gaps."""
@@ -474,15 +466,12 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
             f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
         ) from None
     sensor_poses = checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
-    return _stamps_ns(stamps, folder / "timestamps.json"), sensor_poses
-
-
-def _stamps_ns(stamps: list[Any], path: Path) -> NDArray[np.int64]:
-    """Return stamps (N,) int64 ns of what a file states, in s."""
     for k, stamp in enumerate(stamps):
         if not isinstance(stamp, (int, float)) or isinstance(stamp, bool) or not abs(stamp) < MAX_TIME_S:
-            raise LogError(f"{path}: record {k}: {str(stamp)[:40]!a}, expected a stamp in seconds below {MAX_TIME_S:g}")
-    return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64)
+            raise LogError(
+                f"{folder}/timestamps.json: record {k}: {str(stamp)[:40]!a}, expected a stamp in seconds below {MAX_TIME_S:g}"
+            )
+    return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64), sensor_poses
 
 
 def _intrinsics(path: Path) -> Array:
