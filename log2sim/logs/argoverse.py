@@ -53,7 +53,7 @@ CITIES: Mapping[str, tuple[int, float, float]] = {
 
 def map_frame_of(city: str | None, offset_m: tuple[float, float, float], notes: list[str]) -> MapFrame:
     """Map frame whose origin is `offset_m` from that of a city's frame; only local where the city is not known."""
-    if city not in CITIES:
+    if city is None or city not in CITIES:
         why = "map/ has no file that names it" if city is None else f"'{city}' is none of {', '.join(CITIES)}"
         notes.append(f"the city of the log is not known ({why}): the position of the map on Earth is unknown")
         return MapFrame(offset_m=offset_m)
