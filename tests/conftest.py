@@ -14,23 +14,29 @@ from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
+from hypothesis import settings
 
+# A slow or busy machine is no failure, and half of the usual examples do.
+settings.register_profile("suite", max_examples=50, deadline=None)
+settings.load_profile("suite")
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
+# Many tests start processes, which would compile the package each for itself.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave the first case of each test marked `matrix` to the default suite, and none of those of recorded logs.
+    """Leave the first case of each test marked `matrix` to the default suite, and none of recorded logs or in a browser.
 
     Files with slow tests come first, so that no process is left with a long one at the end.
     """
     first = set[str]()
     for item in items:
         function = f"{item.path}::{item.originalname}" if isinstance(item, pytest.Function) else item.nodeid
-        if "real_data" in getattr(item, "fixturenames", ()) or (
-            item.get_closest_marker("matrix") and function in first
-        ):
+        needs = {"real_data", "chromium"} & set(getattr(item, "fixturenames", ()))
+        if needs or (item.get_closest_marker("matrix") and function in first):
             item.add_marker(pytest.mark.slow)
         first.add(function)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
@@ -127,10 +133,19 @@ def tiny_scenario(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -
     return path
 
 
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """One browser for all tests of a module; skips where there is none."""
+@pytest.fixture(scope="session")
+def one_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all tests of a process; skips where there is none."""
     if CHROMIUM is None or DRIVER is None:
         pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
     with browsing(tmp_path_factory.mktemp("profile")) as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def chromium(one_browser: Browser) -> Browser:
+    """The browser, without what pages of other modules told and asked for."""
+    one_browser.open("about:blank")
+    one_browser.log("browser")
+    one_browser.requests()
+    return one_browser

@@ -12,7 +12,7 @@ from export_worlds import ROOT, peer
 
 from log2sim.datatypes import Scenario
 from log2sim.export.exporters import export
-from log2sim.geometry import NS_PER_S, bev_iou, box_corners_bev, wrap_angle
+from log2sim.geometry import NS_PER_S, rectangle_iou, wrap_angle
 
 SCRIPTS = ROOT / "tests" / "peers"
 
@@ -55,12 +55,10 @@ def overlaps(scenario: Scenario, boxes: np.ndarray) -> list[int]:
     """Steps at which the ego's box shares ground with another's, by clipping polygons."""
     steps = []
     for k, (x, y, yaw, length, width) in enumerate(boxes):
-        own = box_corners_bev([x, y], length, width, yaw)[0]
+        own = [x, y, length, width, yaw]
         states = [(a, a.at(a.waypoints.t_s[:1] if a.static else 0.1 * k)) for a in scenario.others]
-        corners = [
-            box_corners_bev([s.x_m[0], s.y_m[0]], *a.size_m[:2], s.yaw_rad[0])[0] for a, s in states if s.valid[0]
-        ]
-        steps += [k] if any(bev_iou(own, other) > 0 for other in corners) else []
+        others = [[s.x_m[0], s.y_m[0], *a.size_m[:2], s.yaw_rad[0]] for a, s in states if s.valid[0]]
+        steps += [k] if any(rectangle_iou(own, other)[0] > 0 for other in others) else []
     return steps
 
 

@@ -158,6 +158,7 @@ def thread_workers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("thread_workers")
+@pytest.mark.slow
 def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

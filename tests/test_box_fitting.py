@@ -58,7 +58,7 @@ def test_one_stray_point_does_not_turn_the_box():
 
 def test_extents_without_trim_are_the_exact_ends_along_and_across():
     corners = np.array([[0.0, 0], [4, 0], [4, 2], [0, 2], [1, 1]])
-    low, high = extents(rotate(corners, 0.7), 0.7, trim=0.0)
+    low, high = extents(rotate(corners, 0.7), 0.7)
     np.testing.assert_allclose(low, [0, 0], atol=1e-12)
     np.testing.assert_allclose(high, [4, 2], atol=1e-12)
 

@@ -17,7 +17,6 @@ from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
 from log2sim.perception.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative import (
-    BoxErrors,
     SeenBoxes,
     match_by_covariance,
     merge_by_covariance,
@@ -60,7 +59,7 @@ def boxes_at(*rows, category="car", score=0.6, points=50, t_ns=0):
 
 def seen(boxes, side_m=0.1, yaw_rad=0.05):
     n = len(boxes)
-    return SeenBoxes(boxes, BoxErrors(np.broadcast_to(side_m, (n, 2, 2)).astype(float), np.full(n, yaw_rad)))
+    return SeenBoxes(boxes, np.broadcast_to(side_m, (n, 2, 2)).astype(float), np.full(n, yaw_rad))
 
 
 def test_each_side_comes_from_whoever_sees_it() -> None:
@@ -70,7 +69,7 @@ def test_each_side_comes_from_whoever_sees_it() -> None:
     merged = merge_by_covariance(rear, front)
     assert merged.boxes.size_m[0, 0] == pytest.approx(4.5, abs=0.05)
     assert merged.boxes.center_m[0, :2] == pytest.approx([0, 0], abs=0.03)
-    assert (merged.errors.side_m <= 0.12).all()
+    assert (merged.sigma_m <= 0.12).all()
     assert merged.boxes.score[0] == pytest.approx(1 - 0.4**2)
     assert merged.boxes.points[0] == 100
 

@@ -19,6 +19,8 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check
 from log2sim.geometry import NS_PER_S
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 def at(t_s: float, x_m: float, y_m: float, **more: float) -> dict[str, Any]:
     return {"t_ns": round(t_s * NS_PER_S), "x_m": x_m, "y_m": y_m, **more}
@@ -91,6 +93,18 @@ def test_a_static_agent_that_is_put_at_different_places_moves_through_them_for_a
     np.testing.assert_allclose(found.waypoints.speed_mps, 2.0, atol=1e-9)
     k = np.searchsorted(found.waypoints.t_s, [1.0, 4.0 - 1e-6])
     assert found.waypoints.sigma_xy_m[k[0]] < 0.06 < 2.0 < found.waypoints.sigma_xy_m[k[1]]
+
+
+def test_a_track_goes_on_to_poses_outside_of_its_life() -> None:
+    whole = straight("car-1", y_m=6.0)
+    part = replace(whole, waypoints=whole.waypoints.take((whole.waypoints.t_s > 0.95) & (whole.waypoints.t_s < 2.05)))
+    poses = [at(0.0, 0.0, 6.0), at(3.0, 30.0, 6.0), at(4.0, 40.0, 6.0)]
+    move = {"kind": "move", "agent": at(1.5, 15.0, 6.0), "poses": poses}
+    w = after(scenario(straight("ego"), part), move)["car-1"].waypoints
+    assert w.t_s[[0, -1]] == pytest.approx([0.0, 4.0])
+    np.testing.assert_allclose(w.x_m, 10.0 * w.t_s, atol=1e-6)
+    np.testing.assert_allclose(w.speed_mps, 10.0, atol=1e-6)
+    assert not w.observed[w.t_s > 2.1].any()
 
 
 def test_a_pose_far_beyond_the_sigmas_bends_no_speed_where_these_change() -> None:
@@ -213,6 +227,41 @@ def test_what_is_not_there_is_told_and_the_rest_is_done(tmp_path: Path) -> None:
     assert ran.code == 0
     assert "correction 1 (delete): no agent within 1 m" in ran.out
     assert Scenario.load(tmp_path / "o.json")["parked"].waypoints.yaw_rad[0] < 0
+
+
+def test_those_of_another_log_and_beyond_the_map_or_the_time_are_told() -> None:
+    source, here = scenario(straight("ego"), parked()), at(1.0, 30.0, -3.0)
+    add = {"kind": "add", "category": "car"}
+    outside = [
+        {"kind": "move", "agent": here, "poses": [at(1.0, 1e6, 0.0)]},
+        {**add, "poses": [at(-3600.0, 1.0, 2.0)]},
+        {"kind": "draw", "feature": "curb", "points_m": [[1e7, 0, 0], [1e7, 5, 0]]},
+    ]
+    result = correct(source, document(*outside, {"kind": "flip", "agent": here}, log="elsewhere"))
+    assert [line.split(" (")[0] for line in result.unmatched] == ["correction 1", "correction 2", "correction 3"]
+    assert len(result.scenario.agents) == 2
+    with pytest.raises(ScenarioError, match="'elsewhere'"):
+        correct(source, document(*outside, log="elsewhere"))
+    # One that creeps more slowly than anything counts as moving has the heading of its way.
+    creeping = correct(source, document({**add, "poses": [at(0.0, 1.0, 20.0), at(4.0, 1.0, 20.2)]})).scenario["car-1"]
+    assert np.allclose(creeping.waypoints.yaw_rad, np.pi / 2)
+
+
+def test_with_the_log_points_of_the_corrected_boxes_are_counted(tmp_path: Path) -> None:
+    truth = Scenario.load(ROOT / "samples/crossing/truth.json")
+    known = truth["car_parked"].at(1.0)
+    place = {"t_ns": truth.t0_ns + NS_PER_S, "x_m": float(known.x_m[0]), "y_m": float(known.y_m[0])}
+    empty = {"kind": "add", "category": "car", "poses": [{**place, "x_m": place["x_m"] + 40, "y_m": place["y_m"] + 40}]}
+    made = document({"kind": "flip", "agent": place, "author": "me", "time": "now", "reason": "seen"}, empty)
+    (tmp_path / "c.json").write_text(json.dumps(made))
+    sample = ROOT / "samples/crossing"
+    ran = run("correct", sample / "truth.json", tmp_path / "c.json", "--log", sample, "--out", tmp_path / "o.json")
+    assert ran.code == 0
+    assert "warning: car-1: the LiDAR has no point in its box" in ran.out
+    after = Scenario.load(tmp_path / "o.json")
+    assert after["car_parked"].quality["points_median"] > 50
+    assert after["car-1"].quality["points_median"] == 0
+    assert after.provenance["corrections"][0]["corrections"] == made["corrections"]
 
 
 def test_contradictions_and_impossible_ones_are_refused() -> None:

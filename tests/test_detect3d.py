@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 from log2sim.config import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import Criterion, match_detections
-from log2sim.geometry import box_corners_bev, overlap_area, wrap_angle
+from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.detect3d.boxes import (
     MIN_HEAT,
     LevelBoxes,
-    Rectangles,
     decode_centers,
     decode_votes,
     headings,
     mean_shift,
     peaks,
-    shared_area,
     sigmoid,
     suppress,
 )
@@ -94,24 +92,11 @@ def test_peaks_are_greatest_among_their_neighbors_and_strongest_first() -> None:
     assert np.all(np.diff(heat.reshape(2, -1)[group, flat]) <= 0)
 
 
-def random_rectangles(rng: np.random.Generator, n: int) -> Rectangles:
-    return Rectangles(rng.uniform(-2, 2, (n, 2)), rng.uniform(0.3, 6, (n, 2)), rng.uniform(-4, 4, n))
+def rectangles(*rows: tuple[float, ...]) -> Array:
+    return np.array(rows)
 
 
-def test_shared_area_is_that_of_the_polygons() -> None:
-    rng = np.random.default_rng(2)
-    a, b = random_rectangles(rng, 500), random_rectangles(rng, 500)
-    expected = overlap_area(*(box_corners_bev(r.xy_m, r.size_m[:, 0], r.size_m[:, 1], r.yaw_rad) for r in (a, b)))
-    assert (expected == 0).sum() > 20
-    np.testing.assert_allclose(shared_area(a, b), expected, atol=1e-4)
-
-
-def rectangles(*rows: tuple[float, ...]) -> Rectangles:
-    a = np.array(rows)
-    return Rectangles(a[:, :2], a[:, 2:4], a[:, 4])
-
-
-def chosen(boxes: Rectangles, score: list[float], group: list[int], *, across: bool = True) -> list[int]:
+def chosen(boxes: Array, score: list[float], group: list[int], *, across: bool = True) -> list[int]:
     return suppress(boxes, np.array(score), np.array(group), across=across).tolist()
 
 
@@ -135,11 +120,11 @@ def test_a_person_inside_a_car_goes_and_one_beside_it_stays() -> None:
 
 def test_the_order_of_boxes_does_not_matter() -> None:
     rng = np.random.default_rng(4)
-    boxes = Rectangles(rng.uniform(-15, 15, (60, 2)), rng.uniform(0.5, 5, (60, 2)), rng.uniform(-3, 3, 60))
+    boxes = np.column_stack([rng.uniform(-15, 15, (60, 2)), rng.uniform(0.5, 5, (60, 2)), rng.uniform(-3, 3, 60)])
     score, group = rng.choice([0.2, 0.5, 0.8], 60), rng.integers(0, 3, 60)
     kept = suppress(boxes, score, group)
     order = rng.permutation(60)
-    assert order[suppress(boxes.take(order), score[order], group[order])].tolist() == kept.tolist()
+    assert order[suppress(boxes[order], score[order], group[order])].tolist() == kept.tolist()
     assert 5 < len(kept) < 60
 
 

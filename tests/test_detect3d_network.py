@@ -118,10 +118,10 @@ def test_boxes_that_cannot_reach_the_least_score_are_left_out_early_and_no_other
 
 
 def taller_is_hotter(folder: Path, **changes: Any) -> Path:
-    """A network for which a cell whose highest point is above 1.2 m is a car of 3 x 3 x 2 m in its middle."""
+    """A network for which a cell whose highest point is above 1.2 m is a car of 2.9 x 2.9 x 2 m in its middle."""
     weight, bias = np.zeros((25, 12)), np.zeros(25)
     weight[0, 0], bias[:3] = 40.0, [-24.0, -9.0, -9.0]
-    bias[8:14] = 0, 0, 1.0, *np.log([3.0, 3.0, 2.0])
+    bias[8:14] = 0, 0, 1.0, *np.log([2.9, 2.9, 2.0])
     bias[15], bias[17] = 1.0, 1.0
     return write_network(folder / "taller.onnx", {**INFO, **changes}, weight=weight, bias=bias)
 
@@ -235,7 +235,7 @@ def test_files_that_are_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="0 bytes; expected an ONNX network"):
         network.load_network(path)
     path.write_bytes(b"not a network")
-    with pytest.raises(ConfigError, match="not a network that ONNX Runtime can load"):
+    with pytest.raises(ConfigError, match="not a network for clouds that ONNX Runtime can load"):
         network.load_network(path)
     monkeypatch.setattr(network, "MAX_FILE_BYTES", 5)
     with pytest.raises(ConfigError, match="13 bytes; expected an ONNX network for clouds of 1 to 5 bytes"):

@@ -42,6 +42,7 @@ def street() -> Scenario:
         Marking("dash", "dashed", flat((0, 1.75), (50, 1.75)), 0.12, "white"),
         Marking("middle", "solid", flat((0, 5.25), (50, 5.25)), 0.12, "yellow"),
         Marking("stop", "stop_line", flat((49, -1.7), (49, 1.7)), 0.4),
+        Marking("west stop", "stop_line", flat((1, 5.4), (1, 8.6)), 0.4),
         Marking("far stop", "stop_line", flat((10, 20), (14, 20)), 0.4),
         Marking("zebra", "crosswalk", flat((51, -2), (54, -2), (54, 5), (51, 5)), 3.0),
     )
@@ -84,8 +85,14 @@ def test_a_light_rules_the_lane_that_it_faces_from_its_stop_line_on(tmp_path: Pa
     items = {item.attrib["id"]: item for item in root}
     ruled = {name: [m.attrib["ref"] for m in r.iterfind("member") if m.attrib["role"] == "regulatory_element"]
              for r in root.iterfind("relation") if (name := tags(r).get("log2sim_id"))}  # fmt: skip
-    ((rule,),) = (found for found in ruled.values() if found)
-    assert ruled["right"] == [rule]
+    assert [name for name, found in ruled.items() if found] == ["right", "west"]
+    (rule,), (other,) = ruled["right"], ruled["west"]
+    # The stop line of the other way has no light: a sign at its end stops them there.
+    assert [tags(items[r])["subtype"] for r in (rule, other)] == ["traffic_light", "traffic_sign"]
+    sign, line = (items[members(items[other])[role]] for role in ("refers", "ref_line"))
+    places = [[float(tags(items[nd.attrib["ref"]])[k]) for nd in sign.iterfind("nd")] for k in ("local_x", "local_y")]
+    assert places == [[1.0, 1.0], [8.6, 9.5]]
+    assert {tags(items[nd.attrib["ref"]])["local_x"] for nd in line.iterfind("nd")} == {"1.0000"}
     light, stop = (items[members(items[rule])[role]] for role in ("refers", "ref_line"))
     x = [float(tags(items[nd.attrib["ref"]])["local_x"]) for nd in stop.iterfind("nd")]
     assert x == [49.0, 49.0]
@@ -119,6 +126,7 @@ def test_lanelet2_routes_over_the_map_and_finds_its_light(tmp_path: Path) -> Non
         "inside": [None, None],
     }
     assert found["lights"] == {"right": [[["light"], True]], "left": [], "west": [], "inside": []}
+    assert found["signs"] == {"right": [], "left": [], "west": [["stop_sign", 1]], "inside": []}
     back = Transformer.from_crs("+proj=longlat +ellps=WGS84", PROJECTION, always_xy=True)
     for one in scenario.map_features.lanes:  # type: ignore[union-attr]
         for own, theirs in zip(edges_of(one), found["edges"][one.id]):

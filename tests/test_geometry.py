@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from log2sim.geometry import (
     PoseTrack,
     apply,
-    bev_iou,
     box_corners_bev,
     box_iou,
     inverse,
     points_in_box,
     quaternion_from_rotation,
+    rectangle_iou,
     rotation_from_quaternion,
     rotation_from_rpy,
     slerp,
@@ -140,18 +140,18 @@ def test_overlap_of_oriented_boxes_is_opencvs() -> None:
         shared, _ = cv2.intersectConvexConvex(a.astype(np.float32), b.astype(np.float32))
         expected = shared / (size.prod(axis=1).sum() - shared)
         some += 0.05 < expected < 0.95
-        assert bev_iou(a, b) == pytest.approx(expected, abs=2e-5)
-        assert bev_iou(b, a) == pytest.approx(bev_iou(a, b), abs=1e-10)
-        far = np.array([4.5e5, 5.4e6])
-        assert bev_iou(a + far, b + far) == pytest.approx(bev_iou(a, b), abs=1e-6)
+        one, other = np.column_stack([xy, size, yaw])
+        assert rectangle_iou(one, other) == pytest.approx(expected, abs=2e-5)
+        assert rectangle_iou(other, one) == pytest.approx(rectangle_iou(one, other), abs=1e-10)
+        far = np.array([4.5e5, 5.4e6, 0, 0, 0])
+        assert rectangle_iou(one + far, other + far) == pytest.approx(rectangle_iou(one, other), abs=1e-6)
     assert some > 50
 
 
 def test_overlap_of_boxes_in_special_places() -> None:
-    box = box_corners_bev([[0.0, 0.0]], 4.0, 2.0, 0.3)[0]
-    assert 1 - 1e-10 <= bev_iou(box, box) <= 1
-    inner = box_corners_bev([[0.0, 0.0]], 2.0, 1.0, 0.3)[0]
-    assert bev_iou(inner, box) == pytest.approx(0.25, abs=1e-10)
-    upright = [box_corners_bev([[x, 0.0]], 4.0, 2.0, 0.0)[0] for x in (0.0, 4.0, 2.0, 9.0)]
-    assert [bev_iou(upright[0], other) for other in upright[1:]] == [0.0, pytest.approx(1 / 3, abs=1e-10), 0.0]
-    assert bev_iou(np.zeros((4, 2)), np.zeros((4, 2))) == 0.0
+    box = [0.0, 0.0, 4.0, 2.0, 0.3]
+    assert 1 - 1e-10 <= rectangle_iou(box, box) <= 1
+    assert rectangle_iou([0.0, 0.0, 2.0, 1.0, 0.3], box) == pytest.approx(0.25, abs=1e-10)
+    upright = [[x, 0.0, 4.0, 2.0, 0.0] for x in (0.0, 4.0, 2.0, 9.0)]
+    assert rectangle_iou(upright[:1] * 3, upright[1:]).tolist() == [0.0, pytest.approx(1 / 3, abs=1e-10), 0.0]
+    assert rectangle_iou(np.zeros(5), np.zeros(5)) == 0.0

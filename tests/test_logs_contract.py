@@ -22,7 +22,7 @@ from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
 from log2sim.logs.opening import open_log
 from log2sim.logs.records import decode_image
-from log2sim.perception.lidar.cloud import deskew, has_motion, transform_rigidly
+from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 
 # Opening may read the index, and where a size is stated nowhere else the first image; images are nearly all of a log.
 MAX_SHARE_READ = 0.25
@@ -162,7 +162,8 @@ def points_in_map(log: Log, lidar: str, i: int) -> tuple[Array, np.ndarray]:
     t_ns = np.full(len(sweep.xyz_m), sweep.stamp_ns) if sweep.t_ns is None else sweep.t_ns
     if sweep.frame == "map":
         return np.asarray(sweep.xyz_m, dtype=np.float64), t_ns
-    xyz = deskew(log, lidar, sweep, t_ns) if has_motion(sweep) else transform_rigidly(log, lidar, sweep)
+    moving = sweep.t_ns is not None and sweep.compensated_ns is None
+    xyz = deskew(log, lidar, sweep, t_ns) if moving else transform_rigidly(log, lidar, sweep)
     assert xyz is not None, f"no pose of sweep {i}"
     return xyz, t_ns
 

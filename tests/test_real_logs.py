@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from plain_settings import AGENTS_ALONE
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.errors import LogError
@@ -16,18 +17,18 @@ from log2sim.files.documents import check
 pytestmark = [pytest.mark.slow, pytest.mark.real]
 
 
-def figures(path: Path, *, max_range_m: float, categories: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Metrics and report of a reconstruction from the log's own boxes."""
+def figures(path: Path, **less: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Metrics of vehicles within 30 m, and report, of a reconstruction from the log's own boxes."""
     log = open_log(path)
-    result = reconstruct(log, Config.load(detect={"name": "labels"}))
+    result = reconstruct(log, Config.load(detect={"name": "labels"}, **less))
     check(result.report, "report-1", LogError)
     used = [str(c["name"]) for c in result.scenario.cameras if c["used"]]
-    found = evaluate(result.scenario, truth_from_log(log, cameras=used), max_range_m=max_range_m, categories=categories)
+    found = evaluate(result.scenario, truth_from_log(log, cameras=used), max_range_m=30.0, categories=("vehicle",))
     return found, result.report
 
 
 def test_pandaset_with_six_cameras(real_data: Path) -> None:
-    found, report = figures(real_data / "pandaset/002", max_range_m=30.0, categories=("vehicle",))
+    found, report = figures(real_data / "pandaset/002", **AGENTS_ALONE)
     assert found["recall"] >= 0.9
     assert found["precision"] >= 0.8
     assert found["position_median_m"] <= 0.35
@@ -38,7 +39,7 @@ def test_pandaset_with_six_cameras(real_data: Path) -> None:
 
 
 def test_kitti_tracking(real_data: Path) -> None:
-    found, report = figures(real_data / "kitti_tracking", max_range_m=30.0, categories=("vehicle",))
+    found, report = figures(real_data / "kitti_tracking")
     assert found["recall"] >= 0.9
     assert found["precision"] >= 0.9
     assert found["position_median_m"] <= 0.4

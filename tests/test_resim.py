@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,6 +21,8 @@ from log2sim.resim.world import World, body_of, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import replay
 from log2sim.synth import Scene, load_scene, synthesize
+from log2sim.visualization.plot.encoding import choose_film_file
+from log2sim.visualization.sensor_film import write_film
 
 SCENES = Path(__file__).resolve().parents[1] / "samples" / "scenes"
 
@@ -211,7 +214,18 @@ def test_the_ground_goes_on_below_what_stands(recorded: tuple[Log, Scenario]) ->
 def test_a_simulated_log_opens_with_its_truth(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
     log, truth = recorded
     short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:6]) for k, s in log.streams.items()})
-    resimulate(short, truth, truth, tmp_path / "out")
+    film = choose_film_file(tmp_path / "film.webm")
+    gone = replace(truth, agents=tuple(a for a in truth.agents if a.id != truth.others[0].id))
+    resimulate(
+        short, truth, truth, tmp_path / "out", then=lambda made: write_film(replace(made, scenario=gone), truth, film)
+    )
+    frames = cv2.VideoCapture(str(tmp_path / "film.webm"))
+    shown = [image for _ in range(6) for found, image in [frames.read()] if found]
+    assert len(shown) == 6
+    recorded_rows, simulated_rows, now_rows = np.split(shown[3].astype(float), 3)
+    # What is simulated looks as what was recorded, more than what happens without an agent.
+    apart = [np.abs(rows - recorded_rows)[20:].mean() for rows in (simulated_rows, now_rows)]
+    assert 0 < apart[0] < apart[1]
     back = open_log(tmp_path / "out")
     (name,) = back.lidars
     assert list(back.streams[name].t_ns) == list(short.streams[name].t_ns)

@@ -125,6 +125,7 @@ def test_pictures_are_refused_far_off_the_path_and_nothing_is_written(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_log_with_pictures_has_a_mask_for_each(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
     log, truth = recorded
     short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:4]) for k, s in log.streams.items()})

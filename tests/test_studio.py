@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,13 @@ from test_edit import parked, scenario, straight
 from log2sim import open_log
 from log2sim.datatypes import COLOR_NAMES, Agent, Finding, Log, Scenario
 from log2sim.datatypes.color_names import name_of
-from log2sim.edit.corrections import load_corrections
+from log2sim.edit.corrections import correct, load_corrections
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Camera, apply, inverse, project
+from log2sim.visualization.page.document import PAINTS
+from log2sim.visualization.page.writer import write_page
 from log2sim.visualization.recording import Recorded
-from log2sim.visualization.studio import PAINTS, Studio
+from log2sim.visualization.studio import Studio
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -234,6 +237,62 @@ def test_a_scenario_is_corrected_on_the_page(chromium: Browser, studio: Studio) 
     assert "car-1" not in shown(browser, studio, 6)
     assert [entry for entry in browser.log("browser") if entry["level"] == "SEVERE"] == []
     assert {address.split("/")[2] for address in browser.requests()} <= {studio.origin.removeprefix("http://")}
+
+
+def test_two_pages_of_a_studio_lose_nothing(chromium: Browser, studio: Studio) -> None:
+    browser = chromium
+    browser.open(studio.address)
+    assert put(studio, FLIP)[0] == 200  # from another page
+    browser.run("log2sim.choose('car-1')")
+    click(browser, "confirm")
+    browser.wait("document.getElementById('studio-status').textContent.includes('load this one again')")
+    assert studio.document["corrections"] == [FLIP]
+    browser.open(studio.address)
+    browser.run("log2sim.choose('car-1')")
+    click(browser, "confirm")
+    shown(browser, studio, 2)
+
+
+def test_the_page_without_a_server_corrects_and_downloads(chromium: Browser, tmp_path: Path) -> None:
+    browser = chromium
+    write_page(world(), tmp_path / "page.html")
+    browser.cdp("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    browser.open((tmp_path / "page.html").as_uri())
+    browser.press("J")
+    assert browser.run("return log2sim.chosen") is None  # folded, the keys are those of the page
+    browser.run("document.getElementById('studio').open = true")
+    for name, text in (("author", "me"), ("reason", "its lamps")):
+        browser.run("document.getElementById(arguments[0]).value = arguments[1]", f"studio-{name}", text)
+    browser.press("J", "B")
+    browser.wait("log2sim.corrections().length === 1")
+    turned = browser.run("return log2sim.headingOf('car-3')")
+    assert np.cos(turned - world()["car-3"].waypoints.yaw_rad[0]) == pytest.approx(-1.0)
+    browser.run("log2sim.choose('car-1'); log2sim.time = 2.2")
+    browser.press("M")
+    browser.run(
+        "[...document.querySelectorAll('#agents button')].find((b) => b.textContent.startsWith('car-2')).click()"
+    )
+    browser.wait("log2sim.agents.length === 3")
+    browser.press("Z")
+    browser.wait("log2sim.agents.length === 4")
+    browser.press("Y")
+    browser.wait("log2sim.agents.length === 3")
+    click(browser, "download")
+    file = tmp_path / "corrections.json"
+    for _ in range(100):
+        if file.exists():
+            break
+        time.sleep(0.05)
+    document = load_corrections(file)
+    assert [(c["kind"], c["author"], c.get("reason")) for c in document["corrections"]] == [
+        ("flip", "me", "its lamps"),
+        ("merge", "me", None),
+    ]
+    result = correct(world(), document)
+    assert result.unmatched == ()
+    assert result.scenario["car-3"].waypoints.yaw_rad[0] < 0
+    assert [agent.id for agent in result.scenario.agents] == ["ego", "car-1", "car-3"]
+    assert [entry for entry in browser.log("browser") if entry["level"] == "SEVERE"] == []
 
 
 def test_on_a_phone_and_by_touch(chromium: Browser, studio: Studio) -> None:

@@ -1,40 +1,37 @@
-"""The benchmark of single estimators: its worlds, its scores, and sections of a file that it leaves alone."""
+"""Benchmarks and fits: one command for each, worlds and figures against closed forms and second methods, small runs."""
 
 from __future__ import annotations
 
 import importlib
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks import map_repeatability, poses, projection, warnings
+from benchmarks.large_vehicles import measured
+from benchmarks.vehicle import SWITCH_MPS, Case, single_track_rates
+from entry import commands_in, run_named
+from fits import late_fusion
+from ground_worlds import World, empty_scenario, world_log
+from localization_worlds import BEND, HOUSES, LIDAR, drive
+from profile_ticks import Measured, Times, figures, show
+from worlds import tiny_toml
+
+from log2sim.config import MapConfig
+from log2sim.datatypes import Log
+from log2sim.logs.native.writer import write_log
+from log2sim.road.builder import map_ground
+from log2sim.road.ground_map import GroundMap
 
 pytestmark = pytest.mark.slow
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
 
-@pytest.fixture(autouse=True)
-def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TOOLS))
-
-
-def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
-    from benchmarks.projection import make_boxes, make_sweep, make_views, with_log2sim, with_numpy, with_opencv
-
-    rng, views = np.random.default_rng(0), make_views()
-    xyz, boxes = make_sweep(6400, rng), [make_boxes(rng) for _ in views]
-    ours = with_log2sim(np.ascontiguousarray(xyz.T), views, boxes)
-    plain, cv = with_numpy(np.float64, xyz, views, boxes), with_opencv(xyz, views, boxes)
-    np.testing.assert_allclose(cv, plain, atol=1e-6)
-    np.testing.assert_array_equal(np.isnan(ours), np.isnan(plain))
-    assert np.nanmedian(np.abs(np.subtract(ours, plain))) < 1e-3
-
-
 def test_one_command_lists_the_benchmarks_runs_them_and_refuses_unknown_ones(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from entry import commands_in, run_named
-
     assert run_named("benchmarks", []) == 0
     listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     assert {"agents", "lanes", "large_vehicles", "homography"} <= {name for name, _ in listed}
@@ -45,8 +42,6 @@ def test_one_command_lists_the_benchmarks_runs_them_and_refuses_unknown_ones(
 
 @pytest.mark.parametrize("folder", ["benchmarks", "fits"])
 def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFixture[str]) -> None:
-    from entry import commands_in, run_named
-
     for name in commands_in(folder):
         with pytest.raises(SystemExit, match="0"):
             run_named(folder, [name, "--help"])
@@ -59,3 +54,117 @@ def test_every_tool_can_be_imported() -> None:
     assert len(modules) > 50
     for name in modules:
         importlib.import_module(name.removesuffix(".__init__"))
+
+
+def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
+    rng, views = np.random.default_rng(0), projection.make_views()
+    xyz, boxes = projection.make_sweep(6400, rng), [projection.make_boxes(rng) for _ in views]
+    ours = projection.with_log2sim(np.ascontiguousarray(xyz.T), views, boxes)
+    plain = projection.with_numpy(np.float64, xyz, views, boxes)
+    np.testing.assert_allclose(projection.with_opencv(xyz, views, boxes), plain, atol=1e-6)
+    np.testing.assert_array_equal(np.isnan(ours), np.isnan(plain))
+    assert np.nanmedian(np.abs(np.subtract(ours, plain))) < 1e-3
+
+
+def test_a_minibus_at_the_curb_neither_slides_nor_turns_nor_grows() -> None:
+    (found,) = next(measured(["minibus"], ["curb"], "labels", 0))
+    assert (found.recall, found.speed_mps) == (1.0, 0.0)
+    off = [found.position_m, found.yaw_deg, found.length_m, found.width_m]
+    assert (np.abs(np.array(off, float)) < [0.3, 3.0, 0.5, 0.3]).all()
+
+
+def test_poses_are_compared_by_surfaces_and_parked_vehicles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sparse = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}
+    log, _ = drive(HOUSES, BEND, duration_s=1.5, sigma_m=0.4, angle_deg=0.2, lidars=[sparse], observe=True)
+    write_log(log, tmp_path / "log")
+    out = tmp_path / "figures.json"
+    assert poses.main([str(tmp_path / "log"), "--every", "--out", str(out)]) == 0
+    found = json.loads(out.read_text())
+    assert found["surfaces"]["lidar"]["apart_m"] < found["surfaces"]["given"]["apart_m"]
+    assert len(found["parked"]) == 4
+    assert "4 of them were labeled once" in capsys.readouterr().out  # synthetic labels are exact
+
+
+def test_the_equations_of_vehicles_given_to_all_are_the_published_ones() -> None:
+    pytest.importorskip("vehiclemodels", reason="needs commonroad-vehicle-models, the published model")
+    from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
+    from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
+
+    rng, theirs = np.random.default_rng(4), parameters_vehicle2()
+    for speed in (0.0, 0.05, 0.2, 3.0, 30.0):
+        inputs = rng.uniform(-0.3, 0.3), rng.uniform(-5.0, 2.0)
+        state = [*rng.normal(0, 0.1, 3), speed, *rng.normal(0, 0.1, 3)]
+        ours = single_track_rates(Case("", 0.0, 0.0, 1.0, lambda t, exp, u=inputs: u), SWITCH_MPS)(0.0, state)
+        # Below the switch what moves is compared: their slip follows the steering by a formula of its own there.
+        count = 5 if speed < SWITCH_MPS else 7
+        expected = vehicle_dynamics_st(state, list(inputs), theirs)
+        np.testing.assert_allclose(ours[:count], expected[:count], rtol=1e-9, atol=1e-12)
+
+
+CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0
+R_rect 1 0 0 0 1 0 0 0 1
+Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0
+Tr_imu_velo 1 0 0 0 0 1 0 0 0 0 1 0
+"""
+
+
+def test_warnings_of_labels_of_kitti_are_counted_a_minute(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The ego goes north at 10 m/s; a car drives 20 m before its camera and 3 m to the left, one stands on the right."""
+    motion, labels = [], []
+    for k in range(30):
+        motion.append(f"{0.1 * k} 100 {k} 1.65 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}")
+        labels.append(f"{k} 1 Car 0 0 0 0 0 0 0 1.5 1.8 4.4 -3 1.65 20 {-np.pi / 2}")
+        labels.append(f"{k} 2 Van 0 0 0 0 0 0 0 2.0 1.9 5.0 6 1.65 {50 - k} {-np.pi / 2}")
+        labels.append(f"{k} -1 DontCare -1 -1 -10 0 0 9 9 -1 -1 -1 -1000 -1000 -1000 -10")
+    files = {"ego_motion": "\n".join(motion) + "\n", "label_02": "\n".join(labels) + "\n", "calib": CALIBRATION}
+    for name, text in files.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0003.txt").write_text(text)
+    warnings.main([str(tmp_path)])
+    assert "3 s driven: 0 warnings, 0.00 a minute" in capsys.readouterr().out
+
+
+def test_pairs_of_labels_that_late_fusion_is_fitted_to_are_right(tmp_path: Path) -> None:
+    scene = tmp_path / "tiny.toml"
+    scene.write_text(tiny_toml(), encoding="utf-8")
+    x, right = late_fusion.pairs_of(scene, "labels", "lidar:labels", 1)
+    assert len(x) > 15
+    assert right.mean() > 0.95
+    assert (x[:, 3] > 0.3).all()
+
+
+def mapped(world: World) -> GroundMap:
+    log = world_log(world)
+    return map_ground(log, empty_scenario(log), MapConfig(cell_m=0.05))
+
+
+def test_an_injected_offset_of_maps_is_found() -> None:
+    # Pictures from farther left, taken as if from the middle, show everything farther right.
+    plain = mapped(World())
+    for shift_m in (0.03, 0.1):
+        offsets = map_repeatability.measure_offsets(plain, mapped(World(camera_shift_m=shift_m, seed=9)))
+        assert offsets is not None
+        assert len(offsets.xy) >= 10
+        np.testing.assert_allclose(np.median(offsets.vector_m, axis=0), [0.0, -shift_m], atol=0.006)
+        assert np.percentile(np.abs(offsets.offset_m - shift_m), 95) < 0.015
+
+
+def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread() -> None:
+    def run(cpu_s: float) -> Measured:
+        stages = {"poses": Times(0.1, 0.1 * cpu_s), "detect": Times(1.0, 0.5 * cpu_s), "lanes": Times(0.1, 0.2 * cpu_s)}
+        return Measured(Times(cpu_s / 2, cpu_s), 10, 40.0, stages)
+
+    log, floor = Log("some", "test", {}, {}, {}), {1: [Times(0.5, 0.5)], 2: [Times(0.3, 0.6)]}
+    found = figures(log, "labels", [run(1.0), run(9.0), run(2.0)], floor)
+    assert (found["cpu_ms"], found["wall_ms"], found["ticks_per_second"]) == (200.0, 100.0, 10.0)
+    assert (
+        found["stages_ms"]["detect"]
+        == {"wall": 100.0, "cpu": found["detector_cpu_ms"]}
+        == {"wall": 100.0, "cpu": 100.0}
+    )
+    assert (found["cpu_over_floor"], found["without_detector_over_floor"]) == (4.0, 2.0)
+    # Of 2 s, half go to ticks, a fifth to 40 m of way, the rest to the log as a whole.
+    assert (found["cpu_of_log_s"], found["cpu_of_tick_ms"], found["cpu_of_100_m_s"]) == (0.6, 100.0, 1.0)
+    assert "| some | `labels` | 10 | 10.00 | 100 | 200 | 0.60 | 100 | 1.0 | 100 | 50 | 30 | 4.00 | 2.00 |" in show(
+        [found]
+    )

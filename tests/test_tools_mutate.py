@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from mutation import running
 from mutation.supervising import Harness, indices, run_many
 
-INPUTS = 64
+INPUTS = 48
 
 
 @pytest.mark.slow

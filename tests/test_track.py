@@ -16,8 +16,16 @@ from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.tracking.forward import CENTER_SIGMA_M, innovation, measurement_noise, predict, track_forward, update
-from log2sim.tracking.stitch import FORBIDDEN, _choose_joins, decide_category, stitch
+from log2sim.tracking.forward import (
+    CENTER_SIGMA_M,
+    ForwardTracker,
+    innovation,
+    measurement_noise,
+    predict,
+    track_forward,
+    update,
+)
+from log2sim.tracking.stitch import FORBIDDEN, choose_pairs, decide_category, stitch
 from log2sim.tracking.tracker import min_hits, track
 
 PERIOD_S = 0.1
@@ -222,10 +230,13 @@ def test_what_was_measured_before_and_after_its_tick_is_placed_where_it_was_then
     found = [
         seen(np.array([[20.0 * (k * PERIOD_S + age[k] / NS_PER_S), 0.0]]), t_ns[k] + age[k], "a") for k in range(40)
     ]
-    (tracklet,) = track_forward(found, t_ns, birth_score=0.4)
+    tracker = ForwardTracker(birth_score=0.4, period_s=PERIOD_S)
+    for m, now_ns in zip(found, t_ns.tolist()):
+        tracker.step(m, now_ns)
     # State at the last tick: exact data of constant speed give the exact place for that tick, not for the old stamp.
-    assert tracklet.mean[0] == pytest.approx(20.0 * 3.9, abs=0.15)
-    assert tracklet.mean[2] == pytest.approx(20.0, abs=0.3)
+    ((x, _, speed, _),) = tracker.mean
+    assert x == pytest.approx(20.0 * 3.9, abs=0.15)
+    assert speed == pytest.approx(20.0, abs=0.3)
 
 
 def test_order_of_rows_does_not_matter() -> None:
@@ -261,7 +272,7 @@ def test_a_track_takes_what_is_likely_and_nothing_else() -> None:
     for aside_m, lives in ((1.2, [40]), (5.0, [20, 20])):
         later = 5.0 + aside_m * (np.arange(40) >= 20) if aside_m > 2 else 5.0 + aside_m * (np.arange(40) == 20)
         found = [seen(np.array([[5.0, y]]), t) for y, t in zip(later, t_ns)]
-        assert [len(t.ticks) for t in track_forward(found, t_ns, birth_score=0.4)] == lives
+        assert [len(ticks) for ticks, _ in track_forward(found, t_ns, birth_score=0.4)] == lives
 
 
 def test_weak_scores_continue_a_track_but_start_none() -> None:
@@ -386,7 +397,7 @@ def test_joins_of_groups_are_as_good_as_those_of_all_together(costs):
     """As many joins as possible, and of those the cheapest: as over a table of all pairs."""
     pairs = np.array(list(costs), dtype=np.intp).reshape(-1, 2)
     cost = np.array(list(costs.values()), dtype=float)
-    first, second = _choose_joins((pairs[:, 0], pairs[:, 1], cost))
+    first, second = choose_pairs(pairs[:, 0], pairs[:, 1], cost)
     table = np.full((8, 8), FORBIDDEN)
     table[pairs[:, 0], pairs[:, 1]] = cost
     i, j = linear_sum_assignment(table)

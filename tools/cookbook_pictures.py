@@ -22,6 +22,7 @@ TARGET = ROOT / "samples/pictures"
 WIDTH_PX, MAX_BYTES = 800, 42_000
 SCENES = ("market", "motorway", "roadside", "two_hertz")
 SIZE = "--size 900x600"
+FRAME = 22  # of a film
 # By name: commands of log2sim, in which {work}, {sample} and {out} are the folder, the sample's scenario and the picture.
 COMMANDS: dict[str, tuple[str, ...]] = {
     "accuracy": ("evaluate {sample} --truth samples/crossing --plot {out}",),
@@ -44,6 +45,15 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "plot {work}/motorway.json --background {work}/motorway --extent 60,-15,130,20 --size 900x480 --out {out}",
     ),
     "roadside": (f"plot {{work}}/roadside.json {SIZE} --out {{out}}",),
+    # A frame of the film.
+    "sensors": (
+        "edit {sample} --remove bus-1 --out {work}/without_bus.json",
+        "resimulate {sample} --log samples/crossing --replay {work}/without_bus.json --sensors lidar_top,front --out {work}/simulated "
+        "--film {work}/sensors.webm",
+    ),
+    "situations": (
+        "plot {work}/motorway.json --agents ego,car-1,car-2 --start 1.7 --stop 5.1 --extent 50,-16,195,8 --size 900x420 --out {out}",
+    ),
     "synthetic": ("inspect {work}/roadside --overlay {out}",),
 }
 
@@ -140,6 +150,10 @@ def main(arguments: list[str] | None = None) -> int:
         screenshots(work, sample, chosen - COMMANDS.keys())
     TARGET.mkdir(exist_ok=True)
     for name in sorted(chosen):
+        if (work / f"{name}.webm").exists():
+            film = cv2.VideoCapture(str(work / f"{name}.webm"))
+            film.set(cv2.CAP_PROP_POS_FRAMES, FRAME)
+            cv2.imwrite(str(work / f"{name}.png"), film.read()[1])
         image = cv2.imread(str(work / f"{name}.png"))
         shrink = min(WIDTH_PX / image.shape[1], 1.0)
         image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)

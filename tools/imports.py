@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 MAX_PARAMETERS = 5
@@ -60,7 +60,7 @@ def _name(file: Path, package: Path) -> str:
 
 
 def _imports(file: Path, known: Mapping[str, Path]) -> Iterator[str]:
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in _statements(ast.parse(file.read_text(encoding="utf-8")).body):
         if isinstance(node, ast.Import):
             yield from (a.name.removeprefix("log2sim.") for a in node.names if a.name.startswith("log2sim."))
         elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "log2sim":
@@ -68,6 +68,14 @@ def _imports(file: Path, known: Mapping[str, Path]) -> Iterator[str]:
             for alias in node.names:
                 inner = f"{module}.{alias.name}".removeprefix(".")
                 yield inner if inner in known else module or "__init__"
+
+
+def _statements(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
+    """All statements in others, without their expressions, which hold none."""
+    for node in body:
+        yield node
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            yield from _statements(getattr(node, part, ()))
 
 
 def room_of(module: str) -> str:

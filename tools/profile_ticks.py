@@ -4,9 +4,7 @@
 
 Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
 with as many as there are cores. Processor time is told apart as seconds of the log (a fixed number of records is looked at: poses, clocks,
-mounts, what is loaded), milliseconds of a tick, and seconds of 100 m of way (map and lanes). With `--parts`, parts are the packages whose functions a thread is in, found by looking at all threads
-every few milliseconds and giving the processor time that each took since then to the function it is in. Kept detections are
-not used. Linux only.
+mounts, what is loaded), milliseconds of a tick, and seconds of 100 m of way (map and lanes). Kept detections are not used.
 """
 
 from __future__ import annotations
@@ -16,14 +14,11 @@ import json
 import os
 import statistics
 import sys
-import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -32,7 +27,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from benchmarks.table import markdown
 
-import log2sim
 from log2sim.config import Config
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError
@@ -42,12 +36,7 @@ from log2sim.perception.sync import Schedule
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.report import Run
 
-PACKAGE = str(Path(log2sim.__file__).parent) + os.sep
-TASKS = Path("/proc/self/task")
-PERIOD_S = 0.008
 DETECTORS = ("labels", "lidar:vehicle", "labels+lidar:vehicle", "ssd-mobilenet-v2+lidar:vehicle")
-DETECTING = ("perception.detect", "perception.detect3d", "libraries")
-LIBRARIES = "libraries"
 WARM_UP_TICKS = 4
 # Stages that look at so many records of a log at most, and those that draw the ground along the way; all others go tick by tick.
 OF_LOG, OF_WAY = ("poses", "calibration", "registration", "sync"), ("pictures", "lanes")
@@ -63,76 +52,12 @@ class Times:
 
 @dataclass
 class Measured:
-    """One run: its times, and those of its stages and parts."""
+    """One run: its times, and those of its stages."""
 
     times: Times
     ticks: int
     way_m: float
     stages: dict[str, Times]
-    parts: Counter[str]
-    functions: Counter[str]
-
-
-class Sampler(threading.Thread):
-    """Processor time of all threads by the function of log2sim that they are in."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.functions: Counter[str] = Counter()
-        self._spent: dict[int, float] = thread_seconds()
-        self._done = threading.Event()
-
-    def __enter__(self) -> Sampler:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._done.set()
-        self.join()
-
-    def run(self) -> None:
-        while not self._done.wait(PERIOD_S):
-            self._look()
-        self._look()
-
-    def _look(self) -> None:
-        frames = sys._current_frames()
-        inside = {thread.native_id: frames.get(thread.ident or 0) for thread in threading.enumerate()}
-        for task, seconds in thread_seconds().items():
-            spent = seconds - self._spent.get(task, 0.0)
-            self._spent[task] = seconds
-            if spent > 0 and task != self.native_id:
-                self.functions[function_of(inside.get(task))] += spent
-
-
-def thread_seconds() -> dict[int, float]:
-    """Processor seconds of all threads of this process, those of libraries included."""
-    out = {}
-    for task in TASKS.iterdir():
-        try:
-            out[int(task.name)] = int((task / "schedstat").read_text().split()[0]) * 1e-9
-        except OSError:  # it ended meanwhile
-            continue
-    return out
-
-
-def function_of(frame: FrameType | None) -> str:
-    """Name of the innermost function of log2sim around a frame; "libraries" for a thread that Python did not start."""
-    if frame is None:
-        return LIBRARIES
-    while frame is not None:
-        path = frame.f_code.co_filename
-        if path.startswith(PACKAGE):
-            module = path[len(PACKAGE) : -len(".py")].replace(os.sep, ".")
-            return f"{module}.{frame.f_code.co_name}"
-        frame = frame.f_back
-    return "other"
-
-
-def part_of(function: str) -> str:
-    """Package that a function belongs to: two names of perception, lanes and agents, else the first."""
-    names = function.split(".")[:-1] or [function]
-    return ".".join(names[: 2 if names[0] == "perception" else 1])
 
 
 def times_of(call: Callable[[], Any]) -> tuple[Any, Times]:
@@ -162,47 +87,26 @@ def floor_of(log: Log, wanted: Sequence[tuple[str, int]], threads: int) -> Times
     """Times to read and decode records with some threads."""
     records = RecordSource(log)
 
-    def read(record: tuple[str, int]) -> None:
-        records.get(*record)
-
     def read_all() -> None:
-        if threads == 1:
-            for record in wanted:
-                read(record)
-            return
         with ThreadPoolExecutor(threads) as pool:
-            for _ in pool.map(read, wanted):
+            for _ in pool.map(lambda record: records.get(*record), wanted):
                 pass
 
     return times_of(read_all)[1]
 
 
-def measure(
-    open_anew: Callable[[], Log], config: Config, *, jobs: int | None = None, sampled: bool = False
-) -> tuple[Measured, Schedule]:
-    """Run all stages on a log that is opened anew; `sampled` in one process, a fifth slower, with its parts."""
-    log, kept = open_anew(), list[Run]()
+def measure(open_anew: Callable[[], Log], config: Config, jobs: int | None = None) -> tuple[Measured, Schedule]:
+    """Run all stages on a log that is opened anew."""
+    log = open_anew()
 
-    def reconstruct() -> None:
-        run = start(log, config, cache=False, jobs=1 if sampled else jobs)
-        kept.append(run)
-        observations = observe_log(run)
-        infer_scenario(run, observations)
+    def reconstruct() -> Run:
+        run = start(log, config, cache=False, jobs=jobs)
+        infer_scenario(run, observe_log(run))
+        return run
 
-    functions: Counter[str] = Counter()
-    if sampled:
-        with Sampler() as sampler:
-            _, times = times_of(reconstruct)
-        functions = sampler.functions
-    else:
-        _, times = times_of(reconstruct)
-    run = kept[0]
-    cpu = run.clock.cpu_seconds
-    stages = {name: Times(seconds, cpu[name]) for name, seconds in run.clock.seconds.items()}
-    parts: Counter[str] = Counter()
-    for name, seconds in functions.items():
-        parts[part_of(name)] += seconds
-    return Measured(times, len(run.schedule), way_of(run), stages, parts, functions), run.schedule
+    run, times = times_of(reconstruct)
+    stages = {name: Times(seconds, run.clock.cpu_seconds[name]) for name, seconds in run.clock.seconds.items()}
+    return Measured(times, len(run.schedule), way_of(run), stages), run.schedule
 
 
 def way_of(run: Run) -> float:
@@ -240,7 +144,7 @@ def profile(open_anew: Callable[[], Log], options: argparse.Namespace) -> Iterat
     floors: dict[tuple[str, int], list[Times]] = {}
     for _ in range(options.repeats):
         for name, config in configs.items():
-            measured, schedule = measure(open_anew, config, jobs=options.jobs, sampled=options.parts)
+            measured, schedule = measure(open_anew, config, options.jobs)
             runs[name].append(measured)
             for count in sorted({1, threads}):
                 floor = floor_of(open_anew(), records_of(schedule), count)
@@ -256,14 +160,12 @@ def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, lis
     def ms(values: list[float]) -> float:
         return round(1e3 * statistics.median(values) / ticks, 2)
 
-    parts = {k: ms([r.parts[k] for r in runs]) for k in {k for r in runs for k in r.parts}}
-    functions = {k: ms([r.functions[k] for r in runs]) for k in {k for r in runs for k in r.functions}}
     wall, cpu = ms([r.times.wall_s for r in runs]), ms([r.times.cpu_s for r in runs])
     floor = {n: {"wall": ms([t.wall_s for t in f]), "cpu": ms([t.cpu_s for t in f])} for n, f in floors.items()}
     of_way = statistics.median(sum(r.stages[k].cpu_s for k in OF_WAY if k in r.stages) for r in runs)
     each = [sum(v.cpu_s for k, v in r.stages.items() if k not in (*OF_LOG, *OF_WAY)) for r in runs]
     fixed_s = statistics.median(r.times.cpu_s - e for r, e in zip(runs, each)) - of_way
-    detecting = sum(parts.get(name, 0.0) for name in DETECTING)
+    detecting = ms([r.stages["detect"].cpu_s for r in runs]) if "detect" in runs[0].stages else 0.0
     return {
         "log": log.name,
         "detector": detector,
@@ -283,13 +185,11 @@ def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, lis
             k: {"wall": ms([r.stages[k].wall_s for r in runs]), "cpu": ms([r.stages[k].cpu_s for r in runs])}
             for k in runs[0].stages
         },
-        "parts_cpu_ms": dict(sorted(parts.items(), key=lambda item: -item[1])),
-        "functions_cpu_ms": dict(sorted(functions.items(), key=lambda item: -item[1])[:40]),
     }
 
 
-def show(found: list[dict[str, Any]], functions: int) -> str:
-    """Tables of rates, stages and parts."""
+def show(found: list[dict[str, Any]]) -> str:
+    """Tables of rates and stages."""
     rates, rest = [], []
     for f in found:
         one, most = min(f["floor_ms"]), max(f["floor_ms"])
@@ -303,12 +203,6 @@ def show(found: list[dict[str, Any]], functions: int) -> str:
         rest.append(f"\n{f['log']}, `{f['detector']}`, ms a tick\n")
         stages = f["stages_ms"].items()
         rest.append(markdown(["stage", "wall", "cpu"], [[k, f"{v['wall']:.1f}", f"{v['cpu']:.1f}"] for k, v in stages]))
-        for title, key, most_rows in (
-            ("part", "parts_cpu_ms", len(f["parts_cpu_ms"])),
-            ("function", "functions_cpu_ms", functions),
-        ):
-            rows = [[k, f"{v:.1f}"] for k, v in f[key].items() if v >= 0.05][:most_rows]
-            rest += ["", markdown([title, "cpu"], rows)] if rows else []
     head = [
         "log", "detector", "ticks", "ticks/s", "wall ms", "cpu ms", "s a log", "ms a tick", "s a 100 m", "detector cpu", "floor cpu", "floor wall, all threads",
         "cpu / floor", "without detector / floor",
@@ -326,10 +220,6 @@ def main() -> int:
     parser.add_argument(
         "--jobs", type=int, metavar="N", help="processes that share the ticks; by default the usable cores"
     )
-    parser.add_argument(
-        "--parts", action="store_true", help="look where one process is every few milliseconds, which costs a fifth"
-    )
-    parser.add_argument("--functions", type=int, default=0, metavar="N", help="lines of functions")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of reconstruct")
     parser.add_argument("--json", action="store_true", help="all figures as JSON")
     options = parser.parse_args()
@@ -342,7 +232,7 @@ def main() -> int:
             return open_log(path, sequence=options.sequence)
 
         found += profile(open_anew, options)
-    print(json.dumps(found, indent=1) if options.json else show(found, options.functions))
+    print(json.dumps(found, indent=1) if options.json else show(found))
     return 0
 
 

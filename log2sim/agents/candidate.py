@@ -26,17 +26,10 @@ REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """The ticks of a run.
+    """The ticks of a run."""
 
-    Attributes
-    ----------
-    t_ns : (T,) int64
-    t0_ns : int
-        Start of the scenario.
-    """
-
-    t_ns: NDArray[np.int64]
-    t0_ns: int
+    t_ns: NDArray[np.int64]  # (T,)
+    t0_ns: int  # start of the scenario
 
     def seconds(self, t_ns: NDArray[np.int64]) -> Array:
         """Convert stamps to seconds since the start."""
@@ -45,21 +38,13 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class AgentCandidate:
-    """An agent made of one track, with what it is made of.
-
-    Attributes
-    ----------
-    track : Track
-        Whose measurements, one at each of its ticks, the agent is made of.
-    geometry : TrackGeometry
-        Size of the track, and positions at its measurements.
-    followed : float
-        As many independent ticks as those at which points fit the predicted box at places without a detection, free at other times.
-    """
+    """An agent made of one track, with what it is made of."""
 
     agent: Agent
-    track: Track
-    geometry: TrackGeometry
+    track: Track  # whose measurements, one at each of its ticks, the agent is made of
+    geometry: TrackGeometry  # size of the track, and positions at its measurements
+    # As many independent ticks as those at which points fit the predicted box at places without a detection, free at other
+    # times
     followed: float = 0.0
 
     def doubted(self, doubts: Sequence[Finding]) -> Self:
@@ -72,6 +57,13 @@ def candidate_of(
 ) -> AgentCandidate:
     """Make a candidate of a track, its geometry and waypoints; `quality` is added to that of the track."""
     length, width, height = (float(v) for v in geometry.size_m)
+    m = track.measurements
+    of_track = {
+        "detections": len(m),
+        "without_lidar": int((m.source != "lidar").sum()),
+        "points_median": float(np.median(m.points)),
+        "score_max": round(float(m.score.max()), 4),
+    }
     agent = Agent(
         id="",
         category=track.category,
@@ -79,19 +71,9 @@ def candidate_of(
         waypoints=waypoints,
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
-        quality=_quality_of(track) | quality,
+        quality=of_track | quality,
     )
     return AgentCandidate(agent, track, geometry)
-
-
-def _quality_of(track: Track) -> dict[str, Any]:
-    m = track.measurements
-    return {
-        "detections": len(m),
-        "without_lidar": int((m.source != "lidar").sum()),
-        "points_median": float(np.median(m.points)),
-        "score_max": round(float(m.score.max()), 4),
-    }
 
 
 def name_agents(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:

@@ -32,25 +32,13 @@ MIN_KEPT_TICKS = 2
 
 @dataclass(frozen=True, eq=False)
 class Conflict:
-    """Two agents in one place.
+    """Two agents in one place."""
 
-    Attributes
-    ----------
-    first, second : int
-        Indices of the agents.
-    tick : (n,) intp
-        When.
-    share : (n,) float64
-        Of the smaller box that they share.
-    depth_m : (n,) float64
-        By which one of them would have to move to be apart.
-    """
-
-    first: int
+    first: int  # `first`, `second`: indices of the agents
     second: int
-    tick: NDArray[np.intp]
-    share: Array
-    depth_m: Array
+    tick: NDArray[np.intp]  # (n,): when
+    share: Array  # (n,): of the smaller box that they share
+    depth_m: Array  # (n,): by which one of them would have to move to be apart
 
 
 def find_conflicts(
@@ -104,14 +92,7 @@ def _depths(a: Array, b: Array) -> Array:
 def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[AgentCandidate]:
     """Trim the less likely one of two candidates that are in one place, and drop those that are in the ego all the time.
 
-    Parameters
-    ----------
-    candidates : sequence of AgentCandidate
-        Their confidence says which is more likely.
-    ego : Agent, optional
-        It is where it is.
-    t_s : (T,) float64
-        Ticks.
+    The confidence of the candidates says which is more likely; the ego is where it is. `t_s`: (T,): ticks.
 
     Notes
     -----

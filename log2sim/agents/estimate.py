@@ -44,11 +44,7 @@ def estimate_agents(
 ) -> list[AgentCandidate]:
     """Make a candidate of every object that the tracks show, moving ones first.
 
-    Parameters
-    ----------
-    obstacles : T clouds, None at ticks without LiDAR
-    smooth : bool
-        Whether trajectories are smoothed.
+    `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed.
     """
     parts = [part for track in tracks for part in explain_track(track)]
     candidates = [moving_candidate(p.track, obstacles, timeline, smooth=smooth) for p in parts if not p.static]
@@ -145,20 +141,14 @@ def ego_path(log: Log, schedule: Schedule) -> Array:
 
 def with_observers(candidate: AgentCandidate, agent: Agent, timeline: Timeline) -> Agent:
     """Return an agent with the spans of time in which each end measured the candidate that it was made of."""
-    track = candidate.track
-    spans = {
-        end: spans_of_ticks(track.tick[seen], timeline)
-        for end, seen in zip(ENDS, track.measurements.seen_by.T)
-        if seen.any()
-    }
+    spans: dict[str, tuple[Span, ...]] = {}
+    for end, seen in zip(ENDS, candidate.track.measurements.seen_by.T):
+        tick = candidate.track.tick[seen]
+        # A span goes on over as many missing ticks as a track does.
+        parts = np.split(tick, np.flatnonzero(np.diff(tick) > MAX_MISSES + 1) + 1) if len(tick) else []
+        at_s = [timeline.seconds(timeline.t_ns[part[[0, -1]]]).tolist() for part in parts]
+        spans |= {end: tuple((first, last) for first, last in at_s)} if at_s else {}
     return replace(agent, observed_by=spans)
-
-
-def spans_of_ticks(tick: NDArray[np.int64], timeline: Timeline) -> tuple[Span, ...]:
-    """Return the spans, s, of rising ticks (n,); one goes on over as many missing ticks as a track does."""
-    t_s = timeline.seconds(timeline.t_ns[tick])
-    parts = np.split(t_s, np.flatnonzero(np.diff(tick) > MAX_MISSES + 1) + 1)
-    return tuple((float(part[0]), float(part[-1])) for part in parts)
 
 
 # Largest deviation of an omitted waypoint from the line between its neighbors: x, y, z, yaw, speed.
@@ -170,30 +160,19 @@ MAX_INTERVAL_S = 1.0
 
 def simplify(agents: Sequence[Agent]) -> list[Agent]:
     """Leave out waypoints of straight motion at constant speed; `quality` counts those left out."""
-    return [_simplified(agent) for agent in agents]
+    out = []
+    for agent in agents:
+        waypoints = simplify_waypoints(agent.waypoints)
+        omitted = len(agent.waypoints) - len(waypoints)
+        quality = {**agent.quality, "waypoints_left_out": omitted}
+        out.append(replace(agent, waypoints=waypoints, quality=quality) if omitted else agent)
+    return out
 
 
-def _simplified(agent: Agent) -> Agent:
-    waypoints = simplify_waypoints(agent.waypoints)
-    omitted = len(agent.waypoints) - len(waypoints)
-    if not omitted:
-        return agent
-    return replace(agent, waypoints=waypoints, quality={**agent.quality, "waypoints_left_out": omitted})
-
-
-def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
+def simplify_waypoints(w: Waypoints) -> Waypoints:
     """Leave out the waypoints that linear interpolation restores, keeping intervals of at most `MAX_INTERVAL_S`.
 
-    Where `observed` changes, both neighbors are kept.
-    """
-    kept = waypoints_to_keep(waypoints)
-    if len(kept) == len(waypoints):
-        return waypoints
-    return waypoints.take(kept)
-
-
-def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
-    """Select the indices (K,) of the waypoints to keep, first and last among them.
+    Where `observed` changes, both neighbors are kept; so are the first and the last one.
 
     Notes
     -----
@@ -211,7 +190,7 @@ def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
             else:
                 step //= 2
         kept.append(start + reach)
-    return np.array(kept, dtype=np.intp)
+    return w.take(np.array(kept, dtype=np.intp)) if len(kept) < len(w) else w
 
 
 def _toleranced(w: Waypoints) -> tuple[Array, Array]:
@@ -311,24 +290,19 @@ def _view_of(azimuth_rad: Array) -> tuple[float, float]:
 
 def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:
     """Return the cameras of a log with their homographies, as a scenario states them."""
-    return [_camera_entry(name, homographies.get(name), name in used) for name in log.cameras]
-
-
-def _camera_entry(name: str, ground: CameraHomography | None, used: bool) -> dict[str, Any]:
-    if ground is None or not ground.fit.ok:
-        return {"name": name, "used": used, "homography": None}
-    fit = ground.fit
-    finite_error = float(fit.error_m) if np.isfinite(fit.error_m) else None
-    return {
-        "name": name,
-        "used": used,
-        "homography": {
-            "ground_H_image": fit.ground_H_image.tolist(),
-            "source": ground.source,
-            "inliers": int(fit.inliers.sum()),
-            "correspondences": len(fit.inliers),
-            "error_m": finite_error,
-            "condition": float(fit.condition),
-            "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
-        },
-    }
+    entries = []
+    for name in log.cameras:
+        ground, homography = homographies.get(name), None
+        if ground is not None and ground.fit.ok:
+            fit = ground.fit
+            homography = {
+                "ground_H_image": fit.ground_H_image.tolist(),
+                "source": ground.source,
+                "inliers": int(fit.inliers.sum()),
+                "correspondences": len(fit.inliers),
+                "error_m": float(fit.error_m) if np.isfinite(fit.error_m) else None,
+                "condition": float(fit.condition),
+                "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
+            }
+        entries.append({"name": name, "used": name in used, "homography": homography})
+    return entries

@@ -80,21 +80,11 @@ WEIGHTS = {(False, True): LOW, (False, False): LOW_IN_PART, (True, True): TALL, 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Which cells have points.
+    """Which cells have points."""
 
-    Attributes
-    ----------
-    cells : (`LENGTH_CELLS`, `HEIGHT_CELLS`) bool
-        From back to front and from the ground up.
-    height_m : float
-        Of the highest points.
-    view : float
-        Cosine of the angle from the yaw to the mean viewpoint.
-    """
-
-    cells: NDArray[np.bool_]
-    height_m: float
-    view: float
+    cells: NDArray[np.bool_]  # (`LENGTH_CELLS`, `HEIGHT_CELLS`): from back to front and from the ground up
+    height_m: float  # of the highest points
+    view: float  # cosine of the angle from the yaw to the mean viewpoint
 
     @property
     def kind(self) -> tuple[bool, bool]:
@@ -111,11 +101,7 @@ class Outline:
 def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tuple[float, float, float]) -> float:
     """Return the log-odds that a vehicle's front is where its yaw points, by its LiDAR points; 0 for too few.
 
-    Parameters
-    ----------
-    t_s : (n,) float64, s
-        Times of the n measurements of the track since the start.
-    size_m : (3,) tuple of float, m
+    `t_s`: (n,), s: times of the n measurements of the track since the start. `size_m`: (3,), m.
 
     Notes
     -----
@@ -146,14 +132,8 @@ def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tup
 def outline_of(xyz: Array, size_m: Array, view_m: Array) -> Outline | None:
     """Make the outline of the points of a vehicle; None for fewer than `MIN_POINTS` in its box.
 
-    Parameters
-    ----------
-    xyz : (N, 3) float64, m
-        x along the length and y to the left from the center of the box, z from the ground.
-    size_m : (3,) float64
-        Length, width, height.
-    view_m : (2,) float64, m
-        Mean viewpoint, as the points.
+    `xyz`: (N, 3), m: x along the length and y to the left from the center of the box, z from the ground. `size_m`: (3,):
+    length, width, height. `view_m`: (2,), m: mean viewpoint, as the points.
     """
     length, width, height = size_m
     beside = (np.abs(xyz[:, 1]) < width / 2 + BESIDE_M) & (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < height)
@@ -206,10 +186,7 @@ FAR_M = 500.0
 def side_log_odds(paths: Sequence[Array]) -> float:
     """Return the log-odds that traffic keeps to the right, from vehicles that meet each other.
 
-    Parameters
-    ----------
-    paths : sequence of (K, 3) float64
-        x, y in m and heading in rad of each vehicle that moved, the ego among them.
+    `paths`: (K, 3) each: x, y in m and heading in rad of each vehicle that moved, the ego among them.
 
     Notes
     -----
@@ -236,12 +213,7 @@ def side_log_odds(paths: Sequence[Array]) -> float:
 def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -> float:
     """Return the log-odds that the street's direction where something stands is along its yaw, by the traffic next to it.
 
-    Parameters
-    ----------
-    pose : (3,) float64
-        x, y in m and yaw in rad.
-    paths : sequence of (K, 3) float64
-        As in `side_log_odds`.
+    `pose`: (3,): x, y in m and yaw in rad. `paths`: (K, 3) each: as in `side_log_odds`.
 
     Notes
     -----
@@ -267,21 +239,11 @@ def street_axis(xy: Array, paths: Sequence[Array]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _Passing:
-    """How a path passes a place.
+    """How a path passes a place."""
 
-    Attributes
-    ----------
-    left_m : float
-        Of the place, to the left of the path.
-    heading_rad : float
-        Of the path.
-    belongs : float
-        Probability that the place belongs to its street.
-    """
-
-    left_m: float
-    heading_rad: float
-    belongs: float
+    left_m: float  # of the place, to the left of the path
+    heading_rad: float  # of the path
+    belongs: float  # probability that the place belongs to its street
 
     @property
     def weight(self) -> float:
@@ -327,35 +289,19 @@ ALIKE_ALONG, ALIKE_ACROSS = 0.93, 0.76
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Vehicles that stand in one row.
+    """Vehicles that stand in one row."""
 
-    Attributes
-    ----------
-    members : (R,) int64
-    toward : (R,) float64
-        1 for those whose yaw is that of the first member within a right angle, -1 for the others.
-    alike : float
-        Probability that a member points in the direction of the row.
-    """
-
-    members: NDArray[np.int64]
-    toward: Array
-    alike: float
+    members: NDArray[np.int64]  # (R,)
+    toward: Array  # (R,): 1 for those whose yaw is that of the first member within a right angle, -1 for the others
+    alike: float  # probability that a member points in the direction of the row
 
     def joint(self, own: Array, street: Array) -> tuple[float, Array]:
         """Combine what is known of each of M vehicles with what is known of the street.
 
-        Parameters
-        ----------
-        own, street : (M,) float64
-            Log-odds that a vehicle points along its yaw, and that the street goes that way.
+        `own`, `street`: (M,): log-odds that a vehicle points along its yaw, and that the street goes that way.
 
-        Returns
-        -------
-        log_likelihood : float
-            Of all that is known of the members, given what is known of the street.
-        chance : (R,) float64
-            Probability that each member points along its yaw, given all.
+        Returns `log_likelihood`: of all that is known of the members, given what is known of the street; `chance`: (R,):
+        probability that each member points along its yaw, given all.
         """
         # Everything below is in the direction of the first member: first column for it, second against it.
         known = probability_of(np.outer(self.toward * own[self.members], [1.0, -1.0]))
@@ -373,13 +319,7 @@ class Row:
 def find_rows(poses: Array, lengths_m: Array, stands: NDArray[np.int64]) -> list[Row]:
     """Group those of M vehicles that stand into rows; one without neighbors, or that moves, is a row of its own.
 
-    Parameters
-    ----------
-    poses : (M, 3) float64
-        x, y in m and yaw in rad up to half turns.
-    lengths_m : (M,) float64
-    stands : (S,) int64
-        Which of them stand.
+    `poses`: (M, 3): x, y in m and yaw in rad up to half turns. `lengths_m`: (M,). `stands`: (S,): which of them stand.
     """
     in_line, beside = np.zeros((2, len(poses), len(poses)), dtype=bool)
     standing = np.zeros(len(poses), dtype=bool)
@@ -395,25 +335,18 @@ def find_rows(poses: Array, lengths_m: Array, stands: NDArray[np.int64]) -> list
     linked, label = beside | (in_line & ~lot & ~lot[:, None]), np.arange(len(poses))
     for i, j in zip(*np.nonzero(linked)):
         label[label == label[j]] = label[i]
-    return [_row(np.flatnonzero(label == k), poses, lot) for k in np.unique(label)]
-
-
-def _row(members: NDArray[np.int64], poses: Array, lot: NDArray[np.bool_]) -> Row:
-    toward = np.where(np.cos(poses[members, 2] - poses[members[0], 2]) > 0, 1.0, -1.0)
-    return Row(members, toward, ALIKE_ACROSS if lot[members].any() else ALIKE_ALONG)
+    rows = []
+    for members in (np.flatnonzero(label == k) for k in np.unique(label)):
+        toward = np.where(np.cos(poses[members, 2] - poses[members[0], 2]) > 0, 1.0, -1.0)
+        rows.append(Row(members, toward, ALIKE_ACROSS if lot[members].any() else ALIKE_ALONG))
+    return rows
 
 
 def headings_of(rows: Sequence[Row], own: Array, street: Array, right: float) -> Array:
     """Return the probability (M,) that each vehicle points along its yaw.
 
-    Parameters
-    ----------
-    own : (M,) float64
-        Log-odds by what is known of each alone.
-    street : (2, M) float64
-        Log-odds that the street goes that way, if traffic keeps right, and if it keeps left.
-    right : float
-        Log-odds that traffic keeps right, by other evidence.
+    `own`: (M,): log-odds by what is known of each alone. `street`: (2, M): log-odds that the street goes that way, if traffic
+    keeps right, and if it keeps left. `right`: log-odds that traffic keeps right, by other evidence.
 
     Notes
     -----
@@ -435,11 +368,7 @@ SAME_VEHICLE = 0.95
 def continued_log_odds(waypoints: Sequence[Waypoints], own: Array) -> Array:
     """Add to what is known of each of M candidates what is known of those that it continues, and that continue it.
 
-    Parameters
-    ----------
-    waypoints : M Waypoints
-    own : (M,) float64
-        Log-odds that each points along its yaw, by what is known of it alone.
+    `own`: (M,): log-odds that each points along its yaw, by what is known of it alone.
     """
     first = np.array([[w.t_s[0], w.x_m[0], w.y_m[0], w.yaw_rad[0]] for w in waypoints]).reshape(-1, 4)
     last = np.array([[w.t_s[-1], w.x_m[-1], w.y_m[-1], w.yaw_rad[-1]] for w in waypoints]).reshape(-1, 4)
@@ -469,17 +398,12 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     Each keeps its yaw or is turned round as a whole. How likely its heading is goes to its quality as
     `heading_confidence`; an unlikely one is doubted, and so is what moves as nothing of its category does.
 
-    Parameters
-    ----------
-    candidates : sequence of AgentCandidate
-        With a yaw, known up to half a turn, and a speed along it.
-    ego_path : (K, 3) float64
-        x, y and heading of the ego.
+    `candidates`: with a yaw, known up to half a turn, and a speed along it. `ego_path`: (K, 3): x, y and heading of the ego.
 
     Notes
     -----
     What is known of each alone (motion, boxes of a 3D detector, the outline of its points) is combined with the direction
-    of traffic beside it and with its neighbors (`rows.headings_of`), for traffic on either side of the road.
+    of traffic beside it and with its neighbors (`headings_of`), for traffic on either side of the road.
     """
     of = [k for k, c in enumerate(candidates) if GROUP_OF[c.agent.category] in ("vehicle", "two_wheeler")]
     road_users = [candidates[k] for k in of]
@@ -487,7 +411,8 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     own = continued_log_odds([c.agent.waypoints for c in road_users], alone)
     paths = [_path_of(c, odds) for c, odds in zip(road_users, own.tolist())]
     road_users = [_along_street(c, [ego_path, *paths]) for c in road_users]
-    poses = np.array([_middle_pose(c.agent.waypoints) for c in road_users])
+    middle = [(c.agent.waypoints, len(c.agent.waypoints) // 2) for c in road_users]
+    poses = np.array([[w.x_m[k], w.y_m[k], w.yaw_rad[k]] for w, k in middle])
     street = np.zeros((2, len(of)))
     for k, pose in enumerate(poses):
         others = [ego_path, *paths[:k], *paths[k + 1 :]]
@@ -532,12 +457,6 @@ def _along_street(candidate: AgentCandidate, paths: Sequence[Array]) -> AgentCan
     n = len(w.t_s)
     w = replace(w, yaw_rad=np.full(n, wrap_angle(yaw)), sigma_yaw_rad=np.full(n, sigma))
     return replace(candidate, agent=replace(candidate.agent, waypoints=w))
-
-
-def _middle_pose(w: Waypoints) -> Array:
-    """Return x, y and yaw (3,) of the waypoint in the middle."""
-    k = len(w.t_s) // 2
-    return np.array([w.x_m[k], w.y_m[k], w.yaw_rad[k]])
 
 
 def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:

@@ -147,18 +147,11 @@ MAX_SPLITS = 24
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Measurements of one object.
-
-    Attributes
-    ----------
-    static : bool
-        Whether it stands.
-    at_place : Track, optional
-        The measurements that agree on the place of an object that stands; those of the track without any that do not.
-    """
+    """Measurements of one object."""
 
     track: Track
-    static: bool
+    static: bool  # whether it stands
+    # The measurements that agree on the place of an object that stands; those of the track without any that do not
     at_place: Track | None = None
 
 
@@ -172,7 +165,8 @@ def explain_track(track: Track) -> list[Part]:
     """
     if len(track) < MIN_ROWS:
         return [Part(track, static=GROUP_OF[track.category] == "vehicle")]
-    positions, rows = _positions(track)
+    rows = _spread(len(track))
+    positions = _positions_of(track, rows)
     moving, at_rest = (marginal_likelihood(positions, motion) for motion in (_expected_motion(track), STANDING))
     log, parts = _standing_parts(track, positions)
     drives, starts = motion_of_ends(track)
@@ -210,13 +204,8 @@ def _expected_motion(track: Track) -> MotionPriorSigmas:
     return MotionPriorSigmas(FIRST_SPEED_MPS[group], ACCELERATION_MPS2[group])
 
 
-def _positions(track: Track) -> tuple[Positions, NDArray[np.intp]]:
-    """Return the positions of at most `MAX_ROWS` measurements, and the rows of these."""
-    rows = _spread(len(track))
-    return _positions_of(track, rows), rows
-
-
 def _spread(count: int) -> NDArray[np.intp]:
+    """Choose at most `MAX_ROWS` of so many rows."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_ROWS)).round().astype(np.intp))
 
 

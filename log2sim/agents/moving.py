@@ -18,7 +18,7 @@ from log2sim.agents.candidate import (
 )
 from log2sim.agents.size import TrackGeometry, independent, independent_along, moving_geometry
 from log2sim.agents.smooth import motion_model
-from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD, MotionModel
+from log2sim.agents.smooth.motion_model import SIGNIFICANT_SIGMAS, UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.agents.static import BoxState, LidarMatch, left_free, track_with_lidar
 from log2sim.config import TrackConfig
@@ -100,12 +100,7 @@ def _one_way(speed_mps: Array, step_s: Array, certain_m: float) -> float:
 def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Boxes3D]:
     """Turn the boxes of T sweeps round whose objects move the other way, and give all that move the probability of their front.
 
-    Parameters
-    ----------
-    found : T Boxes3D
-        Map frame.
-    t_ns : (T,) int64
-        Stamps of the sweeps.
+    `found`: map frame. `t_ns`: (T,): stamps of the sweeps.
 
     Notes
     -----
@@ -147,11 +142,9 @@ def _placed(boxes: Boxes3D) -> Measurements:
     )
 
 
-# Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`heading.course.forward_log_odds`); out of a driveway or
+# Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`forward_log_odds`); out of a driveway or
 # to a better parking space it is some car lengths.
 MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
-# A speed counts as beyond a limit where it is by as many of its own standard deviations.
-SIGNIFICANT_SIGMAS = 2.0
 # A measurement is far from the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
 # outlier.
 MIN_BESIDE = 2
@@ -166,10 +159,7 @@ MIN_COURSE_MPS, MAX_SLIP_RAD, MIN_ACROSS = 1.5, np.deg2rad(45.0), 3
 def motion_doubts(category: str, w: Waypoints) -> tuple[Finding, ...]:
     """Doubt what moves faster than its category does, or reverses fast or far.
 
-    Parameters
-    ----------
-    w : Waypoints
-        One at every tick.
+    `w`: one at every tick.
     """
     margin = 0.0 if w.sigma_speed_mps is None else SIGNIFICANT_SIGMAS * w.sigma_speed_mps
     fast = np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category]
@@ -182,14 +172,8 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Finding, ...]:
 def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Finding, ...]:
     """Doubt a smoothed trajectory where several measurements in a row are far from it.
 
-    Parameters
-    ----------
-    t_s : (n,) float64, s
-        Times of the measurements.
-    residual_m : (n,) float64, m
-        Distances from the trajectory; NaN where not used.
-    sigma_m : (n,) float64, m
-        Standard deviations of the measurements, changing views included.
+    `t_s`: (n,), s: times of the measurements. `residual_m`: (n,), m: distances from the trajectory; NaN where not used.
+    `sigma_m`: (n,), m: standard deviations of the measurements, changing views included.
     """
     beside = np.nan_to_num(residual_m) > np.sqrt(CHI2_2DOF_999) * sigma_m
     doubts = []
@@ -203,15 +187,7 @@ def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Finding,
 def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: Array) -> tuple[Finding, ...]:
     """Doubt a vehicle whose length was measured to lie across its way most of the time.
 
-    Parameters
-    ----------
-    m : BoxEvidence
-        n rows.
-    t_s : (n,) float64, s
-    heading_rad : (n,) float64
-        Of the trajectory at these times.
-    speed_mps : (n,) float64, m/s
-        There.
+    `m`: n rows. `t_s`: (n,), s. `heading_rad`: (n,): of the trajectory at these times. `speed_mps`: (n,), m/s: there.
     """
     has_box = np.isfinite(m.box_yaw_rad)
     axis = np.where(has_box, m.box_yaw_rad, m.yaw_rad)

@@ -95,20 +95,10 @@ def _near_rays(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pair M boxes with those of K rays that may meet them, at most `MAX_RAYS` in the azimuths of each.
 
-    Parameters
-    ----------
-    to_center : (M, 3) float64, m
-        From the sensor to the boxes.
-    size_m : (M, 3) float64
-    drift_m : (M,) float64
-        How far sensor and box move past each other during the sweep.
-    to : (K, 3) float64, m
-        From the sensor to the ends of the rays.
+    `to_center`: (M, 3), m: from the sensor to the boxes. `size_m`: (M, 3). `drift_m`: (M,): how far sensor and box move past
+    each other during the sweep. `to`: (K, 3), m: from the sensor to the ends of the rays.
 
-    Returns
-    -------
-    box, ray : (n,) intp
-        Indices of both. None for a box around the sensor.
+    Returns `box`, `ray`: (n,): indices of both. None for a box around the sensor.
     """
     if len(to) == 0:
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
@@ -137,15 +127,8 @@ def _near_rays(
 def classify_rays(start: Floats, to: Floats, yaw_rad: Array, size_m: Array) -> NDArray[np.int64]:
     """Return where each of n rays toward the solid part of its box ends, as `Ending` (n,).
 
-    Parameters
-    ----------
-    start : (n, 3) float64, m
-        Relative to the center of the box.
-    to : (n, 3) float64, m
-        From the start to the end.
-    yaw_rad : (n,) float64
-        Of the box.
-    size_m : (n, 3) float64
+    `start`: (n, 3), m: relative to the center of the box. `to`: (n, 3), m: from the start to the end. `yaw_rad`: (n,): of the
+    box. `size_m`: (n, 3).
     """
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     # One array for each axis: numpy takes several times as long for short last axes.

@@ -8,7 +8,7 @@ ends.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,25 +84,16 @@ CLEAR_LOG_ODDS = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Ends of the points of an object along its length and width in n views.
+    """Ends of the points of an object along its length and width in n views."""
 
-    Attributes
-    ----------
-    low, high : (n, 2) float64, m
-    real : (n, 2, 2) int
-        Kinds of the ends, see `box_completion.real_ends`.
-    gap_m : (n, 2, 2) float64
-        Distances between rays there, see `box_completion.end_gaps`.
-    """
-
-    low: Array
+    low: Array  # `low`, `high`: (n, 2), m
     high: Array
-    real: NDArray[np.int64]
-    gap_m: Array
+    real: NDArray[np.int64]  # (n, 2, 2): kinds of the ends, see `boxes.real_ends`
+    gap_m: Array  # (n, 2, 2): distances between rays there, see `boxes.end_gaps`
 
-    def take(self, rows: slice) -> Ends:
+    def take(self, rows: slice | NDArray[np.intp]) -> Ends:
         """Return the ends of some of the views."""
-        return Ends(self.low[rows], self.high[rows], self.real[rows], self.gap_m[rows])
+        return Ends(*(column[rows] for column in vars(self).values()))
 
     def swapped(self) -> Ends:
         """Return the ends along axes that are turned by a quarter turn."""
@@ -133,7 +124,7 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     m = track.measurements
     axis = mean_box_axis(m)
     yaw = boxes.fit_yaw(xy)[0] if axis is None else boxes.corrected_yaw(xy, axis)
-    low, high = boxes.extents(xy, yaw, max_trim_m=boxes.MAX_TRIM_M)
+    low, high = boxes.extents(xy, yaw)
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
     if track.category in BOXES:
         low, high = _reached(low, high, [m.points_of(k)[:, :2] - origin for k in rows.tolist()], yaw)
@@ -160,7 +151,7 @@ def _reached(low: Array, high: Array, views: list[Array], yaw_rad: float) -> tup
     """
     if not views:
         return low, high
-    each = [boxes.extents(xy, yaw_rad, max_trim_m=boxes.MAX_TRIM_M) for xy in views]
+    each = [boxes.extents(xy, yaw_rad) for xy in views]
     lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
     enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(views)), 2), len(views))
     return np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
@@ -185,38 +176,32 @@ def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: 
 
     Of an end that is seen from two viewpoints counts the better view.
 
-    Parameters
-    ----------
-    yaw_rad : (n,) float64
-        Of the object at each of them.
-    velocity_mps : (n, 2) float64
-        By which points are moved to where they were at the time of the measurement.
+    `yaw_rad`: (n,): of the object at each of them. `velocity_mps`: (n, 2): by which points are moved to where they were at the
+    time of the measurement.
     """
     views = track.measurements.views_of(rows)
     count, place = len(rows), {k: i for i, k in enumerate(rows.tolist())}
     of = np.array([place[k] for k, _ in views], dtype=np.intp)
     seen = _ends_in_views([view for _, view in views], yaw_rad[of], velocity_mps[of], track.category)
     out = seen.take(slice(count))
-    if len(views) == count:
-        return out
-    parts = [out.take(slice(i, i + 1)) for i in range(count)]
-    for j, i in enumerate(of[count:].tolist(), start=count):
-        ends = seen.take(slice(j, j + 1))
-        apart = boxes.rotate((views[j][1].sensor_m - views[i][1].sensor_m)[:2], -yaw_rad[i])
-        parts[i] = _better_ends(parts[i], replace(ends, low=ends.low + apart, high=ends.high + apart))
-    return join_ends(parts)
+    if len(views) > count:
+        second, sensor = of[count:], np.array([view.sensor_m[:2] for _, view in views])
+        apart = boxes.rotate(sensor[count:] - sensor[second], -yaw_rad[second])
+        other = seen.take(slice(count, None))
+        better = _better_ends(out.take(second), replace(other, low=other.low + apart, high=other.high + apart))
+        for name, column in vars(out).items():
+            column[second] = getattr(better, name)
+    return out
 
 
 def _ends_in_views(views: list[OtherView], yaw_rad: Array, velocity_mps: Array, category: str) -> Ends:
     """Find the ends of the points of viewpoints (n,), relative to them, for yaws (n,) and velocities (n, 2)."""
-    low, high, step = np.zeros((len(views), 2)), np.zeros((len(views), 2)), np.zeros(len(views))
-    for k, view in enumerate(views):
-        xy = view.cluster[:, :2] - view.sensor_m[:2]
-        if view.cluster.shape[1] > 3:
-            xy = xy - view.cluster[:, 3:] * velocity_mps[k]
-        local = boxes.rotate(xy, -yaw_rad[k])
-        low[k], high[k] = boxes.extents_of_rotated(local, max_trim_m=boxes.MAX_TRIM_M)
-        step[k] = boxes.azimuth_step_rad(local)
+    moved = [
+        v.cluster[:, :2] - v.sensor_m[:2] - (v.cluster[:, 3:] * velocity if v.cluster.shape[1] > 3 else 0.0)
+        for v, velocity in zip(views, velocity_mps)
+    ]
+    low, high = boxes.extents_of_clusters(np.concatenate(moved), np.array([len(xy) for xy in moved]), yaw_rad)
+    step = np.array([boxes.azimuth_step_rad(boxes.rotate(xy, -yaw)) for xy, yaw in zip(moved, yaw_rad)])
     visible = np.array([view.ends_visible for view in views], dtype=bool).reshape(-1, 2)
     real = boxes.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(category))
     return Ends(low, high, real, boxes.end_gaps(step, low, high, real))
@@ -237,11 +222,6 @@ def _better_ends(one: Ends, other: Ends) -> Ends:
 
 def _min_sine(category: str) -> float:
     return MIN_BOX_SIDE_SINE if category in BOXES else MIN_SIDE_SINE
-
-
-def join_ends(parts: list[Ends]) -> Ends:
-    """Join the ends of several views."""
-    return Ends(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Ends)))
 
 
 # Quantile of the lengths of fully observed sides that is taken for the size: stray points lengthen some, sparse points
@@ -265,28 +245,14 @@ HIGHEST_TRUCK_M, HIGHEST_TRUCK_LENGTH_M = 4.0, 14.25
 
 @dataclass(frozen=True, eq=False)
 class TrackGeometry:
-    """Size of a track, and the center of its box at each of its n measurements.
+    """Size of a track, and the center of its box at each of its n measurements."""
 
-    Attributes
-    ----------
-    size_m : (3,) float64
-        Length, width, height.
-    xy_m : (n, 2) float64
-    covariance : (n, 2, 2) float64
-        Of `xy_m`, m2.
-    z_m : (n,) float64
-    yaw_rad : float, optional
-        Of a static track, up to half turns.
-    is_likely : bool
-        Whether the observed size is one of its category.
-    """
-
-    size_m: Array
-    xy_m: Array
-    covariance: Array
-    z_m: Array
-    yaw_rad: float | None = None
-    is_likely: bool = True
+    size_m: Array  # (3,): length, width, height
+    xy_m: Array  # (n, 2)
+    covariance: Array  # (n, 2, 2): of `xy_m`, m2
+    z_m: Array  # (n,)
+    yaw_rad: float | None = None  # of a static track, up to half turns
+    is_likely: bool = True  # whether the observed size is one of its category
 
 
 def static_geometry(track: Track) -> TrackGeometry:
@@ -329,13 +295,9 @@ def _with_size_error(sigma_m: Array | float, box_size_m: Array | None, size_m: A
 def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = None) -> TrackGeometry:
     """Estimate the size of a moving track, and its center at every measurement.
 
-    Parameters
-    ----------
-    yaw_rad : (n,) float64
-        Heading at every measurement.
-    velocity_mps : (n, 2) float64, optional
-        Velocity there, by which its points are moved to where they were at the time of the measurement: a LiDAR takes
-        20 ms to sweep over a truck beside it, in which that goes on by 0.6 m at 30 m/s. Without it they stay.
+    `yaw_rad`: (n,): heading at every measurement. `velocity_mps`: (n, 2): velocity there, by which its points are moved to
+    where they were at the time of the measurement: a LiDAR takes 20 ms to sweep over a truck beside it, in which that goes on
+    by 0.6 m at 30 m/s. Without it they stay.
     """
     m = track.measurements
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])

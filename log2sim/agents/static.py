@@ -13,17 +13,16 @@ from log2sim.agents.hypotheses import Part, main_place
 from log2sim.agents.rays import Ending, classify_rays
 from log2sim.agents.size import TrackGeometry, independent, static_geometry
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Rays, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import (
     FACING_END,
-    MAX_TRIM_M,
     SENSOR_SIGMA_M,
     SIDE_END,
     UNIFORM_SIGMA,
     complete_box,
     corrected_yaw,
-    extents_of_rotated,
+    extents,
     facing_ends,
     oriented_covariance,
     rotate,
@@ -59,50 +58,26 @@ LONG_WIDTHS = 1.5
 
 @dataclass(frozen=True, eq=False)
 class LidarMatch:
-    """A tracked box found in the LiDAR points of a tick.
-
-    Attributes
-    ----------
-    t_ns : int
-        Mean time of its points.
-    xy_m : (2,) float64
-        Center, map frame.
-    covariance : (2, 2) float64
-        Of the center, m2.
-    yaw_rad : float
-        Direction of its sides; the predicted one where its points do not show it.
-    """
+    """A tracked box found in the LiDAR points of a tick."""
 
     tick: int
-    t_ns: int
-    xy_m: Array
-    covariance: Array
-    yaw_rad: float
+    t_ns: int  # mean time of its points
+    xy_m: Array  # (2,): center, map frame
+    covariance: Array  # (2, 2): of the center, m2
+    yaw_rad: float  # direction of its sides; the predicted one where its points do not show it
     points: int
 
 
 @dataclass(frozen=True, eq=False)
 class BoxState:
-    """A box of known size and its motion at one time, in the map frame.
-
-    Attributes
-    ----------
-    xy_m : (2,) float64
-        Center.
-    velocity_mps : (2,) float64
-        Zero for a static box, which is expected at the same position at every tick.
-    size_m : (3,) float64
-        Length, width, height.
-    bottom_m : float
-        Height of its bottom face.
-    """
+    """A box of known size and its motion at one time, in the map frame."""
 
     t_ns: int
-    xy_m: Array
-    velocity_mps: Array
+    xy_m: Array  # (2,): center
+    velocity_mps: Array  # (2,): zero for a static box, which is expected at the same position at every tick
     yaw_rad: float
-    size_m: Array
-    bottom_m: float
+    size_m: Array  # (3,): length, width, height
+    bottom_m: float  # height of its bottom face
 
 
 def track_with_lidar(
@@ -113,13 +88,8 @@ def track_with_lidar(
     A moving box is predicted with constant velocity, corrected at every match, and lost after `MAX_MISSES` ticks without a
     match in a row.
 
-    Parameters
-    ----------
-    obstacles : T clouds, None at ticks without LiDAR
-    ticks : sequence of int
-        Forward or backward in time from the state.
-    t_ns : (T,) int64
-        Stamps of all ticks.
+    `obstacles`: T clouds, None at ticks without LiDAR. `ticks`: forward or backward in time from the state. `t_ns`: (T,):
+    stamps of all ticks.
     """
     matches: list[LidarMatch] = []
     state, misses, is_static = start, 0, not start.velocity_mps.any()
@@ -213,7 +183,7 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     # The pose of what stands is known from all ticks.
     turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
     box = replace(box, yaw_rad=yaw_rad + turn_rad)
-    low, high = extents_of_rotated(rotate(local[inside], -turn_rad), max_trim_m=MAX_TRIM_M)
+    low, high = extents(local[inside], turn_rad)
     if np.any(high - low > size[:2] + 0.6):
         return None
     sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
@@ -287,12 +257,8 @@ def _ends_by_rays(
 ) -> tuple[NDArray[np.int64], Array]:
     """Find the ends next to which rays (K, 3) pass the sides that face the sensor, between two levels (2,).
 
-    Returns
-    -------
-    real : (2, 2) int
-        Kinds of the ends of the points, with those that face the sensor, `real`.
-    gap_m : (2, 2) float64
-        How far beyond the points the first ray passes.
+    Returns `real`: (2, 2): kinds of the ends of the points, with those that face the sensor, `real`; `gap_m`: (2, 2): how far
+    beyond the points the first ray passes.
     """
     ends, gap_m = real.copy(), np.zeros((2, 2))
     for across, side in np.argwhere(real == FACING_END).tolist():
@@ -331,47 +297,35 @@ def static_candidates(
     Their yaws are known up to half a turn.
     """
     geometries = [_geometry_of(part) for part in parts]
-    boxes = [_box_of(part.track, geometry, timeline) for part, geometry in zip(parts, geometries)]
+    boxes = []
+    for part, geometry in zip(parts, geometries):
+        yaw_rad = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
+        bottom_m = float(geometry.z_m[0]) - geometry.size_m[2] / 2
+        start_ns = int(timeline.t_ns[part.track.tick[0]])
+        boxes.append(BoxState(start_ns, geometry.xy_m[0], np.zeros(2), yaw_rad, geometry.size_m, bottom_m))
     matches = match_standing(obstacles, boxes, [part.track.tick for part in parts])
-    return [
-        _candidate(part.track, geometry, [m.tick for m in found], timeline)
-        for part, geometry, found in zip(parts, geometries, matches)
-    ]
-
-
-def _box_of(track: Track, geometry: TrackGeometry, timeline: Timeline) -> BoxState:
-    z = float(np.median(geometry.z_m))
-    start_ns = int(timeline.t_ns[track.tick[0]])
-    bottom_m = z - geometry.size_m[2] / 2
-    return BoxState(start_ns, geometry.xy_m[0], np.zeros(2), _yaw_of(geometry), geometry.size_m, bottom_m)
-
-
-def _yaw_of(geometry: TrackGeometry) -> float:
-    return 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
-
-
-def _candidate(track: Track, geometry: TrackGeometry, matched: Sequence[int], timeline: Timeline) -> AgentCandidate:
-    """Make an agent with one pose of a track that stands, whose box is matched at other ticks."""
-    xy, z, yaw = geometry.xy_m[0], float(np.median(geometry.z_m)), _yaw_of(geometry)
-    observed = np.union1d(track.tick, np.array(matched, dtype=np.int64))
-    life = np.unique(observed[[0, -1]])
-    n = len(life)
-    sigma = float(np.sqrt(np.trace(np.median(geometry.covariance, axis=0)) / 2))
-    waypoints = Waypoints(
-        t_s=timeline.seconds(timeline.t_ns[life]),
-        x_m=np.full(n, xy[0]),
-        y_m=np.full(n, xy[1]),
-        z_m=np.full(n, z),
-        yaw_rad=np.full(n, yaw),
-        speed_mps=np.zeros(n),
-        observed=np.ones(n, dtype=bool),
-        sigma_xy_m=np.full(n, sigma),
-        sigma_yaw_rad=np.full(n, yaw_sigma(track.measurements, geometry)),
-        sigma_speed_mps=np.full(n, standing_speed_sigma(track.measurements, CENTER_SIGMA_M[GROUP_OF[track.category]])),
-    )
-    share = len(observed) / (observed[-1] - observed[0] + 1)
-    quality = {"lidar_only": len(matched), "observed_share": round(float(share), 3)}
-    return candidate_of(track, geometry, waypoints, quality, static=True)
+    candidates = []
+    for part, geometry, box, found in zip(parts, geometries, boxes, matches):
+        track, m = part.track, part.track.measurements
+        observed = np.union1d(track.tick, np.array([match.tick for match in found], dtype=np.int64))
+        life = np.unique(observed[[0, -1]])
+        n = len(life)
+        waypoints = Waypoints(
+            t_s=timeline.seconds(timeline.t_ns[life]),
+            x_m=np.full(n, box.xy_m[0]),
+            y_m=np.full(n, box.xy_m[1]),
+            z_m=np.full(n, geometry.z_m[0]),
+            yaw_rad=np.full(n, box.yaw_rad),
+            speed_mps=np.zeros(n),
+            observed=np.ones(n, dtype=bool),
+            sigma_xy_m=np.full(n, np.sqrt(np.trace(geometry.covariance[0]) / 2)),
+            sigma_yaw_rad=np.full(n, yaw_sigma(m, geometry)),
+            sigma_speed_mps=np.full(n, standing_speed_sigma(m, CENTER_SIGMA_M[GROUP_OF[track.category]])),
+        )
+        share = len(observed) / (observed[-1] - observed[0] + 1)
+        quality = {"lidar_only": len(found), "observed_share": round(float(share), 3)}
+        candidates.append(candidate_of(track, geometry, waypoints, quality, static=True))
+    return candidates
 
 
 def _geometry_of(part: Part) -> TrackGeometry:

@@ -9,6 +9,7 @@ from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
+    from log2sim.visualization.plot.encoding import FilmFile
 
 
 def resimulate(
@@ -24,6 +25,10 @@ def resimulate(
     ] = None,
     cameras: Annotated[bool, opt.option("All cameras, too.", None, "--cameras")] = False,
     sequence: Annotated[str | None, opt.option("Sequence of a log with several.", "NAME")] = None,
+    film: Annotated[
+        Path | None,
+        opt.option("Film of a LiDAR, and a camera where they are simulated: recorded, simulated, now.", "FILE.webm"),
+    ] = None,
     seed: Annotated[int, opt.option("Seed of noise and lost returns.", min=0)] = 0,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
@@ -34,7 +39,7 @@ def resimulate(
     --------
     log2sim resimulate s.json --log samples/crossing -o simulated/
     log2sim edit s.json --lateral ego=2 -o left.json
-    log2sim resimulate s.json --log samples/crossing --replay left.json -o from_the_left/ --cameras
+    log2sim resimulate s.json --log samples/crossing --replay left.json -o from_the_left/ --cameras --film left.webm
     """
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
@@ -42,25 +47,33 @@ def resimulate(
     from log2sim.logs.native.writer import refuse_target
     from log2sim.logs.opening import open_log
     from log2sim.resim.simulate import resimulate as run
+    from log2sim.visualization.sensor_film import write_film
 
     refuse_target(out, overwrite=overwrite)
+    filmed = None if film is None else _film(film, overwrite=overwrite)
     source = Scenario.load(scenario)
     now = source if replay is None else _happening(replay, source)
     with progress(quiet=quiet) as report:
         recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
         notes = run(
-            recorded,
-            source,
-            now,
-            out,
-            sensors=opt.split_names(sensors),
-            cameras=cameras,
-            seed=seed,
-            overwrite=overwrite,
-            progress=report,
-        )
-    opt.say_all("note", notes, quiet=quiet)
-    opt.report_written(out, quiet=quiet)
+            recorded, source, now, out, sensors=opt.split_names(sensors), cameras=cameras, seed=seed, overwrite=overwrite, progress=report,
+            then=lambda simulation: None if filmed is None else write_film(simulation, source, filmed),
+        )  # fmt: skip
+    opt.say_all("note", (*notes, *([filmed.note] if filmed is not None and filmed.note else [])), quiet=quiet)
+    opt.report_written(out, None if filmed is None else filmed.path, quiet=quiet)
+
+
+def _film(path: Path, *, overwrite: bool) -> FilmFile:
+    """Choose how a film is written; raise `ConfigError` where it cannot be, before the long work."""
+    from log2sim.errors import ConfigError
+    from log2sim.files.documents import check_targets
+    from log2sim.visualization.plot.encoding import choose_film_file
+
+    if path.suffix.lower() not in (".mp4", ".webm"):
+        raise ConfigError(f"--film {path}: a film's name must end in .mp4 or .webm")
+    film = choose_film_file(path)
+    check_targets(film.path, overwrite=overwrite)
+    return film
 
 
 def _happening(path: Path, source: Scenario) -> Scenario:

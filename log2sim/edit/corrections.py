@@ -35,6 +35,8 @@ from log2sim.geometry import NS_PER_S, Array, wrap_angle
 MAX_AWAY_M = 1.0
 # A later run may begin or end a track by some ticks.
 MAX_OUTSIDE_S = 1.0
+# No camera or LiDAR shows an object beyond this.
+MAX_BEYOND_M = 1000.0
 # What a trajectory has wrong it has wrong for about as long as the view of an object stays the same.
 CORRELATION_S = 2.0
 # Some pixels of a map in which a car fills a tenth of the screen.
@@ -97,6 +99,8 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     ------
     ConfigError
         When two corrections contradict each other, or one cannot be: a split outside of the life of an agent.
+    ScenarioError
+        When they are of another log: its name differs, and none of them finds what it is about.
     """
     draft = _Draft(scenario, corrections.get("map_offset_m"))
     unmatched, applied = [], []
@@ -106,6 +110,11 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
             unmatched.append(f"correction {number} ({entry['kind']}): {missing}")
         else:
             applied.append(dict(entry))
+    name = corrections.get("log", scenario.name)
+    if unmatched and not applied and name != scenario.name:
+        raise ScenarioError(
+            f"the corrections are of log '{name}', the scenario is of '{scenario.name}': none of them finds what it is about; {unmatched[0]}"
+        )
     history = [*scenario.provenance.get("corrections", []), {"source_digest": scenario.digest, "corrections": applied}]
     return Corrected(draft.result(history), tuple(unmatched))
 
@@ -126,7 +135,14 @@ class _Draft:
     def result(self, history: list[Any]) -> Scenario:
         provenance = {**self.scenario.provenance, "corrections": history}
         features = self.features if self.features or self.scenario.map_features is not None else None
-        agents = tuple(self.agents.values())
+        known, end_s = {a.id for a in self.scenario.agents}, self.scenario.duration_s
+        agents = tuple(
+            # An added agent that was put at one place stands there all the time.
+            replace(a, waypoints=replace(a.waypoints.take(np.zeros(2, dtype=np.intp)), t_s=np.array([0.0, end_s])))
+            if a.is_permanent and a.id not in known and end_s > 0
+            else a
+            for a in self.agents.values()
+        )
         end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
         duration_s = max(self.scenario.duration_s, end_s)
         return replace(
@@ -136,6 +152,8 @@ class _Draft:
     def apply(self, number: int, entry: Mapping[str, Any]) -> str:
         """Apply one correction; return what it did not find, "" where it is done."""
         kind = entry["kind"]
+        if outside := self._outside(entry):
+            return outside
         if kind == "draw":
             self._draw(entry)
             return ""
@@ -183,6 +201,23 @@ class _Draft:
         else:
             self.agents[agent_id] = settled(_changed(agent, kind, entry), kind)
         return ""
+
+    def _outside(self, entry: Mapping[str, Any]) -> str:
+        """Say which place or time of a correction is outside of the map or the scenario; "" where none is."""
+        poses = self._poses(entry) if "poses" in entry else []
+        late_s = max((max(-p["t_s"], p["t_s"] - self.scenario.duration_s) for p in poses), default=0.0)
+        if late_s > MAX_OUTSIDE_S:
+            return f"a pose is {late_s:.1f} s before the beginning or after the end of the scenario"
+        points = [
+            *(np.array(p[:2]) + self.shift[:2] for p in entry.get("points_m", ())),
+            *([p["x_m"], p["y_m"]] for p in poses),
+        ]
+        known = [np.stack([a.waypoints.x_m, a.waypoints.y_m], axis=1) for a in self.agents.values()]
+        if not points or not known:
+            return ""
+        low, high = (f(np.concatenate(known), axis=0) for f in (np.min, np.max))
+        away_m = float(np.max([np.maximum(low - points, points - high)]))
+        return f"its path lies outside of the map, {away_m:.0f} m from all agents" if away_m > MAX_BEYOND_M else ""
 
     def _find(self, number: int, at: Mapping[str, Any]) -> str | None:
         """Return the id of the agent whose box is nearest to a place at a time; None where none is near enough."""
@@ -303,8 +338,13 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
     correlation time `over_s`; of a static agent it is the same at all times. A single pose of sigma s moves the place at its
     time by the Kalman gain sigma^2 / (sigma^2 + s^2) of its distance (Rasmussen and Williams, "Gaussian Processes for Machine
     Learning", 2006, section 2.2), and less before and after. Where the poses contradict the stated sigmas, there is a
-    further error, equally large at all times, which grows until the distance is as expected. A static agent that they put at different places moves through them.
+    further error, equally large at all times, which grows until the distance is as expected. A static agent that they put at
+    different places moves through them; the track of a moving one goes on to poses before its begin and after its end.
     """
+    if not agent.static:
+        agent, poses = _extended(agent, poses)
+        if not poses:
+            return agent
     key_s = np.array([p["t_s"] for p in poses])
     w = agent.waypoints
     apart_m = np.ptp([[p["x_m"], p["y_m"]] for p in poses], axis=0).max()
@@ -370,6 +410,24 @@ def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CO
         sigma_yaw_rad=sigma_yaw, visible=None, lidar_points=None,
     )  # fmt: skip
     return replace(agent, waypoints=waypoints)
+
+
+def _extended(agent: Agent, poses: Sequence[Mapping[str, float]]) -> tuple[Agent, list[Mapping[str, float]]]:
+    """Return the agent as it goes on through the poses outside of its life, and the other poses."""
+    w = agent.waypoints
+    early = [p for p in poses if p["t_s"] < w.t_s[0] - 1e-6]
+    late = [p for p in poses if p["t_s"] > w.t_s[-1] + 1e-6]
+    for at, outside in ((0, early), (-1, late)):
+        if outside:
+            end = {k: float(getattr(w, k)[at]) for k in ("t_s", "x_m", "y_m", "z_m")}
+            velocity = float(w.speed_mps[at]) * np.array([np.cos(w.yaw_rad[at]), np.sin(w.yaw_rad[at]), 0.0])
+            path = sorted([end, *({"z_m": end["z_m"], **p} for p in outside)], key=lambda p: p["t_s"])
+            ends = ((2, np.zeros(3)), (1, velocity)) if at == 0 else ((1, velocity), (2, np.zeros(3)))
+            more = added(agent.category, agent.size_m, path, agent.id, ends).waypoints
+            more = more.take(more.t_s < end["t_s"] if at == 0 else more.t_s > end["t_s"])
+            parts = [p.columns() for p in ((w, more) if at else (more, w))]
+            w = Waypoints(**{k: np.concatenate([part[k] for part in parts]) for k in parts[0] if k in parts[1]})
+    return replace(agent, waypoints=w), [p for p in poses if p not in early and p not in late]
 
 
 def merge_agents(agent: Agent, other: Agent) -> Agent:
@@ -473,8 +531,13 @@ def _joined(first: Agent, last: Agent) -> Waypoints:
     return Waypoints(**{k: np.concatenate([w.columns()[k] for w in (a, middle, b)]) for k in common})
 
 
-def added(category: str, size_m: Sequence[float], poses: Sequence[Mapping[str, float]], name: str) -> Agent:
-    """Return an agent that passes key poses on the path of least acceleration, static where there is one pose or all are one place."""
+def added(
+    category: str, size_m: Sequence[float], poses: Sequence[Mapping[str, float]], name: str, ends: Any = "natural"
+) -> Agent:
+    """Return an agent that passes key poses on the path of least acceleration, static where there is one pose or all are one place.
+
+    `ends`: boundary conditions, as `scipy.interpolate.CubicSpline` has them; with them the agent moves.
+    """
     from scipy.interpolate import CubicSpline
 
     length, width, height = map(float, size_m)
@@ -482,7 +545,7 @@ def added(category: str, size_m: Sequence[float], poses: Sequence[Mapping[str, f
     at = np.array([[p["x_m"], p["y_m"], p["z_m"]] for p in poses])
     sigma = np.array([p.get("sigma_m", POSE_SIGMA_M) for p in poses])
     given = np.array([p.get("yaw_rad", np.nan) for p in poses])
-    static = bool(np.ptp(at[:, :2], axis=0).max() <= POSE_SIGMA_M)
+    static = ends == "natural" and bool(np.ptp(at[:, :2], axis=0).max() <= POSE_SIGMA_M)
     if static:
         one = np.ones(1)
         yaw = given[np.isfinite(given)][:1] if np.isfinite(given).any() else 0 * one
@@ -490,12 +553,13 @@ def added(category: str, size_m: Sequence[float], poses: Sequence[Mapping[str, f
         return Agent(name, category, (length, width, height), waypoints, static=True)
     t_s = np.unique(np.concatenate([np.arange(key_s[0], key_s[-1], STEP_S), key_s]))
     t_s = t_s[np.concatenate([[True], np.diff(t_s) > 1e-6])]
-    spline = CubicSpline(key_s, at, bc_type="natural")
+    spline = CubicSpline(key_s, at, bc_type=ends)
     xyz, rate = spline(t_s), spline(t_s, 1)
     pace = np.hypot(rate[:, 0], rate[:, 1])
     course = np.unwrap(np.arctan2(rate[:, 1], rate[:, 0]))
-    # Where it stands it keeps the heading with which it came.
-    course = np.interp(t_s, t_s[pace > STANDSTILL_MPS], course[pace > STANDSTILL_MPS])
+    # Where it stands it keeps the heading with which it came; one that creeps all the time has that of its way.
+    moves = pace >= min(STANDSTILL_MPS, pace.max() / 2)
+    course = np.interp(t_s, t_s[moves], course[moves])
     waypoints = Waypoints(
         t_s,
         xyz[:, 0],

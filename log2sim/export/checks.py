@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Scenario, explain_doubt, list_doubtful
 from log2sim.errors import ScenarioError
-from log2sim.geometry import Array, bev_iou, box_corners_bev, rectangles_overlap, wrap_angle
+from log2sim.geometry import Array, rectangle_iou, rectangles_overlap, wrap_angle
 
 # Players that compute in float32 resolve 4 mm at this distance from the center; beyond, agents jitter.
 MAX_EXTENT_M = 65_536.0
@@ -167,11 +167,9 @@ class _Boxes:
     def iou(self, a: NDArray[np.intp], b: NDArray[np.intp]) -> Array:
         """Compute the IoU (P,) of pairs seen from above; 0 where one is absent or at another height."""
         x, y, z, yaw = self.states
-        corners = (
-            box_corners_bev(np.column_stack([x[k], y[k]]), self.size_m[k, 0], self.size_m[k, 1], yaw[k]) for k in (a, b)
-        )
+        boxes = (np.column_stack([x[k], y[k], self.size_m[k, :2], yaw[k]]) for k in (a, b))
         level = np.abs(z[a] - z[b]) <= (self.size_m[a, 2] + self.size_m[b, 2]) / 2  # False for NaN
-        return np.where(level, bev_iou(*corners), 0.0)
+        return np.where(level, rectangle_iou(*boxes), 0.0)
 
 
 def _states(agents: Sequence[Agent], t_s: Array) -> Array:

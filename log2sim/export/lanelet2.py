@@ -19,6 +19,7 @@ from log2sim.road.polyline import Polyline
 
 SHARED_M = 0.5  # edges whose ends are nearer than this are one way: lanes of log2sim are measured to some decimeters
 STOP_M = 8.0  # from a stop line to where its lane ends: across a crosswalk
+SIGN_M, SIGN_BOTTOM_M = 0.9, 2.0  # of a usual stop sign
 TURN_RAD = float(np.deg2rad(30.0))  # less is straight on
 TYPE_OF_MARK = {
     "solid": ("line_thin", "solid"), "broken": ("line_thin", "dashed"), "curb": ("curbstone", "high"), "none": ("virtual", None),
@@ -35,8 +36,8 @@ class Lanelet2:
 
     options: tuple[str, ...] = ()
     loses = (
-        "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; stop lines without a light are "
-        "ways that no lanelet names; `location` is always urban, and speed limits are not known"
+        "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "
+        "gets a stop sign at its right end (`log2sim_assumed`), since Lanelet2 has no stop line by itself; `location` is always urban, and speed limits are not known"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
@@ -47,17 +48,25 @@ class Lanelet2:
         features = scenario.map_features or MapFeatures()
         stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
         rules: dict[str, list[int]] = {lane.id: [] for lane in roads}
+        lit: set[int] = set()  # stop lines of lights
         for signal in scenario.signals:
             ahead = signal_lanes(signal, roads)
             members = [("way", _add_light(draft, signal), "refers")]
             if not ahead:
                 continue
-            members += [
-                ("way", number, "ref_line") for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)
-            ][:1]
+            lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
+            members += [("way", number, "ref_line") for number in lines]
+            lit |= set(lines)
             rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
             for lane in ahead:
                 rules[lane.id].append(rule)
+        for stop, number in stops:
+            ahead = [lane for lane in roads if number not in lit and _ends_at(lane, stop)]
+            if ahead:
+                members = [("way", _add_sign(draft, stop, ahead[0]), "refers"), ("way", number, "ref_line")]
+                rule = draft.relation(members, type="regulatory_element", subtype="traffic_sign", log2sim_assumed="yes")
+                for lane in ahead:
+                    rules[lane.id].append(rule)
         for lane in roads:
             members = [("way", way_of[lane.id, side], side) for side in ("left", "right")]
             members += [("relation", rule, "regulatory_element") for rule in rules[lane.id]]
@@ -198,13 +207,21 @@ def _border_tags(lane: MapLane, side: str, marks: MarkFinder) -> dict[str, str]:
 
 def _add_light(draft: _Draft, signal: Signal) -> int:
     """Add a traffic light as the lower edge of its housing, from the left to the right of who looks at it."""
-    x, y, z = signal.position_m
     across = 0.0 if signal.heading_rad is None else signal.heading_rad + np.pi / 2
-    side = np.array([np.cos(across), np.sin(across)]) * LIGHT_WIDTH_M / 2
-    bottom = z - LIGHT_HEIGHT_M / 2
-    points = np.array([[x - side[0], y - side[1], bottom], [x + side[0], y + side[1], bottom]])
+    side = np.array([np.cos(across), np.sin(across), 0.0]) * LIGHT_WIDTH_M / 2
+    bottom = signal.position_m - [0.0, 0.0, LIGHT_HEIGHT_M / 2]
     tags = {"subtype": "red_yellow_green", "height": f"{LIGHT_HEIGHT_M:g}", "log2sim_id": xml_text.escaped(signal.id)}
-    return draft.way(points, type="traffic_light", **tags)
+    return draft.way(np.stack([bottom - side, bottom + side]), type="traffic_light", **tags)
+
+
+def _add_sign(draft: _Draft, stop: Marking, lane: MapLane) -> int:
+    """Add the stop sign of a stop line as its lower edge, at the end of the line that is to the right of a lane."""
+    heading = float(Polyline(lane.points_m).heading_rad[-1])
+    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    end = stop.points_m[-1 if float((stop.points_m[-1] - stop.points_m[0]) @ right) > 0 else 0]
+    end = end + np.array([0.0, 0.0, SIGN_BOTTOM_M])
+    tags = {"subtype": "stop_sign", "height": f"{SIGN_M:g}", "log2sim_assumed": "yes"}
+    return draft.way(np.stack([end, end + SIGN_M * right]), type="traffic_sign", **tags)
 
 
 def _ends_at(lane: MapLane, stop: Marking) -> bool:

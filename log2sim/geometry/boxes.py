@@ -23,14 +23,8 @@ def box_corners_bev(xy_m: ArrayLike, length_m: ArrayLike, width_m: ArrayLike, ya
     m = len(xy)
     half_l, half_w = np.broadcast_to(length, m) / 2, np.broadcast_to(width, m) / 2
     yaw = np.broadcast_to(yaw, m)
-    local = np.stack(
-        [
-            np.stack([half_l, half_w], -1),
-            np.stack([-half_l, half_w], -1),
-            np.stack([-half_l, -half_w], -1),
-            np.stack([half_l, -half_w], -1),
-        ],
-        axis=1,
+    local = (
+        np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * np.stack([half_l, half_w], axis=-1)[:, None]
     )
     c, s = np.cos(yaw), np.sin(yaw)
     rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)

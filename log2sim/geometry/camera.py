@@ -18,7 +18,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.files.documents import short_repr
-from log2sim.geometry.transforms import Array, inverse
+from log2sim.geometry.transforms import Array, apply, inverse
 
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane, or behind it, are not projected."""
@@ -37,49 +37,29 @@ Mount = Literal["ego", "map"]
 
 @dataclass(frozen=True)
 class RollingShutter:
-    """Reading of an image line by line.
+    """Reading of an image line by line."""
 
-    Attributes
-    ----------
-    direction : {"down", "up", "right", "left"}
-        Way in the image in which lines, or columns, are read one after the other.
-    readout_s : float, s
-        From the first line to the last.
-    """
-
+    # Way in the image in which lines, or columns, are read one after the other
     direction: Literal["down", "up", "right", "left"]
-    readout_s: float
+    readout_s: float  # from the first line to the last
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera with lens distortion.
-
-    Attributes
-    ----------
-    K : (3, 3) float64, px
-        Camera matrix.
-    mount : {"ego", "map"}
-        Frame that it is fixed in: on the vehicle or at the roadside.
-    mount_T_cam : (4, 4) float64
-    distortion_model : {"none", "brown", "fisheye"}
-    distortion : tuple of float
-        In OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] for "brown", k1..k4 for "fisheye".
-    rolling_shutter : RollingShutter or None
-        None for a global shutter, or where the log does not state it.
-    """
+    """A pinhole camera with lens distortion."""
 
     __repr__ = short_repr
 
     name: str
     width_px: int
     height_px: int
-    K: Array
-    mount: Mount
-    mount_T_cam: Array
-    distortion_model: str = "none"
+    K: Array  # (3, 3), px: camera matrix
+    mount: Mount  # whether it is fixed on the vehicle or at the roadside
+    mount_T_cam: Array  # (4, 4)
+    distortion_model: str = "none"  # "none", "brown" or "fisheye"
+    # In OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] for "brown", k1..k4 for "fisheye"
     distortion: tuple[float, ...] = ()
-    rolling_shutter: RollingShutter | None = None
+    rolling_shutter: RollingShutter | None = None  # None for a global shutter, or where the log does not state it
 
     @property
     def rectified(self) -> bool:
@@ -90,12 +70,8 @@ class Camera:
 def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Array, NDArray[np.bool_]]:
     """Project points (N, 3), m, cam frame.
 
-    Returns
-    -------
-    uv_px : (N, 2) float64
-        NaN for a point that is not in front of the camera, or outside the invertible range of the lens model.
-    valid : (N,) bool
-        In front of the camera and inside the image.
+    Returns `uv_px`: (N, 2): NaN for a point that is not in front of the camera, or outside the invertible range of the lens
+    model; `valid`: (N,): in front of the camera and inside the image.
     """
     points = np.asarray(points_cam)
     front = points[:, 2] > MIN_DEPTH_M
@@ -272,21 +248,11 @@ def project_moving(
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Project points (N, 3), m, through a camera that moves while its image is read.
 
-    Parameters
-    ----------
-    points : (N, 3), m
-        In a frame in which they stand still.
-    cam_T_points : callable
-        Transforms (K, 4, 4) from that frame to the camera at times (K,), s, relative to the middle of the image.
+    `points`: (N, 3), m: in a frame in which they stand still. `cam_T_points`: transforms (K, 4, 4) from that frame to the
+    camera at times (K,), s, relative to the middle of the image.
 
-    Returns
-    -------
-    uv_px : (N, 2) float64
-        NaN where `project` gives NaN.
-    depth_m : (N,) float64
-        Along the optical axis at the time of the point's line.
-    valid : (N,) bool
-        In front of the camera and inside the image.
+    Returns `uv_px`: (N, 2): NaN where `project` gives NaN; `depth_m`: (N,): along the optical axis at the time of the point's
+    line; `valid`: (N,): in front of the camera and inside the image.
 
     Notes
     -----
@@ -295,12 +261,12 @@ def project_moving(
     """
     shutter = camera.rolling_shutter
     if shutter is None or shutter.readout_s <= 0:
-        local = _moved(points, cam_T_points(np.zeros(1))[0])
+        local = apply(cam_T_points(np.zeros(1))[0], points)
         uv, valid = project(camera, local)
         return uv, local[:, 2], valid
     times = np.linspace(-0.5, 0.5, KNOTS) * shutter.readout_s
     transforms = cam_T_points(times)
-    uv = project(camera, _moved(points, transforms[KNOTS // 2]))[0]
+    uv = project(camera, apply(transforms[KNOTS // 2], points))[0]
     depth = np.zeros(len(points))
     for _ in range(ITERATIONS):
         place = (line_time_s(camera, uv) / shutter.readout_s + 0.5) * (KNOTS - 1)
@@ -320,14 +286,10 @@ def _project_between(
     for k in np.unique(before):
         rows = before == k
         for knot, share in ((k, 1 - weight[rows]), (k + 1, weight[rows])):
-            local = _moved(points[rows], transforms[knot])
+            local = apply(transforms[knot], points[rows])
             uv[rows] += share[:, None] * project(camera, local)[0]
             depth[rows] += share * local[:, 2]
     return uv, depth
-
-
-def _moved(points: NDArray[np.floating[Any]], dst_T_src: Array) -> Array:
-    return np.asarray(points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3])
 
 
 MIN_CAMERA_HEIGHT_M = 1e-3
@@ -354,12 +316,8 @@ def ground_homography(camera: Camera, dst_T_cam: Array, ground_z_m: float = 0.0)
 def apply_homography(ground_H_image: Array, uv_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """Map pixels (N, 2) to the ground.
 
-    Returns
-    -------
-    xy_m : (N, 2) float64
-        Ground positions; NaN at and above the horizon.
-    below : (N,) bool
-        Whether the pixels lie below the horizon.
+    Returns `xy_m`: (N, 2): ground positions; NaN at and above the horizon; `below`: (N,): whether the pixels lie below the
+    horizon.
     """
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
     q = uv @ ground_H_image[:, :2].T + ground_H_image[:, 2]

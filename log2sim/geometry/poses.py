@@ -57,11 +57,8 @@ class PoseTrack:
     def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolate the pose at stamps (N,) int64 ns: rotation by slerp, translation linearly.
 
-        Returns
-        -------
-        map_T_ego : (N, 4, 4) float64
-        valid : (N,) bool
-            False in gaps longer than `max_gap_s` and farther than `extrapolate_s` outside the track.
+        Returns `map_T_ego`: (N, 4, 4); `valid`: (N,): false in gaps longer than `max_gap_s` and farther than `extrapolate_s`
+        outside the track.
         """
         t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
         if len(self.t_ns) == 1:

@@ -13,6 +13,7 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.boxes import rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import Cloud
+from log2sim.tracking.stitch import choose_pairs
 
 # Boxes that are no road users must not move points.
 MIN_SCORE = 0.3
@@ -22,7 +23,6 @@ MIN_SPEED_MPS, MAX_SPEED_MPS = 4.0, 40.0
 MAX_ACROSS_SHARE = 0.3
 # A box is off by less than this after it was moved on.
 MARGIN_M = 0.3
-NOT_ALLOWED = 1e6
 
 
 def align_parts(cloud: Cloud, before: Sequence[Boxes3D]) -> Cloud:
@@ -55,8 +55,6 @@ def align_parts(cloud: Cloud, before: Sequence[Boxes3D]) -> Cloud:
 
 def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     """Return the boxes (M,) of the later moment that moved along their axis since the earlier one, and their speeds (M,), m/s."""
-    from scipy.optimize import linear_sum_assignment
-
     a, b = (found.take(_is_driven(found)) for found in (earlier, later))
     if not len(a) or not len(b):
         return b.take(np.zeros(0, dtype=np.intp)), np.zeros(0)
@@ -64,8 +62,8 @@ def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     passed_s = np.maximum((b.t_ns[:, None] - a.t_ns) / NS_PER_S, 1.0 / NS_PER_S)
     distance = np.hypot(away[..., 0], away[..., 1])
     allowed = (distance <= MAX_SPEED_MPS * passed_s) & (b.category[:, None] == a.category)
-    i, j = linear_sum_assignment(np.where(allowed, distance, NOT_ALLOWED))
-    i, j = i[allowed[i, j]], j[allowed[i, j]]
+    first, second = np.nonzero(allowed)
+    i, j = choose_pairs(first, second, distance[allowed])
     local = rotate(away[i, j], -b.yaw_rad[i])
     speed = local[:, 0] / passed_s[i, j]
     moves = (np.abs(speed) >= MIN_SPEED_MPS) & (np.abs(local[:, 1]) <= MAX_ACROSS_SHARE * np.abs(local[:, 0]))

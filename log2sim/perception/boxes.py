@@ -184,17 +184,36 @@ def fit_extents_of_clusters(
         yaw[known] = correct_yaws(xy_m[of_known], count[known], yaw[known])
     if not known.all():
         yaw[~known] = fit_yaws(xy_m[~of_known], count[~known])[0]
-    local = np.ascontiguousarray(rotate(xy_m, -np.repeat(yaw, count)).T)
-    sort_clusters(local, count)
-    start, third = np.cumsum(count) - count, np.minimum(2, (count - 1) // 2)
-    low = np.minimum(quantile_of_clusters(local, count, TRIM), local[:, start + third] + MAX_TRIM_M).T
-    last = start + count - 1
-    high = np.maximum(quantile_of_clusters(local, count, 1 - TRIM), local[:, last - third] - MAX_TRIM_M).T
+    low, high = extents_of_clusters(xy_m, count, yaw)
     for k in np.flatnonzero(~known).tolist():
         if axes_swapped(high[k] - low[k], -(low[k] + high[k]) / 2, typical[k]):
             yaw[k] += np.pi / 2
             low[k], high[k] = [low[k, 1], -high[k, 0]], [high[k, 1], -low[k, 0]]
     return yaw, low, high
+
+
+def extents_of_clusters(xy_m: Array, count: NDArray[np.intp], yaw_rad: Array) -> tuple[Array, Array]:
+    """Measure the lower and upper ends (R, 2), (R, 2) of clusters along the length and width axes of their yaws (R,).
+
+    `xy_m`: (N, 2), m: points of the first cluster, then those of the next. `count`: (R,): number of points of each cluster, at
+    least 1.
+
+    The ends are quantiles, so that a few stray points do not stretch a box, but at most `MAX_TRIM_M` inside the third outermost
+    point: the far ends of a long object close by hold few of its points.
+    """
+    local = np.ascontiguousarray(rotate(xy_m, -np.repeat(yaw_rad, count)).T)
+    sort_clusters(local, count)
+    start, third = np.cumsum(count) - count, np.minimum(2, (count - 1) // 2)
+    low = np.minimum(quantile_of_clusters(local, count, TRIM), local[:, start + third] + MAX_TRIM_M)
+    last = start + count - 1
+    high = np.maximum(quantile_of_clusters(local, count, 1 - TRIM), local[:, last - third] - MAX_TRIM_M)
+    return low.T, high.T
+
+
+def extents(xy_m: Array, yaw_rad: float) -> tuple[Array, Array]:
+    """Measure the lower and upper ends (2,), (2,) of points (N, 2), N > 0, along the axes of a yaw, as `extents_of_clusters`."""
+    low, high = extents_of_clusters(xy_m, np.array([len(xy_m)]), np.array([yaw_rad]))
+    return low[0], high[0]
 
 
 def sort_clusters(values: Array, count: NDArray[np.intp]) -> None:
@@ -266,24 +285,6 @@ def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp],
         wanted = low[:, None] + (np.arange(most) + 0.5) / most * (high - low)[:, None]
         kept[np.searchsorted(area[1:], wanted.ravel())] = True
     return np.flatnonzero(kept)
-
-
-def extents(xy_m: Array, yaw_rad: float, trim: float = TRIM, max_trim_m: float = np.inf) -> tuple[Array, Array]:
-    """Measure the lower and upper ends (2,), (2,) of points (N, 2) along the length and width axes of a yaw.
-
-    The ends are the quantiles `trim` and 1 - `trim`, so that a few stray points do not stretch a box, but at most
-    `max_trim_m` inside the third outermost point: the far ends of a long object close by hold few of its points.
-    """
-    return extents_of_rotated(rotate(xy_m, -yaw_rad), trim, max_trim_m)
-
-
-def extents_of_rotated(local_m: Array, trim: float = TRIM, max_trim_m: float = np.inf) -> tuple[Array, Array]:
-    """Measure the lower and upper ends (2,), (2,) of points (N, 2) along their own axes, as `extents`."""
-    local = np.sort(local_m, axis=0)
-    third = min(2, (len(local) - 1) // 2)
-    low = np.minimum(quantile_of_sorted(local, trim), local[third] + max_trim_m)
-    high = np.maximum(quantile_of_sorted(local, 1 - trim), local[-1 - third] - max_trim_m)
-    return low, high
 
 
 def quantile_of_sorted(ordered: Array, share: float) -> Array:
@@ -432,7 +433,7 @@ def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.
 
     An end seen from the side is up to one such distance beyond the outermost point. One that faces the sensor is hit.
 
-    `step_rad`: (...), rad: angle between neighboring rays, from `box_fitting.azimuth_step_rad`. `low`, `high`: (..., 2), m:
+    `step_rad`: (...), rad: angle between neighboring rays, from `azimuth_step_rad`. `low`, `high`: (..., 2), m:
     ends of the extents along the length and the width, relative to the sensor. `real`: (..., 2, 2): from `real_ends`.
 
     Notes

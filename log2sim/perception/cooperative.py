@@ -3,7 +3,7 @@
 A detector sees the near sides of an object and guesses where the far ones are. So the sides, not the center, have errors of
 their own; those of center and size follow.
 
-A box is four sides with errors of their own (`box_errors`). Besides, all sides of an object move on together between the times
+A box is four sides with errors of their own (`SeenBoxes`). Besides, all sides of an object move on together between the times
 at which the ends saw it, and all sides of a box are off together where the pose of its sensor is. Generalized least squares
 with the covariance of all three gives the sides at one time: Aitken, "On least squares and linear combination of observations"
 (1935).
@@ -24,12 +24,14 @@ from log2sim.datatypes import GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import oriented_covariance, rotate
-from log2sim.perception.detect3d.boxes import Rectangles, suppress
+from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
 from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
+from log2sim.tracking.stitch import choose_pairs
+from log2sim.tracking.tracker import POSE_SIGMA_M
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
 # Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
@@ -46,29 +48,6 @@ YAW_WEIGHTS: dict[str, Array] = {
 MIN_SCORE, MAX_ERROR_SCORE = 0.02, 0.98
 # No side is known better than the noise of a LiDAR's ranges and the roundness of bodies allow, and no yaw worse than any.
 MIN_SIDE_SIGMA_M, MAX_YAW_SIGMA_RAD = 0.03, np.pi / np.sqrt(12)
-
-
-@dataclass(frozen=True, eq=False)
-class BoxErrors:
-    """Standard deviations of M boxes."""
-
-    side_m: Array  # (M, 2, 2): of the lower and the upper end along the length and the width, m
-    yaw_rad: Array  # (M,): up to half turns
-
-    @property
-    def center_m(self) -> Array:
-        """Standard deviations (M, 2) of the centers along the length and the width, m."""
-        return np.asarray(np.hypot(self.side_m[..., 0], self.side_m[..., 1]) / 2)
-
-
-def estimate_errors(boxes: Boxes3D, sensor_m: Array) -> BoxErrors:
-    """Estimate the errors of boxes (M,) seen from a sensor at (2,) or (3,), m, map frame."""
-    group = [GROUP_OF[str(c)] for c in boxes.category]
-    of_sides = np.array([SIDE_WEIGHTS.get(g, SIDE_WEIGHTS["vehicle"]) for g in group]).reshape(-1, 1, 1, 7)
-    of_yaw = np.array([YAW_WEIGHTS.get(g, np.zeros(4)) for g in group]).reshape(-1, 4)
-    side = np.exp((of_sides * side_terms(boxes, sensor_m)).sum(axis=-1))
-    yaw = np.exp((of_yaw * yaw_terms(boxes, sensor_m)).sum(axis=-1))
-    return BoxErrors(np.maximum(side, MIN_SIDE_SIGMA_M), np.minimum(yaw, MAX_YAW_SIGMA_RAD))
 
 
 def yaw_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
@@ -118,17 +97,17 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
 MIN_CLASS_IOU = 0.3
 # Road users do not share ground: boxes of one group that overlap by more are one object, whatever their errors.
 MIN_GROUP_IOU = 0.1
-# Standard deviation of where the road's sensors are after registration, m, and of how they are turned, rad.
-POSE_SIGMA_M, POSE_SIGMA_RAD = 0.1, np.deg2rad(0.3)
-NOT_ALLOWED = 1e6
+# Standard deviation of how the road's sensors are turned after registration, rad.
+POSE_SIGMA_RAD = np.deg2rad(0.3)
 
 
 @dataclass(frozen=True, eq=False)
 class SeenBoxes:
-    """Boxes with their errors."""
+    """Boxes with standard deviations of their errors."""
 
     boxes: Boxes3D  # M Boxes3D
-    errors: BoxErrors
+    sigma_m: Array  # (M, 2, 2): of the lower and the upper end along the length and the width
+    sigma_rad: Array  # (M,): of the yaw, up to half turns
     sensor_m: Array | None = None  # (3,): where they are all seen from, m, map frame
 
     def __len__(self) -> int:
@@ -138,18 +117,28 @@ class SeenBoxes:
     @classmethod
     def of(cls, boxes: Boxes3D, sensor_m: Array) -> Self:
         """Estimate the errors of boxes (M,) that were seen from a sensor at (3,), m, map frame."""
-        return cls(boxes, estimate_errors(boxes, sensor_m), sensor_m)
+        group = [GROUP_OF[str(c)] for c in boxes.category]
+        of_sides = np.array([SIDE_WEIGHTS.get(g, SIDE_WEIGHTS["vehicle"]) for g in group]).reshape(-1, 1, 1, 7)
+        of_yaw = np.array([YAW_WEIGHTS.get(g, np.zeros(4)) for g in group]).reshape(-1, 4)
+        side = np.exp((of_sides * side_terms(boxes, sensor_m)).sum(axis=-1))
+        yaw = np.exp((of_yaw * yaw_terms(boxes, sensor_m)).sum(axis=-1))
+        return cls(boxes, np.maximum(side, MIN_SIDE_SIGMA_M), np.minimum(yaw, MAX_YAW_SIGMA_RAD), sensor_m)
 
     def take(self, index: NDArray[Any]) -> SeenBoxes:
         """Take the boxes at `index`, integers or a mask."""
-        errors = BoxErrors(self.errors.side_m[index], self.errors.yaw_rad[index])
-        return SeenBoxes(self.boxes.take(index), errors, self.sensor_m)
+        return SeenBoxes(self.boxes.take(index), self.sigma_m[index], self.sigma_rad[index], self.sensor_m)
 
     @property
     def rectangles(self) -> Array:
         """The boxes in the plane (M, 5): x, y, length, width, yaw."""
         b = self.boxes
         return np.column_stack([b.center_m[:, :2], b.size_m[:, :2], b.yaw_rad])
+
+    @property
+    def center_covariance(self) -> Array:
+        """Covariances (M, 2, 2) of the centers, m2, map frame."""
+        sigma_m = np.hypot(self.sigma_m[..., 0], self.sigma_m[..., 1]) / 2
+        return oriented_covariance(sigma_m, self.boxes.yaw_rad)
 
 
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -161,7 +150,7 @@ def match_by_overlap(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     i, j = _touching(a, b)
     iou = rectangle_iou(a.take(i).rectangles, b.take(j).rectangles)
     allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[i] == b.boxes.category[j])
-    return _assign((len(a), len(b)), (i[allowed], j[allowed]), 1 - iou[allowed])
+    return choose_pairs(i[allowed], j[allowed], 1 - iou[allowed])
 
 
 def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -173,13 +162,13 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     i, j = _touching(a, b)
     one, other = a.take(i), b.take(j)
     away = one.boxes.center_m[:, :2] - other.boxes.center_m[:, :2]
-    c = center_covariance(one) + center_covariance(other) + POSE_SIGMA_M**2 * np.eye(2) + motion_covariance(one, other)
+    c = one.center_covariance + other.center_covariance + POSE_SIGMA_M**2 * np.eye(2) + motion_covariance(one, other)
     squared = np.einsum("pi,pi->p", away, np.linalg.solve(c, away[..., None])[..., 0])
     reach = (one.boxes.size_m[:, 0] + other.boxes.size_m[:, 0]) / 2
     near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
     overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
     allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
-    return _assign((len(a), len(b)), (i[allowed], j[allowed]), np.minimum(squared, CHI2_2DOF_99)[allowed])
+    return choose_pairs(i[allowed], j[allowed], np.minimum(squared, CHI2_2DOF_99)[allowed])
 
 
 def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -192,11 +181,6 @@ def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
 
 def _groups(boxes: Boxes3D) -> NDArray[np.str_]:
     return np.array([GROUP_OF[str(c)] for c in boxes.category], dtype="<U16")
-
-
-def center_covariance(seen: SeenBoxes) -> Array:
-    """Return the covariances (M, 2, 2) of the centers of boxes, m2, map frame."""
-    return oriented_covariance(seen.errors.center_m, seen.boxes.yaw_rad)
 
 
 def motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
@@ -217,17 +201,6 @@ def first_speeds(boxes: Boxes3D) -> Array:
 def is_walking(boxes: Boxes3D) -> NDArray[np.bool_]:
     """Mark the boxes (M,) of objects that move in any direction, and whose axes say little."""
     return np.array([GROUP_OF[str(c)] in ("pedestrian", "other") for c in boxes.category], dtype=bool)
-
-
-def _assign(shape: tuple[int, int], pairs: Pairs, cost: Array) -> Pairs:
-    """Choose of allowed pairs of M and N boxes those with the least sum of costs (P,)."""
-    from scipy.optimize import linear_sum_assignment
-
-    every = np.full(shape, NOT_ALLOWED)
-    every[pairs] = cost
-    i, j = linear_sum_assignment(every)
-    kept = every[i, j] < NOT_ALLOWED
-    return i[kept], j[kept]
 
 
 ROUNDS = 4
@@ -261,12 +234,12 @@ def _estimate(a: SeenBoxes, b: SeenBoxes, pivot: Array) -> tuple[Array, float]:
     """Estimate shift (2,), m, and turn, rad, of the road's boxes b."""
     away = b.boxes.center_m[:, :2] - pivot
     difference = a.boxes.center_m[:, :2] - b.boxes.center_m[:, :2]
-    precision = np.linalg.inv(center_covariance(a) + center_covariance(b) + motion_covariance(a, b))
+    precision = np.linalg.inv(a.center_covariance + b.center_covariance + motion_covariance(a, b))
     design = np.zeros((len(a), 2, 3))
     design[:, 0, 0] = design[:, 1, 1] = 1.0
     design[:, 0, 2], design[:, 1, 2] = -away[:, 1], away[:, 0]
     turned = wrap_angle(2 * (a.boxes.yaw_rad - b.boxes.yaw_rad)) / 2
-    of_yaw = np.where(is_walking(a.boxes), 0.0, 1 / (a.errors.yaw_rad**2 + b.errors.yaw_rad**2))
+    of_yaw = np.where(is_walking(a.boxes), 0.0, 1 / (a.sigma_rad**2 + b.sigma_rad**2))
     prior = np.diag([POSE_SIGMA_M**-2, POSE_SIGMA_M**-2, POSE_SIGMA_RAD**-2])
     x = np.zeros(3)
     for _ in range(ROUNDS):
@@ -328,14 +301,13 @@ def fuse_boxes(a: SeenBoxes, b: SeenBoxes, method: Method) -> SeenBoxes:
     out = join([part for part in parts if len(part)])
     names = tuple(GROUPS)
     group = np.array([names.index(GROUP_OF[str(c)]) for c in out.boxes.category], dtype=np.intp)
-    flat = Rectangles(out.boxes.center_m[:, :2], out.boxes.size_m[:, :2], out.boxes.yaw_rad)
-    return out.take(suppress(flat, out.boxes.score, group))
+    return out.take(suppress(out.rectangles, out.boxes.score, group))
 
 
 def join(parts: list[SeenBoxes]) -> SeenBoxes:
     """Concatenate at least one set of boxes."""
-    errors = BoxErrors(*(np.concatenate([getattr(p.errors, k) for p in parts]) for k in ("side_m", "yaw_rad")))
-    return SeenBoxes(Boxes3D.join([p.boxes for p in parts]), errors)
+    sigmas = (np.concatenate([getattr(p, name) for p in parts]) for name in ("sigma_m", "sigma_rad"))
+    return SeenBoxes(Boxes3D.join([p.boxes for p in parts]), *sigmas)
 
 
 def merge_by_covariance(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
@@ -362,29 +334,21 @@ def merge_by_covariance(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
         center_m=np.column_stack([center, z]),
         size_m=np.column_stack([np.maximum(high - low, MIN_SIZE_M), height]),
     )
-    whole = _take_better(a, b)
-    misfit = misfit + apart_rad**2 / (a.errors.yaw_rad**2 + b.errors.yaw_rad**2)
+    misfit = misfit + apart_rad**2 / (a.sigma_rad**2 + b.sigma_rad**2)
     contradict = (np.abs(apart_rad) > MAX_TURN_RAD) | (misfit > CHI2_5DOF_999)
     variance = np.stack([covariance[..., 0, 0], covariance[..., 1, 1]], axis=-1)
-    errors = BoxErrors(
-        np.where(contradict[:, None, None], whole.errors.side_m, np.sqrt(variance)),
-        np.where(contradict, whole.errors.yaw_rad, axes.errors.yaw_rad),
-    )
-    return SeenBoxes(_join_evidence(_choose(contradict, whole.boxes, merged), a.boxes, b.boxes), errors)
+    chosen = _choose(contradict, _take_better(a, b), SeenBoxes(merged, np.sqrt(variance), axes.sigma_rad))
+    return replace(chosen, boxes=_join_evidence(chosen.boxes, a.boxes, b.boxes))
 
 
 def merge_by_points(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
     """Merge boxes (P,) of two ends row by row: the mean center, weighted by points, and the rest from the one with more points."""
-    more = (b.boxes.points > a.boxes.points)[:, None]
-    share = (b.boxes.points / np.maximum(a.boxes.points + b.boxes.points, 1))[:, None]
-    chosen = _choose(more[:, 0], b.boxes, a.boxes)
-    center = a.boxes.center_m + share * (b.boxes.center_m - a.boxes.center_m)
-    errors = BoxErrors(
-        np.where(more[..., None], b.errors.side_m, a.errors.side_m),
-        np.where(more[:, 0], b.errors.yaw_rad, a.errors.yaw_rad),
-    )
-    merged = replace(chosen, center_m=center, t_ns=_mean_time(a.boxes, b.boxes))
-    return SeenBoxes(_join_evidence(merged, a.boxes, b.boxes), errors)
+    chosen = _choose(b.boxes.points > a.boxes.points, b, a)
+    share = b.boxes.points / np.maximum(a.boxes.points + b.boxes.points, 1)
+    center = a.boxes.center_m + share[:, None] * (b.boxes.center_m - a.boxes.center_m)
+    t_ns = a.boxes.t_ns + np.round(share * (b.boxes.t_ns - a.boxes.t_ns)).astype(np.int64)
+    merged = replace(chosen.boxes, center_m=center, t_ns=t_ns)
+    return replace(chosen, boxes=_join_evidence(merged, a.boxes, b.boxes))
 
 
 METHODS = {
@@ -394,35 +358,24 @@ METHODS = {
 """Overlap alone is the feature-level fusion of Chen, "Intelligent Perception System for Vehicle-Road Cooperation"."""
 
 
-def _mean_time(a: Boxes3D, b: Boxes3D) -> NDArray[np.int64]:
-    """Return the mean times (P,) of the points in both boxes, ns."""
-    share = b.points / np.maximum(a.points + b.points, 1)
-    return np.asarray(a.t_ns + np.round(share * (b.t_ns - a.t_ns)).astype(np.int64))
-
-
 def _vertical(boxes: Boxes3D) -> tuple[Array, Array]:
     return boxes.center_m[:, 2], boxes.size_m[:, 2]
 
 
 def _share_of_second(a: SeenBoxes, b: SeenBoxes) -> Array:
     """Return the share (P,) of the second box in what has no error of its own, by the variance of the sides."""
-    va, vb = ((seen.errors.side_m**2).sum(axis=(1, 2)) for seen in (a, b))
+    va, vb = ((seen.sigma_m**2).sum(axis=(1, 2)) for seen in (a, b))
     return np.asarray(va / (va + vb))
 
 
 def _take_better(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
     """Take of each pair the box whose sides are better known."""
-    second = _share_of_second(a, b) > 0.5
-    errors = BoxErrors(
-        np.where(second[:, None, None], b.errors.side_m, a.errors.side_m),
-        np.where(second, b.errors.yaw_rad, a.errors.yaw_rad),
-    )
-    return SeenBoxes(_choose(second, b.boxes, a.boxes), errors)
+    return _choose(_share_of_second(a, b) > 0.5, b, a)
 
 
-def _choose(mask: NDArray[np.bool_], one: Boxes3D, other: Boxes3D) -> Boxes3D:
+def _choose(mask: NDArray[np.bool_], one: SeenBoxes, other: SeenBoxes) -> SeenBoxes:
     """Take rows (P,) of the one where the mask is set, else of the other."""
-    return Boxes3D.join([one, other]).take(np.where(mask, 0, len(one)) + np.arange(len(one)))
+    return join([one, other]).take(np.where(mask, 0, len(one)) + np.arange(len(one)))
 
 
 def _join_evidence(boxes: Boxes3D, a: Boxes3D, b: Boxes3D) -> Boxes3D:
@@ -440,7 +393,7 @@ def _join_axes(a: SeenBoxes, b: SeenBoxes) -> tuple[SeenBoxes, Array]:
     """
     better, walking = _take_better(a, b), is_walking(a.boxes)
     apart = wrap_angle(2 * (b.boxes.yaw_rad - a.boxes.yaw_rad)) / 2
-    va, vb = a.errors.yaw_rad**2, b.errors.yaw_rad**2
+    va, vb = a.sigma_rad**2, b.sigma_rad**2
     axis = np.where(walking, better.boxes.yaw_rad, a.boxes.yaw_rad + va / (va + vb) * apart)
     ahead = sum(
         np.sign(np.cos(seen.boxes.yaw_rad - axis)) * log_odds_of(np.clip(seen.boxes.heading_score, 0.5, MAX_SCORE))
@@ -450,8 +403,7 @@ def _join_axes(a: SeenBoxes, b: SeenBoxes) -> tuple[SeenBoxes, Array]:
     yaw = wrap_angle(axis + np.where(ahead < 0, np.pi, 0.0))
     heading = np.minimum(probability_of(np.abs(ahead)), MAX_SCORE)
     boxes = replace(better.boxes, yaw_rad=np.asarray(yaw), heading_score=heading)
-    errors = BoxErrors(better.errors.side_m, np.sqrt(va * vb / (va + vb)))
-    return SeenBoxes(boxes, errors), np.where(walking, 0.0, apart)
+    return SeenBoxes(boxes, better.sigma_m, np.sqrt(va * vb / (va + vb))), np.where(walking, 0.0, apart)
 
 
 def _in_axes(seen: SeenBoxes, axes: SeenBoxes, origin: Array) -> tuple[Array, Array]:
@@ -459,7 +411,7 @@ def _in_axes(seen: SeenBoxes, axes: SeenBoxes, origin: Array) -> tuple[Array, Ar
     center = rotate(seen.boxes.center_m[:, :2] - origin, -axes.boxes.yaw_rad)
     half = seen.boxes.size_m[:, :2] / 2
     turned = np.cos(seen.boxes.yaw_rad - axes.boxes.yaw_rad) < 0
-    sigma = np.where(turned[:, None, None], seen.errors.side_m[..., ::-1], seen.errors.side_m)
+    sigma = np.where(turned[:, None, None], seen.sigma_m[..., ::-1], seen.sigma_m)
     return np.stack([center - half, center + half], axis=-1), sigma
 
 

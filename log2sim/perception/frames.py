@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -105,7 +105,7 @@ class FrameDetector:
             index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
             if index >= 0 and (name, tick) not in self._known:
                 encoded = None if stream.encoded is None else partial(stream.encoded, index)
-                image = _LazyImage(reader, name, index)
+                image = cache(partial(reader.require, name, index))  # decoded at the first call
                 frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with clock.stage("decode"):
@@ -119,19 +119,6 @@ class FrameDetector:
                 cut = crop_lights(name, frame.t_ns, frame.image(), lights) if len(lights) else []
                 self._known[name, tick] = PictureFindings(boxes, thumbnails.get(name), tuple(cut))
         return {name: found for name in cameras if (found := self._known.get((name, tick))) is not None}
-
-
-class _LazyImage:
-    """An image that is decoded at the first call and kept."""
-
-    def __init__(self, reader: RecordSource, stream: str, index: int) -> None:
-        self._reader, self._stream, self._index = reader, stream, index
-        self._image: NDArray[np.uint8] | None = None
-
-    def __call__(self) -> NDArray[np.uint8]:
-        if self._image is None:
-            self._image = self._reader.require(self._stream, self._index)
-        return self._image
 
 
 def _thumbnail_of(frame: Frame) -> Thumbnail | None:

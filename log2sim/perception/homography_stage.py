@@ -24,11 +24,10 @@ from log2sim.perception.homography.estimate import (
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.lidar.measure import BORDER_PX
 from log2sim.perception.observe_tick import base_pose
 from log2sim.plan import HomographyScope, Plan
 
-# A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
-FOOT_BORDER_PX = 3
 # A camera lower than this sees the ground under too flat an angle, m.
 MIN_CAMERA_HEIGHT_M = 0.2
 # Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
@@ -65,27 +64,23 @@ def fit_homographies(
     """
     if plan.homography is HomographyScope.NONE:
         return {}
-    options = EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=config.rig == "together")
+    options = EstimationOptions(config.method, hypotheses=config.hypotheses or None)
     wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
-    together, why_apart = _fit_together(log, observed, plan, options, rng) if wanted else ({}, {})
+    joins = bool(wanted) and config.rig == "together" and config.method in STREAM_METHODS
+    together, why_apart = _fit_together(log, observed, plan, options, rng) if joins else ({}, {})
     apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}
-    apart = {c: replace(g, source=_source(g.source, why_apart.get(c, ""))) for c, g in apart.items()}
+    apart = {
+        c: replace(g, source=f"{g.source} (apart: {why_apart[c]})") if why_apart.get(c) else g for c, g in apart.items()
+    }
     return {c: together[c] if c in together else apart[c] for c in plan.cameras if c in wanted}
-
-
-def _source(source: str, why_apart: str) -> str:
-    return f"{source} (apart: {why_apart})" if why_apart else source
 
 
 def _fit_together(
     log: Log, observed: Observations, plan: Plan, options: EstimationOptions, rng: np.random.Generator
 ) -> tuple[dict[str, CameraHomography], dict[str, str]]:
     """Fit the cameras of each rig together; returns their homographies, and why the others are fitted apart, by camera."""
-    if not options.together or options.method not in STREAM_METHODS:
-        return {}, {}
-    found, why_apart = {}, {}
-    rigs, left_out = list_rigs(log, plan.cameras)
-    why_apart.update(left_out)
+    found = {}
+    rigs, why_apart = list_rigs(log, plan.cameras)
     for names in rigs:
         rig = Rig.of({c: log.cameras[c] for c in names}, log.ground_z_ego_m)
         feet, ground = (
@@ -137,7 +132,7 @@ def _cameras_in_need(log: Log, observed: Observations) -> set[str]:
 
 def _has_foot(camera: Camera, box_px: Array) -> bool:
     """Return whether the obstacle in a box (4,) touches the ground inside the image."""
-    return bool(box_px[3] <= camera.height_px - FOOT_BORDER_PX)
+    return bool(box_px[3] <= camera.height_px - BORDER_PX)
 
 
 def _fit_one(

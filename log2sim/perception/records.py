@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding, Log, Sweep, Treatment
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import NS_PER_S, Array, Camera
+from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera
 from log2sim.logs.records import decode_image
 
 Motion = Literal["drives", "stands", "unclear"]
@@ -130,13 +130,8 @@ def shrink(image: NDArray[np.uint8]) -> Thumbnail:
     return np.asarray(cv2.resize(gray, cells, interpolation=cv2.INTER_AREA))
 
 
-def measure_change(before: Thumbnail, after: Thumbnail) -> float:
-    """Return by how many gray levels two pictures differ: the 95 % quantile over the cells."""
-    return quantile_of_change(np.abs(after - before))
-
-
 def quantile_of_change(change: NDArray[np.float32]) -> float:
-    """Return the quantile of changes of cells that tells whether two pictures differ, levels; 0 without cells."""
+    """Return by how many gray levels two pictures differ, given the changes of all cells: their 95 % quantile; 0 without cells."""
     values = change.ravel()
     if not len(values):
         return 0.0
@@ -188,7 +183,6 @@ def _second_differences(thumbnail: Thumbnail) -> Array:
 # What is not ground is assumed as far away as this, so that no more motion is expected than there is at least; houses and
 # trees along a road are nearer.
 FAR_M = 50.0
-MIN_DEPTH_M = 0.1
 
 
 def expect_change(
@@ -381,7 +375,7 @@ class CameraWatch:
 
     def _is_copy(self, last: _Picture, t_ns: int, thumbnail: Thumbnail) -> bool:
         """Compare a picture with the one before it."""
-        change = measure_change(last.thumbnail, thumbnail)
+        change = quantile_of_change(np.abs(thumbnail - last.thumbnail))
         share = changed_share(last.thumbnail, thumbnail)
         if change > MAX_CHANGED_SHARE * float(last.thumbnail.max() - last.thumbnail.min()):
             self._steps_without_change = 0
@@ -509,8 +503,6 @@ class RecordWatch:
     """Judge pictures and sweeps as they are read, each once.
 
     Another process gets what it needs to go on, and `attach` gives it the log.
-
-    `cameras`: . `lidars`: .
     """
 
     def __init__(self, log: Log) -> None:

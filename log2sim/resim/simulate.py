@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -289,6 +289,7 @@ def resimulate(
     seed: int = 0,
     overwrite: bool = False,
     progress: Progress = lambda *_: None,
+    then: Callable[[Simulation], None] = lambda _: None,
 ) -> tuple[str, ...]:
     """Write what the sensors of a log would have recorded in a scenario as a native log folder with `truth.json`.
 
@@ -304,6 +305,8 @@ def resimulate(
         LiDARs and cameras; all LiDARs of the log where it is empty.
     cameras : bool
         All cameras of the log, too.
+    then : callable
+        Called with the simulation once its log is there, as for a film of it.
 
     Returns
     -------
@@ -337,6 +340,7 @@ def resimulate(
         for file, data in masks.items():
             (folder / MASKS / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / MASKS / file).write_bytes(data)
+    then(simulation)
     return tuple(notes)
 
 

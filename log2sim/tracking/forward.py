@@ -135,28 +135,10 @@ Index = NDArray[np.intp]
 _Costs = tuple[Array, Array, NDArray[np.bool_]]
 
 
-@dataclass(frozen=True, eq=False)
-class Tracklet:
-    """Measurements assigned to one track.
-
-    Attributes
-    ----------
-    ticks : (n,) int64
-    rows : (n,) int64
-        Row of the measurement in its tick.
-    mean : (4,) float64
-        Last state: x, y, vx, vy in the map.
-    """
-
-    ticks: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    mean: Array
-
-
 def track_forward(
     measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float, whole_boxes: bool = False
-) -> list[Tracklet]:
-    """Assign the measurements of T ticks (stamps (T,)) to tracklets, which come in the order of their births."""
+) -> list[tuple[Index, Index]]:
+    """Assign the measurements of T ticks (stamps (T,)) to tracks, in the order of their births: the ticks and rows (n,) of each."""
     if not len(measurements):
         return []
     tracker = ForwardTracker(birth_score=birth_score, period_s=period_of(t_ns), whole_boxes=whole_boxes)
@@ -168,35 +150,26 @@ def track_forward(
     ]
     rows, number = (np.concatenate(column) for column in zip(*log))
     ticks = np.repeat(np.arange(len(log)), [len(taken) for taken, _ in log])
-    rows = rows - np.concatenate([[0], np.cumsum(count)])[ticks]
+    rows = rows - np.cumsum([0, *count])[ticks]
     order = np.argsort(number, kind="stable")
-    cuts = np.flatnonzero(np.diff(number[order])) + 1
-    means = tracker.last_states()
-    return [Tracklet(ticks[i], rows[i], means[k]) for k, i in enumerate(np.split(order, cuts))] if len(order) else []
+    parts = np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else []
+    return [(ticks[i], rows[i]) for i in parts]
+
+
+COLUMNS = (
+    "number", "mean", "covariance", "seen_ns", "hits", "standing", "place_m", "place_covariance", "_group", "_riderless",
+)  # fmt: skip
+"""Of the active tracks of a `ForwardTracker`."""
 
 
 class ForwardTracker:
     """Active tracks, one row each; `step` is causal.
 
-    Attributes
-    ----------
-    number : (A,) intp
-        Index of the track in the order of births.
-    mean : (A, 4) float64
-        States x, y, vx, vy in the map at the last tick.
-    covariance : (A, 4, 4) float64
-    seen_ns : (A,) int64
-        Time of the last measurement.
-    hits : (A,) int64
-        Number of measurements.
-    standing : (A,) float64
-        Probability that the object stands; 0 once it surely moves.
-    place_m : (A, 2) float64
-        Where it stands if it does, with covariances `place_covariance` (A, 2, 2).
-    birth_score : float
-        Lowest score that can start a track.
-    whole_boxes : bool
-        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
+    `number`: (A,): index of the track in the order of births. `mean`: (A, 4): states x, y, vx, vy in the map at the last tick.
+    `covariance`: (A, 4, 4). `seen_ns`: (A,): time of the last measurement. `hits`: (A,): number of measurements. `standing`:
+    (A,): probability that the object stands; 0 once it surely moves. `place_m`: (A, 2): where it stands if it does, with
+    covariances `place_covariance` (A, 2, 2). `birth_score`: lowest score that can start a track. `whole_boxes`: whether the
+    measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
     """
 
     def __init__(self, *, birth_score: float, period_s: float, whole_boxes: bool = False) -> None:
@@ -214,7 +187,6 @@ class ForwardTracker:
         self._riderless = np.zeros(0)
         self._born = 0
         self._now_ns: int | None = None
-        self._ended: list[tuple[Index, Array]] = []
 
     def step(self, found: Measurements, now_ns: int) -> tuple[Index, Index]:
         """Take the measurements of a tick; return the rows assigned to tracks and the numbers of these tracks.
@@ -246,22 +218,13 @@ class ForwardTracker:
             taken = np.concatenate([taken, born])
         return columns.row[taken], numbers
 
-    def last_states(self) -> Array:
-        """Return the last states (N, 4) of all tracks, ended ones included, by number."""
-        ended = [*self._ended, (self.number, self.mean)]
-        number = np.concatenate([n for n, _ in ended])
-        return np.concatenate([m for _, m in ended])[np.argsort(number)]
-
     def _predict(self, now_ns: int) -> None:
         """End the tracks without a recent measurement and predict the others to `now_ns`."""
         age_s = (now_ns - self.seen_ns) / NS_PER_S
         alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, self._confirmed_age_s, self._tentative_age_s)
         if not alive.all():
-            self._ended.append((self.number[~alive], self.mean[~alive]))
-            self.number, self.mean, self.covariance = self.number[alive], self.mean[alive], self.covariance[alive]
-            self.seen_ns, self.hits, self._group = self.seen_ns[alive], self.hits[alive], self._group[alive]
-            self.standing, self.place_m = self.standing[alive], self.place_m[alive]
-            self.place_covariance, self._riderless = self.place_covariance[alive], self._riderless[alive]
+            for name in COLUMNS:
+                setattr(self, name, getattr(self, name)[alive])
         if self._now_ns is not None and len(self.number):
             dt_s = (now_ns - self._now_ns) / NS_PER_S
             self.mean, self.covariance = predict(self.mean, self.covariance, dt_s, _ACCELERATION[self._group])
@@ -326,20 +289,18 @@ class ForwardTracker:
         )
 
     def _start(self, columns: _Columns, born: Index, now_ns: int) -> None:
-        count, group = len(born), columns.group[born]
+        count = len(born)
         mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
         mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
         covariance[:, 2:, 2:] = columns.velocity[born]
         prior = np.where(columns.riderless[born] > 0, RIDERLESS_STANDING_PRIOR, STANDING_PRIOR)
-        self.standing = np.concatenate([self.standing, prior])
-        self.place_m = np.concatenate([self.place_m, columns.xy[born]])
-        self.place_covariance = np.concatenate([self.place_covariance, columns.r[born]])
-        self.number = np.concatenate([self.number, np.arange(self._born, self._born + count)])
-        self.mean, self.covariance = np.concatenate([self.mean, mean]), np.concatenate([self.covariance, covariance])
-        self.seen_ns = np.concatenate([self.seen_ns, np.full(count, now_ns, dtype=np.int64)])
-        self.hits = np.concatenate([self.hits, np.ones(count, dtype=np.int64)])
-        self._group = np.concatenate([self._group, group])
-        self._riderless = np.concatenate([self._riderless, columns.riderless[born]])
+        number, seen_ns = np.arange(self._born, self._born + count), np.full(count, now_ns, dtype=np.int64)
+        of_born = (
+            number, mean, covariance, seen_ns, np.ones(count, dtype=np.int64), prior, columns.xy[born], columns.r[born],
+            columns.group[born], columns.riderless[born],
+        )  # fmt: skip
+        for name, values in zip(COLUMNS, of_born, strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
         self._born += count
 
 

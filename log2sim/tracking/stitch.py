@@ -108,30 +108,18 @@ MAX_STATIONARY_OFFSET_M = 1.0
 # Number of measurements from the end of a track that the filter uses; earlier ones no longer influence the state.
 END_MEASUREMENTS = 20
 
-_Costs = tuple[NDArray[np.intp], NDArray[np.intp], Array]
-
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """States of tracks at both ends, from one filter pass in each direction.
+    """States of tracks at both ends, from one filter pass in each direction."""
 
-    Attributes
-    ----------
-    first_ns : (A,) int64
-    last_ns : (A,) int64
-    first, last : (A, 4) float64
-        States.
-    first_covariance, last_covariance : (A, 4, 4) float64
-    group : (A,) str
-    """
-
-    first_ns: NDArray[np.int64]
-    last_ns: NDArray[np.int64]
-    first: Array
-    first_covariance: Array
+    first_ns: NDArray[np.int64]  # (A,)
+    last_ns: NDArray[np.int64]  # (A,)
+    first: Array  # `first`, `last`: (A, 4): states
+    first_covariance: Array  # `first_covariance`, `last_covariance`: (A, 4, 4)
     last: Array
     last_covariance: Array
-    group: NDArray[np.str_]
+    group: NDArray[np.str_]  # (A,)
 
     def join(self, other: _Ends) -> _Ends:
         return _Ends(*(np.concatenate(columns) for columns in zip(vars(self).values(), vars(other).values())))
@@ -151,7 +139,7 @@ def stitch(
     current = list(tracks)
     ends = _ends(current, whole_boxes=whole_boxes) if len(current) > 1 else None
     while ends is not None:
-        i, j = _choose_joins(_joining_costs(ends, max_gap_s))
+        i, j = choose_pairs(*_joining_costs(ends, max_gap_s))
         if not len(i):
             break
         following = dict(zip(i.tolist(), j.tolist()))
@@ -169,21 +157,21 @@ def stitch(
     return current
 
 
-def _choose_joins(costs: _Costs) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of the best assignment: as many as possible, and of those the cheapest.
+def choose_pairs(
+    first: NDArray[np.intp], second: NDArray[np.intp], cost: Array
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the best assignment among possible pairs (P,): as many as possible, and of those the cheapest.
 
-    Tracks that no chain of possible pairs connects do not compete: each group of the others is assigned on its own, so that a
-    long log with many tracks takes no table of all pairs.
+    What no chain of possible pairs connects does not compete: each group of the others is assigned on its own, so that a long
+    log with many tracks takes no table of all pairs.
     """
     from scipy.optimize import linear_sum_assignment
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    first, second, cost = costs
     if not len(first):
         return first, second
     count = int(max(first.max(), second.max())) + 1
-    # The end of a track and its start are different things: rows and columns.
     graph = coo_array((np.ones(len(first)), (first, second + count)), shape=(2 * count, 2 * count))
     group = connected_components(graph, directed=False)[1][first]
     order = np.argsort(group, kind="stable")
@@ -197,7 +185,8 @@ def _choose_joins(costs: _Costs) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         possible = table[i, j] < FORBIDDEN
         chosen.append((ends[i[possible]], starts[j[possible]]))
     i, j = (np.concatenate(side) for side in zip(*chosen))
-    return i, j
+    order = np.argsort(i)
+    return i[order], j[order]
 
 
 def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -226,7 +215,7 @@ def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], ND
     return a[same], b[same]
 
 
-def _joining_costs(ends: _Ends, max_gap_s: float) -> _Costs:
+def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
     """Return the pairs (P,), (P,) of tracks of which the second may continue the first, and the cost (P,) of each."""
     a, b = _possible_pairs(ends, max_gap_s)
     gap_s = (ends.first_ns[b] - ends.last_ns[a]) / NS_PER_S

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from log2sim.config import TrackConfig
 from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
-from log2sim.tracking.forward import CHI2_2DOF_99, measurement_noise, track_forward
+from log2sim.tracking.forward import CHI2_2DOF_99, RELATED, measurement_noise, track_forward
 from log2sim.tracking.stitch import decide_category, stitch
 
 SWEEPS = ""
@@ -27,32 +27,17 @@ SWEEPS = ""
 def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]]) -> list[Track]:
     """Return tracks that know at which ticks none of the sensors that measured them recorded, and how often pictures were searched.
 
-    Parameters
-    ----------
-    recorded : mapping of str to (T,) bool
-        Whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
+    `recorded`: (T,) each: whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
     """
-    return [
-        replace(track, unrecorded=_unrecorded(track, recorded), searched=_searched(track, recorded)) for track in tracks
-    ]
-
-
-def _searched(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> float:
-    """Return at which share of its ticks any camera that measured a track was searched; 1 without a camera."""
-    cameras = {str(camera) for camera in track.measurements.camera} - {SWEEPS}
-    seen = [recorded[name] for name in cameras if name in recorded]
-    return float(np.any(seen, axis=0)[track.tick].mean()) if seen else 1.0
-
-
-def _unrecorded(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
-    m = track.measurements
-    sensors = {str(camera) for camera in m.camera} - {SWEEPS}
-    if np.isfinite(m.box_yaw_rad).any():
-        sensors.add(SWEEPS)
-    seen = [recorded[name] for name in sensors if name in recorded]
-    if not seen:
-        return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(~np.any(seen, axis=0))
+    marked = []
+    for one in tracks:
+        m = one.measurements
+        by_camera = [recorded[name] for name in {str(c) for c in m.camera} - {SWEEPS} if name in recorded]
+        by_any = by_camera + [recorded[SWEEPS]] * bool(SWEEPS in recorded and np.isfinite(m.box_yaw_rad).any())
+        unrecorded = np.flatnonzero(~np.any(by_any, axis=0)) if by_any else np.zeros(0, dtype=np.int64)
+        searched = float(np.any(by_camera, axis=0)[one.tick].mean()) if by_camera else 1.0
+        marked.append(replace(one, unrecorded=unrecorded, searched=searched))
+    return marked
 
 
 def track(
@@ -66,28 +51,22 @@ def track(
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, sorted by their first tick.
 
-    Parameters
-    ----------
-    t_ns : (T,) int64
-    birth_score : float
-        Lowest score that can start a track.
-    max_gap_s : float
-        Longest occlusion that is bridged, s.
-    whole_boxes : bool
-        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
-    min_life_s : float
-        Shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
+    `t_ns`: (T,). `birth_score`: lowest score that can start a track. `max_gap_s`: longest occlusion that is bridged, s.
+    `whole_boxes`: whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the
+    motion. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
     """
-    tracklets = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes)
     everything = Measurements.join(measurements)
     first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
-    for t in tracklets:
-        rows = everything.take(first_row[t.ticks] + t.rows)
-        tracks.append(Track(decide_category(rows, whole_boxes=whole_boxes), t.ticks, rows))
-    joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-    required = min_hits(t_ns, min_life_s)
-    kept = [t for t in joined if len(t) >= required]
+    for ticks, rows in track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes):
+        found = everything.take(first_row[ticks] + rows)
+        tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
+    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes), t_ns, min_life_s)
+
+
+def _long_enough(tracks: Sequence[Track], t_ns: NDArray[np.int64], min_life_s: float) -> list[Track]:
+    """Return the tracks with enough measurements, sorted by their first tick."""
+    kept = [t for t in tracks if len(t) >= min_hits(t_ns, min_life_s)]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
@@ -104,19 +83,13 @@ VELOCITY_WINDOW_S = 0.5
 POSE_SIGMA_M = 0.1
 # Tracks of one object may both be seen at so many of the ticks at which another track of it is, by a mistake of either tracker.
 MAX_SHARED_TICKS = 1
-RELATED = ({"pedestrian", "two_wheeler"},)
 
 
 def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
     """Track the measurements of each end on their own and merge the tracks.
 
-    Parameters
-    ----------
-    ends : sequence of sequences of T Measurements
-        Of each end, by tick; those of a single one are tracked and no more.
-    t_ns : (T,) int64
-    config : TrackConfig
-        As for `track`; what both ends have of an object counts as its life.
+    `ends`: of each end, by tick; those of a single one are tracked and no more. `t_ns`: (T,). `config`: as for `track`; what
+    both ends have of an object counts as its life.
     """
     birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
     if len(ends) == 1:
@@ -125,9 +98,7 @@ def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], 
     for measurements in ends:
         found = track(measurements, t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=0.0)
         tracks = merge_tracks(tracks, found) if tracks else found
-    required = min_hits(t_ns, min_life_s)
-    kept = [t for t in stitch(tracks, t_ns, max_gap_s=max_gap_s) if len(t) >= required]
-    return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s), t_ns, min_life_s)
 
 
 def merge_tracks(a: Sequence[Track], b: Sequence[Track]) -> list[Track]:
@@ -136,32 +107,27 @@ def merge_tracks(a: Sequence[Track], b: Sequence[Track]) -> list[Track]:
     Pairs are taken in the order of how well they agree. Several tracks of one end may belong to one of the other, which followed
     the object through a gap.
     """
-    velocity_a, velocity_b = ([velocities(t) for t in tracks] for tracks in (a, b))
+    tracks, velocity = [*a, *b], [velocities(t) for t in (*a, *b)]
     costs = {
         (i, j): cost
-        for i, one in enumerate(a)
-        for j, other in enumerate(b)
-        if (cost := compare(one, other, velocity_a[i], velocity_b[j])) is not None
+        for i in range(len(a))
+        for j in range(len(a), len(tracks))
+        if (cost := compare(tracks[i], tracks[j], velocity[i], velocity[j])) is not None
     }
-    owner = {("a", i): i for i in range(len(a))} | {("b", j): len(a) + j for j in range(len(b))}
-    members = {number: [key] for key, number in owner.items()}
-    tracks = {("a", i): t for i, t in enumerate(a)} | {("b", j): t for j, t in enumerate(b)}
+    owner, members = list(range(len(tracks))), {k: [k] for k in range(len(tracks))}
     for i, j in sorted(costs, key=lambda pair: costs[pair]):
-        one, other = owner["a", i], owner["b", j]
-        if one != other and _can_join(members[one], members[other], tracks):
-            for key in members.pop(other):
-                owner[key] = one
-                members[one].append(key)
-    velocity = {("a", i): v for i, v in enumerate(velocity_a)} | {("b", j): v for j, v in enumerate(velocity_b)}
-    return [_merge([tracks[k] for k in keys], [velocity[k] for k in keys]) for keys in members.values()]
+        one, other = owner[i], owner[j]
+        if one != other and _can_join(members[one], members[other], tracks, len(a)):
+            for k in members[other]:
+                owner[k] = one
+            members[one] += members.pop(other)
+    return [_merge([tracks[k] for k in group], [velocity[k] for k in group]) for group in members.values()]
 
 
-def _can_join(
-    one: Sequence[tuple[str, int]], other: Sequence[tuple[str, int]], tracks: dict[tuple[str, int], Track]
-) -> bool:
-    """Return whether no end sees two of the tracks at the same ticks."""
-    for end in "ab":
-        mine, theirs = ([tracks[k].tick for k in keys if k[0] == end] for keys in (one, other))
+def _can_join(one: Sequence[int], other: Sequence[int], tracks: Sequence[Track], of_first: int) -> bool:
+    """Return whether neither end, the first of which has so many of the tracks, sees two of them at the same ticks."""
+    for first_end in (True, False):
+        mine, theirs = ([tracks[k].tick for k in group if (k < of_first) == first_end] for group in (one, other))
         if mine and theirs and len(np.intersect1d(np.concatenate(mine), np.concatenate(theirs))) > MAX_SHARED_TICKS:
             return False
     return True
@@ -170,13 +136,10 @@ def _can_join(
 def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) -> float | None:
     """Return the median squared Mahalanobis distance of two tracks at their common ticks, less for many; None if they differ.
 
-    Parameters
-    ----------
-    velocity, velocity_other : (n, 2), (m, 2) float64
-        Velocities of the tracks at their measurements, m/s.
+    `velocity`, `velocity_other`: (n, 2), (m, 2): velocities of the tracks at their measurements, m/s.
     """
-    groups = {GROUP_OF[one.category], GROUP_OF[other.category]}
-    if len(groups) > 1 and groups not in RELATED:
+    groups = GROUP_OF[one.category], GROUP_OF[other.category]
+    if groups[0] != groups[1] and groups not in RELATED:
         return None
     if one.tick[0] > other.tick[-1] or other.tick[0] > one.tick[-1]:
         return None
@@ -184,7 +147,7 @@ def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) ->
     if not len(i):
         return None
     m, n = one.measurements.take(i), other.measurements.take(j)
-    group = np.full(len(i), GROUP_OF[one.category])
+    group = np.full(len(i), groups[0])
     late_s = ((m.t_ns - n.t_ns) / NS_PER_S)[:, None]
     away = n.center_m[:, :2] + late_s * velocity_other[j] - m.center_m[:, :2]
     c = measurement_noise(m.covariance + n.covariance, group) + POSE_SIGMA_M**2 * np.eye(2)

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from log2sim.datatypes import CATEGORIES, CATEGORY, Labels, Log, Sweep
+from log2sim.datatypes import CATEGORIES, CATEGORY, Boxes3D, Labels, Log, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.files.documents import refuse_existing, replaced
 from log2sim.geometry import (
@@ -32,7 +32,7 @@ from log2sim.geometry import (
     line_time_s,
     project_moving,
 )
-from log2sim.perception.detect.detectors import MAX_AGE_S, LabelBoxes, interpolate_pairs, window_ns
+from log2sim.perception.detect.detectors import MAX_AGE_S, boxes_of_labels, interpolate_pairs, window_ns
 from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_to_map
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
@@ -78,7 +78,7 @@ class OverlayMoment:
     at_s: float  # since the first tick
     shots: tuple[Shot, ...]
     sweeps: tuple[SweepInMap, ...]  # those nearest to the tick
-    boxes: LabelBoxes  # labels at the tick
+    boxes: Boxes3D  # labels at the tick
     notes: tuple[str, ...]  # what is missing
 
 
@@ -121,12 +121,11 @@ def read_moment(
     return OverlayMoment(log, t_ns, at, shots, sweeps, boxes, (*notes, *reader.problems))
 
 
-def labels_at(labels: Labels | None, t_ns: int) -> LabelBoxes:
+def labels_at(labels: Labels | None, t_ns: int) -> Boxes3D:
     """Interpolate the labels of every track to a stamp; a track that begins or ends there is kept up to `MAX_AGE_S`."""
     if labels is None:
-        none = np.zeros(0)
-        return LabelBoxes(np.zeros(0, np.int64), np.zeros(0, "<U16"), np.zeros((0, 3)), np.zeros((0, 3)), none)
-    everything = LabelBoxes(labels.t_ns, labels.category, labels.center_m, labels.size_m, labels.yaw_rad)
+        return Boxes3D.empty()
+    everything = boxes_of_labels(labels)
     near = np.flatnonzero(np.abs(labels.t_ns - t_ns) <= window_ns(labels.t_ns))
     near = near[np.argsort(labels.t_ns[near], kind="stable")]
     before, after = [], []
@@ -140,13 +139,8 @@ def labels_at(labels: Labels | None, t_ns: int) -> LabelBoxes:
     first, second = np.array(before, dtype=np.intp), np.array(after, dtype=np.intp)
     alone = first == second
     pairs = interpolate_pairs(everything.take(first[~alone]), everything.take(second[~alone]), t_ns)
-    singles = everything.take(first[alone])
-    joined = [np.concatenate(p) for p in zip(_columns(pairs), _columns(singles))]
-    return LabelBoxes(np.full(len(joined[0]), t_ns, dtype=np.int64), *joined)
-
-
-def _columns(boxes: LabelBoxes) -> tuple[NDArray[np.str_], Array, Array, Array]:
-    return boxes.category, boxes.center_m, boxes.size_m, boxes.yaw_rad
+    out = Boxes3D.join([pairs, everything.take(first[alone])])
+    return replace(out, t_ns=np.full(len(out), t_ns, dtype=np.int64))
 
 
 def _find_tick(schedule: Schedule, at_s: float | None) -> int:

@@ -21,6 +21,7 @@ from log2sim.geometry import (
     apply,
     box_corners,
     box_lines,
+    fold_radius,
     inverse,
     line_time_s,
     nearest_index,
@@ -204,6 +205,7 @@ SIZES = tuple(
 
 PROBES = 3  # pictures of each camera that are encoded in all sizes, to estimate how many bytes the others will have
 SAFETY = 1.1  # by how much a scene may have more bytes than its probes tell; what is still too much is thinned out
+POSE_BYTES = 140  # of the pose of a camera: twelve numbers
 OUTLINE_BYTES = 100  # of an outline in the page: sixteen numbers of up to four digits, mostly
 
 
@@ -245,8 +247,8 @@ def picture_document(
 ) -> dict[str, Any]:
     """Return the pictures of cameras within a budget, with the outlines of the agents in them.
 
-    `budget_bytes`: of the pictures and outlines as text in a page. Returns "cameras": for each name, size in px, times
-    in s, JPEGs as base64 and outlines; "ahead": which of them looks ahead; "agents": ids that outlines refer to;
+    `budget_bytes`: of the pictures and outlines as text in a page. Returns "cameras": for each name, size in px, calibration, times
+    in s, JPEGs as base64, poses and outlines; "ahead": which of them looks ahead; "agents": ids that outlines refer to;
     "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out. Raises
     `ConfigError` when not even one small picture of each camera fits.
     """
@@ -284,7 +286,7 @@ def _probe(
                 continue
             outlines = OUTLINE_BYTES * len(projector.outlines(name, int(log.streams[name].t_ns[i])))
             for width in widths:
-                sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines)
+                sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines + POSE_BYTES)
         if sizes[widths[0]]:
             out[name] = {width: float(np.mean(found)) for width, found in sizes.items()}
     return out
@@ -319,9 +321,17 @@ def _entry(
 ) -> dict[str, Any]:
     camera, t_ns = log.cameras[name], log.streams[name].t_ns
     order = sorted(index for index, data in jpeg.items() if data)
+    map_T_cam, known = log.map_T_sensor(name, t_ns[order])
+    reach = fold_radius(camera)
     return {
         "name": name,
         "size_px": [camera.width_px, camera.height_px],
+        # For what is pulled in a picture; rolling shutters are left out.
+        "K": [float(camera.K[0, 0]), float(camera.K[1, 1]), float(camera.K[0, 2]), float(camera.K[1, 2])],
+        "model": camera.distortion_model,
+        "distortion": list(map(float, camera.distortion)),
+        "reach": reach if np.isfinite(reach) else 1e6,
+        "cam_T_map": [np.round(inverse(m)[:3].ravel(), 7).tolist() if k else None for m, k in zip(map_T_cam, known)],
         "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / NS_PER_S, 4) for i in order],
         "jpeg": [base64.b64encode(jpeg[i]).decode() for i in order],
         "outlines": [projector.outlines(name, int(t_ns[i])) for i in order],
@@ -339,7 +349,7 @@ def _thin_out(entries: Mapping[str, dict[str, Any]], budget_bytes: int) -> None:
     while (total := sum(map(_bytes_of, entries.values()))) > budget_bytes:
         for entry in entries.values():
             kept = take_evenly(len(entry["t_s"]), int(0.97 * len(entry["t_s"]) * budget_bytes / total))
-            for key in ("t_s", "jpeg", "outlines"):
+            for key in ("t_s", "jpeg", "outlines", "cam_T_map"):
                 entry[key] = [entry[key][k] for k in kept.tolist()]
         if all(len(entry["t_s"]) <= 1 for entry in entries.values()):
             return
@@ -347,7 +357,7 @@ def _thin_out(entries: Mapping[str, dict[str, Any]], budget_bytes: int) -> None:
 
 def _bytes_of(entry: Mapping[str, Any]) -> int:
     """Return the bytes of the pictures of a camera and their outlines in a page."""
-    numbers = sum(len(str(outlines).replace(" ", "")) for outlines in entry["outlines"])
+    numbers = sum(len(str(row).replace(" ", "")) for key in ("outlines", "cam_T_map") for row in entry[key])
     return sum(map(len, entry["jpeg"])) + numbers + 12 * len(entry["t_s"])
 
 

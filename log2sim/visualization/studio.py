@@ -9,26 +9,18 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from log2sim.datatypes import CATEGORIES, Log, Scenario
+from log2sim.datatypes import Scenario
 from log2sim.edit.corrections import Corrected, correct, load_corrections
 from log2sim.errors import Log2SimError, ScenarioError
 from log2sim.files.documents import check, write_json
-from log2sim.geometry import NS_PER_S, fold_radius, inverse
-from log2sim.visualization.page.document import SCALES, feature_columns, page_document, second_differences
+from log2sim.visualization.page.document import SCALES, feature_columns, page_document
 from log2sim.visualization.page.writer import make_page, page_html
 from log2sim.visualization.plot.drawing import Background
-from log2sim.visualization.recording import Recorded, records_within
+from log2sim.visualization.recording import Recorded
 
 # A hundred thousand corrections have some 20 MB.
 MAX_BODY_BYTES = 32_000_000
 HOST = "127.0.0.1"
-# sRGB of usual paints by the names of `COLOR_NAMES`.
-PAINTS = {
-    "black": (25, 25, 27), "white": (238, 238, 236), "gray": (105, 106, 108), "silver": (180, 182, 184), "red": (165, 25, 30),
-    "blue": (30, 65, 150), "green": (30, 100, 55), "yellow": (235, 200, 40), "brown": (95, 65, 45), "orange": (230, 110, 30),
-}  # fmt: skip
 
 
 class Studio:
@@ -65,6 +57,7 @@ class Studio:
         self.document: dict[str, Any] = load_corrections(path) if path.exists() else empty
         self.result: Corrected = correct(scenario, self.document)
         self._token = secrets.token_urlsafe(24)
+        self._version = 0  # of the corrections: a page that does not know the present one would drop some
         self._lock = threading.Lock()
         # Pictures and points take long to gather: once, with the corrections of then.
         self._recording: tuple[Corrected, dict[str, Any] | None] | None = None
@@ -93,18 +86,11 @@ class Studio:
         """Return the page with the scenario as it is corrected now."""
         with self._lock:
             document = page_document(self.result.scenario, background=self.background)
-            document["layers"]["scenario"] = _agents(self.result.scenario)
-            document["studio"] = {
+            document["studio"] |= {
                 "address": f"/{self._token}/corrections",
-                "t0_ns": self.scenario.t0_ns,
-                "map_offset_m": list(self.scenario.map.offset_m),
-                "log": self.scenario.name,
-                "categories": list(CATEGORIES),
-                "paints": PAINTS,
+                "version": self._version,
                 "corrections": self.document["corrections"],
                 "before": [{**entry, "doubts": [], "doubted": []} for entry in _agents(self.scenario)],
-                "scales": SCALES,
-                "cameras": [] if self.recorded is None else _calibrations(self.recorded.log, self.scenario),
                 "corrected": self._recording is not None and self._recording[0] is not self.result,
             }
             if self._recording is None:
@@ -114,10 +100,11 @@ class Studio:
             document |= {"scales": SCALES, "recording": self._recording[1]}
             return page_html(document).encode()
 
-    def keep(self, body: bytes) -> dict[str, Any]:
+    def keep(self, body: bytes, version: str | None = None) -> dict[str, Any]:
         """Apply a document of corrections, write it to the file, and return what the page shows of the scenario then.
 
-        Raises `Log2SimError` for what is no such document, and for corrections that cannot be.
+        Raises `Log2SimError` for what is no such document, for corrections that cannot be, and when another page has corrected
+        since `version`.
         """
         try:
             document = json.loads(body, parse_constant=_refuse)
@@ -125,10 +112,14 @@ class Studio:
             raise ScenarioError(f"no JSON: {type(problem).__name__}") from None
         check(document, "corrections-1", ScenarioError)
         with self._lock:
+            if version not in (None, str(self._version)):
+                raise ScenarioError("another page of this studio has corrected meanwhile; load this one again")
             result = correct(self.scenario, document)
             write_json(self.path, document)
             self.document, self.result = document, result
-        shown = {"agents": _agents(result.scenario), "features": feature_columns(result.scenario), "scales": SCALES}
+            self._version += 1
+            version = str(self._version)
+        shown = {"agents": _agents(result.scenario), "features": feature_columns(result.scenario), "version": version}
         return {**shown, "unmatched": list(result.unmatched)}
 
     def allows(self, path: str, host: str | None, origin: str | None) -> bool:
@@ -138,30 +129,8 @@ class Studio:
 
 
 def _agents(scenario: Scenario) -> list[dict[str, Any]]:
-    """Return the agents as a page has them, with their heights."""
     entries: list[dict[str, Any]] = page_document(scenario)["layers"]["scenario"]
-    return [{**e, "z_m": second_differences(scenario[e["id"]].waypoints.z_m, SCALES["x_m"])} for e in entries]
-
-
-def _calibrations(log: Log, scenario: Scenario) -> list[dict[str, Any]]:
-    """Return the cameras of a log with their poses at the stamps of their pictures; rolling shutters are left out."""
-    out = []
-    for name, camera in log.cameras.items():
-        t_ns = log.streams[name].t_ns if name in log.streams else np.zeros(0, dtype=np.int64)
-        t_ns = t_ns[records_within(t_ns, scenario)]
-        map_T_cam, known = log.map_T_sensor(name, t_ns)
-        reach = fold_radius(camera)
-        entry = {
-            "name": name,
-            "K": [float(camera.K[0, 0]), float(camera.K[1, 1]), float(camera.K[0, 2]), float(camera.K[1, 2])],
-            "model": camera.distortion_model,
-            "distortion": list(map(float, camera.distortion)),
-            "reach": reach if np.isfinite(reach) else 1e6,
-            "t_s": np.round((t_ns[known] - scenario.t0_ns) / NS_PER_S, 4).tolist(),
-            "cam_T_map": [np.round(inverse(pose)[:3].ravel(), 7).tolist() for pose in map_T_cam[known]],
-        }
-        out += [entry] if known.any() else []
-    return out
+    return entries
 
 
 def _refuse(word: str) -> float:
@@ -198,7 +167,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return self._answer(413, "application/json", b'{"error": "too large"}')
         try:
-            reply, code = self.served.keep(self.rfile.read(int(length))), 200
+            reply, code = self.served.keep(self.rfile.read(int(length)), self.headers["If-Match"]), 200
         except Log2SimError as error:
             reply, code = {"error": str(error)}, 422
         except OSError as error:

@@ -45,6 +45,14 @@ def main() -> None:
             ]
             for lane in roads
         },
+        "signs": {
+            name(lane): [
+                [rule.type() if callable(rule.type) else rule.type, len(rule.refLines())]
+                for rule in lane.regulatoryElements
+                if isinstance(rule, lanelet2.core.TrafficSign)
+            ]
+            for lane in roads
+        },
         "complaints": graph.checkValidity(),
         "crosswalks": sum(lane.attributes["subtype"] == "crosswalk" for lane in found.laneletLayer),
     }

@@ -1,6 +1,6 @@
 """Markings found in single pictures of TuSimple and OpenLane, without a network, against their annotations.
 
-    python tools/bench.py lane_pictures FOLDER [--draw DIR]
+    python tools/bench.py lane_pictures FOLDER
 
 FOLDER holds `tusimple/image` with `tusimple/gt_binary_image`, and `openlane/lane3d/annotations` with
 `openlane/lane2d/images`; either may be missing. TuSimple's cameras are not known and are estimated from each picture;
@@ -48,9 +48,7 @@ def score_masks(found: np.ndarray, true: np.ndarray) -> Score:
     """Compare masks (H, W): shares of the pixels of each within `WITHIN_PX` of the other."""
 
     def share(of: np.ndarray, near: np.ndarray) -> float:
-        if not of.any():
-            return 0.0
-        if not near.any():
+        if not of.any() or not near.any():
             return 0.0
         distance = cv2.distanceTransform((~near).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         return float(np.mean(distance[of] <= WITHIN_PX))
@@ -58,27 +56,17 @@ def score_masks(found: np.ndarray, true: np.ndarray) -> Score:
     return Score(share(found, true), share(true, found))
 
 
-def draw_lines(shape: tuple[int, ...], lines: list[np.ndarray], width_px: int = DRAWN_PX) -> np.ndarray:
+def draw_lines(shape: tuple[int, ...], lines: list[np.ndarray]) -> np.ndarray:
     """Draw lines (N, 2) on a mask (H, W)."""
     mask = np.zeros(shape[:2], np.uint8)
     for uv in lines:
         # Pixels far outside the picture overflow what OpenCV draws.
         known = uv[np.isfinite(uv).all(axis=1) & (np.abs(uv) < 2**14).all(axis=1)]
-        cv2.polylines(mask, [np.rint(known).astype(np.int32).reshape(-1, 1, 2)], False, 255, width_px)
+        cv2.polylines(mask, [np.rint(known).astype(np.int32).reshape(-1, 1, 2)], False, 255, DRAWN_PX)
     return mask > 0
 
 
-def draw_overlay(image: np.ndarray, found: PictureMarkings, path: Path) -> None:
-    """Draw lane lines green, their markings red."""
-    out = image.copy()
-    out[draw_lines(image.shape, [found.project(line.points_m) for line in found.lane_lines], 2)] = (0, 220, 0)
-    painted = [found.project(m.points_m) for line in found.lane_lines for m in line.markings]
-    out[draw_lines(image.shape, painted, 3)] = (0, 0, 255)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), out)
-
-
-def score_tusimple(folder: Path, draw: Path | None) -> list[Score]:
+def score_tusimple(folder: Path) -> list[Score]:
     scores = []
     for path in sorted((folder / "image").glob("*.jpg")):
         image, true = cv2.imread(str(path)), cv2.imread(str(folder / "gt_binary_image" / f"{path.stem}.png"), 0) > 0
@@ -88,12 +76,10 @@ def score_tusimple(folder: Path, draw: Path | None) -> list[Score]:
         score = score_masks(draw_lines(image.shape, [found.project(line.points_m) for line in found.lane_lines]), true)
         print(_row(f"tusimple {path.stem}", score, f"{len(found.lane_lines)} lines, {seconds:.1f} s"))
         scores.append(score)
-        if draw:
-            draw_overlay(image, found, draw / f"tusimple_{path.stem}.png")
     return scores
 
 
-def score_openlane(folder: Path, draw: Path | None) -> list[Score]:
+def score_openlane(folder: Path) -> list[Score]:
     scores = []
     for path in sorted((folder / "lane3d" / "annotations").rglob("*.json")):
         image = cv2.imread(str(folder / "lane2d" / "images" / f"{path.stem}.jpg"))
@@ -109,8 +95,6 @@ def score_openlane(folder: Path, draw: Path | None) -> list[Score]:
         errors = "; ".join(lateral_errors(document, camera, found))
         print(_row(f"openlane {path.stem}", score, f"{len(found.lane_lines)} lines, {seconds:.1f} s; {errors}"))
         scores.append(score)
-        if draw:
-            draw_overlay(image, found, draw / f"openlane_{path.stem}.png")
     return scores
 
 
@@ -155,11 +139,10 @@ def _row(name: str, score: Score, more: str) -> str:
 def main(arguments: list[str] | None = None) -> None:
     parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--draw", type=Path, help="folder for pictures with what was found")
-    args = parser.parse_args(arguments)
+    folder = parser.parse_args(arguments).folder
     for name, scores in (
-        ("tusimple", score_tusimple(args.folder / "tusimple", args.draw)),
-        ("openlane", score_openlane(args.folder / "openlane", args.draw)),
+        ("tusimple", score_tusimple(folder / "tusimple")),
+        ("openlane", score_openlane(folder / "openlane")),
     ):
         if scores:
             print(f"{name}: mean F1 {np.mean([s.f1 for s in scores]):.3f} of {len(scores)} pictures")

@@ -4,7 +4,7 @@ The poses are refined once, with all records, as for a map of the whole log. The
 Patches of the ground that both parts show are registered; what counts is how far they are shifted against each other where a
 LiDAR saw the ground, and by how much the heights differ.
 
-    python tools/bench.py map_repeatability LOG [--sequence NAME] [--cell 0.05] [--picture DIFFERENCE.png]
+    python tools/bench.py map_repeatability LOG [--sequence NAME] [--cell 0.05]
 """
 
 from __future__ import annotations
@@ -194,7 +194,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("log", type=Path)
     parser.add_argument("--sequence")
     parser.add_argument("--cell", type=float, default=0.05)
-    parser.add_argument("--picture", type=Path, help="red: the first part, cyan: the second; beginning of the names")
     parser.add_argument("--as-logged", action="store_true", help="with the poses of the log, not refined ones")
     options = parser.parse_args(arguments)
     log = open_log(options.log, sequence=options.sequence)
@@ -220,8 +219,6 @@ def main(arguments: list[str] | None = None) -> None:
             print(
                 f"  {layer:10} {near} patches, {offsets.unlike} unlike; mean {100 * mean[0]:.1f} {100 * mean[1]:.1f} cm"
             )
-        if options.picture is not None:
-            write_difference(a, b, options.picture.with_stem(f"{options.picture.stem}_{title.split()[0]}"))
 
 
 def scenario_of(log: Log) -> Scenario:
@@ -237,12 +234,3 @@ def scenario_of(log: Log) -> Scenario:
 def restricted(scenario: Scenario, log: Log) -> Scenario:
     """The scenario, naming only the cameras that a part of the log has."""
     return replace(scenario, cameras=tuple({"name": name, "used": True} for name in log.cameras))
-
-
-def write_difference(a: GroundMap, b: GroundMap, path: Path) -> None:
-    """Write both maps on each other: gray where they agree."""
-    parts = on_common_cells(a, b)
-    if parts is None:
-        return
-    first, second = (cv2.cvtColor(g.color_bgr[p], cv2.COLOR_BGR2GRAY) for g, p in zip((a, b), parts))
-    cv2.imwrite(str(path), np.dstack([second, second, first]))

@@ -4,6 +4,7 @@ python tools/bench.py resim samples/crossing out/scenario.json
 python tools/bench.py resim samples/crossing out/scenario.json --figures pictures --camera front --images out/
 python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3 --figures sweeps
 python tools/bench.py resim samples/crossing.toml --figures pictures --sideways 0 -0.5 -1 -2 -3
+python tools/bench.py resim samples/crossing out/scenario.json --circle out/edited.json
 python tools/bench.py resim samples/crossing out/scenario.json --picture out/sweeps.jpg --without bus-1
 """
 
@@ -15,26 +16,32 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import matplotlib.pyplot as plt
 import numpy as np
 from entry import parser_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.config import LidarConfig
-from log2sim.datatypes import Frame, Log, Scenario, Sweep
-from log2sim.geometry import Array, apply, bev_iou, box_corners_bev, box_iou, inverse
+from log2sim.config import Config, LidarConfig
+from log2sim.datatypes import Agent, Boxes3D, Frame, Log, Scenario, Sweep
+from log2sim.evaluation.detection.boxes import DetectedBoxes
+from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes
+from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.truth import count_points
+from log2sim.geometry import Array, apply, box_iou, inverse, rectangle_iou
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.detect3d.detectors import open_shipped
 from log2sim.perception.first_pass import cloud_origin
 from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.pipeline import reconstruct
 from log2sim.resim.cameras import Pictures
-from log2sim.resim.rays import Shots, all_shots, angles_of, poses_of, recorded_shots
-from log2sim.resim.simulate import Simulation
+from log2sim.resim.rays import Shots, all_shots, poses_of, recorded_shots
+from log2sim.resim.simulate import Simulation, simulated_log
 from log2sim.resim.world import World, build_world
+from log2sim.scenarios import find_tags
 from log2sim.synth import load_scene, synthesize
+from log2sim.visualization.sensor_film import range_image, title_line, window_of
 
 EVERY = 5
 LIMIT_M = 40.0
@@ -106,23 +113,68 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World) -> li
     """Detect in recorded sweeps that were left out and in simulated ones of the same moments, within 30 m, BEV IoU 0.7."""
     detector, simulation, out = open_shipped("vehicle", LidarConfig()), Simulation(log, world, scenario), []
 
-    def boxes(i: int, sweep: Sweep) -> Array:
+    all_found: tuple[list[Boxes3D], list[Boxes3D]] = [], []
+    chosen = np.arange(EVERY // 2, len(log.streams[name].t_ns), EVERY)
+
+    def boxes(i: int, sweep: Sweep, kept: list[Boxes3D]) -> Array:
         origin, ground_z = cloud_origin(log, int(log.streams[name].t_ns[i]))
         cloud = assemble_cloud(log, {name: sweep}, origin=origin, ground_z=ground_z, max_range_m=50.0)
         found = detector.detect(cloud)
-        corners = box_corners_bev(found.center_m[:, :2], found.size_m[:, 0], found.size_m[:, 1], found.yaw_rad)
+        kept.append(found)
         here = log.map_T_sensor(name, log.streams[name].t_ns[i])[0][0][:2, 3]
         sure = (found.score > 0.5) & (np.linalg.norm(found.center_m[:, :2] - here, axis=1) < 30)
-        return corners[sure]
+        return np.column_stack([found.center_m[:, :2], found.size_m[:, :2], found.yaw_rad])[sure]
 
-    for i in range(EVERY // 2, len(log.streams[name].t_ns), EVERY):
+    for i in chosen.tolist():
         sweep = simulation.cast(
             name, simulation.shots(name, i), log, int(log.streams[name].t_ns[i]), np.random.default_rng(i)
         )[0]
-        recorded, simulated = boxes(i, log.streams[name].read(i)), boxes(i, sweep)
+        recorded, simulated = boxes(i, log.streams[name].read(i), all_found[0]), boxes(i, sweep, all_found[1])
         a, b = np.broadcast_arrays(recorded[:, None], simulated[None])
-        out.append(found_again(bev_iou(a, b), 0.7))
-    return [("boxes in sweeps", shares(out))]
+        out.append(found_again(rectangle_iou(a, b).reshape(a.shape[:2]), 0.7))
+    rows = [("boxes in sweeps", shares(out))]
+    for title, found in zip(("recorded sweeps", "simulated sweeps"), all_found):
+        if log.labels is not None:
+            detected = DetectedBoxes(log.name, "lidar:vehicle", log.streams[name].t_ns[chosen], tuple(found))
+            rows.append((title, average_precision(detected, log)))
+    return rows
+
+
+def average_precision(detected: DetectedBoxes, log: Log) -> Figures:
+    """AP R40 in BEV of each class that has labels within 30 m, against the labels of the recorded log."""
+    judged = evaluate_boxes(detected, log, DetectionOptions("dair", max_range_m=30.0))
+    rows = {
+        name: next(f for f in of["figures"] if f["match"]["measure"] != "iou_3d")
+        for name, of in judged["classes"].items()
+    }
+    return {f"AP {name} ({row['truths']})": float(row["ap_r40"]) for name, row in rows.items() if row["truths"]}
+
+
+def moved(old: Agent | None, new: Agent) -> bool:
+    """Whether an agent is elsewhere than before, or was not there."""
+    if old is None:
+        return True
+    was = old.at(new.waypoints.t_s)
+    return not (was.valid & (np.hypot(was.x_m - new.waypoints.x_m, was.y_m - new.waypoints.y_m) < 0.1)).all()
+
+
+def circle(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tuple[str, Figures]]:
+    """Reconstruct what is simulated of a scenario and of an edited one, and compare with each."""
+    world, rows = build_world(log, source, [name]), []
+    known = {agent.id: agent for agent in source.agents}
+    for title, now in (("circle", source), ("circle, edited", edited)):
+        simulated = simulated_log(Simulation(log, world, now))
+        found = reconstruct(simulated, Config(detect="lidar:vehicle")).scenario
+        judged = evaluate(found, count_points(now, simulated), max_range_m=LIMIT_M)
+        figures = {k: float(judged[k]) for k in ("recall", "precision", "position_median_m")}
+        changed = [row for row in judged["agents"] if moved(known.get(row["id"]), now[row["id"]])]
+        if ticks := sum(r["ticks"] for r in changed):
+            figures["recall of changed"] = sum(r["matched"] for r in changed) / ticks
+        cut_ins = [sum(tag.tag == "cut_in" for tag in find_tags(s)) for s in (now, found)]
+        rows.append(
+            (title, figures | ({"cut-ins": float(cut_ins[0]), "found": float(cut_ins[1])} if cut_ins[0] else {}))
+        )
+    return rows
 
 
 def shares(counts: list[Figures]) -> Figures:
@@ -173,20 +225,14 @@ def picture(log: Log, scenario: Scenario, name: str, index: int, without: str, p
     """Draw ranges of a recorded sweep, of the same simulated, and of the same without an agent."""
     world = build_world(log, scenario, [name], leave_out=lambda _, i: i == index)
     rest = replace(scenario, agents=tuple(a for a in scenario.agents if a.id != without))
-    figure, axes = plt.subplots(3, 1, figsize=(11, 5.4), sharex=True, layout="constrained")
-    titles = ("recorded", "simulated from the other sweeps", f"simulated without {without}")
     shots = Simulation(log, world, scenario).shots(name, index)
-    azimuth, elevation = (np.degrees(a) for a in angles_of(shots.direction))
-    for axis, title, what in zip(axes, titles, (None, scenario, rest), strict=True):
-        rows, distance = np.arange(len(azimuth)), shots.range_m
-        if what is not None:
-            simulation = Simulation(log, world, what)
-            sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(0))
-            distance = np.linalg.norm(sweep.xyz_m, axis=1)
-        axis.scatter(-azimuth[rows], elevation[rows], s=2.5, c=distance, cmap="turbo", vmin=3, vmax=40, linewidths=0)
-        axis.set(title=title, ylabel="elevation, deg", facecolor="black")
-    axes[-1].set(xlabel="azimuth, deg, to the right")
-    figure.savefig(path, dpi=90)
+    window = window_of(shots.direction)
+    parts = [title_line("recorded"), range_image(shots.direction, shots.range_m, window)]
+    for title, what in (("simulated from the other sweeps", scenario), (f"simulated without {without}", rest)):
+        sweep, rows = Simulation(log, world, what).cast(name, shots, log, 0, np.random.default_rng(0))
+        distance = np.linalg.norm(sweep.xyz_m, axis=1)
+        parts += [title_line(title), range_image(shots.direction[rows], distance, window)]
+    cv2.imwrite(str(path), np.vstack(parts))
 
 
 def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:
@@ -249,6 +295,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=8, help="of pictures")
     parser.add_argument("--images", type=Path, help="folder for pictures, recorded above simulated")
     parser.add_argument("--sideways", type=float, nargs="+", default=[0.0, 0.5, 1.0, 2.0, 3.0], metavar="M")
+    parser.add_argument(
+        "--circle", type=Path, help="an edit of the scenario: both are simulated and reconstructed instead"
+    )
     parser.add_argument("--picture", type=Path, help="draw a sweep instead")
     parser.add_argument("--sweep", type=int, default=22, help="of --picture")
     parser.add_argument("--without", default="", metavar="AGENT", help="agent that --picture leaves out")
@@ -265,16 +314,19 @@ def main(argv: list[str] | None = None) -> int:
         if given.picture is not None:
             picture(log, scenario, name, given.sweep, given.without, given.picture)
             return 0
-        begin, rows = time.process_time(), []
-        world = build_world(log, scenario, [name], leave_out=left_out)
-        print(f"build s/sweep {(time.process_time() - begin) / len(log.streams[name].t_ns):.3f}")
-        if "sweeps" in given.figures:
-            rows += held_out(log, scenario, name, world)
-        if "boxes" in given.figures:
-            rows += boxes_in_sweeps(log, scenario, name, world)
-        camera = given.camera or next(iter(log.cameras), None)
-        if "pictures" in given.figures and camera is not None:
-            rows += pictures(log, scenario, camera, world, given.count, given.images)
+        if given.circle is not None:
+            rows = circle(log, scenario, Scenario.load(given.circle), name)
+        else:
+            begin, rows = time.process_time(), []
+            world = build_world(log, scenario, [name], leave_out=left_out)
+            print(f"build s/sweep {(time.process_time() - begin) / len(log.streams[name].t_ns):.3f}")
+            if "sweeps" in given.figures:
+                rows += held_out(log, scenario, name, world)
+            if "boxes" in given.figures:
+                rows += boxes_in_sweeps(log, scenario, name, world)
+            camera = given.camera or next(iter(log.cameras), None)
+            if "pictures" in given.figures and camera is not None:
+                rows += pictures(log, scenario, camera, world, given.count, given.images)
     for label, figures in rows:
         print(f"{label:22s}", ", ".join(f"{key} {value:.3f}" for key, value in figures.items()))
     print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")

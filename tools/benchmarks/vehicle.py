@@ -2,7 +2,7 @@
 
     python tools/bench.py vehicle --out vehicle.json
 
-writes the figures, draws them into vehicle.png and prints the table. Everyone integrates the same equations with the same
+writes the figures and prints the table. Everyone integrates the same equations with the same
 inputs (steering rate and acceleration as functions of time): the published single-track model of vehicle 2, a BMW 320i, and
 the kinematic bicycle. Errors are the largest distance in m, every 0.1 s, to a converged solution. The published equations
 are switched to the kinematic ones below 0.1 m/s, since they divide by the speed; log2sim's are not, so each is held against
@@ -35,10 +35,6 @@ FLEET = 1000
 PEERS = ("RK45", "LSODA", "Radau", "BDF")
 KNOWN, ALONE, EACH = "log2sim, known inputs", "log2sim, one agent", f"log2sim, each of {FLEET}"
 COMPARED = ((KNOWN, "LSODA"), (KNOWN, "LSODA (odeint)"), (ALONE, "LSODA, 20 ms at a time"), (EACH, "LSODA"))
-COLORS = {
-    KNOWN: "#D55E00", ALONE: "#E69F00", EACH: "#882255", "Euler": "#999999", "RK4": "#555555", "RK45": "#56B4E9",
-    "LSODA": "#0072B2", "LSODA (odeint)": "#332288", "LSODA, 20 ms at a time": "#88CCEE", "Radau": "#009E73", "BDF": "#CC79A7",
-}  # fmt: skip
 LOST_M = 1e3  # a path that is off by more is no path
 
 
@@ -239,43 +235,6 @@ def table(rows: list[Row]) -> str:
     return markdown(["method", "setting", *cases], body)
 
 
-def draw(rows: list[Row], path: Path) -> None:
-    """Error against run time, a panel for every case."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    panels = list(dict.fromkeys((r.model, r.case) for r in rows))
-    figure, axes = plt.subplots(2, math.ceil(len(panels) / 2), figsize=(14, 8), sharex=True, sharey=True)
-    for axis, (model, case) in zip(axes.flat, panels):
-        for name in COLORS:
-            runs = sorted(
-                (r.milliseconds, r.error_m) for r in rows if (r.model, r.case, r.method) == (model, case, name)
-            )
-            own = name.startswith("log2sim")
-            axis.plot(
-                *zip(*runs),
-                "o-" if own else "s--",
-                color=COLORS[name],
-                ms=5 if own else 4,
-                lw=2 if own else 1,
-                label=name,
-            )
-        axis.set(xscale="log", yscale="log", title=f"{model}: {case}", ylim=(1e-9, 50))
-        axis.axhline(0.01, color="#BBBBBB", lw=0.8)
-        axis.grid(alpha=0.3)
-    for axis in axes.flat[len(panels) :]:
-        axis.axis("off")
-        axes[0, -1].tick_params(labelbottom=True)
-    figure.supxlabel("run time of an agent, ms")
-    figure.supylabel("largest distance from the converged path, m")
-    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="lower right", ncols=1, frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def main(arguments: list[str] | None = None) -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
@@ -302,7 +261,6 @@ def main(arguments: list[str] | None = None) -> None:
     print("the switch at 0.1 m/s moves the path by " + ", ".join(f"{v:.1e} m ({k})" for k, v in apart.items()))
     document = {"rows": [asdict(r) for r in rows], "switch_moves_m": apart, "faster_than_lsoda": compared}
     write_json(arguments.out, document)
-    draw(rows, arguments.out.with_suffix(".png"))
 
 
 VEHICLE = published_parameters(2, rear_axle_offset_m=1.4)

@@ -1,6 +1,6 @@
 """Names the colors of vehicles in photos that lie in folders named by color, and counts how often the names agree.
 
-    python tools/bench.py vehicle_colors FOLDER [--detector NAME_OR_FILE.onnx] [--sheet FILE.png]
+    python tools/bench.py vehicle_colors FOLDER [--detector NAME_OR_FILE.onnx]
 
 Labels that are not among the names of `log2sim.datatypes.COLOR_NAMES` are merged with the next one: silver and gray are one,
 pink is red. Nothing is learned from the photos.
@@ -28,7 +28,6 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 MERGED = {"silver": "gray", "grey": "gray", "pink": "red", "magenta": "red", "purple": "blue", "cyan": "blue", "beige": "brown",
           "tan": "brown", "gold": "yellow"}  # fmt: skip
 MAX_BYTES = 20 * 1024**2
-TILE_PX = 160
 MIN_VEHICLE_SHARE = 0.1  # of the photo; a smaller box is of something in the background
 
 
@@ -36,7 +35,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--detector", help="finds the box of the vehicle; without it the photo is the box")
-    parser.add_argument("--sheet", type=Path, help="picture of all photos with their names, wrong ones in red")
     options = parser.parse_args(arguments)
     detector = None
     if options.detector:
@@ -44,15 +42,13 @@ def main(arguments: list[str] | None = None) -> int:
 
         detector = create_detector(options.detector, Log("photos", "photos", {}, {}, {}), min_score=0.3)
     confusion: Counter[tuple[str, str]] = Counter()
-    second, tiles, begin = 0, [], time.perf_counter()
+    second, begin = 0, time.perf_counter()
     for label, path in photos(options.folder):
         image = cv2.imdecode(np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8), cv2.IMREAD_COLOR)
         found = None if image is None else color_of_picture(image, box_of(image, detector))
         order = ["none", "none"] if found is None else ranked(found)
         confusion[label, order[0]] += 1
         second += label in order[:2]
-        if options.sheet and found is not None:
-            tiles.append(tile(image, found, f"{label}: {order[0]}, {order[1]}", order[0] == label))
     count = sum(confusion.values())
     if not count:
         print(f"{options.folder}: no photos in folders named by color", file=sys.stderr)
@@ -63,8 +59,6 @@ def main(arguments: list[str] | None = None) -> int:
     print(
         f"{count} photos, top 1 {first / count:.3f}, top 2 {second / count:.3f}, {1000 * seconds / count:.0f} ms each"
     )
-    if options.sheet:
-        cv2.imwrite(str(options.sheet), sheet_of(tiles))
     return 0
 
 
@@ -105,20 +99,3 @@ def print_table(confusion: Counter[tuple[str, str]]) -> None:
     for label in names:
         if any(pair[0] == label for pair in confusion):
             print(label.ljust(14) + "".join(str(confusion[label, name] or ".").rjust(8) for name in names))
-
-
-def tile(image: NDArray[np.uint8], found: PictureColor, text: str, right: bool) -> NDArray[np.uint8]:
-    """Draw a photo, what of it was used, and the color."""
-    used = cv2.resize(found.weight / found.weight.max(), (TILE_PX, TILE_PX))[..., None]
-    small = cv2.resize(image, (TILE_PX, TILE_PX), interpolation=cv2.INTER_AREA)
-    out = np.full((TILE_PX + 18, 2 * TILE_PX + 10, 3), 255, np.uint8)
-    out[18:, :TILE_PX], out[18:, TILE_PX : 2 * TILE_PX] = small, (small * (0.15 + 0.85 * used)).astype(np.uint8)
-    out[18:, 2 * TILE_PX :] = found.color["rgb"][::-1]
-    cv2.putText(out, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0) if right else (0, 0, 255), 1, cv2.LINE_AA)
-    return out
-
-
-def sheet_of(tiles: list[NDArray[np.uint8]], columns: int = 6) -> NDArray[np.uint8]:
-    blank = np.full_like(tiles[0], 255)
-    tiles = tiles + [blank] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])

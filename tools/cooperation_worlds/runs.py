@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.table import cell, markdown
 from numpy.typing import NDArray
 
 from cooperation_worlds.world import ROAD_LIDAR, Array, RoadError, disturb
@@ -79,30 +80,21 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
     return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
 
 
-class Rows:
-    """What was measured, by test, seed, way and settings; with a file also across runs.
+class Rows(dict[tuple[Any, ...], Any]):
+    """What was measured, by test, seed, way and settings; with a file of JSON lines also across runs.
 
-    `path`: JSON lines; rows of older code are not told apart, so begin a new file after a change.
+    Rows of older code are not told apart, so begin a new file after a change.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._path, self._rows = path, {}
+        super().__init__()
+        self._path = path
         if path is not None and path.is_file():
-            for line in path.read_text().splitlines():
-                key, row = json.loads(line)
-                self._rows[tuple(key)] = row
-
-    def __contains__(self, key: tuple[Any, ...]) -> bool:
-        """Return whether a row is there."""
-        return key in self._rows
-
-    def __getitem__(self, key: tuple[Any, ...]) -> Any:
-        """Return a row."""
-        return self._rows[key]
+            self.update((tuple(key), row) for key, row in map(json.loads, path.read_text().splitlines()))
 
     def __setitem__(self, key: tuple[Any, ...], row: Any) -> None:
         """Keep a row."""
-        self._rows[key] = row
+        super().__setitem__(key, row)
         if self._path is not None:
             with self._path.open("a") as file:
                 file.write(json.dumps([key, row]) + "\n")
@@ -168,29 +160,29 @@ OVERLAP = (
 def range_table(figures: dict[str, Any]) -> str:
     bins = list(next(iter(figures.values()))["recall_by_distance"])
     rows = [
-        [NAMES[w], f"{f['range_m']:.0f}", _n(f["recall_30m"]), *(_n(v) for v in f["recall_by_distance"].values())]
+        [NAMES[w], f"{f['range_m']:.0f}", cell(f["recall_30m"]), *(cell(v) for v in f["recall_by_distance"].values())]
         for w, f in figures.items()
     ]
-    return _table(["", "range m", "recall at 30 m", *(f"{b} m" for b in bins)], rows)
+    return markdown(["", "range m", "recall at 30 m", *(f"{b} m" for b in bins)], rows)
 
 
 def blind_area_table(figures: dict[str, Any]) -> str:
     rows = [[NAMES[w], *(format(f[key], form) for _, key, form in BLIND_AREA)] for w, f in figures.items()]
-    return _table(["", *(title for title, _, _ in BLIND_AREA)], rows)
+    return markdown(["", *(title for title, _, _ in BLIND_AREA)], rows)
 
 
 def overlap_table(figures: dict[str, Any]) -> str:
     found = [(of, w, f) for of in ("boxes", "scenario") for w, f in figures[of].items()]
     rows = [[NAMES[w], of, *(format(f[key], form) for _, key, form in OVERLAP)] for of, w, f in found]
-    return _table(["", "of", *(title for title, _, _ in OVERLAP)], rows)
+    return markdown(["", "of", *(title for title, _, _ in OVERLAP)], rows)
 
 
 def ap_table(figures: dict[str, Any]) -> str:
     ways = list(next(iter(figures["ap"].values())))
-    rows = [[kind, *(_n(ap[w] and 100 * ap[w], 1) for w in ways)] for kind, ap in figures["ap"].items()]
-    rows += [[f"recall, vehicles {what}", *(_n(of[w]) for w in ways)] for what, of in figures["recall"].items()]
+    rows = [[kind, *(cell(ap[w] and 100 * ap[w], 1) for w in ways)] for kind, ap in figures["ap"].items()]
+    rows += [[f"recall, vehicles {what}", *(cell(of[w]) for w in ways)] for what, of in figures["recall"].items()]
     share = f"{figures['vehicles']} vehicles, {100 * figures['hidden_from_vehicle']:.0f} % hidden from the vehicle"
-    return _table(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
+    return markdown(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
 
 
 def registration_table(figures: dict[str, Any]) -> str:
@@ -198,18 +190,10 @@ def registration_table(figures: dict[str, Any]) -> str:
     for when in ("before", "after"):
         cells = [figures[f"{name}_{when}"] for name in ("offset_m", "turn_deg", "delay_s")]
         rows.append([when, *(f"{c['median']:.3f} / {c['p90']:.3f}" for c in cells)])
-    table = _table(["median / 90 %", "position m", "angle deg", "clock s"], rows)
-    return table + f"\n\nwithin 0.1 m and 0.3 deg: {_n(figures['within_target'])}; left out: {_n(figures['left_out'])}"
-
-
-def _n(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    lines = [list(head), *(list(r) for r in rows)]
-    marks = ["---", *["---:"] * (len(lines[0]) - 1)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], marks, *lines[1:]])
+    table = markdown(["median / 90 %", "position m", "angle deg", "clock s"], rows)
+    return (
+        table + f"\n\nwithin 0.1 m and 0.3 deg: {cell(figures['within_target'])}; left out: {cell(figures['left_out'])}"
+    )
 
 
 TABLE: dict[str, Callable[[dict[str, Any]], str]] = {

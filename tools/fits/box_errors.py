@@ -18,10 +18,9 @@ from scipy.optimize import minimize
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, GROUPS, Boxes3D
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import rotate
 from log2sim.perception.cooperative import refine_boxes, side_terms, yaw_terms
-from log2sim.perception.detect3d.boxes import Rectangles, shared_area
 from log2sim.perception.detect3d.detectors import open_shipped
 
 # A box that overlaps an object less is none of it.
@@ -44,9 +43,7 @@ def errors_of(boxes: Boxes3D, truth: Boxes3D, sensor: Array) -> list[Row]:
     out: list[Row] = []
     found, true = rectangles(boxes), rectangles(truth)
     for k in range(len(boxes)):
-        one = found.take(np.full(len(truth), k))
-        shared = shared_area(one, true)
-        iou = shared / (one.size_m.prod(axis=1) + true.size_m.prod(axis=1) - shared)
+        iou = rectangle_iou(np.repeat(found[k : k + 1], len(truth), axis=0), true)
         best, group = int(np.argmax(iou)), GROUP_OF[str(boxes.category[k])]
         if iou[best] < MIN_IOU or GROUP_OF[str(truth.category[best])] != group:
             continue
@@ -63,9 +60,9 @@ def errors_of(boxes: Boxes3D, truth: Boxes3D, sensor: Array) -> list[Row]:
     return out
 
 
-def rectangles(boxes: Boxes3D) -> Rectangles:
-    """Take the boxes in the plane."""
-    return Rectangles(boxes.center_m[:, :2], boxes.size_m[:, :2], boxes.yaw_rad)
+def rectangles(boxes: Boxes3D) -> Array:
+    """Take the boxes in the plane (M, 5)."""
+    return np.column_stack([boxes.center_m[:, :2], boxes.size_m[:, :2], boxes.yaw_rad])
 
 
 def fit_sigma(terms: Array, error: Array) -> Array:

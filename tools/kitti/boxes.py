@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kitti.paths import smooth_paths
 from log2sim.datatypes import Measurements
 from log2sim.errors import LogError
-from log2sim.geometry import NS_PER_S, Array, box_corners_bev
+from log2sim.geometry import NS_PER_S, Array, rectangle_overlap
 from log2sim.tracking.forward import ForwardTracker
 from log2sim.tracking.tracker import track
 
@@ -113,53 +113,16 @@ def write_tracks(path: Path, boxes: Boxes) -> None:
 
 def overlap_3d(a: Boxes, b: Boxes) -> Array:
     """IoU (N,) in 3D of boxes with each other, row by row."""
-    inner = _overlap_areas(_corners(a), _corners(b))
     top = np.maximum(a.bottom_m[:, 1] - a.size_hwl_m[:, 0], b.bottom_m[:, 1] - b.size_hwl_m[:, 0])
     height = np.clip(np.minimum(a.bottom_m[:, 1], b.bottom_m[:, 1]) - top, 0, None)
-    common = inner * height
+    common = rectangle_overlap(_from_above(a), _from_above(b)) * height
     union = a.size_hwl_m.prod(1) + b.size_hwl_m.prod(1) - common
     return np.divide(common, union, out=np.zeros(len(a)), where=union > 0)
 
 
-def _corners(boxes: Boxes) -> Array:
-    """Corners (N, 4, 2) on the camera's x-z plane, counter-clockwise with x to the right and z up."""
-    # rotation_y turns from z toward x, so it is clockwise on this plane.
-    return box_corners_bev(boxes.bottom_m[:, [0, 2]], boxes.size_hwl_m[:, 2], boxes.size_hwl_m[:, 1], -boxes.yaw_rad)
-
-
-def _overlap_areas(a: Array, b: Array) -> Array:
-    """Area (N,) that convex counter-clockwise quadrilaterals (N, 4, 2) have in common.
-
-    The corners of the common polygon are corners of one inside the other and crossings of edges; sorted by angle about their
-    mean, the shoelace formula gives the area. Edges that lie on each other add no crossing, but their ends are corners.
-    """
-    d = np.roll(a, -1, axis=1) - a
-    e = np.roll(b, -1, axis=1) - b
-    inside_b = np.all(_cross(e[:, None], a[:, :, None] - b[:, None]) >= -1e-9, axis=2)
-    inside_a = np.all(_cross(d[:, None], b[:, :, None] - a[:, None]) >= -1e-9, axis=2)
-    turn = _cross(d[:, :, None], e[:, None])
-    gap = b[:, None] - a[:, :, None]
-    parallel = np.abs(turn) < 1e-12
-    safe = np.where(parallel, 1.0, turn)
-    s, t = _cross(gap, e[:, None]) / safe, _cross(gap, d[:, :, None]) / safe
-    crossing = ~parallel & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    points = np.concatenate([a, b, (a[:, :, None] + s[..., None] * d[:, :, None]).reshape(-1, 16, 2)], axis=1)
-    there = np.concatenate([inside_b, inside_a, crossing.reshape(-1, 16)], axis=1)
-    count = there.sum(1)
-    middle = np.where(there[..., None], points, 0).sum(1) / np.maximum(count, 1)[:, None]
-    points = np.where(there[..., None], points - middle[:, None], 0.0)
-    angle = np.where(there, np.arctan2(points[..., 1], points[..., 0]), np.inf)
-    order = np.argsort(angle, axis=1)
-    points = np.take_along_axis(points, order[..., None], axis=1)
-    last = np.take_along_axis(there, order, axis=1)
-    # Rows behind the polygon's corners repeat its first one, which adds nothing to the area.
-    points = np.where(last[..., None], points, points[:, :1])
-    area = _cross(points, np.roll(points, -1, axis=1)).sum(1) / 2
-    return np.where(count >= 3, np.abs(area), 0.0)
-
-
-def _cross(u: Array, v: Array) -> Array:
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+def _from_above(boxes: Boxes) -> Array:
+    """Rectangles (N, 5) on the camera's x-z plane, on which rotation_y, from z toward x, is clockwise."""
+    return np.column_stack([boxes.bottom_m[:, [0, 2]], boxes.size_hwl_m[:, :0:-1], -boxes.yaw_rad])
 
 
 def _text(path: Path) -> str:

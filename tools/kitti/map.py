@@ -55,7 +55,10 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     if len(rows) < frames:
         raise LogError(f"{ego_motion}: {len(rows)} poses, expected one for each of {frames} frames of the detections")
     map_T_imu = transform(rotation_from_quaternion(rows[:, [7, 4, 5, 6]]), rows[:, 1:4])
-    return View(map_T_imu @ inverse(_rect_T_imu(c, calib)), P)
+    rect_T_cam = transform(labels.rotation_entry(c, calib, "R0_rect", "R_rect"), np.zeros(3))
+    cam_T_velo = labels.rigid_entry(c, calib, "Tr_velo_to_cam", "Tr_velo_cam")
+    velo_T_imu = labels.rigid_entry(c, calib, "Tr_imu_to_velo", "Tr_imu_velo")
+    return View(map_T_imu @ inverse(rect_T_cam @ cam_T_velo @ velo_T_imu), P)
 
 
 def _poses(path: Path) -> Array:
@@ -70,20 +73,6 @@ def _poses(path: Path) -> Array:
     if not (np.isfinite(rows).all() and np.all(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 1e-2)):
         raise LogError(f"{path}: poses must be finite and their quaternions of length 1")
     return rows
-
-
-def _rect_T_imu(c: Mapping[str, Array], path: Path) -> Array:
-    rect = transform(
-        labels.checked_rotation(
-            labels.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
-        ),
-        np.zeros(3),
-    )
-    links = []
-    for keys in (("Tr_velo_to_cam", "Tr_velo_cam"), ("Tr_imu_to_velo", "Tr_imu_velo")):
-        m = labels.calibration_entry(c, path, (3, 4), *keys)
-        links.append(transform(labels.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
-    return np.asarray(rect @ links[0] @ links[1], dtype=np.float64)
 
 
 def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:

@@ -36,7 +36,7 @@ from log2sim.evaluation.detection.evaluation import average_precision
 from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion
 from log2sim.geometry import Array, inverse, nearest_index, rotation_from_rpy, transform, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.perception.detect3d.boxes import Rectangles, suppress
+from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, open_network
 from log2sim.perception.lidar.cloud import Cloud
 
@@ -508,8 +508,7 @@ class TwoStreamDetector:
         best = np.argsort(-score)[:MAX_CANDIDATES]
         best = best[score[best] >= MIN_SCORE]
         boxes = decode(codes[best, seen.kind[best]], seen.anchors[best])
-        flat = Rectangles(boxes[:, :2], boxes[:, 3:5], boxes[:, 6])
-        kept = suppress(flat, score[best], seen.kind[best]) if len(best) else np.zeros(0, np.intp)
+        kept = suppress(boxes[:, [0, 1, 3, 4, 6]], score[best], seen.kind[best]) if len(best) else np.zeros(0, np.intp)
         boxes, best = boxes[kept], best[kept]
         boxes[:, 2] += boxes[:, :2] @ pair.ground[:2] + pair.ground[2]
         return SceneBoxes.of(boxes, np.array(CLASSES)[seen.kind[best]], score[best])

@@ -9,7 +9,6 @@ records whose contents are exchanged, bytes of a format without check sums.
 
 from __future__ import annotations
 
-import builtins
 import gzip
 import io
 import json
@@ -21,7 +20,7 @@ import sqlite3
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -40,6 +39,7 @@ TABLES = (".txt", ".csv")
 CHECKED = (".npz", ".gz", ".png", ".tfrecord")
 # Lengths, an index at the end, or an end mark: a file that ends too early can be told.
 ENDED = (*CHECKED, ".json", ".xosc", ".jpg", ".feather", ".parquet", ".bag", ".mcap", ".db3", ".npy", ".pcd")
+BOMB_BYTES = 300_000_000
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,31 @@ class Place:
 
 
 Rng = np.random.Generator
-Function = Callable[[Rng, Path, Place], "Damage | None"]
 # New content, words and whether it shows; None where the way does not fit.
 Changed = tuple[Any, str, bool] | None
 
 
 @dataclass(frozen=True)
 class Mutation:
-    """A way to damage a file, of the files with `suffixes` (all without); None from it: not of this file."""
+    """A way to damage files with `suffixes` (all without): `change(rng, file, place)`, or with a codec `change(rng, content, file)`.
 
-    function: Function
+    A codec reads content from a file and writes it.
+    """
+
+    change: Callable[..., Any]
     suffixes: tuple[str, ...] = ()
     weight: float = 1.0
+    codec: tuple[Callable[[Path], Any], Callable[[Path, Any], Any]] | None = None
 
-    @property
-    def name(self) -> str:
-        return self.function.__name__
+    def apply(self, rng: Rng, file: Path, place: Place) -> Damage | None:
+        """Damage a file; None where this does not fit."""
+        if self.codec is None:
+            done: Damage | None = self.change(rng, file, place)
+            return done
+        changed: Changed = self.change(rng, self.codec[0](file), file)
+        if changed is not None:
+            self.codec[1](file, changed[0])
+        return changed and Damage(changed[1], bool(changed[2]))
 
 
 def files_below(path: Path) -> list[Path]:
@@ -90,46 +99,20 @@ def damage(rng: Rng, place: Place, mutations: Sequence[Mutation]) -> tuple[str, 
     for file in files_below(place.input):
         groups.setdefault((file.parent, "".join(file.suffixes[-2:])), []).append(file)
     for _ in range(MAX_TRIES):
-        group = pick(rng, list(groups.values()))
-        file = pick(rng, group)
+        file = pick(rng, pick(rng, list(groups.values())))
         usable = [m for m in mutations if not m.suffixes or file.name.endswith(m.suffixes)]
         weights = np.array([m.weight for m in usable])
         chosen = usable[rng.choice(len(usable), p=weights / weights.sum())]
-        done = chosen.function(rng, file, place)
+        done = chosen.apply(rng, file, place)
         if done is not None:
             inner = file.relative_to(place.input) if file != place.input else Path(file.name)
-            return f"{chosen.name} {inner}", done
+            return f"{chosen.change.__name__} {inner}", done
     raise RuntimeError(f"no mutation fits to {place.input}")
 
 
 def pick(rng: Rng, values: Sequence[Any]) -> Any:
     """One of some values, which may be of different types."""
     return values[int(rng.integers(len(values)))]
-
-
-def changing(
-    change: Callable[..., Changed], read: Callable[[Path], Any], write: Callable[[Path, Any], Any]
-) -> Function:
-    """A mutation of `change(rng, content, file)`, which gives other content."""
-
-    def mutate(rng: Rng, file: Path, place: Place) -> Damage | None:
-        changed = change(rng, read(file), file)
-        if changed is None:
-            return None
-        content, words, visible = changed
-        write(file, content)
-        return Damage(words, bool(visible))
-
-    mutate.__name__ = change.__name__
-    return mutate
-
-
-def of_bytes(change: Callable[[Rng, bytes, Path], Changed]) -> Function:
-    return changing(change, Path.read_bytes, Path.write_bytes)
-
-
-def of_text(change: Callable[[Rng, str, Path], Changed]) -> Function:
-    return changing(change, lambda f: f.read_text("utf-8"), lambda f, text: f.write_text(text, "utf-8"))
 
 
 # --- bytes of any file
@@ -165,26 +148,18 @@ def cut_file(rng: Rng, data: bytes, file: Path) -> Changed:
     return data[:keep], f"cut to {keep} of {len(data)} bytes", visible
 
 
-def change_length(rng: Rng, data: bytes, file: Path) -> Changed:
-    """Bytes inserted, deleted or repeated; appended ones may be room for growth."""
+def change_stretch(rng: Rng, data: bytes, file: Path) -> Changed:
+    """Bytes inserted, deleted, repeated or zero; appended ones may be room for growth."""
     if len(data) < 2:
         return None
-    kind, at = int(rng.integers(3)), int(rng.integers(len(data)))
-    count = int(rng.integers(1, min((65, 65, 4096)[kind], len(data) - at + 1))) if kind else int(rng.integers(1, 65))
-    out = (data[:at] + rng.bytes(count) + data[at:], data[:at] + data[at + count :], data[: at + count] + data[at:])[
-        kind
-    ]
-    within = at + count < len(data) if kind == 2 else True
-    visible = count % 4 != 0 if file.suffix == ".bin" else within and file.name.endswith(CHECKED)
-    return out, f"{count} bytes {('inserted', 'deleted', 'repeated')[kind]} at {at}", visible
-
-
-def zero_bytes(rng: Rng, data: bytes, file: Path) -> Changed:
-    if len(data) < 2:
-        return None
-    at = int(rng.integers(len(data)))
-    count = min(int(rng.integers(1, 4096)), len(data) - at)
-    return data[:at] + bytes(count) + data[at + count :], f"{count} bytes at {at} are zero", file.name.endswith(CHECKED)
+    kind, at = pick(rng, ("inserted", "deleted", "repeated", "zero")), int(rng.integers(len(data)))
+    limit = 65 if kind in ("inserted", "deleted") else 4096
+    count = int(rng.integers(1, limit if kind == "inserted" else min(limit, len(data) - at + 1)))
+    new = {"inserted": data[:at] + rng.bytes(count) + data[at:], "deleted": data[:at] + data[at + count :],
+           "repeated": data[: at + count] + data[at:], "zero": data[:at] + bytes(count) + data[at + count :]}[kind]  # fmt: skip
+    within = kind != "repeated" or at + count < len(data)
+    visible = kind != "zero" and count % 4 != 0 if file.suffix == ".bin" else within and file.name.endswith(CHECKED)
+    return new, f"{count} bytes at {at} {kind}", visible
 
 
 def blow_up_integer(rng: Rng, data: bytes, file: Path) -> Changed:
@@ -193,28 +168,16 @@ def blow_up_integer(rng: Rng, data: bytes, file: Path) -> Changed:
     if file.suffix in TEXT or not starts:
         return None
     at, value = pick(rng, starts), pick(rng, (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF))
-    return (
-        data[:at] + value.to_bytes(4, "little") + data[at + 4 :],
-        f"the integer at {at} is {value}",
-        file.name.endswith(CHECKED),
-    )
+    new = data[:at] + value.to_bytes(4, "little") + data[at + 4 :]
+    return new, f"the integer at {at} is {value}", file.name.endswith(CHECKED)
 
 
 def replace_content(rng: Rng, data: bytes, file: Path) -> Changed:
-    contents = {
-        "nothing": b"", "one zero": b"\0", "spaces": b" \n" * 50, "noise": rng.bytes(2000), "zeros": bytes(3000),
-        "a page": b"<!DOCTYPE html><html><body>404 Not Found</body></html>",
-        "a git-lfs pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n",
-    }  # fmt: skip
-    name = pick(rng, list(contents))
-    return contents[name], f"holds {name}", not (file.suffix in (".bin", ".txt") and not contents[name].strip())
-
-
-RAW = tuple(
-    Mutation(of_bytes(change), weight=weight)
-    for change, weight in ((flip_bytes, 3.0), (cut_file, 2.0), (change_length, 3.0), (zero_bytes, 1.0), (blow_up_integer, 1.0),
-                           (replace_content, 1.0))
-)  # fmt: skip
+    new = pick(rng, (
+        b"", b"\0", b" \n" * 50, rng.bytes(2000), bytes(3000), b"<!DOCTYPE html><html><body>404 Not Found</body></html>",
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n",
+    ))  # fmt: skip
+    return new, f"holds {new[:30]!r}", not (file.suffix in (".bin", ".txt") and not new.strip())
 
 
 # --- lines and numbers of text
@@ -232,24 +195,17 @@ def put(match: re.Match[str], text: str, value: str, group: int = 0) -> str:
     return text[: match.start(group)] + value + text[match.end(group) :]
 
 
-def replace_number(rng: Rng, text: str, file: Path) -> Changed:
-    found = list(_NUMBER.finditer(text))
-    if not found:
-        return None
-    match, value = pick(rng, found), pick(rng, IMPOSSIBLE)
-    line = text.count("\n", 0, match.start()) + 1
-    return put(match, text, value), f"line {line}: {match.group()} is {value[:50]!r}", file.suffix != ".yaml"
-
-
 def change_number(rng: Rng, text: str, file: Path) -> Changed:
-    """Another value of the same kind: its opposite, zero, or ten times as much."""
+    """An impossible value, or now and then another of the same kind: its opposite, zero, or ten times as much."""
     found = list(_NUMBER.finditer(text))
     if not found:
         return None
-    match = pick(rng, found)
+    match, impossible = pick(rng, found), rng.random() < 6 / 7
     old = match.group()
-    value = pick(rng, (f"-{old}".replace("--", ""), "0", f"{old[:1]}{old[1:2] or '0'}{old[1:]}", "-1", "1e-300"))
-    return put(match, text, value), f"{old} is {value}", False
+    same = (f"-{old}".replace("--", ""), "0", f"{old[:1]}{old[1:2] or '0'}{old[1:]}", "-1", "1e-300")
+    value = pick(rng, IMPOSSIBLE if impossible else same)
+    line = text.count("\n", 0, match.start()) + 1
+    return put(match, text, value), f"line {line}: {old} is {value[:50]!r}", impossible and file.suffix != ".yaml"
 
 
 def change_line(rng: Rng, text: str, file: Path) -> Changed:
@@ -258,28 +214,24 @@ def change_line(rng: Rng, text: str, file: Path) -> Changed:
     if not lines:
         return None
     at, separator = int(rng.integers(len(lines))), "," if file.suffix == ".csv" else " "
-    line = lines[at].rstrip("\n")
+    words = lines[at].rstrip("\n").split(separator)
     kind = pick(rng, ("removed", "cut", "cut", "twice", "exchanged", "longer"))
-    # A header, or the line that pairs with a file; any other row may never have been there.
-    visible = (file.suffix == ".csv" and at == 0) or file.name.startswith("timestamps") or "calib" in str(file)
-    if kind == "removed":
-        del lines[at]
-    elif kind == "cut":
-        parts = line.split(separator)
-        if len(parts) < 2:
-            return None
-        lines[at], visible = separator.join(parts[: int(rng.integers(1, len(parts)))]) + "\n", True
-    elif kind == "twice":
+    if (kind == "cut" and len(words) < 2) or (kind == "exchanged" and len(lines) < 3):
+        return None
+    visible = {
+        # A header, or the line that pairs with a file; any other row may never have been there.
+        "removed": (file.suffix == ".csv" and at == 0) or file.name.startswith("timestamps") or "calib" in str(file),
         # Two boxes in one place may be two objects for layouts without tracks.
-        lines[at], visible = lines[at] * 2, file.name.startswith(("timestamps", "index.csv", "poses.csv"))
-    elif kind == "exchanged":
-        if len(lines) < 3:
-            return None
+        "twice": file.name.startswith(("timestamps", "index.csv", "poses.csv")),
+        "cut": True, "exchanged": False, "longer": file.suffix == ".csv",
+    }[kind]  # fmt: skip
+    if kind == "exchanged":
         a, b = rng.choice(np.arange(1, len(lines)), 2, replace=False)
         lines[a], lines[b] = lines[b], lines[a]
-        visible = False
     else:
-        lines[at], visible = f"{line}{separator}1.5\n", file.suffix == ".csv"
+        cut = separator.join(words[: int(rng.integers(1, max(len(words), 2)))]) + "\n"
+        longer = separator.join([*words, "1.5"]) + "\n"
+        lines[at] = {"removed": "", "cut": cut, "twice": lines[at] * 2, "longer": longer}[kind]
     return "".join(lines), f"line {at + 1}: {kind}", visible
 
 
@@ -289,12 +241,6 @@ def encode_otherwise(rng: Rng, data: bytes, file: Path) -> Changed:
     ends = {"crlf": "\r\n", "cr": "\r"}
     out = text.replace("\n", ends[kind]).encode() if kind in ends else text.encode(kind)
     return out, f"written as {kind}", kind == "utf-16"
-
-
-LINES = (
-    Mutation(of_text(replace_number), (*TABLES, ".yaml"), 6.0), Mutation(of_text(change_number), (*TABLES, ".yaml"), 1.0),
-    Mutation(of_text(change_line), TABLES, 6.0), Mutation(of_bytes(encode_otherwise), TEXT),
-)  # fmt: skip
 
 
 # --- values, keys and lists of JSON
@@ -320,6 +266,10 @@ OTHER_WORDS = (
 )
 
 
+def read_json(file: Path) -> Any:
+    return {"": json.loads(file.read_text("utf-8"))}
+
+
 def write_json(file: Path, root: Any) -> None:
     text = json.dumps(root[""])
     file.write_text(re.sub(rf'"{VERBATIM}(.*?)@@"', lambda m: m[1].replace('\\"', '"'), text), encoding="utf-8")
@@ -329,30 +279,6 @@ def is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def value_of(wanted: Callable[[Any], bool]) -> Callable[[Callable[..., tuple[str, bool]]], Mutation]:
-    """Make a mutation of a function `(rng, holder, key, path)` that changes a value in place, where a wanted one stands."""
-
-    def decorate(change: Callable[..., tuple[str, bool]]) -> Function:
-        def at_random(rng: Rng, root: Any, file: Path) -> Changed:
-            for _ in range(30):
-                holder, key, path = root, "", ""
-                while True:
-                    value = holder[key]
-                    if not isinstance(value, (dict, list)) or not value or rng.random() < 0.1:
-                        break
-                    key = pick(rng, list(value) if isinstance(value, dict) else range(len(value)))
-                    holder = value
-                    path += f"[{key}]" if isinstance(holder, list) else f".{key}"
-                if wanted(holder[key]) and path:
-                    return root, *change(rng, holder, key, path)
-            return None
-
-        at_random.__name__ = change.__name__
-        return changing(at_random, lambda f: {"": json.loads(f.read_text("utf-8"))}, write_json)
-
-    return decorate
-
-
 def is_allowed(path: str, value: Any) -> bool:
     """Whether a scenario's format allows the value there: free-form parts, and what may be null."""
     return any(p in path for p in (".quality", ".provenance", ".homography")) or (
@@ -360,68 +286,71 @@ def is_allowed(path: str, value: Any) -> bool:
     )
 
 
-@value_of(is_number)
-def replace_number_by_impossible(rng: Rng, holder: Any, key: Any, path: str) -> tuple[str, bool]:
-    old, holder[key] = holder[key], pick(rng, IMPOSSIBLE_VALUES)
-    return f"{path}: {old} is {str(holder[key])[:50]}", not is_allowed(path, holder[key])
+def change_tree(rng: Rng, root: Any, file: Path) -> Changed:
+    """Another value, type, key or element at a random place of a document."""
+    kinds = (impossible_number, other_value, other_type, other_keys, other_elements, deep_nesting)
+    change = kinds[rng.choice(len(kinds), p=np.array([6.0, 2.0, 3.0, 3.5, 3.5, 0.5]) / 18.5)]
+    for _ in range(30):
+        holder, key, path = root, "", ""
+        while isinstance(holder[key], (dict, list)) and holder[key] and rng.random() >= 0.1:
+            holder = holder[key]
+            key = pick(rng, list(holder) if isinstance(holder, dict) else range(len(holder)))
+            path += f"[{key}]" if isinstance(holder, list) else f".{key}"
+        changed = change(rng, holder[key], path) if path else None
+        if changed is not None:
+            holder[key], words, visible = changed
+            return root, f"{path} {words}", visible
+    return None
 
 
-@value_of(lambda v: is_number(v) or isinstance(v, str))
-def change_value(rng: Rng, holder: Any, key: Any, path: str) -> tuple[str, bool]:
-    old = holder[key]
-    holder[key] = pick(rng, (-old, 0, old * 10, 1e-300) if is_number(old) else OTHER_WORDS)
-    return f"{path}: {str(old)[:50]} is {str(holder[key])[:50]!r}", False
+def impossible_number(rng: Rng, old: Any, path: str) -> Changed:
+    new = pick(rng, IMPOSSIBLE_VALUES)
+    return (new, f"{old} is {str(new)[:50]}", not is_allowed(path, new)) if is_number(old) else None
 
 
-@value_of(lambda v: isinstance(v, (str, dict, list)) and bool(v))
-def replace_by_other_type(rng: Rng, holder: Any, key: Any, path: str) -> tuple[str, bool]:
-    old, holder[key] = holder[key], pick(rng, (None, 1, -1.5, 10**40, [], {}, True, [None]))
+def other_value(rng: Rng, old: Any, path: str) -> Changed:
+    if not is_number(old) and not isinstance(old, str):
+        return None
+    new = pick(rng, (-old, 0, old * 10, 1e-300) if is_number(old) else OTHER_WORDS)
+    return new, f"{str(old)[:50]} is {str(new)[:50]!r}", False
+
+
+def other_type(rng: Rng, old: Any, path: str) -> Changed:
+    if not isinstance(old, (str, dict, list)) or not old:
+        return None
+    new = pick(rng, (None, 1, -1.5, 10**40, [], {}, True, [None]))
     # An empty object or list instead of another is of the same type, and may have been so.
-    visible = type(old) is not type(holder[key]) and not is_allowed(path, holder[key])
-    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", visible
+    return new, f"{type(old).__name__} is {str(new)[:50]}", type(old) is not type(new) and not is_allowed(path, new)
 
 
-@value_of(lambda v: isinstance(v, dict) and bool(v))
-def change_key(rng: Rng, holder: Any, key: Any, path: str) -> tuple[str, bool]:
+def other_keys(rng: Rng, old: Any, path: str) -> Changed:
     """A key removed, which a format may lack; once more with another value; or one that is not known."""
-    part, kind = holder[key], int(rng.integers(3))
-    name = pick(rng, list(part))
+    if not isinstance(old, dict) or not old:
+        return None
+    name, kind = pick(rng, list(old)), int(rng.integers(3))
+    value = old[name]
     if kind == 0:
-        del part[name]
-        return f"{path}.{name} removed", False
+        return {k: v for k, v in old.items() if k != name}, f"{name} removed", False
     if kind == 1:
-        old = part[name]
-        part[f'{VERBATIM}"{name}"@@'] = old * 2 + 1 if is_number(old) else old
-        return f"{path}.{name} occurs twice", is_number(old)
-    part[pick(rng, ("unknown", "__proto__", "__class__", "", "k" * 10_000))] = 1
-    return f"{path} has an unknown key", False
+        twice = value * 2 + 1 if is_number(value) else value
+        return {**old, f'{VERBATIM}"{name}"@@': twice}, f"{name} occurs twice", is_number(value)
+    unknown = pick(rng, ("unknown", "__proto__", "__class__", "", "k" * 10_000))
+    return {**old, unknown: 1}, "has an unknown key", False
 
 
-@value_of(lambda v: isinstance(v, list) and bool(v))
-def change_list(rng: Rng, holder: Any, key: Any, path: str) -> tuple[str, bool]:
-    values, kind = holder[key], int(rng.integers(4))
-    at = int(rng.integers(len(values)))
+def other_elements(rng: Rng, old: Any, path: str) -> Changed:
+    if not isinstance(old, list) or not old:
+        return None
+    at, kind = int(rng.integers(len(old))), int(rng.integers(4))
+    new = (old[:at] + old[at + 1 :], old[: at + 1] + old[at:], [], old[::-1])[kind]
     # A vector of another length shows; a list of records may have any.
-    fixed = is_number(values[0]) and len(values) <= 9 and kind < 3
-    holder[key] = (values[:at] + values[at + 1 :], values[: at + 1] + values[at:], [], values[::-1])[kind]
-    return (
-        f"{path}[{at}] {('removed', 'occurs twice', 'and all others are gone', 'and all others are in reverse order')[kind]}",
-        fixed,
-    )
+    visible = is_number(old[0]) and len(old) <= 9 and kind < 3
+    return new, (f"[{at}] removed", f"[{at}] occurs twice", "has no elements", "is in reverse order")[kind], visible
 
 
-@value_of(lambda v: True)
-def nest_deeply(rng: Rng, holder: Any, key: Any, path: str) -> tuple[str, bool]:
+def deep_nesting(rng: Rng, old: Any, path: str) -> Changed:
     depth = pick(rng, (100, 3000, 200_000))
-    holder[key] = f"{VERBATIM}{'[' * depth}{']' * depth}@@"
-    return f"{path} is {depth} lists in each other", True
-
-
-TREES = tuple(
-    Mutation(function, (".json",), weight)
-    for function, weight in ((replace_number_by_impossible, 6.0), (change_value, 2.0), (replace_by_other_type, 3.0), (change_key, 3.5),
-                             (change_list, 3.5), (nest_deeply, 0.5))
-)  # fmt: skip
+    return f"{VERBATIM}{'[' * depth}{']' * depth}@@", f"is {depth} lists in each other", True
 
 
 # --- attributes and elements of XML
@@ -434,31 +363,22 @@ _XML_NUMBER = re.compile(r"-?\d+(\.\d+)?([eE][-+]?\d+)?")
 def change_attribute(rng: Rng, text: str, file: Path) -> Changed:
     """A number that is none, another value, removed, or twice."""
     match, kind = pick(rng, list(_ATTRIBUTE.finditer(text))), pick(rng, (0, 0, 0, 0, 1, 1, 2, 3))
-    if kind == 0:
-        if not _XML_NUMBER.fullmatch(match[2]):
-            return None
-        value = pick(rng, IMPOSSIBLE).replace("'", "&apos;")
-        return put(match, text, value, 2), f"{match[1]}: {match[2]} is {value[:40]!r}", True
-    if kind == 1:
-        value = pick(rng, ("0", "-1", "x", "$x", "..", "a/b", "&#x202e;", "1e3", "true"))
-        return put(match, text, value, 2), f"{match[1]}: {match[2][:40]} is {value!r}", False
-    if kind == 2:
-        return put(match, text, ""), f"{match[1]} removed", False
-    return put(match, text, f"{match[0]} {match[0]}"), f"{match[1]} occurs twice", True
+    if kind == 0 and not _XML_NUMBER.fullmatch(match[2]):
+        return None
+    new = (pick(rng, IMPOSSIBLE).replace("'", "&apos;"), pick(rng, ("0", "-1", "x", "$x", "..", "a/b", "&#x202e;", "1e3", "true")),
+           "", f"{match[0]} {match[0]}")[kind]  # fmt: skip
+    return put(match, text, new, 2 if kind < 2 else 0), f"{match[1]}: {match[2][:40]} is {new[:40]!r}", kind in (0, 3)
 
 
 def change_elements(rng: Rng, text: str, file: Path) -> Changed:
-    found = list(_EMPTY_ELEMENT.finditer(text))
+    """An element removed, twice or of another name, or very many within each other."""
+    found, kind = list(_EMPTY_ELEMENT.finditer(text)), pick(rng, ("removed", "twice", "unknown", "nested"))
     if not found:
         return None
-    match, kind = pick(rng, found), int(rng.integers(3))
-    other = ("", match[0] * 2, match[0].replace(f"<{match[1]}", "<Unknown"))[kind]
-    return put(match, text, other), f"<{match[1]}> {('removed', 'occurs twice', 'is called Unknown')[kind]}", False
-
-
-def nest_elements(rng: Rng, text: str, file: Path) -> Changed:
-    depth, at = pick(rng, (100, 5000, 300_000)), text.find("<Storyboard")
-    return f"{text[:at]}{'<a>' * depth}{'</a>' * depth}{text[at:]}", f"{depth} elements in each other", False
+    match, depth = pick(rng, found), pick(rng, (100, 5000, 300_000))
+    new = {"removed": "", "twice": match[0] * 2, "unknown": match[0].replace(f"<{match[1]}", "<Unknown"),
+           "nested": "<a>" * depth + "</a>" * depth}[kind]  # fmt: skip
+    return put(match, text, new), f"<{match[1]}> {kind}", False
 
 
 def add_entities(rng: Rng, file: Path, place: Place) -> Damage | None:
@@ -476,29 +396,13 @@ def add_entities(rng: Rng, file: Path, place: Place) -> Damage | None:
     return Damage(f"declares {inner[:60]}", True)
 
 
-XML = (
-    Mutation(of_text(change_attribute), (".xosc",), 14.0), Mutation(of_text(change_elements), (".xosc",), 3.0),
-    Mutation(add_entities, (".xosc",), 2.0), Mutation(of_text(nest_elements), (".xosc",), 0.5),
-)  # fmt: skip
+# --- archives and pickles
 
-
-# --- containers: archives of arrays, tables, images
-
-EXTREMES = (np.nan, np.inf, -np.inf, 1e308, -1e30, 1e9)
-BOMB_BYTES = 300_000_000
+HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 3), }"
 OBJECTS = "{'descr': '|O', 'fortran_order': False, 'shape': (4, 3), }"
-HUGE_HEADER = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 3), }"
 HEADERS = (
-    HUGE_HEADER, OBJECTS,
-    "{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }",
-    "{'descr': '<f8', 'fortran_order': False, 'shape': (3, 4611686018427387905), }",
-    "{'descr': '|V1000000', 'fortran_order': False, 'shape': (100000, 3), }",
-    "{'descr': [('x', '<f8'), ('y', '<f8'), ('z', '<f8')], 'fortran_order': False, 'shape': (4,), }",
-    "{'descr': '<U500000', 'fortran_order': False, 'shape': (1000, 3), }",
-    "{'descr': '<f8', 'fortran_order': True, 'shape': (4, 3, 2, 1), }",
-    "{'descr': '<f8', 'fortran_order': 7, 'shape': '4', }",
-    "{'descr': '<f8', 'shape': (4, 3), }",
-    "__import__('os').mkdir('pwned')", "(" * 500 + ")" * 500, "{'descr': '<f8', 'fortran_order': False, 'shape': (4, 3)", "\0\n\t" * 30,
+    HUGE, OBJECTS, HUGE.replace("1000000000", "-1"), HUGE.replace("(1000000000, 3)", "'4'"), HUGE.replace("<f8", "|V1000000"),
+    HUGE.replace("False", "7"), "{'descr': '<f8', 'shape': (4, 3), }", "__import__('os').mkdir('pwned')", "(" * 500 + ")" * 500, HUGE[:-4],
 )  # fmt: skip
 
 
@@ -522,7 +426,7 @@ def npy_with_header(header: str, data: bytes) -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", min(len(header), 65535)) + header.encode()[:65535] + data
 
 
-def archive(members: list[tuple[str, bytes]], method: int = zipfile.ZIP_DEFLATED) -> bytes:
+def archive(members: Sequence[tuple[str, bytes]], method: int = zipfile.ZIP_DEFLATED) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", method) as file:
         for name, data in members:
@@ -534,68 +438,59 @@ def change_arrays(rng: Rng, file: Path, place: Place) -> Damage | None:
     """Other values, types, shapes and members; whatever is compressed stays consistent."""
     with np.load(file) as loaded:
         arrays = {name: loaded[name] for name in loaded.files}
-    members = {k: npy(v) for k, v in arrays.items()}
-    name, kind = pick(rng, list(arrays)), int(rng.integers(9))
-    array = arrays[name].copy()
-    if kind == 0 and array.dtype.kind == "f":
-        value, rows = pick(rng, EXTREMES), rng.random(len(array)) < rng.choice([0.001, 0.3, 1.0])
-        array[rows] = value
-        new, words, visible = npy(array), f"{rows.sum()} rows are {value}", bool(rows.sum() > len(array) / 2)
-    elif kind == 1 and array.dtype.kind == "i":
-        limits = np.iinfo(array.dtype)
-        value = min(int(pick(rng, (limits.max, limits.min, 10**9 + 1))), limits.max)
-        array[int(rng.integers(len(array)))] = value
-        new, words, visible = npy(array), f"a value is {value}", abs(value) > 10**9
-    elif kind == 2:
+    name, kind = pick(rng, list(arrays)), int(rng.integers(7))
+    array, new, visible = arrays[name].copy(), None, True
+    if kind == 0 and array.dtype.kind in "fi":
+        extreme = (2**62, -(2**62)) if array.dtype.kind == "i" else EXTREMES
+        rows = rng.random(len(array)) < rng.choice([0.001, 0.3, 1.0])
+        with np.errstate(over="ignore"):
+            array[rows] = np.array(pick(rng, extreme), array.dtype if array.dtype.itemsize == 8 else "f4").astype(
+                array.dtype
+            )
+        new, words, visible = npy(array), f"{rows.sum()} rows are extreme", rows.sum() > len(array) / 2
+    elif kind <= 2:
         dtype = pick(rng, ("f2", "i8", "u1", "c16", "?", "U10", "O", "M8[ns]", "f16", ">f4"))
         new, words, visible = npy(array.astype(dtype)), f"is of type {dtype}", dtype not in ("f2", "f16", ">f4", "i8")
     elif kind == 3:
         other = pick(rng, (array[:0], array[:-1], array[..., None], np.concatenate([array] * 2), array[:1]))
         new, words, visible = npy(other), f"is {other.shape}", other.shape[1:] != array.shape[1:] or len(arrays) > 1
     elif kind == 4:
-        new, words, visible = None, "is missing", name == "xyz_m"
+        words, visible = "is missing", name == "xyz_m"
     elif kind == 5:
         header = pick(rng, HEADERS)
-        new, words, visible = npy_with_header(header, array.tobytes()), f"has the header {header[:60]!r}", True
-    elif kind == 6:
-        data = pickle.dumps(Payload(os.mkdir, str(place.outside / "pwned")))
-        new, words, visible = npy_with_header(OBJECTS, data), "is a pickle that makes a folder", True
-    elif kind == 7:
-        new, words, visible = (
-            npy_with_header(HUGE_HEADER, b"") + bytes(BOMB_BYTES),
-            f"unpacks to {BOMB_BYTES} zeros",
-            True,
-        )
+        new, words = npy_with_header(header, array.tobytes()), f"has the header {header[:60]!r}"
     else:
-        new, words, visible = rng.bytes(300), "is noise", True
-    rest = {**members, name: new}
-    file.write_bytes(archive([(f"{k}.npy", v) for k, v in rest.items() if v is not None]))
-    return Damage(f"{name} {words}", visible)
+        payload = pickle.dumps(Payload(os.mkdir, str(place.outside / "pwned")))
+        bad = (npy_with_header(OBJECTS, payload), npy_with_header(HUGE, bytes(BOMB_BYTES)), rng.bytes(300))
+        which = int(rng.integers(3))
+        new, words = (
+            bad[which],
+            ("is a pickle that makes a folder", f"unpacks to {BOMB_BYTES} zeros", "is noise")[which],
+        )
+    members = {**{k: npy(v) for k, v in arrays.items()}, name: new}
+    file.write_bytes(archive([(f"{k}.npy", v) for k, v in members.items() if v is not None]))
+    return Damage(f"{name} {words}", bool(visible))
 
 
 def change_archive(rng: Rng, data: bytes, file: Path) -> Changed:
-    """Other compressions, an encrypted bit, a member twice, names that lead elsewhere."""
+    """Other compressions, an encrypted bit, names that lead elsewhere, a wrong number of members."""
     with zipfile.ZipFile(io.BytesIO(data)) as loaded:
         members = [(i.filename, loaded.read(i)) for i in loaded.infolist()]
-    out, kind = bytearray(data), int(rng.integers(6))
+    out, kind = bytearray(data), int(rng.integers(4))
     if kind == 0:
         method = pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
         return archive(members, method), f"compressed by method {method}", False
     if kind == 1:
-        out = bytearray(archive(members, pick(rng, (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))))
-        out[len(out) // 3] ^= 0xFF
-        return out, "compressed otherwise, a byte inverted", True
+        # In the entry of the index and in the member's own header: a flag, or the method.
+        encrypted, method = rng.random() < 0.5, int(rng.integers(1, 100))
+        for mark, flag in ((b"PK\1\2", 8), (b"PK\3\4", 6)):
+            at = out.find(mark) + flag
+            if encrypted:
+                out[at] |= 1
+            else:
+                out[at + 2 : at + 4] = method.to_bytes(2, "little")
+        return out, "its first member is encrypted" if encrypted else f"of method {method}", encrypted or method != 8
     if kind == 2:
-        for mark, offset in ((b"PK\1\2", 8), (b"PK\3\4", 6)):
-            out[out.find(mark) + offset] |= 1
-        return out, "its first member is encrypted", True
-    if kind == 3:
-        method = int(rng.integers(1, 100))
-        for mark, offset in ((b"PK\1\2", 10), (b"PK\3\4", 8)):
-            at = out.find(mark) + offset
-            out[at : at + 2] = method.to_bytes(2, "little")
-        return out, f"its first member states the method {method}", method != 8
-    if kind == 4:
         name = pick(rng, ("../../pwned.npy", "/tmp/pwned.npy", "xyz_m.npy/", "a" * 60_000))
         return archive([(name, b"x"), *members]), f"has a member {name[:30]}", False
     at = out.rfind(b"PK\5\6")
@@ -603,57 +498,126 @@ def change_archive(rng: Rng, data: bytes, file: Path) -> Changed:
     return out, "states 65535 members", False
 
 
-def change_table_pickle(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """Payloads, deep nesting, and tables with other columns, types and values."""
-    import pandas
-
-    table = pandas.read_pickle(file)
-    column, kind, target = pick(rng, list(table.columns)), int(rng.integers(10)), str(place.outside / "pwned")
-    row = table.index[int(rng.integers(len(table)))] if len(table) else None
-    visible: Any = True
-    payloads = (Payload(os.mkdir, target), Payload(os.system, f"touch {target}"), Payload(builtins.eval, f"open({target!r}, 'w')"),
-                Payload(builtins.open, target, "w"), Payload(np.load, target), [Payload(os.mkdir, target), table])  # fmt: skip
-    if kind == 0:
-        data, words = pickle.dumps(pick(rng, payloads)), "a pickle that runs a function"
-    elif kind == 1:
-        nested = b"(" * 100_000 + b"." if rng.random() < 0.5 else b"]" + b"]a" * 5 + b"\x85" * 100_000 + b"."
-        data, words = b"\x80\x04" + nested, "deeply nested pickle"
-    elif kind == 2:
-        data, words = b"\x80\x04\x8e" + (2**62).to_bytes(8, "little") + b"abc.", "a pickle of 4 EiB"
-    elif kind == 3 and row is not None:
-        table[column] = table[column].astype(object)
-        table.loc[row, column] = pick(rng, ("x", ""))
-        data, words, visible = (
-            pickle.dumps(table),
-            f"{column} holds a word",
-            column not in ("uuid", "label") and "attributes" not in column,
-        )
-    elif kind == 4 and table[column].dtype.kind == "f" and row is not None:
-        table.loc[row, column] = pick(rng, EXTREMES)
-        # Points that are not finite are misses; a cuboid has no such value.
-        data, words, visible = (
-            pickle.dumps(table),
-            f"{column} is extreme",
-            "cuboids" in str(file) and "rider" not in column,
-        )
-    elif kind == 5:
-        data, words = pickle.dumps(table.drop(columns=[column])), f"{column} is missing"
-        visible = not column.startswith(("attributes", "cuboids", "camera", "i", "stationary"))
-    elif kind == 6:
-        data, words, visible = pickle.dumps(table.iloc[:0]), "has no rows", False
-    elif kind == 7:
-        other = pick(rng, (table.to_dict(), table.values, [1, 2], None, "text", table[column]))
-        data, words = pickle.dumps(other), f"is a {type(other).__name__}"
-    elif kind == 8:
-        data, words, visible = (
-            pickle.dumps(pandas.concat([table, table])),
-            "each row occurs twice",
-            "cuboids" in str(file),
-        )
-    else:
-        data, words = bytes(BOMB_BYTES), f"{BOMB_BYTES} zeros"
+def replace_pickle(rng: Rng, file: Path, place: Place) -> Damage | None:
+    """Pickles that run a function, that are deeply nested or huge, or hold no table."""
+    target = str(place.outside / "pwned")
+    data = pick(rng, (
+        pickle.dumps(Payload(os.mkdir, target)), pickle.dumps(Payload(os.system, f"touch {target}")), pickle.dumps(Payload(open, target, "w")),
+        pickle.dumps(Payload(eval, f"open({target!r}, 'w')")), pickle.dumps([Payload(np.load, target), 1]), b"\x80\x04" + b"(" * 100_000 + b".",
+        b"\x80\x04]" + b"]a" * 5 + b"\x85" * 100_000 + b".", b"\x80\x04\x8e" + (2**62).to_bytes(8, "little") + b"abc.",
+        pickle.dumps({"x": [1.0]}), pickle.dumps(np.zeros((4, 3))), pickle.dumps(None), bytes(BOMB_BYTES),
+    ))  # fmt: skip
     file.write_bytes(gzip.compress(data, 1))
-    return Damage(words, visible)
+    return Damage(f"holds {data[:40]!r}", True)
+
+
+# --- tables: Arrow and pickled ones
+
+EXTREMES = (np.nan, np.inf, -np.inf, 1e308, -1e30)
+EXTREME_VALUES: dict[str, tuple[Any, ...]] = {"f": EXTREMES, "i": (2**63 - 1, -(2**63), 2**31 - 1, -1)}
+
+
+def read_table(file: Path) -> Any:
+    import pandas
+    import pyarrow.feather
+    import pyarrow.parquet
+
+    if file.name.endswith(".pkl.gz"):
+        return pyarrow.Table.from_pandas(pandas.read_pickle(file))
+    # Read from bytes: a file that is mapped must not be written over.
+    data = pyarrow.BufferReader(file.read_bytes())
+    return pyarrow.feather.read_table(data) if file.suffix == ".feather" else pyarrow.parquet.read_table(data)
+
+
+def write_table(file: Path, table: Any) -> None:
+    import pyarrow.feather
+    import pyarrow.parquet
+
+    if file.name.endswith(".pkl.gz"):
+        file.write_bytes(gzip.compress(pickle.dumps(table.to_pandas()), 1))
+    elif file.suffix == ".feather":
+        pyarrow.feather.write_feather(table, file, compression="lz4")
+    else:
+        pyarrow.parquet.write_table(table, file)
+
+
+def change_cells(rng: Rng, table: Any, file: Path) -> Changed:
+    """One cell is extreme or null, or a whole column is of another type, null or gone."""
+    import pyarrow
+
+    names = [name for name in table.column_names if not name.startswith("__index")]
+    if not table.num_rows:
+        return None
+    name, at, kind = pick(rng, names), int(rng.integers(table.num_rows)), int(rng.integers(6))
+    column, where, pickled = table.column(name), table.column_names.index(name), file.name.endswith(".gz")
+    if kind <= 2:
+        group = "f" if pyarrow.types.is_floating(column.type) else "i" if pyarrow.types.is_integer(column.type) else ""
+        if not group and (kind < 2 or pickled):
+            return None
+        values, value = column.to_pylist(), pick(rng, EXTREME_VALUES[group]) if kind < 2 or pickled else None
+        values[at] = value
+        try:
+            changed = pyarrow.array(values, column.type)
+        except (pyarrow.ArrowInvalid, OverflowError):
+            return None  # more than the type holds
+        # Points may be misses; a measure of -1 may be one; a cuboid has no such value.
+        shows = (
+            "cuboids" in str(file) and group == "f" and "rider" not in name
+            if pickled
+            else "lidar" not in str(file.parent.name)
+        )
+        return table.set_column(where, name, changed), f"{name}[{at}] is {value}", value != -1 and shows
+    if kind == 3:
+        optional = ("attributes", "cuboids", "camera", "i", "stationary") if pickled else ("num_interior", "intensity")
+        return table.drop_columns([name]), f"{name} is missing", not name.startswith(optional)
+    if kind == 4:
+        words = pyarrow.array([str(v)[:20] for v in column.to_pylist()])
+        wordy = any(part in name for part in ("uuid", "label", "attributes")) or column.type == pyarrow.string()
+        return table.set_column(where, name, words), f"{name} holds text", not wordy
+    nulls = table.set_column(where, name, pyarrow.nulls(table.num_rows))
+    return None if pickled else (nulls, f"{name} is null", True)
+
+
+def change_rows(rng: Rng, table: Any, file: Path) -> Changed:
+    if table.num_rows < 2:
+        return None
+    at, kind = int(rng.integers(table.num_rows)), int(rng.integers(4))
+    rows = list(range(table.num_rows))
+    kept = (rows[:at] + rows[at + 1 :], rows[: at + 1] + rows[at:], [], rows[::-1])[kind]
+    return table.take(np.array(kept, np.int64)), f"row {at}: rows {kept[:4]}...", kind == 1 and "cuboids" in str(file)
+
+
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT"
+MESSAGE, TOPIC = (f"WHERE id = (SELECT id FROM {table} LIMIT 1 OFFSET {{row}})" for table in ("messages", "topics"))
+STATEMENTS = (
+    (f"ALTER TABLE messages RENAME TO old; CREATE VIEW messages AS {ENDLESS} x AS id, 1 AS topic_id, x AS timestamp, x'00' AS data FROM n", True),
+    (f"ALTER TABLE topics RENAME TO old; CREATE VIEW topics AS {ENDLESS} x AS id, 'a' AS name, 'b' AS type, 'cdr' AS serialization_format,"
+     " '' AS offered_qos_profiles FROM n", True),
+    ("DELETE FROM messages", True), (f"DELETE FROM topics {TOPIC}", True), ("UPDATE topics SET type = 'x/msg/Y'", True),
+    (f"UPDATE topics SET type = (SELECT type FROM topics LIMIT 1) {TOPIC}", True), (f"UPDATE topics SET name = 5.5 {TOPIC}", True),
+    (f"UPDATE messages SET data = 'text' {MESSAGE}", True), (f"UPDATE messages SET data = CAST(NULL AS BLOB) {MESSAGE}", True),
+    (f"UPDATE messages SET data = zeroblob(500000000) {MESSAGE}", True),
+    (f"UPDATE messages SET data = substr(data, 1, length(data) / 2) {MESSAGE}", True),
+    (f"UPDATE messages SET timestamp = 'x' {MESSAGE}", False), (f"DELETE FROM messages {MESSAGE}", False),
+    (f"UPDATE messages SET topic_id = 1 + topic_id {MESSAGE}", False), ("DROP TABLE messages", True),
+)  # fmt: skip
+
+
+def change_database(rng: Rng, file: Path, place: Place) -> Damage | None:
+    statements, visible = pick(rng, STATEMENTS)
+    statements = statements.replace("{row}", str(int(rng.integers(4))))
+    connection = sqlite3.connect(file)
+    try:
+        connection.executescript(statements)
+        connection.commit()
+    except sqlite3.Error:
+        return None
+    finally:
+        connection.close()
+    return Damage(statements[:120], visible)
+
+
+# --- pictures
 
 
 def change_image(rng: Rng, data: bytes, file: Path) -> Changed:
@@ -662,17 +626,15 @@ def change_image(rng: Rng, data: bytes, file: Path) -> Changed:
 
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     height, width = image.shape[:2]
-    kind, huge = int(rng.integers(6)), pick(rng, (65_535, 65_500, 30_000))
-    if kind <= 1:
-        return _with_size(data, huge, huge), f"states {huge} x {huge} pixels", True
-    if kind == 2:
-        size = pick(rng, (0, 1, 2))
-        return _with_size(data, size, height), f"states a width of {size}", True
-    if kind == 3:
+    kind, huge = int(rng.integers(4)), pick(rng, (65_535, 65_500, 30_000))
+    if kind == 0:
+        wide, high = pick(rng, ((huge, huge), (huge, huge), (0, height), (1, height)))
+        return _with_size(data, wide, high), f"states {wide} x {high} pixels", True
+    if kind == 1:
         suffix = pick(rng, (".bmp", ".tiff", ".webp", ".png", ".jpg", ".ppm", ".jp2", ".hdr"))
         other = cv2.imencode(suffix, image.astype(np.float32) if suffix == ".hdr" else image)[1].tobytes()
         return other, f"is a {suffix} image", False
-    if kind == 4:
+    if kind == 2:
         head = pick(rng, (f"P6 {huge} {huge} 255\n", f"P1 {huge} {huge}\n", "GIF89a\xff\xff\xff\xff",
                           f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {huge} +X {huge}\n"))  # fmt: skip
         return head.encode("latin-1") + bytes(100), "is another image format that states a huge size", True
@@ -692,113 +654,7 @@ def _with_size(data: bytes, width: int, height: int) -> bytes:
     return data if at < 0 else data[: at + 5] + struct.pack(">HH", height, width) + data[at + 9 :]
 
 
-CONTAINERS = (
-    Mutation(change_arrays, (".npz",), 8.0), Mutation(of_bytes(change_archive), (".npz",), 4.0),
-    Mutation(change_table_pickle, (".pkl.gz",), 10.0), Mutation(of_bytes(change_image), (".png", ".jpg"), 3.0),
-)  # fmt: skip
-
-
-# --- tables and records: Arrow, SQLite, TFRecord, messages of ROS
-
-EXTREME_VALUES: dict[str, tuple[Any, ...]] = {
-    "f": (np.nan, np.inf, -np.inf, 1e308, -1e30), "i": (2**63 - 1, -(2**63), 2**31 - 1, -1),
-}  # fmt: skip
-
-
-def read_arrow(file: Path) -> Any:
-    import pyarrow.feather
-    import pyarrow.parquet
-
-    # Read from bytes: a file that is mapped must not be written over.
-    data = pyarrow.BufferReader(file.read_bytes())
-    return pyarrow.feather.read_table(data) if file.suffix == ".feather" else pyarrow.parquet.read_table(data)
-
-
-def write_arrow(file: Path, table: Any) -> None:
-    import pyarrow.feather
-    import pyarrow.parquet
-
-    if file.suffix == ".feather":
-        pyarrow.feather.write_feather(table, file, compression="lz4")
-    else:
-        pyarrow.parquet.write_table(table, file)
-
-
-def change_cells(rng: Rng, table: Any, file: Path) -> Changed:
-    """One cell, or a whole column, is extreme or null, of another type, or gone."""
-    import pyarrow
-
-    if not table.num_rows:
-        return None
-    where, at, kind = int(rng.integers(table.num_columns)), int(rng.integers(table.num_rows)), int(rng.integers(6))
-    name, column = table.column_names[where], table.column(where)
-    if kind <= 2:
-        group = "f" if pyarrow.types.is_floating(column.type) else "i" if pyarrow.types.is_integer(column.type) else ""
-        if not group and kind < 2:
-            return None
-        values, value = column.to_pylist(), pick(rng, EXTREME_VALUES[group]) if kind < 2 else None
-        values[at] = value
-        try:
-            changed = pyarrow.array(values, column.type)
-        except (pyarrow.ArrowInvalid, OverflowError):
-            return None  # more than the type holds
-        # Points may be misses; a measure of -1 may be one.
-        visible = value != -1 and "lidar" not in str(file.parent.name)
-        return table.set_column(where, name, changed), f"{name}[{at}] is {value}", visible
-    if kind == 3:
-        return table.drop_columns([name]), f"{name} is missing", "num_interior" not in name
-    if kind == 4:
-        words = pyarrow.array([str(v)[:20] for v in column.to_pylist()])
-        return (
-            table.set_column(where, name, words),
-            f"{name} holds text",
-            "uuid" not in name and column.type != pyarrow.string(),
-        )
-    return table.set_column(where, name, pyarrow.nulls(table.num_rows)), f"{name} is null", True
-
-
-def change_rows(rng: Rng, table: Any, file: Path) -> Changed:
-    import pyarrow
-
-    if table.num_rows < 2:
-        return None
-    at, kind = int(rng.integers(table.num_rows)), int(rng.integers(4))
-    rows = list(range(table.num_rows))
-    kept = (rows[:at] + rows[at + 1 :], rows[: at + 1] + rows[at:], [], rows[::-1])[kind]
-    return table.take(pyarrow.array(kept, pyarrow.int64())), f"row {at}: rows {kept[:4]}...", False
-
-
-ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT"
-MESSAGE, TOPIC = (f"WHERE id = (SELECT id FROM {table} LIMIT 1 OFFSET {{row}})" for table in ("messages", "topics"))
-STATEMENTS = (
-    (f"ALTER TABLE messages RENAME TO old; CREATE VIEW messages AS {ENDLESS} x AS id, 1 AS topic_id, x AS timestamp, x'00' AS data FROM n", True),
-    (f"ALTER TABLE topics RENAME TO old; CREATE VIEW topics AS {ENDLESS} x AS id, 'a' AS name, 'b' AS type, 'cdr' AS serialization_format,"
-     " '' AS offered_qos_profiles FROM n", True),
-    ("DELETE FROM messages", True), ("DELETE FROM topics", True), (f"DELETE FROM topics {TOPIC}", True),
-    ("UPDATE topics SET type = 'x/msg/Y'", True), (f"UPDATE topics SET type = (SELECT type FROM topics LIMIT 1) {TOPIC}", True),
-    (f"UPDATE topics SET name = 5.5 {TOPIC}", True), (f"UPDATE messages SET data = 'text' {MESSAGE}", True),
-    (f"UPDATE messages SET data = CAST(NULL AS BLOB) {MESSAGE}", True), (f"UPDATE messages SET data = x'' {MESSAGE}", True),
-    (f"UPDATE messages SET data = zeroblob(500000000) {MESSAGE}", True),
-    (f"UPDATE messages SET data = substr(data, 1, length(data) / 2) {MESSAGE}", True),
-    (f"UPDATE messages SET timestamp = 'x' {MESSAGE}", False), (f"DELETE FROM messages {MESSAGE}", False),
-    (f"UPDATE messages SET topic_id = 1 + topic_id {MESSAGE}", False), ("DROP TABLE messages", True),
-    ("CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM topics; END", False),
-)  # fmt: skip
-
-
-def change_database(rng: Rng, file: Path, place: Place) -> Damage | None:
-    statements, visible = pick(rng, STATEMENTS)
-    statements = statements.replace("{row}", str(int(rng.integers(4))))
-    connection = sqlite3.connect(file)
-    try:
-        connection.execute("PRAGMA writable_schema = ON")
-        connection.executescript(statements)
-        connection.commit()
-    except sqlite3.Error:
-        return None
-    finally:
-        connection.close()
-    return Damage(statements[:120], visible)
+# --- records: TFRecord, messages of ROS
 
 
 def change_records(rng: Rng, data: bytes, file: Path) -> Changed:
@@ -808,36 +664,30 @@ def change_records(rng: Rng, data: bytes, file: Path) -> Changed:
         length = int.from_bytes(data[begin : begin + 8], "little")
         records.append(data[begin + 12 : begin + 12 + length])
         begin += length + 16
-    at, kind, visible = int(rng.integers(len(records))), int(rng.integers(7)), False
-    if kind <= 2:
-        changed = bytearray(records[at])
-        for _ in range(int(rng.integers(1, 8))):
-            # Near the begin, as tags and lengths of the outer messages stand there.
-            changed[int(rng.integers(len(changed) if rng.random() < 0.5 else min(len(changed), 400)))] = int(
-                rng.integers(256)
-            )
-        records[at], words = bytes(changed), f"bytes of record {at} changed"
-    elif kind == 3:
-        records[at], words, visible = records[at][: int(rng.integers(len(records[at])))], f"record {at} is cut", True
-    elif kind == 4:
-        del records[at]
-        words = f"record {at} is gone"
-    elif kind == 5:
-        records.insert(at, records[at])
-        words, visible = f"record {at} occurs twice", True
-    else:
-        records.reverse()
-        words = "records in reverse order"
+    at, kind = (
+        int(rng.integers(len(records))),
+        pick(rng, ("changed", "changed", "changed", "cut", "gone", "twice", "reversed")),
+    )
+    one = bytearray(records[at])
+    for _ in range(int(rng.integers(1, 8))):
+        # Near the begin, as tags and lengths of the outer messages stand there.
+        one[int(rng.integers(len(one) if rng.random() < 0.5 else min(len(one), 400)))] = int(rng.integers(256))
+    new = {
+        "changed": [bytes(one)],
+        "cut": [records[at][: int(rng.integers(len(one)))]],
+        "gone": [],
+        "twice": [records[at]] * 2,
+    }
+    records = records[::-1] if kind == "reversed" else records[:at] + new[kind] + records[at + 1 :]
     lengths = [struct.pack("<Q", len(record)) for record in records]
-    if rng.random() < 0.1:
+    wrong = bool(lengths) and rng.random() < 0.1
+    if wrong:
         lengths[0] = struct.pack("<Q", int(pick(rng, (2**64 - 1, 2**62, 2**33, 0))))
-        words, visible = "the first record states another length", True
     checked = [part + struct.pack("<I", masked_crc32c(part)) for pair in zip(lengths, records) for part in pair]
-    return b"".join(checked), words, visible
+    return b"".join(checked), f"record {at} {kind}, length wrong: {wrong}", wrong or kind in ("cut", "twice")
 
 
 STYLES = {".bag": ros.Style(container="bag"), ".mcap": ros.Style(), ".db3": ros.Style(container="db3")}
-FLOATS = (np.nan, np.inf, -np.inf, 1e308, -1e308)
 
 
 @cache
@@ -866,8 +716,6 @@ def change_message(rng: Rng, file: Path, place: Place) -> Damage | None:
     else:
         stamp = pick(rng, (0, 2**62, 1))
         messages[at], words = (stamp, stamp, *messages[at][2:]), f"a message was recorded at {stamp}"
-    if not messages:
-        return None
     target = file if file == place.input else file.parent
     anew = place.outside.parent / "anew"
     shutil.rmtree(anew, ignore_errors=True)  # of a try that failed
@@ -884,41 +732,33 @@ def _changed(rng: Rng, message: Any) -> Changed:
     """A message in which one value, at any depth, is another."""
     name = pick(rng, [f.name for f in fields(message) if not f.name.startswith("__")])
     old = getattr(message, name)
-    if isinstance(old, list) and old and is_dataclass(old[0]):
-        at = int(rng.integers(len(old)))
-        inner = _changed(rng, old[at])
-        return inner and (
-            replace(message, **{name: [*old[:at], inner[0], *old[at + 1 :]]}),
-            f"{name}[{at}].{inner[1]}",
-            inner[2],
-        )
-    if is_dataclass(old):
-        inner = _changed(rng, old)
-        return inner and (replace(message, **{name: inner[0]}), f"{name}.{inner[1]}", inner[2])
+    inner = old[int(rng.integers(len(old)))] if isinstance(old, list) and old else old
+    if is_dataclass(inner):
+        changed = _changed(rng, inner)
+        if changed is None:
+            return None
+        value = [changed[0] if one is inner else one for one in old] if isinstance(old, list) else changed[0]
+        return replace(message, **{name: value}), f"{name}.{changed[1]}", changed[2]
+    visible = True
     if isinstance(old, np.ndarray) and old.dtype.kind == "f" and len(old):
-        value, visible = old.copy(), True
-        value[int(rng.integers(len(old)))] = pick(rng, FLOATS)
+        value = old.copy()
+        value[int(rng.integers(len(old)))] = pick(rng, EXTREMES)
     elif isinstance(old, np.ndarray) and old.dtype == np.uint8 and len(old):
-        value, visible = old[: len(old) // 2] if rng.random() < 0.5 else old[:0], True
-    elif isinstance(old, bool):
-        value, visible = not old, False
+        value = old[: len(old) // 2] if rng.random() < 0.5 else old[:0]
     elif isinstance(old, float):
-        value, visible = pick(rng, FLOATS), True
-    elif isinstance(old, int):
-        value, visible = pick(rng, (0, 1, -1, 2**31 - 1, -(2**31), 2**32 - 1, 2**16 - 1)), False
-    elif isinstance(old, str):
-        value, visible = pick(rng, ("", "x", "/" * 500, "../..", "\u0663", "base_link", "map")), False
+        value = pick(rng, EXTREMES)
+    elif isinstance(old, (bool, int, str)):
+        words, numbers = (
+            ("", "x", "/" * 500, "../..", "\u0663", "base_link", "map"),
+            (0, 1, -1, 2**31 - 1, -(2**31), 2**32 - 1, 2**16 - 1),
+        )
+        value, visible = (
+            not old if isinstance(old, bool) else pick(rng, words if isinstance(old, str) else numbers),
+            False,
+        )
     else:
         return None
     return replace(message, **{name: value}), f"{name} is {str(value)[:30]!r}", visible
-
-
-STORED = (
-    Mutation(changing(change_cells, read_arrow, write_arrow), (".feather", ".parquet"), 10.0),
-    Mutation(changing(change_rows, read_arrow, write_arrow), (".feather", ".parquet"), 2.0),
-    Mutation(change_database, (".db3",), 12.0), Mutation(of_bytes(change_records), (".tfrecord",), 10.0),
-    Mutation(change_message, tuple(STYLES), 14.0),
-)  # fmt: skip
 
 
 # --- files and folders
@@ -961,63 +801,61 @@ def rename_file(rng: Rng, file: Path, place: Place) -> Damage | None:
     return Damage(f"is called {name}", False)
 
 
+DEVICES = ("/dev/zero", "/dev/null", "/dev/urandom", "/dev/tty", "/proc/self/mem", "/proc/self/environ")
+
+
 def replace_file(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """A folder, a pipe, a device, or a link to itself or to nothing in the place of the file."""
+    """A folder, a pipe, a device, a file of eight GiB that takes no place, or a link to itself or to nothing in the place of the file."""
+    kind = pick(rng, ("folder", "pipe", "pipe", "device", "device", "loop", "nothing", "8 GiB"))
+    if kind == "8 GiB":
+        os.truncate(file, 8 * 1024**3)
+        return Damage("has 8 GiB", True)
     file.unlink()
-    kind = pick(rng, ("folder", "pipe", "pipe", "device", "device", "loop", "nothing"))
     if kind == "folder":
         file.mkdir()
     elif kind == "pipe":
         os.mkfifo(file)
-    elif kind == "device":
-        target = pick(
-            rng, ("/dev/zero", "/dev/null", "/dev/urandom", "/dev/tty", "/proc/self/mem", "/proc/self/environ")
-        )
+    else:
+        target = pick(rng, DEVICES) if kind == "device" else file.name if kind == "loop" else "nothing-there"
         file.symlink_to(target)
         # A log that is one file is what the user named.
-        return Damage(f"links to {target}", True, (Path(target),) if file == place.input else ())
-    else:
-        file.symlink_to(file.name if kind == "loop" else "nothing-there")
+        return Damage(f"links to {target}", True, (Path(target),) if kind == "device" and file == place.input else ())
     return Damage(f"is a {kind}", True)
 
 
-def link_outside(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """To a sound file of another name, which no log may read unless links are followed."""
-    target = place.outside / f"secret{file.suffix}"
+def link_file(rng: Rng, file: Path, place: Place) -> Damage | None:
+    """Link to a sound file of another name outside, which no log may read unless links are followed, or as data sets do to its like."""
+    alike, single = rng.random() < 1 / 3, file == place.input
+    target = (
+        place.sound / (Path() if single else file.relative_to(place.input))
+        if alike
+        else place.outside / f"secret{file.suffix}"
+    )
     if not target.exists():
         shutil.copyfile(file, target)
     file.unlink()
     file.symlink_to(target)
-    return Damage("links to a file outside", file != place.input, (target,) if file == place.input else ())
+    return Damage(
+        f"links to {'its sound copy' if alike else 'a file outside'}",
+        not alike and not single,
+        (target,) if alike or single else (),
+    )
 
 
-def link_to_same_name(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """To its like of a sound copy, as data sets are laid out."""
-    target = place.sound / (file.relative_to(place.input) if file != place.input else Path())
-    file.unlink()
-    file.symlink_to(target)
-    return Damage("links to its sound copy", False, (target,))
-
-
-def link_folder(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """A folder that links to one above it, or to another one outside."""
+def change_folder(rng: Rng, file: Path, place: Place) -> Damage | None:
+    """A folder that links to one above it or outside, or with what file managers and archives leave behind and a loop."""
     folder = file.parent
     if place.input in (file, folder):
         return None
+    if rng.random() < 0.4:
+        for name, content in ((".DS_Store", b"\0\0\0\1Bud1"), (f"._{file.name}", b"\0\5\x16\7"), ("Thumbs.db", b"")):
+            (folder / name).write_bytes(content)
+        (folder / "loop").symlink_to("..")
+        return Damage("strange files beside it", False)
     shutil.rmtree(folder)
     target = pick(rng, (Path(".."), place.outside))
     folder.symlink_to(target)
     return Damage(f"its folder links to {target.name or 'the one above'}", False)
-
-
-def add_strange_files(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """Files that file managers and archives leave behind, and a loop of folders."""
-    if file == place.input:
-        return None
-    for name, content in ((".DS_Store", b"\0\0\0\1Bud1"), (f"._{file.name}", b"\0\5\x16\7"), ("Thumbs.db", b"")):
-        (file.parent / name).write_bytes(content)
-    (file.parent / "loop").symlink_to("..")
-    return Damage("strange files beside it", False)
 
 
 def forbid_reading(rng: Rng, file: Path, place: Place) -> Damage | None:
@@ -1027,16 +865,26 @@ def forbid_reading(rng: Rng, file: Path, place: Place) -> Damage | None:
     return Damage("may not be read", True)
 
 
-def grow_hugely(rng: Rng, file: Path, place: Place) -> Damage | None:
-    """Eight GiB that take no place on the disk."""
-    os.truncate(file, 8 * 1024**3)
-    return Damage("has 8 GiB", True)
+def _all() -> Iterator[Mutation]:
+    raw, text = (
+        (Path.read_bytes, Path.write_bytes),
+        (lambda f: f.read_text("utf-8"), lambda f, t: f.write_text(t, "utf-8")),
+    )
+    tree, table = (read_json, write_json), (read_table, write_table)
+    arrow, pickled = (".feather", ".parquet"), (".pkl.gz",)
+    for codec, change, suffixes, weight in (
+        (raw, flip_bytes, (), 3.0), (raw, cut_file, (), 2.0), (raw, change_stretch, (), 4.0), (raw, blow_up_integer, (), 1.0),
+        (raw, replace_content, (), 1.0), (text, change_number, (*TABLES, ".yaml"), 7.0), (text, change_line, TABLES, 6.0),
+        (raw, encode_otherwise, TEXT, 1.0), (tree, change_tree, (".json",), 18.5),
+        (text, change_attribute, (".xosc",), 14.0), (text, change_elements, (".xosc",), 3.5), (None, add_entities, (".xosc",), 2.0),
+        (None, change_arrays, (".npz",), 8.0), (raw, change_archive, (".npz",), 4.0), (None, replace_pickle, pickled, 5.0),
+        (table, change_cells, pickled, 5.0), (table, change_rows, pickled, 1.0),
+        (table, change_cells, arrow, 10.0), (table, change_rows, arrow, 2.0), (raw, change_image, (".png", ".jpg"), 3.0),
+        (None, change_database, (".db3",), 12.0), (raw, change_records, (".tfrecord",), 10.0), (None, change_message, tuple(STYLES), 14.0),
+        (None, remove_file, (), 2.0), (None, exchange_files, (), 1.0), (None, rename_file, (), 1.0), (None, replace_file, (), 3.5),
+        (None, link_file, (), 1.5), (None, change_folder, (), 0.8), (None, forbid_reading, (), 0.5),
+    ):  # fmt: skip
+        yield Mutation(change, suffixes, weight, codec)
 
 
-FILES = (
-    Mutation(remove_file, weight=2.0), Mutation(exchange_files), Mutation(rename_file), Mutation(replace_file, weight=3.0),
-    Mutation(link_outside), Mutation(link_to_same_name, weight=0.5), Mutation(link_folder, weight=0.5),
-    Mutation(add_strange_files, weight=0.3), Mutation(forbid_reading, weight=0.5), Mutation(grow_hugely, weight=0.5),
-)  # fmt: skip
-
-ALL: tuple[Mutation, ...] = (*RAW, *LINES, *TREES, *XML, *CONTAINERS, *STORED, *FILES)
+ALL: tuple[Mutation, ...] = tuple(_all())

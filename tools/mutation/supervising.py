@@ -19,7 +19,6 @@ import log2sim
 from mutation.bases import KINDS, LOGS, SCENARIO, XOSC, write_base
 from mutation.damages import ALL, Damage, Mutation, Place, damage
 from mutation.running import (
-    Canaries,
     Outcome,
     Ran,
     Watch,
@@ -62,8 +61,7 @@ class Harness:
     """The sound inputs of the kinds that are asked for, and a place for one damaged input at a time."""
 
     def __init__(self, folder: Path, kinds: Sequence[str] = KINDS, mutations: Sequence[Mutation] = ALL) -> None:
-        self.folder, self.mutations = folder, mutations
-        self.canaries = Canaries(folder / "outside")
+        self.folder, self.mutations, self.outside = folder, mutations, folder / "outside"
         self.bases = {kind: write_base(kind, folder / "sound" / kind.replace(" ", "-")) for kind in kinds}
         self._sound: dict[str, Outcome] = {}
 
@@ -71,19 +69,21 @@ class Harness:
         """Damage, run and judge one input in this process."""
         kind = kind_of(index)
         path, _, name, done = self.make(seed, index)
-        before = {p.name for p in self.canaries.folder.iterdir() if p.name not in Canaries.NAMES}
-        out = self.case(index) / "out"
-        variant = variant_of(index)
-        sound = self._sound_outcome(kind, variant)
-        before |= {"secret.txt"} if "entities" in name else set()
+        out, variant = self.case(index) / "out", variant_of(index)
+        sound, before = self._sound_outcome(kind, variant), self._files_outside()
         os.chdir(self.case(index))
         watch.allow(read=[path.parent if path.is_file() else path, *done.allowed], write=[out])
         ran = runner(kind, path, out, variant, watch.watching)
-        ran.outside += [*watch.found, *self.canaries.check(before)]
+        changed = {name for name, _ in before ^ self._files_outside()}
+        ran.outside += [*watch.found, *(f"made or changed outside: {name}" for name in sorted(changed))]
         verdict, reason = judge(ran, sound, visible=done.visible)
         return Row(
             seed, index, kind, f"{name}: {done.what}", done.visible, verdict, reason, ran.seconds, ran.peak_bytes
         )
+
+    def _files_outside(self) -> set[tuple[str, int]]:
+        """Names and times of what lies beside the input."""
+        return {(p.name, p.lstat().st_mtime_ns) for p in self.outside.iterdir()}
 
     def case(self, index: int) -> Path:
         """The folder of a damaged input and of what is made of it."""
@@ -95,11 +95,13 @@ class Harness:
         # A folder of its own for each, as readers may remember files by their path.
         case, sound = self.case(index), self.bases[kind]
         shutil.rmtree(case.parent, ignore_errors=True)
-        self.canaries.reset()
+        shutil.rmtree(self.outside, ignore_errors=True)
+        self.outside.mkdir(parents=True)
+        (self.outside / "canary").write_text('{"canary": 1}')
         top = self.folder / "sound" / kind.replace(" ", "-")
         shutil.copytree(top, case / "input")
         path = case / "input" / sound.relative_to(top)
-        place = Place(path, sound, self.canaries.folder)
+        place = Place(path, sound, self.outside)
         name, done = damage(np.random.default_rng([seed, index]), place, self.mutations)
         return path, place, name, done
 

@@ -31,13 +31,12 @@ from log2sim.agents.smooth.quadratic import (
     inlier_probability,
     min_density,
     minimize,
-    nearest_index,
     propagate,
     transition,
     weighted_sum,
     zero_motion,
 )
-from log2sim.geometry import Array
+from log2sim.geometry import Array, nearest_index
 from log2sim.tracking.forward import CHI2_2DOF_99
 
 __all__ = ["smooth_interval"]
@@ -61,21 +60,11 @@ MAX_ROUNDS, NEIGHBORS = 12, 3
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Positions of a track.
+    """Positions of a track."""
 
-    Attributes
-    ----------
-    t_s : (n,) float64, s
-        In rising order.
-    xy_m : (n, 2) float64, m
-        Along any two axes.
-    variance : (n, 2) float64, m2
-        Of a position along each of them, changing views included.
-    """
-
-    t_s: Array
-    xy_m: Array
-    variance: Array
+    t_s: Array  # (n,), s: in rising order
+    xy_m: Array  # (n, 2), m: along any two axes
+    variance: Array  # (n, 2), m2: of a position along each of them, changing views included
 
     def __len__(self) -> int:
         """Return the number of positions."""
@@ -88,18 +77,10 @@ class Positions:
 
 @dataclass(frozen=True)
 class MotionPriorSigmas:
-    """How far an object is expected to move.
+    """How far an object is expected to move."""
 
-    Attributes
-    ----------
-    speed_mps : float
-        Standard deviation of each component of the velocity; 0 for one that stands.
-    acceleration_mps2 : float
-        Standard deviation of its change in 1 s.
-    """
-
-    speed_mps: float = 0.0
-    acceleration_mps2: float = 0.0
+    speed_mps: float = 0.0  # standard deviation of each component of the velocity; 0 for one that stands
+    acceleration_mps2: float = 0.0  # standard deviation of its change in 1 s
 
 
 STANDING = MotionPriorSigmas()
@@ -107,17 +88,10 @@ STANDING = MotionPriorSigmas()
 
 @dataclass(frozen=True, eq=False)
 class MarginalLikelihood:
-    """How well a hypothesis explains positions.
+    """How well a hypothesis explains positions."""
 
-    Attributes
-    ----------
-    log : float
-        Logarithm of the marginal likelihood, outliers included.
-    inlier : (n,) bool
-    """
-
-    log: float
-    inlier: NDArray[np.bool_]
+    log: float  # logarithm of the marginal likelihood, outliers included
+    inlier: NDArray[np.bool_]  # (n,)
 
 
 def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> MarginalLikelihood:
@@ -184,44 +158,6 @@ MAX_ROLL_M = 2.0
 HELD_SIGMA_MPS, MAX_HOLDING_ROUNDS = 0.02, 4
 
 
-def backward_runs(state: Array, known: NDArray[np.bool_], heading_rad: float | None) -> list[NDArray[np.intp]]:
-    """Return the knots of each short way backward of a vehicle.
-
-    Parameters
-    ----------
-    state : (K, 3, 2) float64
-    known : (K,) bool
-        Where the course is known.
-    heading_rad : float, optional
-        Heading where the motion does not give one.
-    """
-    velocity = state[:, 1]
-    if heading_rad is None and not known.any():
-        return []
-    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=heading_rad, known=known)
-    forward = velocity[:, 0] * np.cos(yaw) + velocity[:, 1] * np.sin(yaw)
-    runs = spans_of(forward < -2 * HELD_SIGMA_MPS)
-    return [run for run in runs if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() < MAX_ROLL_M]
-
-
-def max_misfit(observed: NoisyPositions) -> float:
-    """Return by how much the squared residuals in sigmas may grow where a vehicle is held.
-
-    A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile. Errors that repeat for
-    `VIEW_S` count once.
-    """
-    if not observed.correlated or len(observed.t_s) < 2:
-        return CHI2_2DOF_99
-    return CHI2_2DOF_99 * max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s))))
-
-
-def held_at(state: Array, rows: NDArray[np.intp]) -> Quadratic:
-    """Pseudo-measurements of zero velocity at some knots of a state (K, 3, 2)."""
-    information = np.zeros((len(state), 2, 2))
-    information[rows] = np.eye(2) / HELD_SIGMA_MPS**2
-    return zero_motion(state, information, np.zeros_like(information))
-
-
 # Candidates are spans in which the smoothed speed stays below this, plus as many of its standard deviations.
 CANDIDATE_MPS, CANDIDATE_SIGMAS = 0.4, 2.0
 MIN_SPAN_S, MIN_OBSERVATIONS = 0.8, 4
@@ -243,14 +179,8 @@ def zero_velocity_sigma(
 ) -> Array:
     """Detect standstill: standard deviation (K,) of the velocity in m/s around zero, infinite where the object moves.
 
-    Parameters
-    ----------
-    knots_s : (K,) float64, s
-    weight : (n,) float64
-        Weights of the observations.
-    state : (K, 3, 2) float64
-        Smoothed state without this constraint.
-    covariance : (K, 6, 6) float64
+    `knots_s`: (K,), s. `weight`: (n,): weights of the observations. `state`: (K, 3, 2): smoothed state without this constraint.
+    `covariance`: (K, 6, 6).
     """
     speed = np.hypot(*state[:, 1].T)
     sigma = np.sqrt(np.trace(covariance[:, 2:4, 2:4], axis1=1, axis2=2) / 2)
@@ -372,28 +302,15 @@ class _RobustFit:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """All terms as quadratic forms about `state` (K, 3, 2).
-
-    Attributes
-    ----------
-    state : (K, 3, 2) float64
-        Reference of the forms.
-    weight : (n,) float64
-    information : (n, 2, 2) float64
-        Inverse covariances of the observations.
-    jerk : (Quadratic, Quadratic)
-        Squared jerk along and across the path.
-    density : (float, float)
-        Jerk densities in m2/s5 along and across the path.
-    """
+    """All terms as quadratic forms about `state` (K, 3, 2)."""
 
     prior: MotionPrior
     measurement: MeasurementModel
-    state: Array
-    weight: Array
-    information: Array
-    jerk: tuple[Quadratic, Quadratic]
-    density: tuple[float, float]
+    state: Array  # (K, 3, 2): reference of the forms
+    weight: Array  # (n,)
+    information: Array  # (n, 2, 2): inverse covariances of the observations
+    jerk: tuple[Quadratic, Quadratic]  # squared jerk along and across the path
+    density: tuple[float, float]  # jerk densities in m2/s5 along and across the path
 
     def solve(self, constraints: Quadratic | None = None) -> tuple[Minimum, Array]:
         """Return the minimum and the state (K, 3, 2) there."""
@@ -424,10 +341,7 @@ class _Problem:
 def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionModel) -> Smoothed:
     """Estimate the most probable trajectory given the positions, under white jerk along and across the path.
 
-    Parameters
-    ----------
-    asked_s : (T,) float64, s
-        Times of the result.
+    `asked_s`: (T,), s: times of the result.
 
     Notes
     -----
@@ -457,17 +371,27 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
 def _without_rolling_back(
     problem: _Problem, least: Minimum, state: Array, constraints: Quadratic | None, motion: MotionModel
 ) -> tuple[Minimum, Array]:
-    """Hold the vehicle where it seems to move backward and standing explains the positions as well."""
+    """Hold the vehicle where it seems to move a short way backward and standing explains the positions within the 99 % quantile."""
     observed = problem.measurement.observed
+    # Errors that repeat for `VIEW_S` count once.
+    repeated = observed.correlated and len(observed.t_s) >= 2
+    max_misfit = CHI2_2DOF_99 * (max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s)))) if repeated else 1.0)
     for _ in range(MAX_HOLDING_ROUNDS):
         before = least
-        covariance = least.covariance
-        known = _known_courses(state, covariance, motion, correlated=observed.correlated)
-        for run in backward_runs(state, known, motion.heading_rad):
-            hold = held_at(problem.state, run)
+        known = _known_courses(state, least.covariance, motion, correlated=observed.correlated)
+        if motion.heading_rad is None and not known.any():
+            break
+        yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, known=known)
+        forward = state[:, 1, 0] * np.cos(yaw) + state[:, 1, 1] * np.sin(yaw)
+        for run in spans_of(forward < -2 * HELD_SIGMA_MPS):
+            if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() >= MAX_ROLL_M:
+                continue
+            information = np.zeros((len(state), 2, 2))
+            information[run] = np.eye(2) / HELD_SIGMA_MPS**2
+            hold = zero_motion(problem.state, information, np.zeros_like(information))
             both = hold if constraints is None else weighted_sum([(1.0, constraints), (1.0, hold)])
             stands, its_state = problem.solve(both)
-            if problem.misfit(its_state) - problem.misfit(state) < max_misfit(observed):
+            if problem.misfit(its_state) - problem.misfit(state) < max_misfit:
                 constraints, least, state = both, stands, its_state
         if least is before:
             break

@@ -34,14 +34,8 @@ def broken_limits(
 ) -> tuple[Finding, ...]:
     """Find the limits that a motion breaks anywhere.
 
-    Parameters
-    ----------
-    t_s : (T,) float64, s
-    acceleration_mps2 : (T, 2) float64, m/s2
-    yaw_rad : (T,) float64, rad
-    curvature_1pm : (T,) float64, 1/m
-    sigma : mapping of str to (T,) float64, optional
-        Standard deviations of the limited quantities by the names of the limits; 0 where none is given.
+    `t_s`: (T,), s. `acceleration_mps2`: (T, 2), m/s2. `yaw_rad`: (T,), rad. `curvature_1pm`: (T,), 1/m. `sigma`: (T,) each:
+    standard deviations of the limited quantities by the names of the limits; 0 where none is given.
     """
     lateral = acceleration_mps2[:, 1] * np.cos(yaw_rad) - acceleration_mps2[:, 0] * np.sin(yaw_rad)
     jerk = np.hypot(*np.diff(acceleration_mps2, axis=0).T) / np.diff(t_s)
@@ -93,17 +87,9 @@ def course_is_known(
 ) -> NDArray[np.bool_]:
     """Where (T,) the direction of the velocity gives the heading.
 
-    Parameters
-    ----------
-    xy_m : (T, 2) float64, m
-    velocity_mps : (T, 2) float64, m/s
-    covariance : (T, 2, 2) float64, m2/s2
-        Of the velocity.
-    correlated : bool
-        Whether the errors of the positions repeat. The covariances are too small then, so the speed alone decides.
-    max_curvature_1pm : float, 1/m
-        Of a path that is not holonomic. Courses that a vehicle could not turn between are not both known, see
-        `_turns_feasible`.
+    `xy_m`: (T, 2), m. `velocity_mps`: (T, 2), m/s. `covariance`: (T, 2, 2), m2/s2: of the velocity. `correlated`: whether the
+    errors of the positions repeat. The covariances are too small then, so the speed alone decides. `max_curvature_1pm`: 1/m: of
+    a path that is not holonomic. Courses that a vehicle could not turn between are not both known, see `_turns_feasible`.
     """
     speed = np.hypot(*velocity_mps.T)
     if correlated:
@@ -167,17 +153,9 @@ def yaw_of_motion(
 
     Between two moving parts the heading changes with the distance covered, so a standing object does not turn.
 
-    Parameters
-    ----------
-    xy_m : (T, 2) float64, m
-    velocity_mps : (T, 2) float64, m/s
-    hint_rad : float, optional
-        Heading before the first motion; it also decides between driving forward and reversing. Without motion and hint the
-        heading is 0.
-    holonomic : bool
-        True for pedestrians, who turn round instead of moving backward.
-    known : (T,) bool, optional
-        Where the course is known; by default where it is fast enough.
+    `xy_m`: (T, 2), m. `velocity_mps`: (T, 2), m/s. `hint_rad`: heading before the first motion; it also decides between driving
+    forward and reversing. Without motion and hint the heading is 0. `holonomic`: true for pedestrians, who turn round instead
+    of moving backward. `known`: (T,): where the course is known; by default where it is fast enough.
     """
     speed = np.hypot(*velocity_mps.T)
     moving = speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS) if known is None else known
@@ -204,15 +182,8 @@ def yaw_sigma(
 
     There it is that of the direction of the velocity; elsewhere it grows with the distance from the nearest known course.
 
-    Parameters
-    ----------
-    xy_m : (T, 2) float64, m
-    velocity_mps : (T, 2) float64, m/s
-    covariance : (T, 2, 2) float64, m2/s2
-        Of the velocity.
-    known : (T,) bool
-    hint_sigma_rad : float
-        Of the heading that is taken without any known course.
+    `xy_m`: (T, 2), m. `velocity_mps`: (T, 2), m/s. `covariance`: (T, 2, 2), m2/s2: of the velocity. `known`: (T,).
+    `hint_sigma_rad`: of the heading that is taken without any known course.
     """
     rows = np.flatnonzero(known)
     if len(rows) == 0:
@@ -258,27 +229,13 @@ def _heading_of_course(course: Array, hint_rad: float | None) -> Array:
 
 @dataclass(frozen=True)
 class MotionModel:
-    """What is known of how an object moves.
+    """What is known of how an object moves."""
 
-    Attributes
-    ----------
-    jerk_density : float, optional
-        Spectral density of the jerk in m2/s5; None to estimate it.
-    holonomic : bool
-        Whether it may move in any direction, as pedestrians do.
-    heading_rad : float, optional
-        Heading where the motion does not give one.
-    heading_sigma_rad : float
-        Its standard deviation.
-    max_curvature_1pm : float, 1/m
-        Of its way, unless it is holonomic.
-    """
-
-    jerk_density: float | None = None
-    holonomic: bool = False
-    heading_rad: float | None = None
-    heading_sigma_rad: float = UNKNOWN_YAW_RAD
-    max_curvature_1pm: float = MAX_CURVATURE_1PM
+    jerk_density: float | None = None  # spectral density of the jerk in m2/s5; None to estimate it
+    holonomic: bool = False  # whether it may move in any direction, as pedestrians do
+    heading_rad: float | None = None  # heading where the motion does not give one
+    heading_sigma_rad: float = UNKNOWN_YAW_RAD  # its standard deviation
+    max_curvature_1pm: float = MAX_CURVATURE_1PM  # of its way, unless it is holonomic
 
     @property
     def density_by_direction(self) -> bool:
@@ -288,26 +245,12 @@ class MotionModel:
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A smoothed trajectory at the asked times and what was found out about the observations.
+    """A smoothed trajectory at the asked times and what was found out about the observations."""
 
-    Attributes
-    ----------
-    state : (T, 3, 2) float64
-        Position in m, velocity in m/s, acceleration in m/s2.
-    covariance : (T, 6, 6) float64
-    yaw_rad, sigma_yaw_rad : (T,) float64
-    residual_m : (n,) float64
-        Distance of each observation from the trajectory.
-    weight : (n,) float64
-        Weight of each observation in [0, 1].
-    jerk_density : (float, float)
-        Along and across the path, m2/s5.
-    """
-
-    state: Array
-    covariance: Array
-    yaw_rad: Array
+    state: Array  # (T, 3, 2): position in m, velocity in m/s, acceleration in m/s2
+    covariance: Array  # (T, 6, 6)
+    yaw_rad: Array  # `yaw_rad`, `sigma_yaw_rad`: (T,)
     sigma_yaw_rad: Array
-    residual_m: Array
-    weight: Array
-    jerk_density: tuple[float, float]
+    residual_m: Array  # (n,): distance of each observation from the trajectory
+    weight: Array  # (n,): weight of each observation in [0, 1]
+    jerk_density: tuple[float, float]  # along and across the path, m2/s5

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, nearest_index
 
 # A chain of at most as many states is inverted as a dense matrix.
 MAX_DENSE_STATES = 8
@@ -21,21 +21,11 @@ MAX_DENSE_STATES = 8
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """`value - 2 gradient.d + d.A.d` of a step d away from a reference state, A block-tridiagonal.
+    """`value - 2 gradient.d + d.A.d` of a step d away from a reference state, A block-tridiagonal."""
 
-    Attributes
-    ----------
-    band : (K p, 2p) float64
-        Columns of A from the diagonal down.
-    gradient : (K, p, m) float64
-        Negative half gradient at the reference, of m columns of unknowns that share A.
-    value : float
-        At the reference.
-    """
-
-    band: Array
-    gradient: Array
-    value: float
+    band: Array  # (K p, 2p): columns of A from the diagonal down
+    gradient: Array  # (K, p, m): negative half gradient at the reference, of m columns of unknowns that share A
+    value: float  # at the reference
 
     @classmethod
     def of(cls, diagonal: Array, off: Array | None, gradient: Array, value: float) -> Quadratic:
@@ -45,21 +35,11 @@ class Quadratic:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Minimum of a quadratic form.
+    """Minimum of a quadratic form."""
 
-    Attributes
-    ----------
-    step : (K, p, m) float64
-        From the reference to the minimum.
-    value : float
-        At the minimum.
-    log_determinant : float
-        log(det A).
-    """
-
-    step: Array
-    value: float
-    log_determinant: float
+    step: Array  # (K, p, m): from the reference to the minimum
+    value: float  # at the minimum
+    log_determinant: float  # log(det A)
     form: Quadratic
 
     @cached_property
@@ -82,10 +62,7 @@ def weighted_sum(terms: Iterable[tuple[float, Quadratic]]) -> Quadratic:
 def minimize(form: Quadratic) -> Minimum:
     """Find the minimum by a banded Cholesky factorization, O(K p^3).
 
-    Raises
-    ------
-    np.linalg.LinAlgError
-        When A is not positive definite.
+    Raises `np.linalg.LinAlgError`: When A is not positive definite.
     """
     from scipy.linalg.lapack import dpbtrf, dpbtrs
 
@@ -186,52 +163,26 @@ _UNIT_INFORMATION = np.linalg.inv(_UNIT_Q)
 
 @dataclass(frozen=True, eq=False)
 class NoisyPositions:
-    """Measured positions with their noise.
+    """Measured positions with their noise."""
 
-    Attributes
-    ----------
-    t_s : (n,) float64, s
-    xy : (n, 2) float64, m
-    r : (n, 2, 2) float64, m2
-        Covariance of each position.
-    unknown_scale : bool
-        Whether `r` is known up to a common factor only.
-    correlated : bool
-        Whether errors repeat from tick to tick and have heavier tails than Gaussian ones, as those of measured boxes.
-    """
-
-    t_s: Array
-    xy: Array
-    r: Array
-    unknown_scale: bool = False
+    t_s: Array  # (n,), s
+    xy: Array  # (n, 2), m
+    r: Array  # (n, 2, 2), m2: covariance of each position
+    unknown_scale: bool = False  # whether `r` is known up to a common factor only
+    # Whether errors repeat from tick to tick and have heavier tails than Gaussian ones, as those of measured boxes
     correlated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """Knots and the motion between them, at a jerk density of 1 m2/s5.
+    """Knots and the motion between them, at a jerk density of 1 m2/s5."""
 
-    Attributes
-    ----------
-    knots_s : (K,) float64, s
-    step : (K-1, 3, 3) float64
-        Transition of position, velocity and acceleration to the next knot.
-    inverse : (K-1, 3, 3) float64
-        Information about the process noise of each step.
-    inverse_before : (K-1, 3, 3) float64
-        The same, propagated to the earlier knot.
-    cross : (K-1, 3, 3) float64
-        Blocks above the diagonal of the squared jerk.
-    diagonal : (K, 3, 3) float64
-        Blocks on the diagonal of the squared jerk.
-    """
-
-    knots_s: Array
-    step: Array
-    inverse: Array
-    inverse_before: Array
-    cross: Array
-    diagonal: Array
+    knots_s: Array  # (K,), s
+    step: Array  # (K-1, 3, 3): transition of position, velocity and acceleration to the next knot
+    inverse: Array  # (K-1, 3, 3): information about the process noise of each step
+    inverse_before: Array  # (K-1, 3, 3): the same, propagated to the earlier knot
+    cross: Array  # (K-1, 3, 3): blocks above the diagonal of the squared jerk
+    diagonal: Array  # (K, 3, 3): blocks on the diagonal of the squared jerk
 
     @classmethod
     def over(cls, t_s: Array, step_s: float = KNOT_STEP_S) -> MotionPrior:
@@ -311,14 +262,6 @@ def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
     return np.array(knots)
 
 
-def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
-    """Index of the knot nearest to each time."""
-    if len(knots) == 1:
-        return np.zeros(len(t), dtype=np.intp)
-    i = np.clip(np.searchsorted(knots, t), 1, len(knots) - 1)
-    return np.where(np.abs(knots[i - 1] - t) <= np.abs(knots[i] - t), i - 1, i)
-
-
 # Information about position, velocity and acceleration of the first knot.
 INITIAL_INFORMATION = np.array([0.0, VELOCITY_PRIOR_MPS**-2, ACCELERATION_PRIOR_MPS2**-2])
 # Prior share of outliers and the ratio of their standard deviation to that of inliers.
@@ -332,21 +275,12 @@ class MeasurementModel:
     """Which state each observation measures, and how.
 
     All forms contain the vague prior of the first knot, with which a single observation, or two of them, have a solution.
-
-    Attributes
-    ----------
-    knot : (n,) int
-        Index of the knot that each observation measures.
-    design : (n, 3) float64
-        Row that takes the knot's position, velocity and acceleration to the observed position.
-    group_start : (G,) int
-        Rows at which the observations of another knot begin.
     """
 
     observed: NoisyPositions
-    knot: NDArray[np.intp]
-    design: Array
-    group_start: NDArray[np.intp]
+    knot: NDArray[np.intp]  # (n,): index of the knot that each observation measures
+    design: Array  # (n, 3): row that takes the knot's position, velocity and acceleration to the observed position
+    group_start: NDArray[np.intp]  # (G,): rows at which the observations of another knot begin
 
     @classmethod
     def of(cls, observed: NoisyPositions, prior: MotionPrior) -> MeasurementModel:
@@ -469,33 +403,19 @@ SEARCH_WIDTHS = (2.0, 0.8)
 
 @dataclass(frozen=True)
 class DensityEstimator:
-    """Maximizes the marginal likelihood of jerk densities.
-
-    Attributes
-    ----------
-    unknown_scale : bool
-        Whether the variance of the noise is known up to a factor only.
-    rounds : int
-        Rounds of the search for one density, each narrower; 1 where a finer search follows.
-    """
+    """Maximizes the marginal likelihood of jerk densities."""
 
     prior: LogNormalPrior = WEAK_PRIOR
-    unknown_scale: bool = False
-    rounds: int = 2
+    unknown_scale: bool = False  # whether the variance of the noise is known up to a factor only
+    rounds: int = 2  # rounds of the search for one density, each narrower; 1 where a finer search follows
 
     def isotropic(
         self, motion: MotionPrior, state: Array, likelihood: Quadratic, weight_sum: float
     ) -> tuple[float, float]:
         """Estimate one jerk density in m2/s5 for both axes and the factor on the noise's variance.
 
-        Parameters
-        ----------
-        state : (K, 3, 2) float64
-            Reference state of the forms.
-        likelihood : Quadratic
-            Squared residuals over 3 unknowns a knot and 2 columns, about `state`.
-        weight_sum : float
-            Sum of the observations' weights.
+        `state`: (K, 3, 2): reference state of the forms. `likelihood`: squared residuals over 3 unknowns a knot and 2 columns,
+        about `state`. `weight_sum`: sum of the observations' weights.
         """
         jerk = motion.jerk(state)
         steps = len(motion) - 1

@@ -27,41 +27,20 @@ MIN_ROWS_FOR_SIGMA, DEFAULT_SIGMA_M, MIN_SIGMA_M = 8, 0.2, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SmoothedTrack:
-    """A smoothed trajectory.
+    """A smoothed trajectory."""
 
-    Attributes
-    ----------
-    t_s : (T,) float64, s
-        The asked times.
-    xy_m : (T, 2) float64, m
-    velocity_mps : (T, 2) float64, m/s
-    acceleration_mps2 : (T, 2) float64, m/s2
-    yaw_rad : (T,) float64, rad
-    curvature_1pm : (T,) float64, 1/m
-        0 below 1.5 m/s.
-    covariance : (T, 2, 2) float64, m2
-        Of the position.
-    residual_m : (n,) float64, m
-        Distance of each observation from the trajectory; NaN where it was not used.
-    inlier : (n,) bool
-    sigma_yaw_rad, sigma_speed_mps : (T,) float64
-        One standard deviation of heading and speed.
-    broken : tuple of Finding
-        Limits that the motion breaks.
-    """
-
-    t_s: Array
-    xy_m: Array
-    velocity_mps: Array
-    acceleration_mps2: Array
-    yaw_rad: Array
-    curvature_1pm: Array
-    covariance: Array
-    residual_m: Array
-    inlier: NDArray[np.bool_]
-    sigma_yaw_rad: Array
+    t_s: Array  # (T,), s: the asked times
+    xy_m: Array  # (T, 2), m
+    velocity_mps: Array  # (T, 2), m/s
+    acceleration_mps2: Array  # (T, 2), m/s2
+    yaw_rad: Array  # (T,), rad
+    curvature_1pm: Array  # (T,), 1/m: 0 below 1.5 m/s
+    covariance: Array  # (T, 2, 2), m2: of the position
+    residual_m: Array  # (n,), m: distance of each observation from the trajectory; NaN where it was not used
+    inlier: NDArray[np.bool_]  # (n,)
+    sigma_yaw_rad: Array  # `sigma_yaw_rad`, `sigma_speed_mps`: (T,): one standard deviation of heading and speed
     sigma_speed_mps: Array
-    broken: tuple[Finding, ...]
+    broken: tuple[Finding, ...]  # limits that the motion breaks
 
 
 def smooth_track(
@@ -76,27 +55,13 @@ def smooth_track(
 ) -> SmoothedTrack:
     """Smooth positions over a fixed interval, rejecting outliers.
 
-    Parameters
-    ----------
-    t_s : (n,) float64, s, strictly increasing
-    xy_m : (n, 2) float64, m
-    valid : (n,) bool, optional
-        Rows to use; rows that are not finite are never used.
-    sigma_m : float or (n,), optional
-        Standard deviation of the positions; estimated from their third differences when neither it nor `covariance`
-        is given.
-    covariance : (n, 2, 2), optional
-        Covariance of the positions, m2. Given by measurements, whose errors are correlated over time and have heavier
-        tails than Gaussian ones.
-    at_s : (T,), optional
-        Times of the result, by default `t_s`.
-    motion : MotionModel, optional
-        By default a vehicle whose most likely jerk densities along and across the path are estimated.
+    `t_s`: (n,), s, strictly increasing. `xy_m`: (n, 2), m. `valid`: (n,): rows to use; rows that are not finite are never used.
+    `sigma_m`: of all or (n,): standard deviation of the positions; estimated from their third differences when neither it nor
+    `covariance` is given. `covariance`: (n, 2, 2): covariance of the positions, m2. Given by measurements, whose errors are
+    correlated over time and have heavier tails than Gaussian ones. `at_s`: (T,): times of the result, by default `t_s`.
+    `motion`: by default a vehicle whose most likely jerk densities along and across the path are estimated.
 
-    Raises
-    ------
-    ValueError
-        For stamps that do not increase, shapes that do not fit or no valid row.
+    Raises `ValueError`: For stamps that do not increase, shapes that do not fit or no valid row.
     """
     motion = MotionModel() if motion is None else motion
     t, xy = np.asarray(t_s, dtype=np.float64), np.asarray(xy_m, dtype=np.float64)

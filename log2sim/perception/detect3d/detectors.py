@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import LidarConfig
-from log2sim.datatypes import CATEGORIES, GROUPS, Boxes3D, Log
+from log2sim.datatypes import GROUPS, Boxes3D, Log
 from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT_IN_CLOUD, require_members
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.detect.detectors import LabelBoxes, interpolate_boxes, window_ns
+from log2sim.perception.detect.detectors import ForeignDetector, interpolate_boxes, road_users
 from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach, most_points, points_of_boxes
 from log2sim.perception.detect3d.boxes import MIN_SCORE, LevelBoxes, decode_centers, decode_votes, sigmoid, suppress
 from log2sim.perception.detect3d.network import (
@@ -56,27 +56,14 @@ class LabelBoxDetector:
         points = points_of_boxes(cloud.xyz, local, found.size_m, found.yaw_rad, ~cloud.ground).count
         seen = np.flatnonzero(points > 0)
         seen = seen[np.lexsort((np.hypot(*away[near][seen].T), -points[seen]))]
-        found, one = found.take(seen), np.ones(len(seen))
-        return Boxes3D(
-            found.t_ns,
-            found.center_m,
-            found.size_m,
-            found.yaw_rad,
-            one,
-            found.category.astype("<U16"),
-            one,
-            points[seen],
-        )
+        return replace(found.take(seen), points=points[seen])
 
     @cached_property
-    def _labels(self) -> tuple[LabelBoxes, int]:
-        """Labels of road users in the order of their stamps, and the time around a cloud in which to search them, ns."""
+    def _labels(self) -> tuple[Boxes3D, int]:
+        """Labels of road users, and the time around a cloud in which to search them, ns."""
         labels = self.log.labels
         assert labels is not None
-        rows = np.flatnonzero(np.isin(labels.category, CATEGORIES))
-        rows = rows[np.argsort(labels.t_ns[rows], kind="stable")]
-        everything = LabelBoxes(labels.t_ns, labels.category, labels.center_m, labels.size_m, labels.yaw_rad)
-        return everything.take(rows), window_ns(labels.t_ns)
+        return road_users(labels)
 
 
 def create(log: Log, settings: LidarConfig) -> LabelBoxDetector:
@@ -150,7 +137,7 @@ class NetworkDetector:
         score = sigmoid(boxes.heat) if self.decode == "votes" else boxes.score(self.network.info, found.terms)
         # What holds no point is nothing that the LiDAR saw.
         good = np.flatnonzero((points > 0) & (score >= self._least(boxes)))
-        kept = good[suppress(boxes.rectangles.take(good), score[good], boxes.group[good])]
+        kept = good[suppress(boxes.rectangles[good], score[good], boxes.group[good])]
         boxes, inside = boxes.take(kept), found.inside.take(kept)
         center = boxes.center_m + cloud.origin
         center[:, 2] += ground_under(boxes.center_m[:, :2], inside, cloud, found.index)
@@ -326,22 +313,8 @@ def checked(detector: Any, source: str) -> LidarDetector:
     return CheckedLidarDetector(detector, source)
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedLidarDetector:
+class CheckedLidarDetector(ForeignDetector):
     """A detector of somebody else; what it raises and what it returns is checked."""
-
-    inner: LidarDetector
-    source: str
-
-    @property
-    def name(self) -> str:
-        """Name in the provenance of a scenario."""
-        return self.inner.name
-
-    @property
-    def cache_key(self) -> str | None:
-        """What its result depends on besides the clouds; None where it does not say, so that nothing of it is cached."""
-        return getattr(self.inner, "cache_key", None)
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud; `PluginError` when the detector raises something, or returns no `Boxes3D`."""

@@ -28,23 +28,31 @@ from log2sim.perception.detect3d.box_points import PointsOfBoxes
 from log2sim.perception.lidar.cloud import Cloud
 
 
-def open_session(path: Path, options: Any) -> Any:
-    """Load a model into a session on the CPU.
+def open_session(path: Path, max_bytes: int, kind: str) -> Any:
+    """Load an ONNX file of a kind into an `onnxruntime.InferenceSession` on one core of the CPU.
 
-    Builds of ONNX Runtime for Windows report events to Microsoft unless that is turned off, which is done here.
-
-    Parameters
-    ----------
-    options : onnxruntime.SessionOptions
-
-    Returns
-    -------
-    onnxruntime.InferenceSession
+    Builds of ONNX Runtime for Windows report events to Microsoft unless that is turned off, which is done here. Raises
+    `ConfigError` for a missing, oversized or broken file.
     """
     import onnxruntime
 
+    require_readable(path, max_bytes, ConfigError, f"an ONNX {kind}")
     onnxruntime.disable_telemetry_events()
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    options = onnxruntime.SessionOptions()
+    # Threads that share a run wait for each other; runs side by side, and the stages beside, do not.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
+        raise ConfigError(f"{path}: not a {kind} that ONNX Runtime can load: {first_line(error)}") from None
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of a message, shortened."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:300] if lines else type(error).__name__
 
 
 CHANNELS = 12
@@ -59,22 +67,10 @@ MIN_SIZE_CELLS = 64
 def grid_window(
     xy: NDArray[np.float32], *, cell_m: float, range_m: float, center: Array
 ) -> tuple[Array, tuple[int, int]]:
-    """Choose the part of the plane that a grid covers: the bounding box of the points in range.
+    """Choose the part of the plane that a grid covers: the bounding box of the points (N, 2) in a square of `range_m` around a center.
 
-    Parameters
-    ----------
-    xy : (N, 2) float32, m
-    range_m : float
-        Largest magnitude of x and y relative to `center`, m.
-    center : (2,) float64, m
-        Position of the sensor.
-
-    Returns
-    -------
-    low : (2,) float64, m
-        Lower corner, a multiple of the cell from `center` less the range.
-    shape : (int, int)
-        Cells along x and y, multiples of `SIZE_MULTIPLE`.
+    Returns its lower corner (2,), m, a multiple of the cell from the center less the range, and its cells along x and y,
+    multiples of `SIZE_MULTIPLE`.
     """
     limit = int(np.ceil(2 * range_m / (cell_m * SIZE_MULTIPLE))) * SIZE_MULTIPLE
     corner = np.asarray(center, np.float64) - limit * cell_m / 2
@@ -95,22 +91,13 @@ def grid_window(
 
 
 def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Make the grid of a cloud.
+    """Make the grid of a cloud, H cells along x and W along y from a lower corner `low` (2,), m.
 
-    Parameters
-    ----------
-    xyz : (N, 3) float32, m
-        Points whose z is the height above the ground; points outside the grid, of other heights or not finite are left out.
-    low : (2,) float64, m
-        Lower corner of the grid.
-    shape : (int, int)
-        Cells H along x and W along y.
+    `xyz`: (N, 3) float32, m: z is the height above the ground; points outside the grid, of other heights or not finite are left
+    out.
 
-    Returns
-    -------
-    (12, H, W) float32
-        Greatest, mean and least height, each half; logarithm of the count; logarithms of the counts in six slices of
-        height; mean offsets from the middle of the cell along x and y, in cells. All zero in an empty cell.
+    Returns (12, H, W) float32: greatest, mean and least height, each half; logarithm of the count; logarithms of the counts in
+    six slices of height; mean offsets from the middle of the cell along x and y, in cells. All zero in an empty cell.
     """
     h, w = shape
     scale, (x0, y0) = np.float32(1 / cell_m), np.asarray(low, np.float32)
@@ -157,19 +144,10 @@ PLANE_POINTS = 64
 
 
 def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Take the points in range of a cloud's sensors, relative to the cloud's origin.
+    """Take the points of a cloud within range of a sensor of it along x and along y.
 
-    Parameters
-    ----------
-    range_m : float
-        Largest distance from a sensor along x and along y, m.
-
-    Returns
-    -------
-    xyz : (n, 3) float32, m
-        z is the height above the ground, within the limits of the grid.
-    index : (n,) int
-        Of the points in the cloud.
+    Returns `xyz`: (n, 3) float32, m, relative to the cloud's origin, z the height above the ground within the limits of the grid;
+    `index`: (n,): of the points in the cloud.
     """
     return _cropped(cloud, viewpoints_xy(cloud), range_m)
 
@@ -212,21 +190,9 @@ def _cropped(cloud: Cloud, centers: Array, range_m: float) -> tuple[NDArray[np.f
 
 
 def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[np.intp]) -> Array:
-    """Estimate the height (M,) of the ground under positions (M, 2) by a plane through that under the points of each box.
+    """Estimate the height (M,) of the ground under centers (M, 2), m, by a plane through that under the points of each box.
 
-    Parameters
-    ----------
-    xy : (M, 2) float64, m
-        Centers of the boxes, relative to the cloud's origin.
-    inside : PointsOfBoxes
-        Each box has at least one point.
-    index : (n,) int
-        Of the points that `inside` numbers in the cloud.
-
-    Returns
-    -------
-    (M,) float64, m
-        Relative to the cloud's origin.
+    All are relative to the cloud's origin. Each box has a point; `index` (n,) are those that `inside` numbers in the cloud.
 
     Notes
     -----
@@ -263,41 +229,22 @@ CALIBRATION_TERMS = 5
 
 
 class NetworkInfo(BaseModel):
-    """What the metadata of a network's file say about it.
-
-    Attributes
-    ----------
-    cell_m : float
-        Side of a cell of the grid, m.
-    stride : int
-        Cells of the grid along a cell of the maps.
-    range_m : float
-        Largest distance from the sensor along x and along y, m.
-    groups : tuple of str
-        Groups of categories in the order of the channels of heat.
-    categories : dict of str to tuple of str
-        Categories of each group in the order of the channels of categories.
-    calibration : dict of str to tuple of float
-        For each group the weights of 1, logit of the heat, logit of the quality, log(1 + points) and range in units of
-        10 m, whose sum is the logit of the score.
-    min_score : dict of str to float
-        Lowest score of a box of each group.
-    card : dict
-        How the network was trained and how good it is; free.
-    """
+    """What the metadata of a network's file say about it."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     version: int
     name: str
-    cell_m: float = Field(ge=0.05, le=2.0)
-    stride: int = Field(ge=1, le=16)
-    range_m: float = Field(gt=0.0, le=1000.0)
-    groups: tuple[str, ...] = Field(min_length=1)
-    categories: dict[str, tuple[str, ...]]
+    cell_m: float = Field(ge=0.05, le=2.0)  # side of a cell of the grid, m
+    stride: int = Field(ge=1, le=16)  # cells of the grid along a cell of the maps
+    range_m: float = Field(gt=0.0, le=1000.0)  # largest distance from the sensor along x and along y, m
+    groups: tuple[str, ...] = Field(min_length=1)  # of categories, in the order of the channels of heat
+    categories: dict[str, tuple[str, ...]]  # of each group, in the order of the channels of categories
+    # For each group the weights of 1, logit of the heat, logit of the quality, log(1 + points) and range in units of 10 m, whose
+    # sum is the logit of the score
     calibration: dict[str, tuple[float, ...]]
-    min_score: dict[str, float]
-    card: dict[str, Any] = {}
+    min_score: dict[str, float]  # lowest score of a box of each group
+    card: dict[str, Any] = {}  # how the network was trained and how good it is; free
 
     @model_validator(mode="after")
     def _check(self) -> NetworkInfo:
@@ -331,39 +278,17 @@ class NetworkInfo(BaseModel):
 
 @dataclass(frozen=True)
 class Channels:
-    """Places of the outputs among the channels of the maps, in their order.
+    """Places of the outputs among the channels of the maps, in their order."""
 
-    Attributes
-    ----------
-    heat : slice
-        Logit of a center of each group.
-    category : dict of str to slice
-        Logits of the categories of groups that have more than one.
-    box : slice
-        Center x, y from the middle of the cell, z above the ground, m; logarithms of length, width, height in m.
-    axis : slice
-        Sine and cosine of twice the yaw.
-    direction : slice
-        Sine and cosine of the yaw by least squares: shorter than 1 where front and back are not told apart.
-    quality : int
-        Logit of the expected IoU in the ground plane.
-    segment : slice
-        Logits of background and of each group.
-    vote : slice
-        Center x, y of the cell's object from the middle of the cell, m.
-    count : int
-        Number of channels.
-    """
-
-    heat: slice
-    category: dict[str, slice]
-    box: slice
-    axis: slice
-    direction: slice
-    quality: int
-    segment: slice
-    vote: slice
-    count: int
+    heat: slice  # logit of a center of each group
+    category: dict[str, slice]  # logits of the categories of groups that have more than one
+    box: slice  # center x, y from the middle of the cell, z above the ground, m; logarithms of length, width, height in m
+    axis: slice  # sine and cosine of twice the yaw
+    direction: slice  # those of the yaw by least squares: shorter than 1 where front and back are not told apart
+    quality: int  # logit of the expected IoU in the ground plane
+    segment: slice  # logits of background and of each group
+    vote: slice  # center x, y of the cell's object from the middle of the cell, m
+    count: int  # of channels
 
     @classmethod
     def of(cls, info: NetworkInfo) -> Channels:
@@ -385,16 +310,11 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Loaded network; `run` may be called from several threads.
-
-    Attributes
-    ----------
-    session : onnxruntime.InferenceSession
-    """
+    """Loaded network; `run` may be called from several threads."""
 
     path: Path
     info: NetworkInfo
-    session: Any
+    session: Any  # onnxruntime.InferenceSession
 
     def digest(self) -> str:
         """Return what tells it from other networks: the content of its file, and the version of what runs it."""
@@ -404,17 +324,11 @@ class Network:
         return f"{hashlib.sha256(content).hexdigest()} onnxruntime {onnxruntime.__version__}"
 
     def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Compute the maps (C, H / stride, W / stride) of a grid (12, H, W).
-
-        Raises
-        ------
-        ConfigError
-            When the network fails, or its maps have another shape.
-        """
+        """Compute the maps (C, H / stride, W / stride) of a grid (12, H, W); `ConfigError` when it fails or they have another shape."""
         try:
             (maps,) = self.session.run(["maps"], {"grid": grid[None]})
-        except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
-            raise ConfigError(f"{self.path}: the network fails on a grid {grid.shape}: {brief(error)}") from None
+        except Exception as error:  # as above
+            raise ConfigError(f"{self.path}: the network fails on a grid {grid.shape}: {first_line(error)}") from None
         stride, count = self.info.stride, self.info.channels.count
         expected = (1, count, grid.shape[1] // stride, grid.shape[2] // stride)
         if maps.shape != expected or maps.dtype != np.float32:
@@ -429,23 +343,9 @@ class Network:
 def load_network(path: Path) -> Network:
     """Load a network, check its description and try it on an empty grid.
 
-    Raises
-    ------
-    ConfigError
-        A missing, oversized or broken file, an ONNX file of another kind, or metadata that are missing or wrong.
+    Raises `ConfigError`: a missing, oversized or broken file, an ONNX file of another kind, or metadata that are missing or wrong.
     """
-    import onnxruntime
-
-    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX network for clouds")
-    options = onnxruntime.SessionOptions()
-    # Networks this small gain nothing from a second thread, which the stages beside need.
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    try:
-        session = open_session(path, options)
-    except Exception as error:  # as in `Network.run`
-        raise ConfigError(f"{path}: not a network that ONNX Runtime can load: {brief(error)}") from None
+    session = open_session(path, MAX_FILE_BYTES, "network for clouds")
     check_names(session, path)
     network = Network(path, read_info(session.get_modelmeta().custom_metadata_map, path), session)
     network.run(np.zeros((CHANNELS, MIN_SIZE_CELLS, MIN_SIZE_CELLS), np.float32))
@@ -486,9 +386,3 @@ def read_info(metadata: dict[str, str], path: Path) -> NetworkInfo:
         return NetworkInfo.model_validate_json(text)
     except ValidationError as error:
         raise ConfigError(f"{where}: {first_problem(error, NetworkInfo)}") from None
-
-
-def brief(error: Exception) -> str:
-    """Return the first line of a message, shortened."""
-    lines = str(error).strip().splitlines()
-    return lines[0][:300] if lines else type(error).__name__

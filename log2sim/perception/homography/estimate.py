@@ -20,7 +20,6 @@ from log2sim.perception.homography.correspondences import (
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import NormalizedCorrespondences, scaled
 from log2sim.perception.homography.pitch_roll import (
-    MIN_SIGNIFICANCE_SIGMA,
     PITCH_SIGMA_PX,
     HeldOutErrors,
     angle_sigmas_deg,
@@ -35,7 +34,6 @@ from log2sim.perception.homography.ransac import (
     RANSAC_SCHEDULE_OF_A_FRAME,
     RansacRound,
     RansacSchedule,
-    RobustFit,
     ransac,
 )
 
@@ -56,7 +54,6 @@ class EstimationOptions:
     pitch_roll: bool = False
     # Samples of four to draw, for the stream or for each frame; None for as many as the data need
     hypotheses: int | None = None
-    together: bool = False  # whether the cameras of a rig are fitted together, see `rig_fit`
     # `sigma_px`, `sigma_m`: assumed standard deviations of pixels and of ground positions; they are estimated anew from the
     # inliers, within a factor of 4
     sigma_px: float = 1.5
@@ -139,14 +136,9 @@ def _fit_stream(data: NormalizedCorrespondences, options: EstimationOptions, rng
     robust = ransac(data, rng, pitch_sigma=pitch_sigma, image_K=image_K, schedule=schedule)
     if robust.h is None or not options.pitch_roll:
         return validated_fit(robust, image_K)
-    moving = fit_pitch_roll(data, robust.h, image_K)
-    warps = moving.warps[data.tick]
-    fit = validated_fit(
-        RobustFit(moving.image_H_ground, moving.data, moving.linear, warps, moving.effective_parameters), image_K
-    )
-    if not fit.ok:
-        return fit
-    return replace(fit, per_tick=data.to_ground_H_image(moving.warps @ moving.image_H_ground))
+    moving, warps = fit_pitch_roll(data, robust.h, image_K)
+    fit = validated_fit(moving, image_K)
+    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h)) if fit.ok and moving.h is not None else fit
 
 
 def _spread_to_all(
@@ -281,11 +273,9 @@ def _test_feet(
 
 def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: EstimationOptions) -> PitchRoll:
     """Accept or refuse the angles by the held-out errors."""
-    pitches = np.abs(stabilizing_warps(moving) - np.eye(3)).max() > MIN_WARP
-    significance = errors.significance() if pitches else 0.0
+    pitches = bool(np.abs(stabilizing_warps(moving) - np.eye(3)).max() > MIN_WARP)
     sigmas_deg = (float("nan"), float("nan")) if options.K is None else angle_sigmas_deg(moving, options.K)
-    before, after = np.median(errors.distance_px, axis=1).tolist()
-    return PitchRoll(significance > MIN_SIGNIFICANCE_SIGMA, source, *sigmas_deg, (before, after), significance)
+    return errors.decide(source, sigmas_deg, moves=pitches)
 
 
 def _finite(correspondences: Correspondences) -> Correspondences:
@@ -308,13 +298,7 @@ def place_obstacle(
     `ground_H_image`: (3, 3). `box_px`: (4,). `category`: its typical size is used. `camera_xy`: (2,): position of the
     camera in the frame of the ground positions, m.
 
-    Returns
-    -------
-    center : (2,) float64
-        Center of the obstacle on the ground, m.
-    covariance : (2, 2) float64
-    or None
-        Above the horizon and beyond 60 m.
+    Returns its center (2,), m, on the ground and the covariance (2, 2); None above the horizon and beyond `MAX_RANGE_M`.
     """
     uv = undistorted_pixels(camera, np.array([[(box_px[0] + box_px[2]) / 2, box_px[3]]]))
     xy, below = apply_homography(ground_H_image, uv)

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.tracking.forward import CHI2_2DOF_99
 
-# 99 % quantile of chi-squared with 2 degrees of freedom: the inlier gate on a squared whitened error, and the value at
-# which the bounded loss is cut.
-CHI2_2DOF_99 = 9.21
+# `CHI2_2DOF_99` is the inlier gate on a squared whitened error, and the value at which the bounded loss is cut.
 
 
 @dataclass(frozen=True, eq=False)

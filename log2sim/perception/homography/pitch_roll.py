@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.fit import HomographyFit, PitchRoll
 from log2sim.perception.homography.normalized import (
-    CHI2_2DOF_99,
     Linearization,
     NormalizedCorrespondences,
     linearize,
@@ -29,6 +28,8 @@ from log2sim.perception.homography.normalized import (
     pose_tangent,
     scale_free_basis,
 )
+from log2sim.perception.homography.ransac import RobustFit
+from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Standard deviations of pitch, as a shift along v, and of roll, before they are estimated.
 PITCH_SIGMA_PX = 4.0
@@ -55,20 +56,11 @@ class _Angles:
         return np.asarray(np.eye(3) + first + first @ first / 2)
 
 
-@dataclass(frozen=True, eq=False)
-class PitchRollFit:
-    """A stream's homography with pitch and roll of each tick, in normalized units."""
-
-    image_H_ground: Array  # (3, 3): homography of the stream
-    warps: Array  # (T, 3, 3): image homography of each tick on top of it
-    data: NormalizedCorrespondences  # all correspondences, with the noise as estimated
-    linear: Linearization  # errors of the final homographies
-    # Effective number of parameters of the angles: each counts by how little the prior determines it
-    effective_parameters: float
-
-
-def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | None) -> PitchRollFit:
+def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | None) -> tuple[RobustFit, Array]:
     """Fit the stream's homography and the angles of all ticks together, starting from `h` (3, 3).
+
+    Returns the fit, and the image homography of each tick on top of it (T, 3, 3). An angle counts among the effective parameters
+    by how little its prior determines it.
 
     Notes
     -----
@@ -94,8 +86,8 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
         sigma = np.sqrt(np.maximum((angles.value**2 + variance).mean(axis=0), angles.sigma**2 / 25))
         angles = replace(angles, sigma=sigma)
     warps = angles.warps()
-    effective_parameters = float((angles.significant * information * variance).sum())
-    return PitchRollFit(h, warps, noisy, linearize(noisy, h[None], warps[noisy.tick]), effective_parameters)
+    of_rows, parameters = warps[noisy.tick], float((angles.significant * information * variance).sum())
+    return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps
 
 
 def _is_significant(angles: _Angles, information: Array) -> NDArray[np.bool_]:
@@ -229,6 +221,12 @@ class HeldOutErrors:
         fall = np.bincount(number, loss[0] - loss[1])
         error = float(fall.std()) / np.sqrt(len(fall))
         return float(fall.mean() / error) if error > 0 and len(fall) >= MIN_TICKS else 0.0
+
+    def decide(self, source: str, sigmas_deg: tuple[float, float], *, moves: bool) -> PitchRoll:
+        """Accept or refuse angles from a source, of which it is known whether they differ from none at all."""
+        significance = self.significance() if moves else 0.0
+        before, after = np.median(self.distance_px, axis=1).tolist()
+        return PitchRoll(significance > MIN_SIGNIFICANCE_SIGMA, source, *sigmas_deg, (before, after), significance)
 
 
 def stabilizing_warps(moving: HomographyFit) -> Array:

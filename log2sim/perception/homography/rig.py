@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, Camera, inverse
+from log2sim.geometry import Array, Camera, inverse, shift_poses
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.normalized import scaled
 
@@ -25,19 +25,12 @@ PROBE_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class RigCamera:
-    """A camera of a rig, by its calibration."""
-
-    camera: Camera
-    # (4, 4): the rig frame is the ground frame of the correspondences with its origin on the ground below the cameras' mean
-    cam_T_rig: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Rig:
     """Cameras that see one ground plane."""
 
-    cameras: Mapping[str, RigCamera]
+    cameras: Mapping[str, Camera]
+    # (4, 4) each: the rig frame is the ground frame of the correspondences with its origin on the ground below the cameras' mean
+    cam_T_rig: Mapping[str, Array]
     origin_m: Array  # (3,): origin of the rig frame in the ground frame of the correspondences
 
     @classmethod
@@ -45,12 +38,8 @@ class Rig:
         """Make the rig of cameras whose mounts are poses in one frame, in which the ground is at `ground_z_m`."""
         places = np.array([c.mount_T_cam[:3, 3] for c in cameras.values()])
         origin = np.array([*places[:, :2].mean(axis=0), ground_z_m])
-        members = {}
-        for name, camera in cameras.items():
-            rig_T_cam = np.array(camera.mount_T_cam, dtype=np.float64)
-            rig_T_cam[:3, 3] -= origin
-            members[name] = RigCamera(camera, inverse(rig_T_cam))
-        return cls(members, origin)
+        poses = {name: inverse(shift_poses(camera.mount_T_cam, origin)) for name, camera in cameras.items()}
+        return cls(cameras, poses, origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +57,9 @@ class RigState:
     feet: Mapping[str, Array]
 
     @classmethod
-    def calibrated(cls, rig: Rig, plane: Array | None = None) -> RigState:
-        """Make the state of a rig that is as its calibration says, over flat ground or a `plane` (3,)."""
-        none = {name: np.zeros(3) for name in rig.cameras}
-        return cls(np.zeros(3) if plane is None else plane, 0.0, dict.fromkeys(rig.cameras, 0.0), none)
+    def calibrated(cls, rig: Rig, plane: Array) -> RigState:
+        """Make the state of a rig that is as its calibration says, over a plane (3,)."""
+        return cls(plane, 0.0, dict.fromkeys(rig.cameras, 0.0), {name: np.zeros(3) for name in rig.cameras})
 
 
 def rotation_of(vector: Array) -> Array:
@@ -85,12 +73,12 @@ def rotation_of(vector: Array) -> Array:
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + np.sinc(angle / 2 / np.pi) ** 2 / 2 * cross @ cross)
 
 
-def cam_of_ground(member: RigCamera, plane: Array, turn: Array) -> Array:
-    """Compute the matrices (..., 3, 3) from ground positions (x, y, 1), rig frame, to points in a camera.
+def cam_of_ground(cam_T_rig: Array, plane: Array, turn: Array) -> Array:
+    """Compute the matrices (..., 3, 3) from ground positions (x, y, 1), rig frame, to points in a camera (4, 4).
 
     `plane`: (..., 3). `turn`: (3, 3): rotation of the camera against its calibration.
     """
-    r, t = turn @ member.cam_T_rig[:3, :3], turn @ member.cam_T_rig[:3, 3]
+    r, t = turn @ cam_T_rig[:3, :3], turn @ cam_T_rig[:3, 3]
     rise = r[:, 2, None] * np.asarray(plane)[..., None, :]
     return np.asarray(np.column_stack([r[:, :2], t]) + rise)
 
@@ -100,12 +88,11 @@ def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = 
 
     px and m, in the ground frame of the correspondences; `plane` (..., 3) replaces that of the state, as that of a tick does.
     """
-    member = rig.cameras[name]
-    turn = rotation_of(state.feet[name])
     lifted = (state.plane if plane is None else plane) + [0.0, 0.0, state.lift_m[name]]
-    below = np.eye(3)
-    below[1, 2] = state.below_px
-    return scaled(_to_ground(rig, member, cam_of_ground(member, lifted, turn)) @ below)
+    image_H_ground = rig.cameras[name].K @ cam_of_ground(rig.cam_T_rig[name], lifted, rotation_of(state.feet[name]))
+    back, below = np.eye(3), np.eye(3)
+    back[:2, 2], below[1, 2] = rig.origin_m[:2], state.below_px
+    return scaled(scaled(back @ np.linalg.inv(image_H_ground)) @ below)
 
 
 def foot_sigma_m(rig: Rig, state: RigState, name: str, covariance: Array) -> float:
@@ -113,30 +100,23 @@ def foot_sigma_m(rig: Rig, state: RigState, name: str, covariance: Array) -> flo
 
     `covariance` (5, 5) is that of `below_px`, and of `lift_m` and the rotation `feet` of the camera.
     """
-    member = rig.cameras[name]
-    axis = member.cam_T_rig[2, :3]
-    place = inverse(member.cam_T_rig)[:2, 3]
+    cam_T_rig = rig.cam_T_rig[name]
+    axis, place = cam_T_rig[2, :3], inverse(cam_T_rig)[:2, 3]
     if not np.hypot(*axis[:2]) > 0:
         return float("nan")
     at = place + PROBE_M * axis[:2] / np.hypot(*axis[:2])
     turn = rotation_of(state.feet[name])
-    matrix = cam_of_ground(member, state.plane, turn)
+    matrix = cam_of_ground(cam_T_rig, state.plane, turn)
     point = matrix @ [*at, 1.0]
     if not point[2] > 0:
         return float("nan")
     by_point = np.array([[1.0, 0.0, -point[0] / point[2]], [0.0, 1.0, -point[1] / point[2]]]) / point[2]
     by_parameter = np.zeros((2, 5))
-    by_parameter[1, 0] = -1.0 / member.camera.K[1, 1]
-    by_parameter[:, 1] = by_point @ (turn @ member.cam_T_rig[:3, 2])
+    by_parameter[1, 0] = -1.0 / rig.cameras[name].K[1, 1]
+    by_parameter[:, 1] = by_point @ (turn @ cam_T_rig[:3, 2])
     by_parameter[:, 2:] = by_point @ np.cross(np.eye(3), point).T
     on_ground = np.linalg.solve(by_point @ matrix[:, :2], by_parameter)
     return float(np.sqrt(np.linalg.eigvalsh(on_ground @ covariance @ on_ground.T)[-1]))
-
-
-def _to_ground(rig: Rig, member: RigCamera, cam_H_ground: Array) -> Array:
-    back = np.eye(3)
-    back[:2, 2] = rig.origin_m[:2]
-    return scaled(back @ np.linalg.inv(member.camera.K @ cam_H_ground))
 
 
 # Parameters of feet: one that all cameras share, then of each camera the height of feet above the road, m, and its rotation.
@@ -159,10 +139,10 @@ class RigRows:
     def of(cls, rig: Rig, found: Mapping[str, Correspondences], sigma_px: float, sigma_m: float) -> RigRows:
         """Join the correspondences of the cameras; rows that are not finite are left out."""
         parts = []
-        for k, (name, member) in enumerate(rig.cameras.items()):
+        for k, (name, camera) in enumerate(rig.cameras.items()):
             rows = found.get(name) or Correspondences.join([])
             rows = rows.take(np.isfinite(np.column_stack([rows.uv, rows.xy_ego])).all(axis=1))
-            K, one = member.camera.K, np.ones(len(rows))
+            K, one = camera.K, np.ones(len(rows))
             ray = (rows.uv - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
             focal = float(np.sqrt(K[0, 0] * K[1, 1])) * one
             xy = rows.xy_ego - rig.origin_m[:2]
@@ -186,9 +166,8 @@ class RigRows:
 
 def heights_of(rig: Rig, rows: RigRows) -> tuple[Array, Array]:
     """Compute how high the rays of rows pass over their ground positions, by the calibration: (N,) m, and sigmas (N,) m."""
-    members = list(rig.cameras.values())
-    rotation = np.array([m.cam_T_rig[:3, :3].T for m in members])[rows.camera]
-    place = np.array([-m.cam_T_rig[:3, :3].T @ m.cam_T_rig[:3, 3] for m in members])[rows.camera]
+    rig_T_cam = inverse(np.array(list(rig.cam_T_rig.values())))[rows.camera]
+    rotation, place = rig_T_cam[:, :3, :3], rig_T_cam[:, :3, 3]
     direction = np.einsum("nij,nj->ni", rotation, np.column_stack([rows.ray, np.ones(len(rows))]))
     level = (direction[:, :2] ** 2).sum(axis=1)
     reach = ((rows.xy - place[:, :2]) * direction[:, :2]).sum(axis=1) / level
@@ -211,9 +190,8 @@ class FootErrors:
 
 def linearize_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | None = None) -> FootErrors:
     """Linearize the errors of feet; `planes` (N, 3) replaces the plane of the state, as each tick has its own."""
-    members = list(rig.cameras.values())
     turns = rotation_of(np.array([state.feet[n] for n in rig.cameras]))
-    poses = turns @ np.array([m.cam_T_rig[:3] for m in members])
+    poses = turns @ np.array([pose[:3] for pose in rig.cam_T_rig.values()])
     flat = np.concatenate([poses[:, :, :2], poses[:, :, 3:]], axis=2)[rows.camera]
     up = poses[rows.camera, :, 2]
     lift = np.array([state.lift_m[name] for name in rig.cameras])[rows.camera]

@@ -23,8 +23,8 @@ from log2sim.perception.homography.estimate import (
     MIN_TESTED_FEET,
 )
 from log2sim.perception.homography.fit import MIN_INLIER_SHARE, MIN_INLIERS, HomographyFit, PitchRoll, refused_fit
-from log2sim.perception.homography.normalized import CHI2_2DOF_99, MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
-from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, MIN_SIGNIFICANCE_SIGMA, HeldOutErrors
+from log2sim.perception.homography.normalized import MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
+from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, HeldOutErrors
 from log2sim.perception.homography.rig import (
     OF_CAMERA,
     SAMPLES,
@@ -41,6 +41,7 @@ from log2sim.perception.homography.rig import (
     linearize_feet,
     tilt_of_ticks,
 )
+from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Standard deviations before anything is fitted. A box ends within some pixels of its object. Overhangs of cars are
 # 0.7 to 1 m, which is as much as 0.1 m in height where a camera 1.6 m high sees them 12 m away.
@@ -200,8 +201,11 @@ def fit_rig(
     fit = fit_feet(rig, foot_rows, RigState.calibrated(rig, plane))
     ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
     if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
-        ticks, planes = _planes_of_ticks(_heights(rig, ground_rows), plane)
-        own = _planes_at(ticks, planes, plane, foot_rows.tick)
+        ticks, tilt = tilt_of_ticks(_heights(rig, ground_rows), plane)
+        planes = plane + np.column_stack([tilt, np.zeros(len(ticks))])
+        # The plane of all ticks where a tick has none of its own.
+        index = np.clip(np.searchsorted(ticks, foot_rows.tick), 0, len(ticks) - 1)
+        own = np.where((ticks[index] == foot_rows.tick)[:, None], planes[index], plane)
         moving = fit_feet(rig, foot_rows, fit.state, own, is_start=False)
         decision = _decide(foot_rows, fit, moving, planes - plane)
         if decision.per_tick:
@@ -222,25 +226,12 @@ def _heights(rig: Rig, rows: RigRows) -> HeightRows:
     return HeightRows(xy1[kept], height[kept], np.hypot(sigma, ROAD_SIGMA_M)[kept], rows.tick[kept])
 
 
-def _planes_of_ticks(heights: HeightRows, plane: Array) -> tuple[NDArray[np.int64], Array]:
-    ticks, tilt = tilt_of_ticks(heights, plane)
-    return ticks, plane + np.column_stack([tilt, np.zeros(len(ticks))])
-
-
-def _planes_at(ticks: NDArray[np.int64], planes: Array, plane: Array, tick: NDArray[np.int64]) -> Array:
-    """Look up the planes (N, 3) of ticks (N,); that of all ticks where there is none."""
-    index = np.clip(np.searchsorted(ticks, tick), 0, len(ticks) - 1)
-    return np.where((ticks[index] == tick)[:, None], planes[index], plane)
-
-
 def _decide(rows: RigRows, fixed: FeetFit, moving: FeetFit, tilt: Array) -> PitchRoll:
     """Accept or refuse the tilt of each tick, which ground points gave, by the errors of the feet."""
     squared = np.stack([fixed.errors.squared, moving.errors.squared])
     errors = HeldOutErrors(rows.tick, squared, np.stack([fixed.errors.pixels, moving.errors.pixels]))
-    significance = errors.significance() if np.abs(tilt).max() > 0 else 0.0
-    before, after = np.median(errors.distance_px, axis=1).tolist()
     pitch, roll = np.degrees(tilt[:, :2].std(axis=0)).tolist()
-    return PitchRoll(significance > MIN_SIGNIFICANCE_SIGMA, "ground points", pitch, roll, (before, after), significance)
+    return errors.decide("ground points", (pitch, roll), moves=bool(np.abs(tilt).max() > 0))
 
 
 def _fit_of_camera(result: RigFit, fit: FeetFit, rows: RigRows, name: str, data: Correspondences) -> HomographyFit:
@@ -254,10 +245,8 @@ def _fit_of_camera(result: RigFit, fit: FeetFit, rows: RigRows, name: str, data:
         return refused_fit(reason, len(data))
     h = foot_homography(result.rig, fit.state, name)
     # The rows of the rig are sorted by tick, and finite.
-    inliers, usable = (
-        np.zeros(len(data), dtype=bool),
-        np.flatnonzero(np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1)),
-    )
+    inliers = np.zeros(len(data), dtype=bool)
+    usable = np.flatnonzero(np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1))
     inliers[usable[np.argsort(data.tick[usable], kind="stable")]] = fit.inliers[own]
     distance = np.hypot(*(apply_homography(h, data.uv[inliers])[0] - data.xy_ego[inliers]).T)
     known = distance[np.isfinite(distance)]

@@ -426,25 +426,26 @@ def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tup
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
     if sweep.frame == "map":
         return np.asarray(sweep.xyz_m, dtype=np.float64), t_s
-    one_pose = not compensate or not has_motion(sweep) or is_at_rest(log, lidar, sweep)
+    one_pose = not compensate or compensation_of(log, lidar, sweep) != "moving"
     xyz = transform_rigidly(log, lidar, sweep) if one_pose else deskew(log, lidar, sweep, t_ns)
     return None if xyz is None else (xyz, t_s)
 
 
-def has_motion(sweep: Sweep) -> bool:
-    """Return whether a sweep holds the motion of its sensor, with the times to compensate it."""
-    return sweep.frame == "lidar" and sweep.compensated_ns is None and sweep.t_ns is not None and len(sweep.t_ns) > 0
+def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
+    """How a sweep is compensated: "in the log" already, "no times" to do it with, "at rest" or "moving".
 
-
-def is_at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
-    """Decide whether a LiDAR moves less than `AT_REST_M`, also at 30 m, during a sweep with point times."""
+    At rest a LiDAR moves less than `AT_REST_M`, also at 30 m, during a sweep.
+    """
+    if sweep.frame == "map" or sweep.compensated_ns is not None:
+        return "in the log"
     if sweep.t_ns is None or len(sweep.t_ns) == 0:
-        return False
+        return "no times"
     probes = np.linspace(0, int(sweep.t_ns.max() - sweep.t_ns.min()), AT_REST_PROBES).astype(np.int64)
     map_T_lidar, valid = log.map_T_sensor(lidar, np.append(sweep.t_ns.min() + probes, sweep.stamp_ns))
     moved = np.linalg.norm(map_T_lidar[:, :3, 3] - map_T_lidar[-1, :3, 3], axis=1)
     turned = np.linalg.norm(map_T_lidar[:, :3, :3] - map_T_lidar[-1, :3, :3], axis=(1, 2)) / np.sqrt(2)
-    return bool(valid.all() and moved.max() < AT_REST_M and turned.max() < AT_REST_RAD)
+    at_rest = valid.all() and moved.max() < AT_REST_M and turned.max() < AT_REST_RAD
+    return "at rest" if at_rest else "moving"
 
 
 def transform_rigidly(log: Log, lidar: str, sweep: Sweep) -> Array | None:
@@ -484,15 +485,6 @@ def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array
     return out.T
 
 
-def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
-    """How a sweep is compensated: "in the log" already, "no times" to do it with, "at rest" or "moving"."""
-    if sweep.frame == "map" or sweep.compensated_ns is not None:
-        return "in the log"
-    if sweep.t_ns is None:
-        return "no times"
-    return "at rest" if is_at_rest(log, lidar, sweep) else "moving"
-
-
 def cloud_origin(log: Log, t_ns: int) -> tuple[Array, float]:
     """Origin (3,) of a tick's clouds in the map frame, and the height of the ground there.
 
@@ -511,37 +503,18 @@ def cloud_origin(log: Log, t_ns: int) -> tuple[Array, float]:
 MAX_APART_M = 5.0
 
 
-def assemble_views(
-    log: Log,
-    sweeps: Mapping[str, Sweep],
-    *,
-    origin: Array,
-    ground_z: float,
-    max_range_m: float,
-    compensate: bool = True,
-) -> Cloud | None:
+def assemble_views(log: Log, sweeps: Mapping[str, Sweep], **options: Any) -> Cloud | None:
     """Merge the simultaneous sweeps of all LiDARs into one cloud, by parts where both ends have LiDARs.
 
-    Parameters are those of `assemble_cloud`, which makes the cloud of a log with one end.
+    The options are those of `assemble_cloud`, which makes the cloud of a log with one end.
 
     Notes
     -----
     The ground is estimated from each viewpoint's own points: between two of them there may be none.
     """
-    groups = group_by_viewpoint(log, sweeps)
-    parts = []
-    for names in groups:
-        part = assemble_cloud(
-            log,
-            {name: sweeps[name] for name in names},
-            origin=origin,
-            ground_z=ground_z,
-            max_range_m=max_range_m,
-            compensate=compensate,
-        )
-        if part is not None:
-            parts.append(part)
-    return join_parts(parts)
+    groups = ({name: sweeps[name] for name in names} for names in group_by_viewpoint(log, sweeps))
+    parts = (assemble_cloud(log, group, **options) for group in groups)
+    return join_parts([part for part in parts if part is not None])
 
 
 def group_by_viewpoint(log: Log, names: Mapping[str, Sweep] | Sequence[str]) -> list[list[str]]:
@@ -567,11 +540,11 @@ def join_parts(parts: Sequence[Cloud]) -> Cloud | None:
         return parts[0] if parts else None
     first = parts[0]
     late_s = [(part.stamp_ns - first.stamp_ns) / NS_PER_S for part in parts]
-    sensors = [
+    sensors = (
         replace(s, position=s.position - late * s.velocity_mps)
         for part, late in zip(parts, late_s)
         for s in part.sensors
-    ]
+    )
     return Cloud(
         first.stamp_ns,
         first.origin,
@@ -673,14 +646,10 @@ def first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.
     """
     i, j, k = np.floor(columns / np.float32(voxel_m)).astype(np.int64)
     voxel = ((i * 4096 + j) * 4096 + k).astype(np.uint64)
-    left, kept, table = (
-        np.arange(len(voxel)),
-        np.zeros(len(voxel), dtype=bool),
-        np.empty(1 << TABLE_BITS, dtype=np.int32),
-    )
-    factor = np.array(
-        [0x9E3779B97F4A7C15], dtype=np.uint64
-    )  # multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)
+    left, kept = np.arange(len(voxel)), np.zeros(len(voxel), dtype=bool)
+    table = np.empty(1 << TABLE_BITS, dtype=np.int32)
+    # Multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4).
+    factor = np.array([0x9E3779B97F4A7C15], dtype=np.uint64)
     while len(left):
         place = ((voxel[left] * factor) >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
         table[place[::-1]] = left[::-1]

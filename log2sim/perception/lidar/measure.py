@@ -49,6 +49,7 @@ from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
     MIN_CLUSTER_POINTS,
+    Index,
     Shown,
     assign_clusters,
     candidate_clusters,
@@ -57,8 +58,8 @@ from log2sim.perception.lidar.clusters import (
     region_grow,
 )
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_boxes_in_view, project_points
+from log2sim.tracking.forward import RELATED
 
-Index = NDArray[np.intp]
 Frame = tuple[View, Detections, "Cloud | None"]
 """A frame with its image boxes, and the cloud nearest in time, None without one."""
 
@@ -153,8 +154,6 @@ def _rows_of_boxes(boxes: Boxes3D, cloud: Cloud, members: Sequence[Index]) -> Me
 MIN_IOU = 0.3
 # The category of the image counts where the boxes overlap by this.
 MIN_CATEGORY_IOU = 0.5
-# A rider is taken for a pedestrian now and then and the other way round.
-RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
 # Scores nearer to 0 or 1 are not believed.
 MIN_SCORE, MAX_SCORE = 0.01, 0.99
 # Recall of a detector in images for objects of at least this height in px, and the height at which it finds none.

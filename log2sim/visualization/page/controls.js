@@ -55,7 +55,7 @@ const listenToKeys = (keys, silent) => {
     for (const name of names) actions.set(name, run);
   }
   window.addEventListener("keydown", (event) => {
-    const typing = event.target instanceof HTMLInputElement && event.target.type === "search";
+    const typing = event.target.matches?.("input:not([type=range])");
     if (event.ctrlKey || event.metaKey || event.altKey || (typing && event.key !== "Escape")) return;
     if (event.key === "Enter" || document.querySelector("dialog[open]")) return;
     const run = actions.get(event.key);

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes import (
+    CATEGORIES,
     GROUP_OF,
     MIN_TRUSTED_CONFIDENCE,
     STANDSTILL_MPS,
@@ -179,6 +180,11 @@ def _shrunk(image: NDArray[np.uint8], edge_px: int) -> NDArray[np.uint8]:
 
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
 SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
+# sRGB of usual paints by the names of `COLOR_NAMES`.
+PAINTS = {
+    "black": (25, 25, 27), "white": (238, 238, 236), "gray": (105, 106, 108), "silver": (180, 182, 184), "red": (165, 25, 30),
+    "blue": (30, 65, 150), "green": (30, 100, 55), "yellow": (235, 200, 40), "brown": (95, 65, 45), "orange": (230, 110, 30),
+}  # fmt: skip
 MAX_ROWS = 3_000_000  # waypoints of all layers together; a page with this many has about 50 MB
 
 
@@ -237,6 +243,14 @@ def page_document(
         "warnings": _warnings(replay),
         "metrics": [[title, text] for title, text in (*metrics, *_replay_metrics(replay))],
         "recording": None,
+        "studio": {
+            "t0_ns": scenario.t0_ns,
+            "map_offset_m": list(m.offset_m),
+            "log": scenario.name,
+            "categories": list(CATEGORIES),
+            "paints": {name: list(rgb) for name, rgb in PAINTS.items()},
+            "corrections": [],
+        },
     }
 
 
@@ -355,7 +369,8 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
     }
     if not isinstance(agent, Agent):
         return entry
-    return {**entry, **_tangents(agent.trajectory), "filled": _filled(columns.observed)}
+    z = second_differences(columns.z_m, SCALES["x_m"])
+    return {**entry, **_tangents(agent.trajectory), "z_m": z, "filled": _filled(columns.observed)}
 
 
 def _tangents(trajectory: Trajectory) -> dict[str, list[int]]:

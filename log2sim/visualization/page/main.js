@@ -196,7 +196,7 @@ const neighbor = (step) => {
   if (count) chooseVisible(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
 };
 
-const list = new List(tracks, { choose: chooseVisible, hover }), details = new Details(data, seek);
+const list = new List(tracks, { choose: (track) => editor?.mergeWith(track) || chooseVisible(track), hover }), details = new Details(data, seek);
 const pictures = data.recording?.pictures ? new Pictures(data.recording.pictures, tracks, { choose: chooseVisible, hover, ready: requestDraw }) : null;
 
 const start = () => {

@@ -4,7 +4,7 @@ const AHEAD = 3;
 
 class CameraTile {
   constructor(entry, agents, act) {
-    Object.assign(this, { name: entry.name, t: entry.t_s, width: entry.size_px[0], height: entry.size_px[1], act, shown: -1 });
+    Object.assign(this, { name: entry.name, t: entry.t_s, calibration: entry, width: entry.size_px[0], height: entry.size_px[1], act, shown: -1 });
     this.reach = reachOf(this.t);
     this.outlines = entry.outlines.map(() => null);
     this.read = (k) => editor?.outlines(this, k) ?? (this.outlines[k] ??= entry.outlines[k].map((values) => new Outline(values, agents)).filter(({ track }) => track));

@@ -15,6 +15,11 @@ window.log2sim = {
   },
   // Position of a place of the map on the canvas, CSS pixels.
   pixelOf: (x, y) => [view.sx(x), view.sy(y)],
+  // Move the map so that a place is in its middle.
+  lookAt: (x, y) => {
+    [view.x, view.y] = [x, y];
+    requestDraw();
+  },
   // Where the box that is moved stands in the map, how it is turned, and how far ahead the handle is that turns it.
   poseOf: () => (editor?.pose ? [editor.pose.x, editor.pose.y, editor.pose.yaw, editor.pose.length / 2 + HANDLE_M] : null),
   // Position of a place of the ground in the picture of a camera, CSS pixels of the window; null where it is not in it.

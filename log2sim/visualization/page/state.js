@@ -10,7 +10,7 @@ const prepareTracks = () => {
   for (const track of doubtful) track.label += "?";
 };
 prepareTracks();
-let editor = null;  // of corrections, on a page of the studio
+let editor = null;  // of corrections
 const state = {
   t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
   shown: { scenario: true, truth: true, replay: true, trails: true, names: true, predictions: true, ends: true, lanes: true, ground: true, pictures: true, points: true },

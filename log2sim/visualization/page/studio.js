@@ -1,4 +1,5 @@
-// Corrections by hand, sent to the program that serves this page, which answers with the corrected scenario.
+// Corrections by hand. A program that serves this page applies them and answers with the corrected scenario; from a file of its own the page shows
+// what they do to each agent alone, and downloads them.
 
 const HANDLE_M = 2.5, NUDGE_M = 0.05, TURN_RAD = Math.PI / 180, SIZE_M = [0.05, 100], CIRCLE_95 = 2.448;
 // What can be pulled: places on the box in half lengths, half widths and heights, and in m ahead.
@@ -8,7 +9,7 @@ const HANDLES = [
 ];
 
 class Editor {
-  // entry: address, t0_ns, map_offset_m, log, categories, corrections
+  // entry: t0_ns, map_offset_m, log, categories, paints, corrections, before, scales; from a program: address, corrected
   constructor(entry) {
     this.entry = entry;
     this.made = [...entry.corrections];
@@ -17,12 +18,18 @@ class Editor {
     this.mode = null;  // null, "move", "merge", "add", "line" or "erase"
     this.pose = null;  // of the box that is moved: x, y, z of the ground below it, yaw, size, and what of it was changed
     this.line = [];  // points of the line that is drawn
-    this.cameras = new Map((entry.cameras ?? []).map((camera) => [camera.name, new Calibrated(camera)]));
-    this.before = new Map(entry.before.map((agent) => [agent.id, new Track(agent, entry.scales)]));
+    this.cameras = new Map((pictures?.tiles ?? []).map((tile) => [tile.name, new Calibrated(tile.calibration)]));
+    this.ghost = null;  // the chosen agent before its corrections
     this.corrected = entry.corrected;  // since the boxes in the pictures were projected
     this.changes = 0;  // so that pictures know when to draw again
     this.sent = Promise.resolve();  // one after the other
-    byId("studio").hidden = false;
+    byId("studio").open = "address" in entry;
+    byId("studio").addEventListener("toggle", () => this.mode && this.toggle(null));
+    byId("studio-author").value = this.made.at(-1)?.author ?? "";
+    if (!("address" in entry)) {
+      byId("studio-download").addEventListener("click", () => { this.downloaded = this.made; });
+      window.addEventListener("beforeunload", (event) => this.made.length && this.downloaded !== this.made && event.preventDefault());
+    }
     byId("studio-category").append(...entry.categories.map((name) => element("option", {}, name)));
     byId("studio-color").append(element("option", { value: "" }, "color"), ...Object.keys(entry.paints).map((name) => element("option", {}, name)));
     const actions = {
@@ -33,7 +40,7 @@ class Editor {
       "studio-line": () => (this.mode === "line" ? this.finish() : this.toggle("line")), "studio-erase": () => this.toggle("erase"),
     };
     for (const [id, run] of Object.entries(actions)) byId(id).addEventListener("click", run);
-    byId("studio-category").addEventListener("change", (event) => this.put("category", { category: event.target.value }));
+    byId("studio-category").addEventListener("change", ({ target }) => this.mode !== "add" && this.put("category", { category: target.value }));
     byId("studio-color").addEventListener("change", ({ target }) => target.value && this.put("color", { name: target.value, rgb: entry.paints[target.value] }));
     this.keys = {
       J: () => this.next(), K: actions["studio-confirm"], B: actions["studio-flip"], M: actions["studio-merge"], S: actions["studio-split"],
@@ -67,8 +74,8 @@ class Editor {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches?.("input[type=search], input[type=number], select")) return;
-    if (document.querySelector("dialog[open]")) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches?.("input:not([type=range]), select")) return;
+    if (document.querySelector("dialog[open]") || !byId("studio").open) return;
     const nudge = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (this.mode === "move" && (nudge || "[]".includes(event.key) || event.key === "Enter")) {
       if (nudge) this.pull(nudge[0] * NUDGE_M, nudge[1] * NUDGE_M);
@@ -106,8 +113,14 @@ class Editor {
   put(kind, more = {}) {
     const track = state.chosen;
     if (!track || track.ego) return this.say("Choose an agent first; the ego is that of the log.");
-    const entry = { kind, agent: this.reference(track), ...more, time: new Date().toISOString() };
+    const entry = this.signed({ kind, agent: this.reference(track), ...more });
     this.send((made) => [...(["category", "size", "color"].includes(kind) ? this.without(made, kind, track) : made), entry]);
+  }
+
+  // With when, by whom and why it was made.
+  signed(entry) {
+    const [author, reason] = ["author", "reason"].map((name) => byId(`studio-${name}`).value.trim());
+    return { ...entry, time: new Date().toISOString(), ...(author && { author }), ...(reason && { reason }) };
   }
 
   toggle(mode) {
@@ -121,12 +134,12 @@ class Editor {
       const tile = pictures?.tiles.find(shows);
       if (tile) seek(tile.t[tile.shown]);
       chooseVisible(track);
-      if (!track.present) this.mode = null;
-      else this.pose = { ...this.boxOf(track), moved: false, turned: false, sized: false };
+      this.reference(track);  // where it is absent, it goes on from its nearest end
+      this.pose = { ...this.boxOf(track), moved: false, turned: false, sized: false };
     }
     const words = {
       move: "Drag the box, or its handles to turn and size it, in the map or a picture; arrows, [ and ] by steps; Enter when it is right.",
-      merge: "Click the agent that is the same object.", add: "Click where it stands.",
+      merge: "Click the agent that is the same object, in the map, a picture or the list.", add: "Choose its category, and click where it stands.",
       line: "Click along the line; Enter when it is done.", erase: "Click a line or border.",
     };
     this.say(words[this.mode] ?? "");
@@ -167,13 +180,8 @@ class Editor {
   click(sx, sy, margin, surface = mapSurface, other = agentAt(sx, sy, margin)) {
     if (this.mode === null) return false;
     if (this.mode === "move") return true;
-    if (this.mode === "merge") {
-      const track = state.chosen;
-      this.toggle(null);
-      if (other && other !== track && !other.ego) this.put("merge", { other: this.reference(other) });
-      return true;
-    }
-    const place = this.under(sx, sy, surface), time = new Date().toISOString();
+    if (this.mode === "merge") return this.mergeWith(other) || true;
+    const place = this.under(sx, sy, surface);
     if (!place) return true;
     if (this.mode === "line") {
       this.line.push(place);
@@ -181,9 +189,18 @@ class Editor {
       return true;
     }
     const kind = this.mode, pose = { t_ns: this.stamp(), x_m: place[0], y_m: place[1], yaw_rad: 0 };
+    const entry = this.signed({ kind, ...(kind === "erase" ? { at: place } : { category: byId("studio-category").value || "car", poses: [pose] }) });
     this.toggle(null);
-    const entry = kind === "erase" ? { at: place } : { category: byId("studio-category").value || "car", poses: [pose] };
-    this.send((made) => [...made, { kind, ...entry, time }]);
+    this.send((made) => [...made, entry]);
+    return true;
+  }
+
+  // The other track of a merge; returns whether one was wanted.
+  mergeWith(other) {
+    if (this.mode !== "merge") return false;
+    const track = state.chosen;
+    this.toggle(null);
+    if (other && other !== track && !other.ego) this.put("merge", { other: this.reference(other) });
     return true;
   }
 
@@ -192,7 +209,7 @@ class Editor {
     const points_m = this.line, feature = byId("studio-feature").value;
     if (points_m.length < 2) return this.say("A line has two points or more.");
     this.toggle(null);
-    const entry = { kind: "draw", feature, points_m, time: new Date().toISOString() };
+    const entry = this.signed({ kind: "draw", feature, points_m });
     this.send((made) => [...made, entry]);
   }
 
@@ -262,13 +279,14 @@ class Editor {
 
   // The box is right: its size, and a key pose at this time.
   place() {
-    const { x, y, yaw, length, width, height, moved, turned, sized } = this.pose, track = state.chosen, time = new Date().toISOString();
+    const { x, y, yaw, length, width, height, moved, turned, sized } = this.pose, track = state.chosen;
     const pose = { t_ns: this.stamp(), x_m: x, y_m: y, ...(turned ? { yaw_rad: yaw } : {}) }, agent = this.reference(track);
     this.toggle(null);
     const entries = [];
-    if (sized) entries.push({ kind: "size", agent, size_m: [length, width, height].map((value) => Math.round(value * 100) / 100), time });
-    if (moved || turned || !sized) entries.push({ kind: "move", agent, poses: [pose], time });
-    this.send((made) => [...(sized ? this.without(made, "size", track) : made), ...entries]);
+    if (sized) entries.push({ kind: "size", agent, size_m: [length, width, height].map((value) => Math.round(value * 100) / 100) });
+    if (moved || turned || !sized) entries.push({ kind: "move", agent, poses: [pose] });
+    const signed = entries.map((entry) => this.signed(entry));
+    this.send((made) => [...(sized ? this.without(made, "size", track) : made), ...signed]);
   }
 
   resize() {
@@ -310,20 +328,28 @@ class Editor {
       const made = build(this.made);
       if (made === null) return;
       this.say("…");
-      const answer = await fetch(this.entry.address, { method: "PUT", headers: { "Content-Type": "application/json" }, body: JSON.stringify(this.document(made)) });
-      const reply = await answer.json();
-      if (!answer.ok) throw new Error(reply.error);
+      const reply = this.entry.address ? await this.ask(made) : null, count = `${made.length} correction${made.length === 1 ? "" : "s"}`;
       done();
       this.made = made;
-      this.say(reply.unmatched.length ? reply.unmatched.join("; ") : `${made.length} correction${made.length === 1 ? "" : "s"} kept.`);
+      byId("studio-reason").value = "";
+      this.say(reply === null ? `${count}: download them for log2sim correct.` : reply.unmatched.join("; ") || `${count} kept.`);
       this.corrected = true;
       this.changes++;
-      data.features = loadFeatures(reply);
-      replaceTracks(reply.agents, reply.scales);
+      if (reply) data.features = loadFeatures({ ...reply, scales: this.entry.scales });
+      replaceTracks(reply?.agents ?? this.entry.before, this.entry.scales, reply ? [] : made);
     } catch (error) {
       this.say(error instanceof TypeError ? "The program that serves this page does not answer; download the corrections." : error.message);
     }
     this.show();
+  }
+
+  async ask(made) {
+    const headers = { "Content-Type": "application/json", "If-Match": String(this.entry.version) };
+    const answer = await fetch(this.entry.address, { method: "PUT", headers, body: JSON.stringify(this.document(made)) });
+    const reply = await answer.json();
+    if (!answer.ok) throw new Error(reply.error);
+    this.entry.version = reply.version;
+    return reply;
   }
 
   say(text) { byId("studio-status").textContent = text; }
@@ -354,15 +380,17 @@ class Editor {
   }
 
   draw(ctx, surface) {
-    const ghost = this.before.get(state.chosen?.id), present = state.chosen?.present;
-    if (ghost && present && (this.mode === "move" || this.made.length)) {
-      ghost.moveTo(state.t);
-      if (ghost.present) this.drawGhost(ctx, surface, ghost);
-    }
+    if (state.chosen?.present && (this.mode === "move" || this.made.length)) this.drawGhost(ctx, surface, state.chosen.id);
     ctx.setLineDash(TRUTH_DASHES);
     ctx.strokeStyle = ctx.fillStyle = theme.alert;
     ctx.lineWidth = 2;
     if (this.mode === "line") this.stroke(ctx, this.line.map((point) => surface.to(...point)), true);
+    // What no program has drawn yet.
+    for (const { points_m, kind, poses, at } of this.entry.address ? [] : this.made) {
+      if (points_m) this.stroke(ctx, points_m.map((point) => surface.to(...point)), true);
+      if (kind === "add") this.dot(ctx, surface.to(poses[0].x_m, poses[0].y_m, this.groundAt(poses[0].x_m, poses[0].y_m)), 6);
+      if (at) this.dot(ctx, surface.to(...at), 3);
+    }
     if (this.mode === "move") {
       this.drawBox(ctx, surface, this.pose);
       const [front, tip] = [HANDLES[1], HANDLES[0]].map((handle) => this.handle(handle, surface));
@@ -374,7 +402,12 @@ class Editor {
   }
 
   // Where the agent was before the corrections, with the circle that the measurements put it into with 95 %.
-  drawGhost(ctx, surface, ghost) {
+  drawGhost(ctx, surface, id) {
+    const entry = this.entry.before.find((agent) => agent.id === id);
+    if (entry && this.ghost?.id !== id) this.ghost = new Track(entry, this.entry.scales);
+    const ghost = entry ? this.ghost : null;
+    ghost?.moveTo(state.t);
+    if (!ghost?.present) return;
     const box = this.boxOf(ghost), radius = CIRCLE_95 * (ghost.sigma(0) ?? 0);
     ctx.setLineDash(DOTTED);
     ctx.strokeStyle = surface.flat ? theme.ink : "#FFFFFF";
@@ -419,10 +452,36 @@ class Editor {
   }
 }
 
+// What a correction does to an agent alone, without the smoother of log2sim; places are moved at and near their time.
+const correctAlone = ({ kind, agent, other, category, size_m, poses, rgb, name }) => {
+  const find = ({ t_ns, x_m, y_m }) => tracks.find((track) => {
+    track.moveTo((t_ns - editor.entry.t0_ns) / 1e9);
+    return !track.ego && track.present && track.contains(x_m, y_m, 0.1);
+  });
+  const track = agent && find(agent), gone = kind === "merge" ? find(other) : kind === "delete" ? track : null;
+  if (gone) tracks.splice(tracks.indexOf(gone), 1);
+  if (!track) return;
+  if (kind === "confirm") [track.doubts, track.doubtSpans] = [[], []];
+  if (kind === "category") track.category = category;
+  if (kind === "size") [track.length, track.width, track.height] = size_m;
+  if (kind === "flip") track.yaw = track.yaw.map((yaw) => yaw + Math.PI);
+  if (kind === "color") [track.paint, track.paintName] = [`rgb(${rgb})`, name];
+  for (const { t_ns, x_m, y_m, yaw_rad } of kind === "move" ? poses : []) {
+    const t = (t_ns - editor.entry.t0_ns) / 1e9;
+    track.moveTo(t);
+    if (!track.present) continue;
+    const shift = [x_m - track.px, y_m - track.py, yaw_rad === undefined ? 0 : yaw_rad - track.pyaw];
+    const near = (k) => Math.exp(track.stationary ? 0 : -((track.t[k] - t) ** 2) / 2);
+    ["x", "y", "yaw"].forEach((column, i) => { track[column] = track[column].map((value, k) => value + shift[i] * near(k)); });
+    track.vx = track.vy = null;
+  }
+};
+
 // Show other tracks of the scenario; the ego stays the same object, as much refers to it.
-const replaceTracks = (entries, scales) => {
-  const made = entries.map((entry) => (entry.ego && ego ? ego : new Track(entry, scales)));
-  tracks.splice(0, tracks.length, ...made);
+const replaceTracks = (entries, scales, corrections) => {
+  tracks.splice(0, tracks.length, ...entries.map((entry) => (entry.ego && ego ? ego : new Track(entry, scales))));
+  for (const correction of corrections) correctAlone(correction);
+  for (const warning of data.warnings) warning.shown = tracks.find((track) => track.id === warning.agent) ?? null;
   prepareTracks();
   applyTheme(data.layers);
   const chosen = tracks.find((track) => track.id === state.chosen?.id) ?? null;

@@ -10,7 +10,7 @@ const mapSurface = {
 
 // A camera as log2sim's geometry has it: brown or fisheye, z forward, (0, 0) the center of the first pixel.
 class Calibrated {
-  // entry: K (fx, fy, cx, cy), model, distortion, reach (of x / z, before the lens model folds), t_s, cam_T_map (rows of 12)
+  // entry: K (fx, fy, cx, cy), model, distortion, reach (of x / z, before the lens model folds), t_s, cam_T_map (rows of 12, null where it is not known)
   constructor(entry) { Object.assign(this, entry); }
 
   poseAt(t) {

@@ -33,7 +33,7 @@ class Track {
     });
     this.vx = entry.vx_mps ? sums(entry.vx_mps, scales.vx_mps) : null;  // only agents of scenarios follow a spline
     this.vy = entry.vy_mps ? sums(entry.vy_mps, scales.vy_mps) : null;
-    this.z = entry.z_m ? sums(entry.z_m, scales.x_m) : null;  // of the middle of the box, on a page of the studio
+    this.z = entry.z_m ? sums(entry.z_m, scales.x_m) : null;  // of the middle of the box
     this.jumps = new Uint8Array(this.t.length);
     for (const k of entry.jumps ?? []) this.jumps[k] = 1;
     this.filled = new Uint8Array(Math.max(this.t.length - 1, 0));
@@ -159,7 +159,7 @@ const load = (text) => {
   const { name, origin, north, metrics, recording, begin_s: begin, end_s: end } = document_;
   return {
     name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title, features: loadFeatures(document_),
-    background: loadBackground(document_.background), north, metrics, recording, studio: document_.studio ?? null,
+    background: loadBackground(document_.background), north, metrics, recording, studio: { before: document_.layers.scenario, ...document_.studio, scales: document_.scales },
     points: recording?.points ? new Points(recording.points, () => requestDraw()) : null,
   };
 };

@@ -47,6 +47,8 @@ SCRIPT_FILES = (
     "timeline.js",
     "lists.js",
     "main.js",
+    "surface.js",
+    "studio.js",
     "scripting.js",
 )
 
@@ -129,16 +131,14 @@ def make_page(document: dict[str, Any], scenario: Scenario, recorded: Recorded |
 def page_html(document: dict[str, Any]) -> str:
     """Assemble the page; its content security policy allows this script and style by their hashes and nothing else.
 
-    Only a page of the studio (`document["studio"]`) talks to anybody: the program that serves it.
+    Only a page that has an address of the studio talks to anybody: the program that serves it.
     """
-    edits = "studio" in document
-    files = (*SCRIPT_FILES[:-1], *(("surface.js", "studio.js") if edits else ()), SCRIPT_FILES[-1])
-    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in files) + "})();\n"
+    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in SCRIPT_FILES) + "})();\n"
     style = _file("style.css")
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
         "base-uri 'none'; form-action 'none'"
-    ) + ("; connect-src 'self'" if edits else "")
+    ) + ("; connect-src 'self'" if "address" in document["studio"] else "")
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     parts = {
         "policy": policy,
@@ -146,7 +146,6 @@ def page_html(document: dict[str, Any]) -> str:
         "style": style,
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": script,
-        "panel": _file("studio.html") if edits else "",
     }
     # One pass: inserted text is not searched again, so no name in a scenario can be taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))

@@ -1,0 +1,163 @@
+"""Training of LiDAR networks: toys learn, go on from files, are exported and find; the shipped kind and those of two papers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from lidar_training.clouds import CATEGORIES, Sample, write_shard
+
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.geometry import Camera, project_boxes, rotation_from_rpy, transform
+from log2sim.perception.detect3d.network import load_network
+from log2sim.perception.lidar.cloud import Cloud
+
+pytestmark = pytest.mark.slow
+pytest.importorskip("onnx", reason="needs the extra 'train'")
+
+
+@pytest.fixture(autouse=True)
+def torch() -> Any:
+    """Loaded by tests that run, not by those that are collected; threads that wait for a busy core are slower than one."""
+    torch = pytest.importorskip("torch", reason="needs the extra 'train'")
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    return torch
+
+
+def test_a_toy_learns_to_find_riders(tmp_path: Path) -> None:
+    """Half a minute from nothing: centers of riders on fresh scenes are found first; chance finds one in hundreds."""
+    import train_lidar
+
+    rounds = [train_lidar.Round(5, 100, 200)]
+    train_lidar.generate("roadside", tmp_path / "data", 100, 5)
+    train_lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
+    train_lidar.finish("roadside", tmp_path, rounds, examples=8)
+    card = json.loads((tmp_path / "roadside.json").read_text())
+    assert card["simulated"]["two_wheeler"]["average_precision"] > 0.08
+    assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000
+
+
+def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any) -> None:
+    """A network that is read back computes what it did, on other grids than those that its layers' moments were taken from."""
+    from lidar_training.export import description, export_onnx, import_onnx
+    from lidar_training.network import BevNetwork
+
+    network = BevNetwork()
+    for layer in network.modules():
+        if isinstance(layer, torch.nn.BatchNorm2d):
+            for values in (layer.weight.data, layer.running_var):
+                values.uniform_(0.5, 2.0)
+            for values in (layer.bias.data, layer.running_mean):
+                values.uniform_(-0.5, 0.5)
+    torch.save({"mean": network.state_dict()}, tmp_path / "x.pt")
+    export_onnx(tmp_path / "x.pt", tmp_path / "x.onnx", description("vehicle", 0.25, 40.0))
+    grids = torch.rand(6, 12, 64, 64)
+    again = import_onnx(tmp_path / "x.onnx", grids[:4])
+    with torch.no_grad():
+        expected = network.eval()(grids[4:])
+        error = 2e-3 * float(expected.abs().max())  # weights are stored in half floats
+        np.testing.assert_allclose(again(grids[4:]), expected, rtol=0, atol=error)
+        # In training a layer is normalized by the batch, whose moments are those that were put in.
+        np.testing.assert_allclose(again.train()(grids[:4]), network.eval()(grids[:4]), rtol=0, atol=error)
+    assert (tmp_path / "x.onnx").stat().st_size < 0.55 * (tmp_path / "x.pt").stat().st_size
+
+
+def points_in(boxes: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Points all over the inside of boxes (M, 7), `count` in each."""
+    parts = []
+    for x, y, z, length, width, height, yaw in boxes:
+        p = rng.uniform(-0.5, 0.5, (count, 3)) * (length, width, height)
+        c, s = np.cos(yaw), np.sin(yaw)
+        parts.append(np.column_stack([x + p[:, 0] * c - p[:, 1] * s, y + p[:, 0] * s + p[:, 1] * c, z + p[:, 2]]))
+    return np.concatenate(parts)
+
+
+def test_the_network_of_cells_and_votes_is_trained_from_shards_and_exported(tmp_path: Path) -> None:
+    from lidar_training import zou2021
+
+    rng, names = np.random.default_rng(0), ("car", "truck", "pedestrian", "cyclist")
+    boxes = np.array(
+        [[4.0, 3.0, 0.8, 4.5, 1.8, 1.6, 0.4], [-6.0, 5.0, 1.6, 9.0, 2.5, 3.2, -2.0], [2.0, -5.0, 0.86, 0.6, 0.6, 1.72, 1.0],
+         [-5.0, -6.0, 0.8, 1.8, 0.7, 1.6, 2.8]]
+    )  # fmt: skip
+    ground = np.column_stack([rng.uniform(-11.9, 11.9, (6000, 2)), rng.normal(0, 0.02, 6000)])
+    xyz = np.concatenate([ground, points_in(boxes, 1500, rng)]).astype(np.float32)
+    category = np.array([CATEGORIES.index(n) for n in names], np.int64)
+    sample = Sample(xyz, boxes.astype(np.float32), category, np.full(4, 1500))
+    (tmp_path / "data").mkdir()
+    write_shard(tmp_path / "data" / "roadside-1-0000.npz", [sample, sample])
+    path = zou2021.train([tmp_path / "data"], tmp_path / "out", steps=2, seed=1, start=None, share=0.1)
+    info = load_network(path).info
+    assert info.card == {"steps": 2, "seed": 1, "share": 0.1, "samples": 2}
+    assert info.stride == 1
+    assert (tmp_path / "out" / "checkpoint.pt").exists()
+
+
+K = np.array([[300.0, 0, 300], [0, 300.0, 90], [0, 0, 1]])
+SIZE_PX = (180, 600)
+# x, y, height of the center, length, width, height, heading, in a frame that looks along x.
+BOXES = np.array([[12.2, 2.1, 0.8, 4.4, 1.8, 1.6, 0.2], [20.0, -4.0, 0.8, 4.6, 1.9, 1.6, 1.5], [9.0, -2.0, 0.86, 0.7, 0.6, 1.72, 0.0]])  # fmt: skip
+NAMES = ["car", "car", "pedestrian"]
+SLOPE = 0.02
+
+
+def pair_of_a_slope(yaw: float = 0.6) -> Any:
+    """A sweep on a slope and a picture of a camera that looks along `yaw`."""
+    from lidar_training import real_logs, two_stream
+
+    rng = np.random.default_rng(3)
+    flat = np.column_stack([rng.uniform(0, 40, 9000), rng.uniform(-15, 15, 9000), rng.normal(0, 0.01, 9000)])
+    xyz = np.concatenate([flat, points_in(BOXES, 300, rng)])
+    height = xyz[:, 2].astype(np.float32)
+    xyz = xyz + xyz[:, :1] * [0, 0, SLOPE]
+    turn = rotation_from_rpy(0, 0, yaw)
+    origin = np.array([50.0, -20.0, 3.0])
+    cloud = Cloud(
+        7, origin, (xyz @ turn.T).astype(np.float32), np.zeros(len(xyz), np.float32),
+        np.array([0, 0, 1.7], np.float32), height < 0.1, height,
+    )  # fmt: skip
+    rows = BOXES.copy()
+    rows[:, 2] += SLOPE * rows[:, 0]
+    rows[:, :3] = rows[:, :3] @ turn.T
+    rows[:, 6] += yaw
+    truth = SceneBoxes.of(rows, NAMES, points=np.full(len(rows), 300))
+    cam = turn @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    camera, cam_T_cloud = (
+        Camera("c", SIZE_PX[1], SIZE_PX[0], K, "map", np.eye(4)),
+        np.linalg.inv(transform(cam, [0, 0, 1.6])),
+    )
+    image = np.full((*SIZE_PX, 3), 90, np.uint8)
+    for k, outline in enumerate(project_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], camera, cam_T_cloud).box_px):
+        u0, v0, u1, v1 = outline.astype(int)
+        image[max(v0, 0) : v1, max(u0, 0) : u1] = (250, 40 * k, 30)
+    sweep = real_logs.LogSweep(cloud, truth, ())
+    return two_stream.pair_of(sweep, image, K, transform(cam, origin + np.array([0, 0, 1.6])))
+
+
+def test_two_streams_learn_one_pair_are_exported_and_find_its_objects(tmp_path: Path) -> None:
+    from lidar_training import fitting, two_stream
+
+    pair = pair_of_a_slope()
+    network = two_stream.TwoStream(((8, 1), (16, 1)))
+    batch = two_stream.Batch.of(two_stream.inputs_of(pair))
+    losses: list[float] = []
+
+    def step(n: Any, rng: np.random.Generator, _: int) -> Any:
+        loss, parts = two_stream.loss_of_anchors(*batch.run(n), batch)
+        losses.append(float(loss.detach()))
+        return loss, parts
+
+    fitting.fit(network, step, fitting.FitPlan(70, peak_rate=5e-3))
+    assert losses[-1] < 0.1 * losses[0]
+    two_stream.export_two_stream(network, tmp_path / "two.onnx")
+    search = two_stream.TwoStreamDetector.open(tmp_path / "two.onnx")
+    found = search(pair)
+    best = found.take(np.argsort(-found.score)[: len(NAMES)])
+    assert sorted(best.category.tolist()) == sorted(NAMES)
+    row = two_stream.compare({"toy": search}, [pair])["toy"]
+    assert row["car"]["IoU BEV > 0.5"] == 1.0
+    assert row["car"]["truths"] == 2
