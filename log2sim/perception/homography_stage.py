@@ -11,7 +11,7 @@ import numpy as np
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse
-from log2sim.perception.first_pass import Observations
+from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
     MAX_CONDITION,
@@ -25,7 +25,6 @@ from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
 from log2sim.perception.lidar.measure import BORDER_PX
-from log2sim.perception.observe_tick import base_pose
 from log2sim.plan import HomographyScope, Plan
 
 # A camera lower than this sees the ground under too flat an angle, m.
