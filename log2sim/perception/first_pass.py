@@ -34,7 +34,7 @@ from log2sim.files.packing import pack
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Array, inverse
-from log2sim.perception.alignment import align_parts
+from log2sim.perception.cooperative import align_parts
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import FrameDetector
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
