@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-FAST = (
-    "--detector", "lidar:labels", "--set", "map.lanes=false", "--set", "appearance.colors=false", "--set", "appearance.signals=false",
-)  # fmt: skip
+from plain_settings import AGENTS_ONLY
+
+FAST = ("--detector", "lidar:labels", *AGENTS_ONLY)
 
 READER_MODULE = '''
 """Folders with a file told.txt: the log of a path, and what happens when it is opened for the first time."""
@@ -15,6 +15,8 @@ import os
 import signal
 import time
 from pathlib import Path
+
+from plain_settings import AGENTS_ONLY
 
 from log2sim.logs.native.reader import READER as NATIVE
 

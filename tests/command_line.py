@@ -6,10 +6,16 @@ import contextlib
 import io
 import sys
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
+import typer.main
+
 from log2sim.cli import entry
+
+# The commands are put together from their signatures, which takes longer than many of them run.
+typer.main.get_command = cache(typer.main.get_command)
 
 
 @dataclass(frozen=True)

@@ -134,9 +134,18 @@ def tiny_scenario(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="session")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def one_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """One browser for all tests of a process; skips where there is none."""
     if CHROMIUM is None or DRIVER is None:
         pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
     with browsing(tmp_path_factory.mktemp("profile")) as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def chromium(one_browser: Browser) -> Browser:
+    """The browser, without what pages of other modules told and asked for."""
+    one_browser.open("about:blank")
+    one_browser.log("browser")
+    one_browser.requests()
+    return one_browser

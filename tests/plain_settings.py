@@ -4,4 +4,5 @@ from __future__ import annotations
 
 from typing import Any
 
+AGENTS_ONLY = ("--set", "map.lanes=false", "--set", "appearance.colors=false", "--set", "appearance.signals=false")
 AGENTS_ALONE: dict[str, Any] = {"map": {"lanes": False}, "appearance": {"colors": False, "signals": False}}

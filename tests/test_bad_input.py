@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import Ran, names, run
+from plain_settings import AGENTS_ONLY
 
 Change = Callable[[Path], Any]
 
@@ -84,6 +85,7 @@ def reconstruct(folder: Path, *options: object, log: Path | None = None) -> Ran:
         out / "r.json",
         "--detector",
         "labels",
+        *AGENTS_ONLY,
         *options,
     )
     if ran.code != 0:

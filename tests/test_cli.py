@@ -13,6 +13,7 @@ import pytest
 import tifffile
 from command_line import names, run
 from localization_worlds import BEND, HOUSES, LIDAR, drive
+from plain_settings import AGENTS_ONLY
 from test_first_pass_cache import PART, TICKS, Seeing, entries, folder, made
 from typer.testing import CliRunner
 from worlds import tiny_toml
@@ -91,7 +92,15 @@ def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: 
     assert again.code == 2
     assert "--overwrite" in again.line
     quiet = run(
-        "reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels", "--overwrite", "--quiet"
+        "reconstruct",
+        tiny_folder,
+        "--out",
+        tmp_path / "s.json",
+        "--detector",
+        "labels",
+        "--overwrite",
+        "--quiet",
+        *AGENTS_ONLY,
     )
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
@@ -426,7 +435,7 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def by_lidar(noisy: Path) -> Path:
     out = noisy.parent / "lidar.json"
     ran = run(
-        "reconstruct", noisy, "--detector", "lidar:labels", "--poses", "lidar", "--out", out, "--report",
+        "reconstruct", noisy, *AGENTS_ONLY, "--detector", "lidar:labels", "--poses", "lidar", "--out", out, "--report",
         noisy.parent / "report.json",
     )  # fmt: skip
     assert ran.code == 0, ran.err

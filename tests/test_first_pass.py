@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from plain_settings import AGENTS_ALONE
 from worlds import camera_ahead, outline_px, scan, standing
 
 from log2sim.config import Config
@@ -235,7 +236,7 @@ def test_mode_paper_runs_from_the_log_to_the_scenario():
     boxes = [Truth(log).detect(Frame(log.cameras["front"], int(t), lambda: None)).box_px for t in STAMPS]
     labels = ImageLabels(np.repeat(STAMPS, 2), np.concatenate(boxes), np.array(CATEGORIES * TICKS))
     log = replace(log, image_labels={"front": labels})
-    config = Config.load(settings=["detect.name=labels", "measure.mode=paper"])
+    config = Config.load(settings=["detect.name=labels", "measure.mode=paper"], **AGENTS_ALONE)
     scenario = reconstruct(log, config).scenario
     assert scenario.ego is not None
     assert scenario.others

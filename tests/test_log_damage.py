@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import run
-from plain_settings import AGENTS_ALONE
+from plain_settings import AGENTS_ALONE, AGENTS_ONLY
 from worlds import tiny_log
 
 from log2sim.config import Config
@@ -160,7 +160,17 @@ def test_reconstruct_inspect_and_validate_tell_the_same(log_folder: Path, tmp_pa
     )
     told = {moved_box, cut_row}
     report = tmp_path / "r.json"
-    ran = run("reconstruct", log_folder, "--out", tmp_path / "s.json", "--report", report, "--detector", "labels")
+    ran = run(
+        "reconstruct",
+        log_folder,
+        "--out",
+        tmp_path / "s.json",
+        "--report",
+        report,
+        "--detector",
+        "labels",
+        *AGENTS_ONLY,
+    )
     assert ran.code == 0
     assert {f"note: {line}" for line in told} <= set(ran.out.splitlines())
     assert told <= set(json.loads(report.read_text())["log"]["notes"])

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_encoders.nuscenes import TURN_NS, encode, hdl32_world
 from log_encoders.world import labels_at
+from plain_settings import AGENTS_ALONE
 
 from log2sim import Config, reconstruct
 from log2sim.datatypes import Labels, Log
@@ -280,7 +281,7 @@ def test_key_frames_alone_give_a_scenario(tmp_path: Path) -> None:
         file.unlink()
     log, world = open_log(root), hdl32_world()
     assert {len(stream.t_ns) for stream in log.streams.values()} == {5}
-    scenario = reconstruct(log, Config.load(detect={"name": "lidar:labels"})).scenario
+    scenario = reconstruct(log, Config.load(detect={"name": "lidar:labels"}, **AGENTS_ALONE)).scenario
     cars = [agent for agent in scenario.others if agent.category == "car"]
     assert len(cars) == 2
     moving = max(cars, key=lambda agent: float(agent.waypoints.speed_mps.max()))

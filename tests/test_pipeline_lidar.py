@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_settings import AGENTS_ALONE
 from worlds import CAR, PARKED, WALKER, tiny_log, tiny_table
 
 from log2sim.config import Config, LidarConfig
@@ -31,7 +32,7 @@ def world() -> tuple[Log, Scenario]:
 
 
 def run(log: Log, detector: str, *settings: str) -> Result:
-    return reconstruct(log, Config.load(settings=[f"detect.name={detector}", *settings]))
+    return reconstruct(log, Config.load(settings=[f"detect.name={detector}", *settings], **AGENTS_ALONE))
 
 
 def nearest(result: Result, xy: Any) -> Agent | None:

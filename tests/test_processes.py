@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_settings import AGENTS_ALONE
 from test_first_pass import STAMPS, TICKS, Truth, driving_log, with_records
 from worlds import tiny_log
 
@@ -88,7 +89,7 @@ def test_records_that_repeat_are_told_alike_by_any_number_of_processes(
 @pytest.mark.parametrize("detector", ["lidar:vehicle", "labels+lidar:vehicle"])
 def test_scenarios_of_any_number_of_processes_are_the_same(detector: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_pass, "PART_TICKS", 2)
-    config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector})
+    config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector}, **AGENTS_ALONE)
     made = [reconstruct(tiny_log()[0], config, jobs=jobs) for jobs in (1, 3)]
     assert len({json.dumps(result.scenario.to_dict(), sort_keys=True) for result in made}) == 1
     assert len({str(result.report["detections"]) for result in made}) == 1

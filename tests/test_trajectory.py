@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.estimate import spans_of_ticks
+from log2sim.agents.estimate import with_observers
 from log2sim.datatypes import Agent, Scenario, Trajectory, Waypoints
 from log2sim.edit.apply import edit
 from log2sim.edit.edits import Shift, Speed
@@ -111,7 +112,9 @@ def test_a_span_goes_on_over_missed_ticks_and_ends_at_longer_gaps() -> None:
     tick = np.array([2, 3, 3 + MAX_MISSES + 1, 3 + 2 * (MAX_MISSES + 1) + 1])
     last = (3 + MAX_MISSES + 1) / 10
     alone = float(timeline.seconds(timeline.t_ns[tick[-1:]])[0])
-    assert spans_of_ticks(tick, timeline) == (pytest.approx((0.2, last)), (alone, alone))
+    measured = SimpleNamespace(tick=tick, measurements=SimpleNamespace(seen_by=np.tile([True, False], (4, 1))))
+    found = with_observers(SimpleNamespace(track=measured), agent(), timeline).observed_by
+    assert found == {"vehicle": (pytest.approx((0.2, last)), (alone, alone))}
 
 
 def agent() -> Agent:

@@ -19,7 +19,7 @@ from typing import Any
 
 from entry import parser_of
 
-from benchmarks.table import markdown
+from benchmarks.table import cell, markdown
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Scenario
 from log2sim.errors import Log2SimError
@@ -47,23 +47,13 @@ def log_of(path: Path, keep: Path) -> Path:
 def row_of(name: str, figures: dict[str, Any]) -> list[str]:
     """Format one row of the table."""
     c = figures["correctness"]
-    shares = [share(c[key]["share"]) for key in SHARES]
-    doubted = [share(c["doubted"][key]) for key in ("wrong_ticks", "right_ticks")]
+    shares = [*(c[key]["share"] for key in SHARES), *(c["doubted"][key] for key in ("wrong_ticks", "right_ticks"))]
+    percent = [cell(value and 100 * value, 1, " %") for value in shares]
     error = c["calibration"]["agents"]["expected_calibration_error"]
     return [
-        name, str(c["agents"]), str(c["ticks"]), fraction(figures["recall"]), fraction(figures["precision"]), *shares, *doubted,
-        fraction(error), fraction(c["sigma"]["nees"]),
+        name, str(c["agents"]), str(c["ticks"]), cell(figures["recall"]), cell(figures["precision"]), *percent,
+        cell(error), cell(c["sigma"]["nees"]),
     ]  # fmt: skip
-
-
-def share(value: float | None) -> str:
-    """A fraction in percent."""
-    return "-" if value is None else f"{100 * value:.1f} %"
-
-
-def fraction(value: float | None) -> str:
-    """A figure with two decimals."""
-    return "-" if value is None else f"{value:.2f}"
 
 
 def run(path: Path, options: argparse.Namespace, keep: Path) -> list[str]:

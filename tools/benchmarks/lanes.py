@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from entry import parser_of
 
-from benchmarks.table import markdown
+from benchmarks.table import cell, markdown
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import Log2SimError
@@ -135,11 +135,6 @@ def mean_of(rows: Sequence[dict[str, Any]], *path: str) -> float | None:
         if value is not None:
             values.append(float(value))
     return float(np.mean(values)) if values else None
-
-
-def cell(value: float | None, digits: int = 2, unit: str = "") -> str:
-    """A figure, '-' without one."""
-    return "-" if value is None else f"{value:.{digits}f}{unit}"
 
 
 def counts(rows: Sequence[dict[str, Any]], kind: str) -> str:

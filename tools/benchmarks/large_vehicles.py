@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from entry import parser_of
 
-from benchmarks.table import markdown
+from benchmarks.table import cell, markdown
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Agent, Labels, Log, Scenario, Stream, Sweep
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
@@ -305,22 +305,12 @@ def measured(
 def row(f: Figures) -> list[str]:
     """Format a line of the table."""
     values = (f.recall, f.position_m, f.yaw_deg, f.length_m, f.width_m, f.speed_mps, f.backwards)
-    return [f.kind, f.pose, f.vehicle, *("-" if v is None else f"{v:.2f}" for v in values), str(f.extra)]
+    return [f.kind, f.pose, f.vehicle, *map(cell, values), str(f.extra)]
 
 
 HEAD = (
-    "kind",
-    "pose",
-    "vehicle",
-    "recall",
-    "position m",
-    "yaw deg",
-    "length m",
-    "width m",
-    "speed m/s",
-    "backwards",
-    "extra",
-)
+    "kind", "pose", "vehicle", "recall", "position m", "yaw deg", "length m", "width m", "speed m/s", "backwards", "extra",
+)  # fmt: skip
 
 
 def totals(rows: Sequence[Figures]) -> str:

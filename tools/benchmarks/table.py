@@ -43,6 +43,11 @@ def timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float]:
     return out, statistics.median(seconds)
 
 
+def cell(value: float | None, digits: int = 2, unit: str = "") -> str:
+    """A figure, '-' without one."""
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
+
+
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table."""
     lines = [head, ["---"] * len(head), *rows]

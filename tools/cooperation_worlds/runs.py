@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.table import markdown
+from benchmarks.table import cell, markdown
 from numpy.typing import NDArray
 
 from cooperation_worlds.world import ROAD_LIDAR, Array, RoadError, disturb
@@ -160,7 +160,7 @@ OVERLAP = (
 def range_table(figures: dict[str, Any]) -> str:
     bins = list(next(iter(figures.values()))["recall_by_distance"])
     rows = [
-        [NAMES[w], f"{f['range_m']:.0f}", _n(f["recall_30m"]), *(_n(v) for v in f["recall_by_distance"].values())]
+        [NAMES[w], f"{f['range_m']:.0f}", cell(f["recall_30m"]), *(cell(v) for v in f["recall_by_distance"].values())]
         for w, f in figures.items()
     ]
     return markdown(["", "range m", "recall at 30 m", *(f"{b} m" for b in bins)], rows)
@@ -179,8 +179,8 @@ def overlap_table(figures: dict[str, Any]) -> str:
 
 def ap_table(figures: dict[str, Any]) -> str:
     ways = list(next(iter(figures["ap"].values())))
-    rows = [[kind, *(_n(ap[w] and 100 * ap[w], 1) for w in ways)] for kind, ap in figures["ap"].items()]
-    rows += [[f"recall, vehicles {what}", *(_n(of[w]) for w in ways)] for what, of in figures["recall"].items()]
+    rows = [[kind, *(cell(ap[w] and 100 * ap[w], 1) for w in ways)] for kind, ap in figures["ap"].items()]
+    rows += [[f"recall, vehicles {what}", *(cell(of[w]) for w in ways)] for what, of in figures["recall"].items()]
     share = f"{figures['vehicles']} vehicles, {100 * figures['hidden_from_vehicle']:.0f} % hidden from the vehicle"
     return markdown(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
 
@@ -191,11 +191,9 @@ def registration_table(figures: dict[str, Any]) -> str:
         cells = [figures[f"{name}_{when}"] for name in ("offset_m", "turn_deg", "delay_s")]
         rows.append([when, *(f"{c['median']:.3f} / {c['p90']:.3f}" for c in cells)])
     table = markdown(["median / 90 %", "position m", "angle deg", "clock s"], rows)
-    return table + f"\n\nwithin 0.1 m and 0.3 deg: {_n(figures['within_target'])}; left out: {_n(figures['left_out'])}"
-
-
-def _n(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    return (
+        table + f"\n\nwithin 0.1 m and 0.3 deg: {cell(figures['within_target'])}; left out: {cell(figures['left_out'])}"
+    )
 
 
 TABLE: dict[str, Callable[[dict[str, Any]], str]] = {

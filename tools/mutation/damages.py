@@ -568,7 +568,7 @@ def change_cells(rng: Rng, table: Any, file: Path) -> Changed:
         )
         return table.set_column(where, name, changed), f"{name}[{at}] is {value}", value != -1 and shows
     if kind == 3:
-        optional = ("attributes", "cuboids", "camera", "i", "stationary") if pickled else ("num_interior",)
+        optional = ("attributes", "cuboids", "camera", "i", "stationary") if pickled else ("num_interior", "intensity")
         return table.drop_columns([name]), f"{name} is missing", not name.startswith(optional)
     if kind == 4:
         words = pyarrow.array([str(v)[:20] for v in column.to_pylist()])
