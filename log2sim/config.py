@@ -213,8 +213,8 @@ class TrackConfig(Section):
         True, "Whether static agents exist for the whole scenario, but where the log shows their place free."
     )
     quarantine_confidence: float = setting(
-        0.15,
-        "Agents of a lower confidence stay in the file, but are left out of replays and exports. Of agents at 0.15 six of seven are wrong.",
+        0.25,
+        "Agents of a lower confidence stay in the file, but are left out of replays and exports. Of agents at 0.25 three of four are wrong.",
         ge=0.0,
         le=1.0,
     )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import ImageRegions, Log
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.evaluation import ClassBoxes, class_figures, precision_recall
+from log2sim.evaluation.detection.evaluation import BothBoxes, class_figures, precision_recall
 from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS, Criterion, candidate_pairs, match_detections
 from log2sim.evaluation.detection.truth import ImageViews, image_views
 from log2sim.geometry import Camera, transform
@@ -60,9 +60,8 @@ def test_each_difficulty_counts_the_labels_that_it_admits():
     truncation = [0.15, 0, 0, 0.16, 0, 0.5, 0, 0]
     truth = row_of(np.arange(8) * 10.0)
     found = row_of(np.arange(8) * 10.0, score=0.9)
-    boxes = ClassBoxes(
-        found, truth, none(found), none(found), views(height), views(height, truncation), occlusion.astype(np.int64)
-    )
+    sides = found, truth, none(found), np.zeros(8), np.full(8, ""), occlusion.astype(np.int64)
+    boxes = BothBoxes(*sides, views(height), views(height, truncation))
     assert [counts(figures(boxes, name))[:3] for name in NAMES] == [(1, 1, 0), (4, 4, 0), (6, 6, 0)]
     assert counts(figures(boxes, "all")) == (8, 8, 0, 0)
 
@@ -202,10 +201,9 @@ def test_published_detections_of_pointrcnn_get_figures_like_the_published_ones()
         return replace(SceneBoxes.join(tables), scene=np.concatenate([t.scene for t in tables]))
 
     found_all, truth_all = joined(found), joined(truth).ignoring(kind == "Van")
-    boxes = ClassBoxes(
-        found_all, truth_all, none(found_all), none(found_all), level_views(np.concatenate(found_px)),
-        level_views(np.concatenate(true_px), np.array([0.0, 0.3, 0.5])[level[:, 0].astype(int)]), level[:, 1].astype(int),
-    )  # fmt: skip
+    views_of_truth = level_views(np.concatenate(true_px), np.array([0.0, 0.3, 0.5])[level[:, 0].astype(int)])
+    sides = found_all, truth_all, none(found_all), np.zeros(len(found_all)), kind, level[:, 1].astype(int)
+    boxes = BothBoxes(*sides, level_views(np.concatenate(found_px)), views_of_truth)
     # KITTI's validation set, R40: about 91, 80 and 78 in 3D, 95, 89 and 87 from above (PointRCNN, Shi et al. 2019, and later
     # evaluations of its weights). Here are other frames, some of which it was trained on, with occlusion and truncation by level.
     result = class_figures(boxes, CAR, 0.5)

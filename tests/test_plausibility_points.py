@@ -10,11 +10,11 @@ from test_plausibility_conflicts import agent, candidate
 from worlds import rows_at
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.evidence import SIGNS, Recording, gather, missing_nats
+from log2sim.agents.evidence import SIGNS, Recording, continued, gather, missing_nats
 from log2sim.agents.judge import MIN_THERE, decide
 from log2sim.agents.rays import Ending, classify_rays, count_rays
 from log2sim.agents.size import static_geometry
-from log2sim.datatypes import Log, Obstacles, Rays, Track
+from log2sim.datatypes import AgentTable, Log, Obstacles, Rays, Track
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.sync import Schedule
 
@@ -98,12 +98,12 @@ def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
 
 
 def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
-    row = dict.fromkeys((*SIGNS, "shown_ticks", "image_ticks"), 0.0) | {"confirmed": 1.0}
+    row = dict.fromkeys((*SIGNS, "pointless", "shown_ticks", "image_ticks"), 0.0) | {"confirmed": 1.0}
     assert decide(agent(5.0), row, MIN_THERE[True] - 0.01, lidar=True) is None
     assert decide(agent(5.0), row, MIN_THERE[True], lidar=True) == []
     assert decide(agent(5.0), row | {"confirmed": 0.0}, 0.9, lidar=True) is None
-    (doubt,) = decide(agent(5.0), row | {"through": 0.9}, 0.9, lidar=True)
-    assert (doubt.kind, doubt.values["through_share"]) == ("empty", 0.9)
+    (doubt,) = decide(agent(5.0), row | {"through": np.log(10)}, 0.9, lidar=True)
+    assert (doubt.kind, doubt.values["through_share"]) == ("empty", pytest.approx(0.9))
 
 
 VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)
@@ -116,7 +116,7 @@ VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0
         (VAN, [0, 0, 0, 0, 0], True, 0.0),
         (VAN, [0, 0, 0, 30, 0], False, 0.0),
         # Of some rays that reach its place most go on.
-        (CORNER, [0, 0, 0, 0, 0], True, 0.7),
+        (CORNER, [0, 0, 0, 0, 0], True, -np.log(0.2)),
         # Its points are those of what stands beside it, but rays end in it.
         (BACK, [0, 0, 0, 0, 0], True, 0.0),
         (BACK, [9, 9, 9, 9, 9], False, 0.0),
@@ -133,4 +133,21 @@ def test_where_the_lidar_looks_an_object_has_points(thing, points, pointless, th
     assert set(SIGNS) <= set(table)
     assert np.isfinite(list(table.values())).all()
     assert table["pointless"] == pointless
-    assert table["through"] == pytest.approx(through, abs=0.15)
+    assert table["through"] == pytest.approx(through, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("low_m", "high_m", "share"),
+    # A side of a car ends with its box; one of a wall goes on at both ends, or at one and above.
+    [((-2.2, 0.0), (2.2, 1.5), 0.0), ((-9.0, 0.0), (9.0, 1.5), 2 / 3), ((-2.2, 0.0), (9.0, 3.0), 2 / 3)],
+)
+def test_walls_go_on_beyond_a_box_and_vehicles_end(low_m, high_m, share):
+    x, z = (a.ravel() for a in np.meshgrid(np.arange(low_m[0], high_m[0], 0.03), np.arange(low_m[1], high_m[1], 0.03)))
+    side = np.column_stack([x, np.full(len(x), -0.9), z])
+    yaw = 0.4
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    points = (side @ turn.T + [20.0, 0.0, 0.0]).astype(np.float32)
+    cloud = Obstacles(0, ORIGIN, points, np.zeros(len(x), np.float32), SENSOR.astype(np.float32))
+    boxes = AgentTable.of([over_map(agent(20.0, yaw=yaw))], TIMELINE.seconds(TIMELINE.t_ns))
+    # Of its sides two ends, one side and the top have points.
+    assert continued(boxes, [cloud] * 5) == pytest.approx([share * 3 / 4], abs=0.05)

@@ -33,16 +33,8 @@ def make_agent(
     t = np.arange(count) * 0.1
     vx, vy = velocity
     n, speed = np.ones(count), float(np.hypot(vx, vy))
-    waypoints = Waypoints(
-        t,
-        start[0] + vx * t,
-        start[1] + vy * t,
-        0.8 * n,
-        np.arctan2(vy, vx) * n,
-        speed * n,
-        np.ones(count, dtype=bool),
-        0.1 * n,
-    )
+    x, y, yaw = start[0] + vx * t, start[1] + vy * t, np.arctan2(vy, vx) * n
+    waypoints = Waypoints(t, x, y, 0.8 * n, yaw, speed * n, np.ones(count, dtype=bool), 0.1 * n)
     return Agent(name, category, TYPICAL_SIZE_M[category], waypoints, static=speed == 0)
 
 
@@ -161,10 +153,6 @@ def reckless() -> tuple[Scenario, Replay]:
     return scenario, replay(scenario, ego=lambda seen: Controls(2.0, 0.0002))
 
 
-def layout_of(scenario: Scenario, result: Replay | None) -> FigureLayout:
-    return still(scenario, assign_view_roles(scenario), Overlays(replay=result))
-
-
 def chart_axes(layout: FigureLayout) -> list:
     return [ax for ax in layout.figure.axes if ax.get_legend() is not None]
 
@@ -175,7 +163,7 @@ def test_the_charts_show_commands_response_and_errors() -> None:
     ego = result.agent("ego")
     by_label = {
         (ax.get_legend().get_title().get_text().split(" (")[0], k): line
-        for ax in chart_axes(layout_of(scenario, result))
+        for ax in chart_axes(draw(scenario, replay=result))
         for k, line in enumerate([a for a in ax.lines if len(a.get_xdata()) > 2])
     }
     assert ego.commands is not None
@@ -225,10 +213,6 @@ def scene_doubts() -> Scenario:
     return world(straight("ego"), *agents, doubted(parked, (None, None)))
 
 
-def drawn(scenario: Scenario) -> FigureLayout:
-    return still(scenario, assign_view_roles(scenario))
-
-
 def striped(layout: FigureLayout) -> list[Array]:
     """The middles of all groups of stripes."""
     groups = [c.get_segments() for c in layout.ax.collections if isinstance(c, LineCollection)]
@@ -263,14 +247,13 @@ def test_a_track_is_striped_where_it_is_doubtful() -> None:
 
 
 def test_boxes_are_hatched_where_they_are_doubtful() -> None:
-    places = striped(drawn(scene_doubts()))
+    places = striped(draw(scene_doubts()))
     for hatched in ([15.0, 12.0], [15.0, 18.0], [20.0, -8.0]):  # the ends of "end" and "unsure", and what is parked
         assert min(np.hypot(*(place - hatched)) for place in places) < 0.05
     assert len(places) == 3
     clean = scene_doubts()
-    assert (
-        striped(drawn(replace(clean, agents=tuple(replace(a, doubts=(), confidence=1.0) for a in clean.agents)))) == []
-    )
+    sure = tuple(replace(a, doubts=(), confidence=1.0) for a in clean.agents)
+    assert striped(draw(replace(clean, agents=sure))) == []
 
 
 def texts(sheet: FigureLayout) -> list[str]:
@@ -286,7 +269,7 @@ def meeting() -> Scenario:
 @pytest.mark.parametrize("scenario", [many(40), meeting()], ids=["spread", "meeting"])
 def test_labels_do_not_overlap(scenario: Scenario) -> None:
     sheet = draw(scenario)
-    sheet.canvas.draw()
+    sheet.figure.canvas.draw()
     labels = [t for t in sheet.ax.texts if t.get_fontweight() == "bold"]
     assert len(labels) > 6
     boxes = [t.get_window_extent() for t in labels]

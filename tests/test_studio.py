@@ -261,6 +261,12 @@ def test_the_page_without_a_server_corrects_and_downloads(chromium: Browser, tmp
     browser.press("J")
     assert browser.run("return log2sim.chosen") is None  # folded, the keys are those of the page
     browser.run("document.getElementById('studio').open = true")
+    read = [n for n in browser.cdp("Accessibility.getFullAXTree")["nodes"] if not n["ignored"]]
+    controls = [
+        n for n in read if n["role"]["value"] in ("button", "combobox", "spinbutton", "textbox", "slider", "image")
+    ]
+    assert len(controls) > 30
+    assert [n["role"]["value"] for n in controls if not n["name"]["value"]] == []
     for name, text in (("author", "me"), ("reason", "its lamps")):
         browser.run("document.getElementById(arguments[0]).value = arguments[1]", f"studio-{name}", text)
     browser.press("J", "B")

@@ -32,7 +32,7 @@ def test_points_of_a_turning_lidar_on_a_moving_ego_lie_on_the_agents_at_their_ow
     result = cast_sweep(spec, moving, int(log.streams["top"].t_ns[5]), np.random.default_rng(0))
     t_ns = result.sweep.t_ns
     assert t_ns is not None
-    poses = moving.ego.map_T_ego_ns(t_ns) @ log.lidars["top"].mount_T_lidar
+    poses = moving.map_T_mount("ego", t_ns) @ log.lidars["top"].mount_T_lidar
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], result.sweep.xyz_m.astype(float)) + poses[:, :3, 3]
     assert np.abs(points[result.hit == GROUND, 2]).max() < 0.05
     for index, actor in enumerate(moving.actors):
@@ -215,7 +215,7 @@ def test_a_roadside_sensor_sees_the_ego_and_a_sensor_on_the_ego_does_not() -> No
     points, hit = in_map(scene, 1)
     on_ego = points[hit == EGO]
     assert len(on_ego) > 20
-    ego = MovingScene.of(scene).ego_body
+    ego = MovingScene.of(scene).ego
     assert ego is not None
     local = apply(inverse(ego.at(0.45).map_T_agent()[0]), on_ego)
     assert np.all(np.abs(local) <= np.array(ego.spec.box_m) / 2 + 0.3)  # it drives on during the sweep

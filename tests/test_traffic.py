@@ -30,7 +30,8 @@ from log2sim.synth.returns import (
     lidar_model,
     reflected,
 )
-from log2sim.synth.traffic import Surface, TrafficScene, draw_scene, labeled_cloud, rig_of
+from log2sim.synth.terrain import Surface
+from log2sim.synth.traffic import TrafficScene, draw_scene, labeled_cloud, rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, write_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
 from log2sim.synth.traffic_shapes import KINDS

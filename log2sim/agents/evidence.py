@@ -22,7 +22,6 @@ from log2sim.datatypes import (
     Agent,
     AgentTable,
     Log,
-    Measurements,
     Obstacles,
     Track,
 )
@@ -56,18 +55,17 @@ class Recording:
 
 
 SIGNS = {
-    "sweep": 1, "weak_sweep": 1, "image": 1, "no_sweep": -1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "range": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
+    "sweep": 1, "weak_sweep": 1, "image": 1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "through_gaps": -1, "pointless": -1, "nearer": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "continued": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
 - sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
   where negative; and of its detections in images. 0 without any.
-- no_sweep, no_image: 1 without any detection in a sweep, in an image, where others have some.
+- no_image: 1 without any detection in an image, where others have some.
 - travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
-- range: logarithm of the median distance, in units of 20 m.
 - scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
 - sigma: logarithm of the standard deviation of its position, in units of 0.1 m.
 - unlikely_size: 1 where the observed size is none of its category.
@@ -78,31 +76,30 @@ SIGNS = {
 - other_category: share of its measurements of another category.
 - impossible: 1 where its motion is doubted.
 - sigma_speed: logarithm of the standard deviation of the speed of what moves, in units of 0.3 m/s.
-- through, through_gaps: share of the rays toward its solid part that go on behind it, of vehicles and of what has gaps, as people
-  and bicycles have; 0 with few.
-- pointless: 1 where the LiDAR looks toward it and none of its detections has a point.
-- nearer: 1 where its points are those of something nearer, which the heights of its image boxes tell.
+- through, through_gaps: logarithm of the rays toward its solid part over those that end in it, of vehicles and of what has gaps, as
+  people and bicycles have: all others go on behind it; 0 with few.
+- continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
+  fences go on there, vehicles end.
 - missing: nats against it by the images that show its place well and in which it is not detected.
 - moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
 """
 
 # Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, `confirmed`, 1
-# where the detections suffice, and `shown_ticks` and `image_ticks`:
-# the ticks at which a searched image shows a candidate well, and at which it is detected in one of these.
+# where the detections suffice, `pointless`, 1 where the LiDAR looks toward it and none of its detections has a point, and
+# `shown_ticks` and `image_ticks`: the ticks at which a searched image shows a candidate well, and at which it is detected in one.
 Table = dict[str, Array]
 
 
 def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
     """Gather the evidence for and against each of C candidates."""
     if not candidates:
-        return {name: np.zeros(0) for name in ("bias", "confirmed", *SIGNS, "shown_ticks", "image_ticks")}
+        return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
     rows = [_own_columns(c, recording.timeline) for c in candidates]
     most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
     parts = [_sensed_columns(candidates[k : k + most], recording) for k in range(0, len(rows), most)]
     table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    for name in ("no_sweep", "no_image"):
-        table[name] *= table[name].min() == 0
+    table["no_image"] *= table["no_image"].min() == 0
     return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
 
 
@@ -113,7 +110,7 @@ MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), 4.6
 
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
 LIMITS: dict[str, tuple[float, float]] = {
-    "range": (np.log(0.1), np.log(5.0)), "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
+    "sigma": (np.log(0.1), np.log(50.0)), "scatter": (0.0, np.log(31.0)), "odd_size": (0.0, 3.0),
     "odd_height": (0.0, np.log(2.0)), "heading": (-MAX_LOG_ODDS, MAX_LOG_ODDS), "sigma_speed": (np.log(0.07), np.log(17.0)),
 }  # fmt: skip
 
@@ -132,12 +129,10 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
         "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
-        "no_sweep": float(not in_sweep.any()),
         "no_image": float(not in_image.any()),
         "travel": travel,
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
-        "range": np.log(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)) / 20.0 + 1e-3),
         "scatter": np.log1p(_scatter(candidate, timeline)),
         "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
         "unlikely_size": float(not candidate.geometry.is_likely),
@@ -250,11 +245,10 @@ def _odd_height(candidate: AgentCandidate) -> float:
 MAX_CELLS = 400_000
 # Rays toward a place before it is said that the LiDAR looks there, and at a tick before they say anything.
 MIN_LOOKING_RAYS, MIN_TICK_RAYS = 30, 8
+# One ray of thirty ends in anything by chance.
+MAX_GONE_NATS = float(np.log(30.0))
 # Rays of fewer ticks may all have gone through a window or past a corner.
 MIN_SEEN_TICKS = 3
-# Fewer image boxes with points may each be wrong. The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5
-# is three standard deviations low. Then the points are not those of what the image shows, but of something nearer that hides it.
-MIN_HEIGHTS, MIN_HEIGHT_SHARE = 3, 0.5
 
 
 def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
@@ -266,25 +260,55 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     seen = (met > 0) & (met >= before)
     sums = [np.where(seen, rays, 0).sum(axis=1) for rays in (met, through)]
     known = (sums[0] >= MIN_LOOKING_RAYS) & (seen.sum(axis=1) >= MIN_SEEN_TICKS)
-    shown = shown_in_images(AgentTable.of(agents, recording.t_s), recording) & seen & (met >= MIN_TICK_RAYS)
+    boxes = AgentTable.of(agents, recording.t_s)
+    shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
-    through_share = np.where(known, sums[1] / np.maximum(sums[0], 1), 0.0)
+    gone = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_GONE_NATS)
     solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
     return {
-        "through": np.where(solid, through_share, 0.0),
-        "through_gaps": np.where(solid, 0.0, through_share),
+        "through": np.where(solid, gone, 0.0),
+        "through_gaps": np.where(solid, 0.0, gone),
+        "continued": continued(boxes, recording.clouds) * solid,
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
-        "nearer": np.array([_height_share(m) < MIN_HEIGHT_SHARE for m in of], dtype=np.float64),
         "shown_ticks": shown.sum(axis=1).astype(np.float64),
         "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
     }  # fmt: skip
 
 
-def _height_share(m: Measurements) -> float:
-    """Return the median height of the image boxes of a track at its distance over that of its points; 1 with few of both."""
-    rows = ~m.truncated & (m.points > 0) & (m.top_m > m.bottom_m) & np.isfinite(m.height_px_m)
-    return float(np.median(m.height_px_m[rows] / (m.top_m - m.bottom_m)[rows])) if rows.sum() >= MIN_HEIGHTS else 1.0
+# Points so near a side of a box, m, are compared with those as far beyond it, but for the error of a side; so high above its floor,
+# where curbs and low plants end. Of fewer points no density is known. So many ticks of each agent suffice.
+SIDE_M, SIDE_ERROR_M, ABOVE_FLOOR_M, MIN_SIDE_POINTS, SIDE_TICKS = 0.5, 0.1, 0.4, 5, 8
+
+
+def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
+    """Return the densities of points just beyond the sides and tops of boxes over those just inside (A,), means of at most 1 each.
+
+    Only where the points inside are, which is where rays arrive: beyond a side of a vehicle whose end they show is nothing.
+    """
+    inside, beyond = np.zeros((len(boxes.present), 5)), np.zeros((len(boxes.present), 5))
+    recorded = np.array([cloud is not None for cloud in clouds], dtype=bool)
+    for k, present in enumerate(boxes.present):
+        ticks = np.flatnonzero(present & recorded)
+        for tick in ticks[:: -(-len(ticks) // SIDE_TICKS) or 1].tolist():
+            cloud, center, half = clouds[tick], boxes.center_m[k, tick], boxes.size_m[k] / 2
+            assert cloud is not None
+            near = cloud.xyz[cloud.near(center[:2], float(np.hypot(*half[:2])) + SIDE_M)] - (center - cloud.origin)
+            c, s = np.cos(boxes.yaw_rad[k, tick]), np.sin(boxes.yaw_rad[k, tick])
+            local = np.stack([c * near[:, 0] + s * near[:, 1], c * near[:, 1] - s * near[:, 0], near[:, 2]], axis=1)
+            local = local[local[:, 2] > ABOVE_FLOOR_M - half[2]]
+            within = np.abs(local) < half + SIDE_ERROR_M / 2
+            for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
+                depth, across = sign * local[:, axis] - half[axis], [a for a in range(3) if a != axis]
+                own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[:, across].all(axis=1)
+                if own.sum() < MIN_SIDE_POINTS:
+                    continue
+                low, high = np.quantile(local[own][:, across], (0.1, 0.9), axis=0)
+                level = ((local[:, across] > low - SIDE_ERROR_M) & (local[:, across] < high + SIDE_ERROR_M)).all(axis=1)
+                inside[k, side] += (own & level).sum()
+                beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
+    share = np.minimum(beyond / np.maximum(inside, 1), 1)
+    return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
 
 
 # Smaller objects are "small" in COCO (Lin et al., ECCV 2014), where detectors find less than half of them.

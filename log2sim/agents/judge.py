@@ -79,13 +79,13 @@ def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: 
     if not evidence["confirmed"] or there < MIN_THERE[lidar]:
         return None
     counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
+    weights = THERE[lidar]
     reasons = {
-        "through": Finding("empty", values={"through_share": evidence["through"]}),
-        "pointless": Finding("hardly_observed", case="no_points"),
+        "through": Finding("empty", values={"through_share": 1 - float(np.exp(-evidence["through"]))}),
         "missing": Finding("hardly_observed", case="images", values=counts),
     }
-    weights = THERE[lidar]
     told = [found for name, found in reasons.items() if -weights.get(name, 0.0) * evidence[name] > DOUBT_NATS]
+    told += [Finding("hardly_observed", case="no_points")] if evidence["pointless"] else []
     return [*told, *doubt_size(agent)]
 
 

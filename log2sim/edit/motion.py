@@ -29,14 +29,8 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
     kept = moved.take(np.arange(first, len(moved)))
     if first == 0 or first == len(moved) or moved.t_s[first] == 0.0:
         return kept
-    at_start = agent.at(-seconds)
-    start = {k: getattr(at_start, k) for k in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")}
-    start["t_s"] = np.zeros(1)
-    for k in moved.columns():
-        if k.startswith("sigma"):
-            start[k] = np.interp([0.0], moved.t_s, getattr(moved, k))
-    start["observed"] = moved.observed[first - 1 : first] & moved.observed[first : first + 1]
-    return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.items()})
+    start = replace(resampled(agent, np.array([-seconds])), t_s=np.zeros(1))
+    return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.columns().items()})
 
 
 def doubts_shifted(agent: Agent, seconds: float) -> tuple[Finding, ...]:

@@ -88,19 +88,9 @@ def seen_ground(truth: Scenario, shift_m: Array) -> BaseGeometry | None:
 
 
 def sampled(points_m: Array) -> tuple[Array, Array, float]:
-    """Sample a line (N, 2 or 3) at steps of at most `STEP_M`.
+    """Sample a line (N, 2 or 3) at steps of at most `STEP_M`: places (S, 2), headings (S,), and the length that each stands for, m.
 
-    Returns
-    -------
-    xy : (S, 2) float64, m
-    heading : (S,) float64, rad
-    length_m : float, m
-        That each sample stands for.
-
-    Raises
-    ------
-    ScenarioError
-        When it is too long to be a line on a road.
+    Raises `ScenarioError` when it is too long to be a line on a road.
     """
     xy = np.asarray(points_m, dtype=np.float64)[:, :2]
     steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
@@ -480,7 +470,8 @@ def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     if figures is not None:
         named = (("lane lines", figures["lane_lines"]), ("borders", figures["borders"]), ("lanes", figures["lanes"]))
         parts = [
-            f"{name} {_percent(f['recall'])} found" + f", {_percent(f['precision'])} right" * bool(f["found_m"])
+            f"{name} {whole_percent(f['recall'])} found"
+            + f", {whole_percent(f['precision'])} right" * bool(f["found_m"])
             for name, f in named
             if f["true_m"]
         ]
@@ -495,7 +486,7 @@ def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
             )
         )
     if signals is not None:
-        right = f", state right {_percent(signals['state_right'])} of the time" if signals["found"] else ""
+        right = f", state right {whole_percent(signals['state_right'])} of the time" if signals["found"] else ""
         out.append(("signals", f"{signals['found']} of {signals['true']} found, {signals['false']} false{right}"))
     return out
 
@@ -515,27 +506,27 @@ def _detailed_lines(result: Mapping[str, Any]) -> list[str]:
         out.append(f"lane lines: {_line_text(figures['lane_lines'])}")
         kinds = figures["lane_lines"]["kind_accuracy"]
         if kinds is not None:
-            out[-1] += f", kind right {_percent(kinds)}"
+            out[-1] += f", kind right {whole_percent(kinds)}"
         out.append(f"borders:    {_line_text(figures['borders'])}")
         counted = [f"{_count(figures[key])} {name}" for key, name in _SHAPES if _any(figures[key])]
         if counted:
             out.append(f"markings:   {', '.join(counted)}")
         lanes = figures["lanes"]
         out.append(
-            f"lanes:      precision {_figure(lanes['precision'])}, recall {_figure(lanes['recall'])}, center off by "
-            f"{_meters(lanes['center_median_m'])} (median), {_percent(lanes['inside'])} of true paths inside"
+            f"lanes:      precision {cell(lanes['precision'], 2)}, recall {cell(lanes['recall'], 2)}, center off by "
+            f"{_meters(lanes['center_median_m'])} (median), {whole_percent(lanes['inside'])} of true paths inside"
         )
     colors = result.get("colors")
     if colors is not None:
         out.append(
             f"colors:     {colors['right']} of {colors['named']} names right, {colors['with_color']} of "
-            f"{colors['vehicles']} vehicles have one, CIEDE2000 {_figure(colors['ciede2000_median'], 1)} (median)"
+            f"{colors['vehicles']} vehicles have one, CIEDE2000 {cell(colors['ciede2000_median'], 1)} (median)"
         )
     signals = result.get("signals")
     if signals is not None:
         out.append(
             f"signals:    {signals['found']} of {signals['true']} found, {signals['false']} false, off by "
-            f"{_meters(signals['position_median_m'])} (median), state right {_percent(signals['state_right'])} of the time"
+            f"{_meters(signals['position_median_m'])} (median), state right {whole_percent(signals['state_right'])} of the time"
         )
     return out
 
@@ -554,19 +545,21 @@ def _count(counts: Mapping[str, int]) -> str:
 
 def _line_text(figures: Mapping[str, Any]) -> str:
     return (
-        f"precision {_figure(figures['precision'])}, recall {_figure(figures['recall'])} "
-        f"({_figure(figures['recall_20_m'])} within 20 m), off by {_meters(figures['lateral_median_m'])} (median) {_meters(figures['lateral_p95_m'])} (p95), "
-        f"{_figure(figures['false_m_per_100_m'], 1)} m false per 100 m"
+        f"precision {cell(figures['precision'], 2)}, recall {cell(figures['recall'], 2)} "
+        f"({cell(figures['recall_20_m'], 2)} within 20 m), off by {_meters(figures['lateral_median_m'])} (median) {_meters(figures['lateral_p95_m'])} (p95), "
+        f"{cell(figures['false_m_per_100_m'], 1)} m false per 100 m"
     )
 
 
-def _figure(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def cell(value: float | None, digits: int, scale: float = 1) -> str:
+    """Format a figure with some decimals; "-" for None."""
+    return "-" if value is None else f"{scale * value:.{digits}f}"
 
 
 def _meters(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} m"
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.0f} %"
+def whole_percent(share: float | None) -> str:
+    """Format a share as a whole number of percent; "-" for None."""
+    return "-" if share is None else f"{100 * share:.0f} %"

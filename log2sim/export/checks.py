@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario, explain_doubt, list_doubtful
+from log2sim.datatypes import Agent, AgentTable, Scenario, explain_doubt, list_doubtful
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, rectangle_iou, rectangles_overlap, wrap_angle
 
@@ -42,7 +42,7 @@ def require_exportable(scenario: Scenario) -> None:
     wrong += [
         f"name or id {text!a}: holds half a surrogate pair, which no file can; give it another"
         for text in (scenario.name, *(a.id for a in scenario.agents))
-        if not _is_text(text)
+        if any("\ud800" <= c <= "\udfff" for c in text)
     ]
     projection = scenario.map.projection
     if projection is not None and _NO_XML.search(projection):
@@ -174,20 +174,8 @@ class _Boxes:
 
 def _states(agents: Sequence[Agent], t_s: Array) -> Array:
     """Return x, y, z, yaw (4, T, A) of all agents at times (T,), NaN for absent ones."""
-    columns = [a.at(t_s) for a in agents]
-    return (
-        np.array([[getattr(c, key) for c in columns] for key in ("x_m", "y_m", "z_m", "yaw_rad")])
-        .reshape(4, len(agents), len(t_s))
-        .swapaxes(1, 2)
-    )
-
-
-def _is_text(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    table = AgentTable.of(agents, t_s)
+    return np.concatenate([table.center_m, table.yaw_rad[..., None]], axis=2).transpose(2, 1, 0)
 
 
 def _problems(agent: Agent) -> list[str]:

@@ -39,13 +39,8 @@ TYPE_OF_CATEGORY = {
     "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
 }  # fmt: skip
 LIGHT = {
-    "red": "red",
-    "red_yellow": "redYellow",
-    "yellow": "yellow",
-    "green": "green",
-    "off": "inactive",
-    "unknown": "inactive",
-}
+    "red": "red", "red_yellow": "redYellow", "yellow": "yellow", "green": "green", "off": "inactive", "unknown": "inactive",
+}  # fmt: skip
 LINE_MARKING = {"solid": "solid", "broken": "dashed", "curb": "curb", "none": "no_marking"}
 # Static obstacles have types of their own, without pedestrians: those are dynamic obstacles that do not move.
 STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
@@ -71,7 +66,7 @@ class CommonRoad:
         start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
         if stop - start < STEP_S:
             raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
-        ego, t_s = ego, step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
+        t_s = step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
         name = f"ZAM_{_camel_case(scenario.name)}-1_1_T-1"
         # The document with its header, dated by the start of the scenario so that the same scenario gives the same bytes.
         root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
@@ -94,9 +89,10 @@ class CommonRoad:
         roads = lanes(scenario)
         number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
         lights = [{lane.id for lane in signal_lanes(signal, roads)} for signal in scenario.signals]
+        marks = MarkFinder(scenario)
         for lane in roads:
             own = [len(roads) + k for k, names in enumerate(lights, start=1) if lane.id in names]
-            root.append(_lanelet(lane, number_of, MarkFinder.of(scenario), own))
+            root.append(_lanelet(lane, number_of, marks, own))
         root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
         first = len(roads) + len(scenario.signals) + 1
         table = [
@@ -142,9 +138,8 @@ def _point(parent: Element, xyz: Array) -> None:
 def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder, lights: Sequence[int]) -> Element:
     """Return a lane with its edges, the lanes before, behind and beside it, and the traffic lights for it."""
     lanelet = element("lanelet", id=str(number_of[lane.id]))
-    for tag, bound, mark in zip(
-        ("leftBound", "rightBound"), edges_of(lane), (marks.left_of(lane), marks.right_of(lane))
-    ):
+    sides = ("leftBound", "rightBound"), edges_of(lane), map(marks.mark, (lane.left, lane.right))
+    for tag, bound, mark in zip(*sides):
         parent = element(tag, lanelet)
         for point in bound:
             _point(parent, point)
@@ -205,11 +200,12 @@ def _state(tag: str, move: SampledMotion, k: int, step: int) -> Element:
     yaw = float(move.yaw_rad[k])
     state = element(tag)
     _point(element("position", state), move.position_m[k, :2])
+    speed, acceleration = (_along(v[k], yaw) for v in (move.velocity_mps, move.acceleration_mps2))
     exact = {
         "orientation": _decimal(yaw),
         "time": str(step),
-        "velocity": _decimal(_along(move.velocity_mps[k], yaw)),
-        "acceleration": _decimal(_along(move.acceleration_mps2[k], yaw)),
+        "velocity": _decimal(speed),
+        "acceleration": _decimal(acceleration),
     }
     for key, value in exact.items():
         _texts(element(key, state), exact=value)
@@ -228,8 +224,8 @@ def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
     speed = _along(move.velocity_mps[last], yaw)
     goal = element("goalState", problem)
     area = element("rectangle", element("position", goal))
-    side = ego.size_m[1] + 2 * GOAL_SIDE_M
-    _texts(area, length=_decimal(GOAL_LENGTH_M), width=_decimal(side), orientation=_decimal(yaw))
+    width = _decimal(ego.size_m[1] + 2 * GOAL_SIDE_M)
+    _texts(area, length=_decimal(GOAL_LENGTH_M), width=width, orientation=_decimal(yaw))
     x, y, _ = map(_decimal, move.position_m[last])
     _texts(element("center", area), x=x, y=y)
     _interval(goal, "orientation", yaw, GOAL_YAW_RAD)

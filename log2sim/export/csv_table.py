@@ -12,17 +12,8 @@ from log2sim.datatypes import Agent, Scenario
 from log2sim.export.exporters import Options
 
 COLUMNS = (
-    "t_s",
-    "x_m",
-    "y_m",
-    "z_m",
-    "yaw_rad",
-    "speed_mps",
-    "observed",
-    "sigma_xy_m",
-    "sigma_yaw_rad",
-    "sigma_speed_mps",
-)
+    "t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "observed", "sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps",
+)  # fmt: skip
 ABOUT = ("length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence", "doubts")
 HEADER = ("id", "category", *COLUMNS, *ABOUT)
 

@@ -32,20 +32,17 @@ class ExportPlacement:
     it, else they stay on their axes; then `origin_m` is subtracted.
     """
 
-    # origin_m, offset_m: (3,), m.
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # projection, target: pROJ strings.
-    projection: str | None = None
+    projection: str | None = None  # PROJ string, as the next one
     target: str | None = None
 
     def forward(self, states: Array) -> Array:
         """Convert states (N, 4) x, y, z, heading from the scenario to the export."""
         origin: Array = np.array([*self.origin_m, 0.0])
-        offset: Array = np.array([*self.offset_m, 0.0])
-        if self.target is None:
-            return states - origin
-        return self._projected(states + offset, self.projection, self.target) - origin
+        if self.target is not None:
+            states = self._projected(states + np.array([*self.offset_m, 0.0]), self.projection, self.target)
+        return states - origin
 
     def back(self, states: Array) -> Array:
         """Convert states (N, 4) from the export to the scenario."""
@@ -73,9 +70,7 @@ class ExportPlacement:
 
 def near_origin(scenario: Scenario) -> ExportPlacement:
     """Subtract whole kilometers, none while all agents are near the map's origin, so that float32 keeps half a millimeter."""
-    xyz = np.concatenate(
-        [np.column_stack([a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m]) for a in scenario.agents]
-    )
+    xyz = np.concatenate([np.stack([w.x_m, w.y_m, w.z_m], 1) for w in (a.waypoints for a in scenario.agents)])
     x, y, z = whole_kilometers(xyz)
     return ExportPlacement((float(x), float(y), float(z)))
 
@@ -146,9 +141,8 @@ def _transformer(source: str, target: str) -> Any:
     return Transformer.from_crs(systems[0], systems[1], always_xy=True)
 
 
-DERIVATIVE_S = (
-    0.05  # half the span of difference quotients: half a step of most logs, so adjacent waypoints decide them
-)
+# Half the span of difference quotients: half a step of most logs, so adjacent waypoints decide them.
+DERIVATIVE_S = 0.05
 ROUNDING_S = 1e-6
 MAX_STEPS = 100_000  # 2.8 hours at 10 Hz
 # Memory of a table of all agents: at 2.8 hours 160 of them.

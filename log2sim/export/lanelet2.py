@@ -43,7 +43,7 @@ class Lanelet2:
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write the map."""
         draft = _Draft(scenario.map)
-        roads, marks = lanes(scenario), MarkFinder.of(scenario)
+        roads, marks = lanes(scenario), MarkFinder(scenario)
         way_of = _add_borders(draft, roads, marks)
         features = scenario.map_features or MapFeatures()
         stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
@@ -196,10 +196,10 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
 
 def _border_tags(lane: MapLane, side: str, marks: MarkFinder) -> dict[str, str]:
     name = lane.left if side == "left" else lane.right
-    item = marks.sides.get(name) if name is not None else None
+    item = marks.items.get(name)
     if isinstance(item, RoadBorder) and item.kind == "edge":
         return {"type": "road_border"}
-    mark = marks.left_of(lane) if side == "left" else marks.right_of(lane)
+    mark = marks.mark(name)
     kind, subtype = TYPE_OF_MARK[mark.kind]
     color = {"color": mark.color} if mark.color in ("white", "yellow") else {}
     return {"type": kind, **({"subtype": subtype} if subtype else {}), **color}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Lidar, Log, Scenario
+from log2sim.datatypes import Agent, AgentTable, Lidar, Log, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.exporters import Options, SampledMotion, sample_steps
 from log2sim.export.viewers import STEP_S, agent_steps, ego_pose
@@ -112,12 +112,10 @@ def _boxes_px(scenario: Scenario, log: Log, camera: str, t_ns: int) -> list[tupl
     view = view_of(log, camera, t_ns)
     if view is None:
         return []
-    at = [agent.at((t_ns - scenario.t0_ns) / NS_PER_S) for agent in scenario.agents]
+    table = AgentTable.of(scenario.agents, np.array([(t_ns - scenario.t0_ns) / NS_PER_S]))
     hidden = scenario.ego if view.camera.mount == "ego" else None
-    rows = [k for k, (a, s) in enumerate(zip(scenario.agents, at)) if s.valid[0] and a is not hidden]
-    center = np.array([[at[k].x_m[0], at[k].y_m[0], at[k].z_m[0]] for k in rows]).reshape(-1, 3)
-    size = np.array([scenario.agents[k].size_m for k in rows]).reshape(-1, 3)
-    found = project_boxes_in_view(view, center, size, np.array([at[k].yaw_rad[0] for k in rows]))
+    rows = [k for k in np.flatnonzero(table.present[:, 0]).tolist() if scenario.agents[k] is not hidden]
+    found = project_boxes_in_view(view, table.center_m[rows, 0], table.size_m[rows], table.yaw_rad[rows, 0])
     out = []
     for i in np.flatnonzero(found.valid).tolist():
         low, high = found.box_px[i, :2], found.box_px[i, 2:]

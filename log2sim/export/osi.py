@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapFeatures, MapFrame, MapLane, Scenario
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options, SampledMotion, file_name
 from log2sim.export.roads.network import MarkFinder, RoadMark
@@ -43,12 +43,12 @@ class StaticMap:
 def static_map(osi: Any, scenario: Scenario, first: int) -> StaticMap:
     """Return the lanes of a scenario with their boundaries, and markings that are no lines, numbered from `first` on."""
     found = lanes(scenario)
-    marks = MarkFinder.of(scenario)
+    marks = MarkFinder(scenario)
     number_of = {lane.id: first + k for k, lane in enumerate(found)}
     boundaries, messages = [], []
     for k, lane in enumerate(found):
         sides = [first + len(found) + 2 * k + side for side in (0, 1)]
-        for number, points, mark in zip(sides, edges_of(lane), (marks.left_of(lane), marks.right_of(lane))):
+        for number, points, mark in zip(sides, edges_of(lane), map(marks.mark, (lane.left, lane.right))):
             boundaries.append(_boundary(osi, number, points, mark))
         messages.append(_lane(osi, lane, number_of, sides))
     free = first + 3 * len(found)
@@ -58,8 +58,12 @@ def static_map(osi: Any, scenario: Scenario, first: int) -> StaticMap:
     return StaticMap(messages, boundaries, painted, free + len(painted))
 
 
+def _vector(osi: Any, xyz: Iterable[float]) -> Any:
+    return osi.Vector3d(**{axis: float(v) for axis, v in zip("xyz", xyz)})
+
+
 def _points(osi: Any, points: Array) -> list[Any]:
-    return [osi.Vector3d(x=x, y=y, z=z) for x, y, z in points.tolist()]
+    return [_vector(osi, point) for point in points]
 
 
 def _boundary(osi: Any, number: int, points: Array, mark: RoadMark) -> Any:
@@ -106,16 +110,16 @@ def _pairing(osi: Any, before: int | None, after: int | None) -> Any:
 def _marking(osi: Any, number: int, points: Array, color: str | None) -> Any:
     kind = osi.RoadMarking.Classification
     low, high = points.min(axis=0), points.max(axis=0)
-    x, y, z = ((low + high) / 2).tolist()
+    middle = (low + high) / 2
     length, width, _ = (high - low).tolist()
     paint = {"white": kind.Color.WHITE, "yellow": kind.Color.YELLOW}.get(color or "", kind.Color.UNKNOWN)
     return osi.RoadMarking(
         id=osi.Identifier(value=number),
         base=osi.BaseStationary(
-            position=osi.Vector3d(x=x, y=y, z=z),
+            position=_vector(osi, middle),
             dimension=osi.Dimension3d(length=length, width=width, height=0.0),
             orientation=osi.Orientation3d(roll=0.0, pitch=0.0, yaw=0.0),
-            base_polygon=[osi.Vector2d(x=px - x, y=py - y) for px, py, _ in points.tolist()],
+            base_polygon=[osi.Vector2d(x=x, y=y) for x, y, _ in (points - middle).tolist()],
         ),
         classification=kind(type=kind.Type.SYMBOLIC_TRAFFIC_SIGN, monochrome_color=paint),
     )
@@ -127,11 +131,10 @@ def traffic_lights(osi: Any, scenario: Scenario, first: int, t_s: float) -> list
     length, width, height = LIGHT_SIZE_M
     out = []
     for number, signal in enumerate(scenario.signals, start=first):
-        x, y, z = signal.position_m.tolist()
         color, mode = LIGHT[str(signal.at(np.array([t_s]))[0])]
         turn = osi.Orientation3d(roll=0.0, pitch=0.0, yaw=float(signal.heading_rad or 0.0))
         base = osi.BaseStationary(
-            position=osi.Vector3d(x=x, y=y, z=z),
+            position=_vector(osi, signal.position_m),
             dimension=osi.Dimension3d(length=length, width=width, height=height),
             orientation=turn,
         )
@@ -180,7 +183,10 @@ class Osi:
         major, minor, patch = map(int, betterosi.__version_osi__.split("."))
         head: dict[str, Any] = {
             "version": betterosi.InterfaceVersion(version_major=major, version_minor=minor, version_patch=patch),
-            "proj_frame_offset": _offset(betterosi, scenario.map),
+            # From the coordinates of the trace to those of its projection.
+            "proj_frame_offset": betterosi.GroundTruth.ProjFrameOffset(
+                position=_vector(betterosi, scenario.map.offset_m), yaw=0.0
+            ),
         }
         if scenario.map.projection is not None:
             head["proj_string"] = scenario.map.projection
@@ -218,20 +224,13 @@ def _trace_name(osi: Any, scenario: Scenario, frames: int) -> str:
     return f"{start}_gt_{standard}_{protobuf}_{frames}_{file_name(scenario.name)}.osi"
 
 
-def _offset(osi: Any, frame: MapFrame) -> Any:
-    """Return the offset from the coordinates of the trace to those of its projection."""
-    x, y, z = frame.offset_m
-    return osi.GroundTruth.ProjFrameOffset(position=osi.Vector3d(x=x, y=y, z=z), yaw=0.0)
-
-
 def _place(osi: Any, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any]:
     """Return size and pose of the bounding box. OSI's angles lie in (-pi, pi], ours in [-pi, pi)."""
     length, width, height = map(float, agent.size_m)
-    x, y, z = move.position_m[k].tolist()
     yaw = float(move.yaw_rad[k])
     return {
         "dimension": osi.Dimension3d(length=length, width=width, height=height),
-        "position": osi.Vector3d(x=x, y=y, z=z),
+        "position": _vector(osi, move.position_m[k]),
         "orientation": osi.Orientation3d(roll=0.0, pitch=0.0, yaw=-yaw if yaw == -np.pi else yaw),
     }
 
@@ -248,12 +247,9 @@ def _identity(osi: Any, number: int, agent: Agent) -> dict[str, Any]:
 
 
 def _moving(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
-    (vx, vy), (ax, ay) = move.velocity_mps[k].tolist(), move.acceleration_mps2[k].tolist()
-    base = osi.BaseMoving(
-        **_place(osi, agent, move, k),
-        velocity=osi.Vector3d(x=vx, y=vy, z=0.0),
-        acceleration=osi.Vector3d(x=ax, y=ay, z=0.0),
-    )
+    rates = {"velocity": move.velocity_mps[k], "acceleration": move.acceleration_mps2[k]}
+    vectors = {name: _vector(osi, (*rate, 0.0)) for name, rate in rates.items()}
+    base = osi.BaseMoving(**_place(osi, agent, move, k), **vectors)
     return osi.MovingObject(base=base, **_identity(osi, number, agent), **_kind(osi, agent))
 
 
@@ -263,7 +259,7 @@ def _kind(osi: Any, agent: Agent) -> dict[str, Any]:
         return {"type": moving.Type.PEDESTRIAN if agent.category == "pedestrian" else moving.Type.OTHER}
     kind = moving.VehicleClassification
     axle_z = (AXLE_OF_HEIGHT - 0.5) * agent.size_m[2]
-    to_rear = osi.Vector3d(x=-float(agent.rear_axle_offset_m), y=0.0, z=float(axle_z))
+    to_rear = _vector(osi, (-agent.rear_axle_offset_m, 0.0, axle_z))
     return {
         "type": moving.Type.VEHICLE,
         "vehicle_attributes": moving.VehicleAttributes(bbcenter_to_rear=to_rear),

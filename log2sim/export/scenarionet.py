@@ -85,15 +85,10 @@ def dynamic_map_states(scenario: Scenario, t_s: Array, origin_m: Array) -> dict[
     for signal in scenario.signals:
         for lane in signal_lanes(signal, names):
             state = {"object_state": [LIGHT_STATE[str(s)] for s in signal.at(t_s)]}
-            meta = {
-                "track_length": len(t_s),
-                "type": "TRAFFIC_LIGHT",
-                "object_id": lane.id,
-                "dataset": "log2sim",
-                "signal": signal.id,
-            }
+            meta = {"type": "TRAFFIC_LIGHT", "object_id": lane.id, "dataset": "log2sim", "signal": signal.id}
             found[lane.id] = {
-                "type": "TRAFFIC_LIGHT", "state": state, "lane": lane.id, "stop_point": lane.points_m[-1] - origin_m, "metadata": meta,
+                "type": "TRAFFIC_LIGHT", "state": state, "lane": lane.id, "stop_point": lane.points_m[-1] - origin_m,
+                "metadata": {"track_length": len(t_s), **meta},
             }  # fmt: skip
     return found
 
@@ -152,9 +147,7 @@ def scenario_description(scenario: Scenario) -> Value:
         "object_summary": {k: _object_summary(k, track) for k, track in tracks.items()},
     }
     objects = metadata["object_summary"]
-    heights = np.concatenate(
-        [feature["polyline" if "polyline" in feature else "polygon"][:, 2] for feature in features.values()]
-    )
+    lines = [feature["polyline" if "polyline" in feature else "polygon"] for feature in features.values()]
     moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
     kinds = [o["type"] for o in objects.values()]
     states = Counter(state for light in lights.values() for state in light["state"]["object_state"])
@@ -168,7 +161,7 @@ def scenario_description(scenario: Scenario) -> Value:
         "num_traffic_light_types": sorted(states),
         "num_traffic_light_each_step": dict(states),
         "num_map_features": len(features),
-        "map_height_diff": float(np.ptp(heights)),
+        "map_height_diff": float(np.ptp(np.concatenate(lines)[:, 2])),
     }
     return {
         "id": scenario.name,

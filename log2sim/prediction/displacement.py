@@ -29,18 +29,12 @@ def figure_leads(lead_s: Array) -> list[int]:
 
 
 def measure_predictions(predictions: Predictions) -> list[dict[str, Any]]:
-    """Compare predictions with the trajectories of their agents, by kind of agent and motion.
+    """Return the `figures` of a document of `schemas/prediction-1.json`, by kind of agent and motion.
 
-    Returns
-    -------
-    The `figures` of a document of `schemas/prediction-1.json`.
-
-    Notes
-    -----
-    Compared are ticks at which an agent was observed, with positions at which it was observed too. Agents that the scenario
-    says never move are left out: it keeps one pose for each, so that nothing can be off. ADE is the mean distance over all
-    leads up to one, FDE the distance at it (Pellegrini et al., ICCV 2009). NEES is the mean squared error over the squared
-    sigma for each axis, 1 when sigmas are honest.
+    Compared with the trajectories of their agents are ticks at which an agent was observed, with positions at which it was
+    observed too. Agents that the scenario says never move are left out: it keeps one pose for each, so that nothing can be off.
+    ADE is the mean distance over all leads up to one, FDE the distance at it (Pellegrini et al., ICCV 2009). NEES is the mean
+    squared error over the squared sigma for each axis, 1 when sigmas are honest.
     """
     truth, seen = _outcome(predictions)
     out = []

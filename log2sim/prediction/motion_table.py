@@ -21,26 +21,15 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class MotionTable(AgentTable):
-    """Agents at T ticks. Positions and velocities are complex numbers x + iy, so that a turn is a product.
+    """Agents at T ticks. Positions and velocities are complex numbers x + iy, so that a turn is a product."""
 
-    Attributes
-    ----------
-    tick_s : float, s
-        Between ticks.
-    velocity_mps : (A, T) complex128, m/s
-        Slope of the trajectory; NaN where the agent is absent.
-    sigma_m : (A, T) float64, m
-        One standard deviation of the position.
-    observed : (A, T) bool
-        False where the agent is absent or its trajectory fills a gap of the observations.
-    piece : (A, T) int
-        Rises by one where the log jumps, from where on it is another object; -1 where the agent is absent.
-    """
-
-    tick_s: float
-    velocity_mps: Complex
-    sigma_m: Array
-    observed: NDArray[np.bool_]
+    tick_s: float  # between ticks
+    velocity_mps: Complex  # (A, T) slope of the trajectory; NaN where the agent is absent
+    sigma_m: Array  # (A, T) one standard deviation of the position
+    observed: NDArray[
+        np.bool_
+    ]  # (A, T) False where the agent is absent or its trajectory fills a gap of the observations
+    # (A, T) rises by one where the log jumps, from where on it is another object; -1 where the agent is absent
     piece: NDArray[np.intp]
 
     @cached_property
@@ -127,19 +116,11 @@ MAX_CURVATURE_1PM = 0.3
 
 @dataclass(frozen=True, eq=False)
 class SmoothedMotion:
-    """Velocity and turn rate of agents, smoothed over their past.
+    """Velocity and turn rate of agents, smoothed over their past."""
 
-    Attributes
-    ----------
-    velocity_mps : (A, T) complex128, m/s
-    turn_radps : (A, T) float64, rad/s
-    constants_s : (A, T, 2) float64, s
-        The likeliest time constants of velocity and turn rate, by the past up to each tick.
-    """
-
-    velocity_mps: Complex
-    turn_radps: Array
-    constants_s: Array
+    velocity_mps: Complex  # (A, T)
+    turn_radps: Array  # (A, T)
+    constants_s: Array  # (A, T, 2) the likeliest time constants of velocity and turn rate, by the past up to each tick
 
 
 def displacement(velocity_mps: Complex, turn_radps: Array, lead_s: Array | float) -> Complex:

@@ -42,31 +42,17 @@ def kind_of(category: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Points of paths, one path after the other.
+    """N points of paths, one path after the other."""
 
-    Attributes
-    ----------
-    point_m : (N,) complex128, m
-    direction : (N,) complex128
-        Unit vectors of travel.
-    distance_m : (N,) float64, m
-        Along the path; of the next path it goes on from the end of the one before, so that it always rises.
-    path : (N,) int
-    known_s : (N,) float64, s
-        When an agent was there; minus infinity on lanes, which are known beforehand.
-    agent : (N,) int
-        Row of the agent that was there; -1 on lanes.
-    kind : (N,) int
-        Who was there, see `kind_of`; `VEHICLES` on lanes.
-    """
-
-    point_m: Complex
-    direction: Complex
-    distance_m: Array
-    path: NDArray[np.intp]
-    known_s: Array
-    agent: NDArray[np.intp]
-    kind: NDArray[np.intp]
+    point_m: Complex  # (N,) m, map frame
+    direction: Complex  # (N,) unit vectors of travel
+    distance_m: (
+        Array  # (N,) along the path; of the next path it goes on from the end of the one before, so that it rises
+    )
+    path: NDArray[np.intp]  # (N,)
+    known_s: Array  # (N,) s, when an agent was there; minus infinity on lanes, which are known beforehand
+    agent: NDArray[np.intp]  # (N,) row of the agent that was there; -1 on lanes
+    kind: NDArray[np.intp]  # (N,) who was there, see `kind_of`; `VEHICLES` on lanes
 
     @classmethod
     def driven(cls, table: MotionTable, lanes: Sequence[Array] = ()) -> Self:
@@ -104,46 +90,23 @@ class Paths:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where agents are on paths.
+    """Where Q agents are on paths."""
 
-    Attributes
-    ----------
-    row : (Q,) int
-        Of the nearest point; -1 where there is no path.
-    distance_m : (Q,) float64, m
-        Along the path.
-    aside_m : (Q,) float64, m
-        To the left of it.
-    end_m : (Q,) float64, m
-        Up to where the path was known.
-    """
-
-    row: NDArray[np.intp]
-    distance_m: Array
-    aside_m: Array
-    end_m: Array
+    row: NDArray[np.intp]  # (Q,) of the nearest point; -1 where there is no path
+    distance_m: Array  # (Q,) along the path
+    aside_m: Array  # (Q,) to the left of it
+    end_m: Array  # (Q,) up to where the path was known
 
 
 @dataclass(frozen=True, eq=False)
 class Seekers:
-    """Agents that look for the paths that they are on.
+    """Q agents that look for the paths that they are on."""
 
-    Attributes
-    ----------
-    position_m, direction : (Q,) complex128
-        Box centers, map frame, and unit vectors of the courses; NaN where the course is unknown.
-    t_s : (Q,) float64, s
-    agent : (Q,) int
-        Rows of the agents.
-    kind : (Q,) int
-        Of the agents, see `kind_of`.
-    """
-
-    position_m: Complex
-    direction: Complex
-    t_s: Array
-    agent: NDArray[np.intp]
-    kind: NDArray[np.intp]
+    position_m: Complex  # (Q,) box centers, m, map frame
+    direction: Complex  # (Q,) unit vectors of the courses; NaN where the course is unknown
+    t_s: Array  # (Q,)
+    agent: NDArray[np.intp]  # (Q,) rows of the agents
+    kind: NDArray[np.intp]  # (Q,) of the agents, see `kind_of`
 
 
 def locate(paths: Paths, seekers: Seekers) -> Places:
@@ -175,17 +138,9 @@ def locate(paths: Paths, seekers: Seekers) -> Places:
 
 
 def follow(paths: Paths, places: Places, speed_mps: Array, lead_s: Array) -> tuple[Complex, Complex]:
-    """Compute where agents on paths are after leads (H,), s.
+    """Compute positions, m, and courses, (Q, H) complex128, of agents with speeds (Q,), m/s, after leads (H,), s.
 
-    Parameters
-    ----------
-    speed_mps : (Q,) float64, m/s
-    lead_s : (H,) float64, s
-
-    Returns
-    -------
-    position_m, course : (Q, H) complex128
-        NaN beyond where a path was known.
+    NaN beyond where a path was known.
     """
     on = places.row >= 0
     ahead = places.distance_m[:, None] + speed_mps[:, None] * lead_s

@@ -29,13 +29,7 @@ from log2sim.prediction.paths import Paths, Seekers, follow, kind_of, locate
 
 
 class Restlessness(NamedTuple):
-    """What agents do that does not follow from their past.
-
-    Attributes
-    ----------
-    along_mps2, across_mps2 : float, m/s2
-        Standard deviations of the acceleration along and across the course.
-    """
+    """Standard deviations of the acceleration along and across the course that does not follow from an agent's past."""
 
     along_mps2: float
     across_mps2: float
@@ -45,17 +39,13 @@ ACCELERATION_S = 2.0
 """For how long an acceleration lasts: drivers and pedestrians change what they do after one to three seconds."""
 
 MOVING: Mapping[str, Restlessness] = {
-    "vehicle": Restlessness(0.8, 0.6),
-    "two_wheeler": Restlessness(0.7, 0.6),
-    "pedestrian": Restlessness(0.35, 0.35),
+    "vehicle": Restlessness(0.8, 0.6), "two_wheeler": Restlessness(0.7, 0.6), "pedestrian": Restlessness(0.35, 0.35),
     "other": Restlessness(0.8, 0.6),
-}
+}  # fmt: skip
 WAITING: Mapping[str, Restlessness] = {
-    "vehicle": Restlessness(0.5, 0.1),
-    "two_wheeler": Restlessness(0.4, 0.1),
-    "pedestrian": Restlessness(0.25, 0.15),
+    "vehicle": Restlessness(0.5, 0.1), "two_wheeler": Restlessness(0.4, 0.1), "pedestrian": Restlessness(0.25, 0.15),
     "other": Restlessness(0.5, 0.1),
-}
+}  # fmt: skip
 """Of agents that stand: most stay, some start."""
 
 WAITING_S = 10.0
@@ -68,18 +58,16 @@ MIN_SCALE = 0.1
 """Of an agent's own variances to the usual ones: what was regular so far can still brake."""
 
 
-def drift_variance(lead_s: Array, lasts_s: float = ACCELERATION_S) -> Array:
+def drift_variance(lead_s: Array) -> Array:
     """Compute the variance, m2, of the way after leads that an acceleration of 1 m/s2 makes, which lasts exponentially long.
 
-    Notes
-    -----
     Twice integrated Ornstein-Uhlenbeck noise (Singer, "Estimating optimal tracking filter performance for manned maneuvering
-    targets", 1970): it grows as lead^4 / 4 within `lasts_s` and as lead^3 beyond.
+    targets", 1970): it grows as lead^4 / 4 within `ACCELERATION_S` and as lead^3 beyond.
     """
-    r = np.asarray(lead_s, dtype=np.float64) / lasts_s
+    r = np.asarray(lead_s, dtype=np.float64) / ACCELERATION_S
     series = r**4 / 4 - r**5 / 15 + r**6 / 72  # cancels below in the closed form
     closed = 2 * r**3 / 3 - r**2 + 2 - 2 * (1 + r) * np.exp(-r)
-    return np.asarray(lasts_s**4 * np.where(r < 0.05, series, closed))
+    return np.asarray(ACCELERATION_S**4 * np.where(r < 0.05, series, closed))
 
 
 def usual_sigma(table: MotionTable, lead_s: Array) -> Array:
@@ -106,18 +94,10 @@ def _lasting(state: NDArray[np.bool_], table: MotionTable) -> NDArray[np.intp]:
 def own_scale(table: MotionTable, error_m: Complex, course: Complex, sigma_m: Array, ticks: int) -> Array:
     """Compute by how much each agent's motion was more regular than usual so far: factors (A, T) on its standard deviations.
 
-    Times at which it stood do not count, nor does their factor differ from 1: they say nothing about how it drives.
-
-    Parameters
-    ----------
-    error_m : (A, T) complex128, m
-        Error of the prediction at each tick for `ticks` later; NaN where unknown.
-    course : (A, T) complex128
-        Unit vectors of the predicted courses.
-    sigma_m : (A, T, 2) float64, m
-        Usual standard deviations then.
-    ticks : int
-        After which the error is known; errors closer to each other count as one.
+    `error_m` (A, T): of the prediction at each tick for `ticks` later, m; NaN where unknown. `course` (A, T): unit vectors of
+    the predicted courses. `sigma_m` (A, T, 2): usual standard deviations then. Errors closer to each other than `ticks`, after
+    which they are known, count as one. Times at which an agent stood do not count, nor does its factor differ from 1: they say
+    nothing about how it drives.
     """
     off = error_m * course.conj()
     squared = (off.real / sigma_m[..., 0]) ** 2 + (off.imag / sigma_m[..., 1]) ** 2
@@ -162,55 +142,28 @@ leads an agent's own motion tells its place more exactly."""
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Predictions of N agent-ticks by one method.
-
-    Attributes
-    ----------
-    position_m : (N, H) complex128, m
-        Predicted box centers x + iy, map frame.
-    course : (N, H) complex128
-        Unit vectors of the predicted courses; of the heading where the agent stands.
-    sigma_m : (N, H, 2) float64, m
-        Standard deviations along and across the course.
-    """
+    """Predictions of N agent-ticks by one method."""
 
     __repr__ = short_repr
 
-    position_m: Complex
-    course: Complex
-    sigma_m: Array
+    position_m: Complex  # (N, H) predicted box centers x + iy, m, map frame
+    course: Complex  # (N, H) unit vectors of the predicted courses; of the heading where the agent stands
+    sigma_m: Array  # (N, H, 2) standard deviations along and across the course
 
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Predictions of all agents at all ticks at which they are present.
-
-    Attributes
-    ----------
-    table : MotionTable
-        What they start from.
-    lead_s : (H,) float64, s
-    row : (N,) int
-        Agents, as indices of `table.agents`; the ticks of one agent follow each other.
-    tick : (N,) int
-        Indices of `table.t_s`.
-    forecasts : mapping of str to Forecast
-        By the names of `METHODS`.
-    constants_s : (N, 2) float64, s
-        Time constants of velocity and turn rate that the past of the agent chose.
-    on_path : (N,) bool
-        Where `path` knows one.
-    """
+    """N predictions, of all agents at all ticks at which they are present, for H leads."""
 
     __repr__ = short_repr
 
-    table: MotionTable
-    lead_s: Array
-    row: NDArray[np.intp]
-    tick: NDArray[np.intp]
-    forecasts: Mapping[str, Forecast]
-    constants_s: Array
-    on_path: NDArray[np.bool_]
+    table: MotionTable  # what they start from
+    lead_s: Array  # (H,)
+    row: NDArray[np.intp]  # (N,) agents, as indices of `table.agents`; the ticks of one agent follow each other
+    tick: NDArray[np.intp]  # (N,) indices of `table.t_s`
+    forecasts: Mapping[str, Forecast]  # by the names of `METHODS`
+    constants_s: Array  # (N, 2) time constants of velocity and turn rate that the past of the agent chose
+    on_path: NDArray[np.bool_]  # (N,) where `path` knows one
 
     def rows_of(self, agent: str) -> NDArray[np.intp]:
         """Return the indices (K,) of the predictions of an agent, in order of time; none for an unknown one."""
@@ -226,10 +179,7 @@ class Predictions:
 def leads_of(horizon_s: float) -> Array:
     """Return the leads (H,), s, up to a horizon, which is rounded to ticks: every `LEAD_STEP_S`, and the horizon itself.
 
-    Raises
-    ------
-    ConfigError
-        For a horizon outside `HORIZON_LIMITS_S`.
+    Raises `ConfigError` for a horizon outside `HORIZON_LIMITS_S`.
     """
     low, high = HORIZON_LIMITS_S
     if not low <= horizon_s <= high:

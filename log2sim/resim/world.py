@@ -129,13 +129,14 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
         position = np.column_stack([states.x_m, states.y_m, states.z_m]) - rays.shift_m
         bins = np.full(len(surfels), len(t_s) // 2)
         for _ in range(2):
-            points, axes = _turned(surfels, states.yaw_rad[bins], position[bins])
+            at = bins
+            points = _turned(surfels.center_m, states.yaw_rad[at]) + position[at]
             seen = points @ sensor[:3, :3].T + sensor[:3, 3]
             bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
         own = there[bins]
         parts.append(surfels.take(own))
         center.append(points[own].astype(np.float32))
-        normal.append(axes[own].astype(np.float32))
+        normal.append(_turned(surfels.normal[own], states.yaw_rad[at[own]]).astype(np.float32))
         ids.append(agent.id)
     first = np.cumsum([0, *(len(p) for p in parts)])
     return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
@@ -152,13 +153,10 @@ def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
 
 
-def _turned(surfels: Surfels, yaw: Array, position: Array) -> tuple[Array, Array]:
+def _turned(v: Floats | Array, yaw: Array) -> Array:
+    """Turn vectors (N, 3) about the vertical axis by yaws (N,)."""
     c, s = np.cos(yaw), np.sin(yaw)
-    points, axes = (
-        np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
-        for v in (surfels.center_m, surfels.normal)
-    )
-    return points + position, axes
+    return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
 
 
 def build_world(

@@ -13,19 +13,28 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.synth.ground import GROUND_M_PER_PX, LEVELS, MEADOW, TILE_PX, Ground, GroundPlan, grain
-from log2sim.synth.light import FAR_M, MIN_FALL, Image, Light, RenderCamera, Texture, light_of, linear
-from log2sim.synth.polytope_caster import Terrain
+from log2sim.synth.light import (
+    FAR_M,
+    MIN_FALL,
+    Image,
+    Light,
+    RenderCamera,
+    Texture,
+    light_of,
+    linear,
+    rows_by_level,
+)
 from log2sim.synth.scene import Building, Scene
+from log2sim.synth.terrain import Surface, meet
 
-NEWTON_STEPS = 3
-MAX_ERROR_M = 0.05  # of the terrain's height where a ray meets it
+MAX_ERROR_M = 0.05  # of the ground's height where a ray meets it
 MAX_MOSAIC_TILES = 24  # along a side: 113 MB at most
 REACH_M = 250.0  # beyond which the ground is as level as it is under the camera
 Flags = NDArray[np.bool_]
 
 
 def draw_terrain(
-    view: RenderCamera, ground: Ground, terrain: Terrain, light: Light, color: Image, depth: Image
+    view: RenderCamera, ground: Ground, terrain: Surface, light: Light, color: Image, depth: Image
 ) -> None:
     """Draw the ground below the horizon."""
     by_column, by_row = view.rays()
@@ -40,7 +49,13 @@ def draw_terrain(
     under = terrain.height(eye[:1], eye[1:2]) + terrain.relief(eye[:1], eye[1:2])
     level = np.maximum(eye[2] - under[0], np.float32(0.1)) / np.maximum(fall[band], np.float32(1e-6))
     level = np.minimum(level, np.float32(FAR_M))
-    away, met = _distances(terrain, eye, (dx, dy, -fall[band]), np.minimum(level, np.float32(REACH_M)))
+    ray = [np.ravel(r) for r in (dx, dy, -fall[band])]
+    t = np.minimum(level, np.float32(REACH_M)).ravel()
+    t, error, rise = meet(terrain, tuple(eye), tuple(ray), t, flattest=1e-3, span=(0.1, 2 * REACH_M))
+    met = (np.abs(error) < MAX_ERROR_M).reshape(level.shape)
+    t += terrain.relief(eye[0] + t * ray[0], eye[1] + t * ray[1]) / np.minimum(rise, np.float32(-0.02))
+    away = t.reshape(level.shape)
+    met &= away < REACH_M
     away = np.where(met, away, level)
     seen = met | (fall[band] > MIN_FALL)
     x, y = eye[0] + away * dx, eye[1] + away * dy
@@ -48,37 +63,12 @@ def draw_terrain(
     color[band][seen], depth[band][seen] = lit[seen], away[seen]
 
 
-def _distances(
-    terrain: Terrain, eye: NDArray[np.float32], ray: tuple[Image, Image, Image], start: Image
-) -> tuple[Image, Flags]:
-    """Depth (H, W) at which rays meet the terrain by Newton's method, and whether they do."""
-    dx, dy, dz = (np.ravel(r) for r in ray)
-    t = start.ravel().copy()
-    for _ in range(NEWTON_STEPS):
-        x, y = eye[0] + t * dx, eye[1] + t * dy
-        sx, sy = terrain.slope(x, y)
-        slope = dz - sx * dx - sy * dy
-        error = eye[2] + t * dz - terrain.height(x, y)
-        t -= error / np.minimum(slope, np.float32(-1e-3))
-        np.clip(t, 0.1, 2 * REACH_M, out=t)
-    x, y = eye[0] + t * dx, eye[1] + t * dy
-    met = np.abs(eye[2] + t * dz - terrain.height(x, y)) < MAX_ERROR_M
-    sx, sy = terrain.slope(x, y)
-    t += terrain.relief(x, y) / np.minimum(dz - sx * dx - sy * dy, np.float32(-0.02))
-    return t.reshape(start.shape), met.reshape(start.shape) & (t.reshape(start.shape) < REACH_M)
-
-
 def _sampled(ground: Ground, view: RenderCamera, x: Image, y: Image, away: Image, seen: Flags) -> Texture:
     """Colors (H, W, 3) of positions, for each row from the level of tiles whose resolution fits."""
-    middle = np.median(away, axis=1)
-    slanted = np.sqrt(np.maximum(middle / max(float(view.map_T_cam[2, 3]), 0.5), 1.0))
-    footprint = middle / view.K[0, 0] * slanted
-    level = np.clip(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0)), 0, LEVELS - 1).astype(int)
     out = np.empty((*x.shape, 3), np.uint8)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [len(level)]])
-    for first, last in pairwise(edges):
-        part = slice(int(first), int(last))
-        out[part] = sampled_ground(ground, int(level[first]), x[part], y[part], seen[part])
+    height = max(float(view.map_T_cam[2, 3]), 0.5)
+    for level, rows in rows_by_level(np.median(away, axis=1), height, view.K[0, 0]):
+        out[rows] = sampled_ground(ground, level, x[rows], y[rows], seen[rows])
     return out
 
 
@@ -143,7 +133,7 @@ class Backdrop:
     """The static parts of a scene: the ground and facades, painted when and where they are looked at."""
 
     ground: Ground
-    terrain: Terrain | None = None  # heights of the ground, None where it is level
+    terrain: Surface | None = None  # heights of the ground, None where it is level
     buildings: tuple[tuple[Wall, ...], ...] = ()  # sides of each
     shadows: tuple[Array, ...] = ()  # convex outlines (P, 2), m, of the shadows of what does not move
 

@@ -182,11 +182,7 @@ def old_lines(road: Road) -> list[Stroke]:
 
 
 def _line(
-    road: Road,
-    middle: Array,
-    kind: Literal["solid", "dashed"],
-    where: tuple[float, float, int],
-    color: PaintColor,
+    road: Road, middle: Array, kind: Literal["solid", "dashed"], where: tuple[float, float, int], color: PaintColor
 ) -> RoadLine:
     """Lay a line at an offset to the left, of a width, that marks a boundary."""
     offset, width_m, boundary = where
@@ -265,13 +261,8 @@ GROUND_M_PER_PX = 0.04
 TILE_PX = 256
 MAX_TILES = 320  # 63 MB
 LEVELS = 7
-MARKING, ASPHALT, PAVING, CURB, MEADOW = (
-    (214, 216, 216),
-    (92, 91, 90),
-    (150, 155, 158),
-    (172, 176, 178),
-    (128, 142, 138),
-)
+MARKING, ASPHALT, PAVING = (214, 216, 216), (92, 91, 90), (150, 155, 158)
+CURB, MEADOW = (172, 176, 178), (128, 142, 138)
 # Yellow as traffic yellow (RAL 1023) in sRGB, BGR.
 PAINT: dict[str, Color] = {"white": MARKING, "yellow": (38, 176, 236)}
 OLD_STRENGTH, OLD_WORN = 0.4, 0.35  # of removed lines: what grinding leaves is dimmer and in pieces

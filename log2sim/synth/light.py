@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -232,10 +232,10 @@ class RenderCamera:
         rays = np.column_stack([(u - self.K[0, 2]) / self.K[0, 0], (v - self.K[1, 2]) / self.K[1, 1], np.ones(len(u))])
         return np.asarray(rays @ self.map_T_cam[:3, :3].T)
 
-    def ground_depth(self, u: NDArray[Any], v: NDArray[Any], far_m: float) -> Array:
-        """Depth (N,) at which rays through points of the image meet z = 0, at most `far_m`."""
+    def ground_depth(self, u: NDArray[Any], v: NDArray[Any]) -> Array:
+        """Depth (N,) at which rays through points of the image meet z = 0, at most `FAR_M`."""
         fall = np.maximum(-self.directions(u, v)[:, 2], 1e-9)
-        return np.asarray(np.minimum(self.map_T_cam[2, 3] / fall, far_m))
+        return np.asarray(np.minimum(self.map_T_cam[2, 3] / fall, FAR_M))
 
     def image_H_plane(self, origin: Array, first: Array, second: Array) -> Array:
         """Homography (3, 3) from coordinates along two directions (3,) in the map, from `origin` (3,) relative to the camera."""
@@ -306,17 +306,23 @@ def _ground_image(view: RenderCamera, ground: Ground, band: slice) -> Texture:
     """Warp the tiles of the ground into rows of the image, for each row from the level whose resolution fits."""
     fine = view.taller(ROWS_PER_PX)
     top = band.start * ROWS_PER_PX
-    middle = fine.ground_depth(np.full(fine.height_px, fine.width_px / 2), np.arange(fine.height_px), FAR_M)
-    slanted = np.sqrt(np.maximum(middle / (ROWS_PER_PX * fine.map_T_cam[2, 3]), 1.0))
-    footprint = middle / fine.K[0, 0] * slanted
-    level = np.clip(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0)), 0, LEVELS - 1).astype(int)
-    level = level[top : band.stop * ROWS_PER_PX]
-    out = np.empty((len(level), fine.width_px, 3), np.uint8)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [len(level)]])
-    for first, last in pairwise(edges):
-        out[first:last] = _warped(fine, ground, int(level[first]), slice(int(top + first), int(top + last)))
+    middle = fine.ground_depth(np.full(fine.height_px, fine.width_px / 2), np.arange(fine.height_px))
+    part = middle[top : band.stop * ROWS_PER_PX]
+    out = np.empty((len(part), fine.width_px, 3), np.uint8)
+    for level, rows in rows_by_level(part, ROWS_PER_PX * fine.map_T_cam[2, 3], fine.K[0, 0]):
+        out[rows] = _warped(fine, ground, level, slice(top + rows.start, top + rows.stop))
     size = (fine.width_px, band.stop - band.start)
     return np.asarray(cv2.resize(out, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def rows_by_level(away_m: Array, height_m: float, focal_px: float) -> Iterator[tuple[int, slice]]:
+    """Yield levels of tiles and the successive rows whose resolution they fit, by their depths (H,) and the camera's height."""
+    slanted = np.sqrt(np.maximum(away_m / height_m, 1.0))
+    footprint = away_m / focal_px * slanted
+    level = np.clip(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0)), 0, LEVELS - 1).astype(int)
+    edges = [0, *(np.flatnonzero(np.diff(level)) + 1).tolist(), len(level)]
+    for first, last in pairwise(edges):
+        yield int(level[first]), slice(first, last)
 
 
 def _warped(fine: RenderCamera, ground: Ground, level: int, rows: slice) -> Texture:
@@ -325,7 +331,7 @@ def _warped(fine: RenderCamera, ground: Ground, level: int, rows: slice) -> Text
     eye = fine.map_T_cam[:2, 3]
     corner_u = np.array([0, fine.width_px - 1, fine.width_px - 1, 0]) + np.array([-1, 1, 1, -1])
     corner_v = np.array([rows.start, rows.start, rows.stop, rows.stop]) + np.array([-1, -1, 1, 1])
-    away = fine.ground_depth(corner_u, corner_v, FAR_M)[:, None]
+    away = fine.ground_depth(corner_u, corner_v)[:, None]
     seen = (eye + fine.directions(corner_u, corner_v)[:, :2] * away) / (step * TILE_PX)
     low = np.floor(seen.min(0) - 0.02).astype(int)
     shape = np.floor(seen.max(0) + 0.02).astype(int) - low + 1  # columns and rows of tiles

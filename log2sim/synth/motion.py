@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +17,7 @@ MAX_ACCELERATION_MPS2 = 3.0
 FIRST_LEG_S = -1e4  # begin of the leg before the first waypoint
 
 
-@dataclass(frozen=True, eq=False)
-class PathStates:
+class PathStates(NamedTuple):
     """States of the guided point at asked times."""
 
     xy_m: Array  # (T, 2), m
@@ -71,10 +70,9 @@ class RoundedPath:
 
 
 def _extended(s: Array, at: Array, values: Array) -> Array:
-    inner = np.interp(s, at, values)
     before = (values[1] - values[0]) / (at[1] - at[0]) * np.minimum(s - at[0], 0)
     after = (values[-1] - values[-2]) / (at[-1] - at[-2]) * np.maximum(s - at[-1], 0)
-    return np.asarray(inner + before + after)
+    return np.asarray(np.interp(s, at, values) + before + after)
 
 
 class TimedPath:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, rotation_from_rpy, wrap_angle
 from log2sim.synth.polytopes import Material, Polytope
 from log2sim.synth.returns import REFLECTANCE, LidarModel, ReturnModel, backscattered, detected, disturbed, reflected
+from log2sim.synth.terrain import Surface, meet
 
 MIN_RANGE_M = 0.4
 WINDOW_MARGIN_RAD = 0.012
@@ -186,25 +186,8 @@ def _passed(
 
 
 GROUND, NOTHING = -1, -2
-NEWTON_STEPS = 3
 # Departure of the ground's surface from the ray that Newton's method must reach.
 MAX_GROUND_ERROR_M = 0.03
-
-
-class Terrain(Protocol):
-    """Height of the ground."""
-
-    def height(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return heights (N,) at positions, m."""
-        ...
-
-    def slope(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return derivatives (N,), (N,) of the height along x and y."""
-        ...
-
-    def relief(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what is too small for `height`, such as kerbs (N,), m."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +205,7 @@ def cast_polytopes(
     model: LidarModel,
     sensor: SensorState,
     solids: Sequence[Solid],
-    terrain: Terrain,
+    surface: Surface,
     rng: np.random.Generator,
     returns: ReturnModel | None = None,
 ) -> Returns:
@@ -230,61 +213,40 @@ def cast_polytopes(
 
     `rng`: draws reflectances, losses and noise. `returns`: by default the noise of the model and no more.
     """
-    rays = _cast_ground(model, sensor, terrain)
+    rays = _cast_ground(model, sensor, surface)
     windows = windows_of(solids, sensor)
     for index in np.argsort(windows.near_m, kind="stable").tolist():
         cast_solid(rays, solids[index], index, windows, sensor, rng)
     return _returned(rays, sensor, len(solids), rng, returns or ReturnModel(model.noise_m, 0.0, 0.0), model.range_m)
 
 
-def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> Rays:
-    """Make the rays and intersect them with the terrain by Newton's method."""
+def _cast_ground(model: LidarModel, sensor: SensorState, surface: Surface) -> Rays:
+    """Make the rays and intersect them with the ground."""
     azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
     flat = np.cos(elevation)[:, None]
-    directions = np.stack(
-        [
-            flat * np.cos(azimuth),
-            flat * np.sin(azimuth),
-            np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
-        ],
-        -1,
-    )
+    up = np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth)))
+    directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], -1)
     direction = (directions @ sensor.rotation.T).astype(np.float32)
     # The sweep turns clockwise: its share of the full turn is the share of its period.
     span = (model.azimuth_deg[1] - model.azimuth_deg[0]) / 360.0 / model.rate_hz
     column_s = ((np.arange(len(azimuth)) + 0.5) / len(azimuth) - 0.5) * span
     shape = direction.shape[:2]
-    out = Rays(
-        azimuth,
-        elevation,
-        direction,
-        column_s.astype(np.float32),
-        np.full(shape, np.inf, np.float32),
-        np.full(shape, NOTHING, np.int32),
-        np.zeros(shape, np.int8),
-        np.ones(shape, np.float32),
-    )
+    range_m, hit = np.full(shape, np.inf, np.float32), np.full(shape, NOTHING, np.int32)
+    material, incidence = np.zeros(shape, np.int8), np.ones(shape, np.float32)
+    out = Rays(azimuth, elevation, direction, column_s.astype(np.float32), range_m, hit, material, incidence)
     # A street rises by a fifth at most.
     line, col = np.nonzero(direction[..., 2] < 0.15)
     d = direction[line, col]
     drift = out.column_s[col, None] * np.append(sensor.velocity_mps, 0)
     start = (sensor.position_m + drift).astype(np.float32)
-    height = start[:, 2] - terrain.height(start[:, 0], start[:, 1])
+    height = start[:, 2] - surface.height(start[:, 0], start[:, 1])
     limit = np.float32(model.range_m)
     t = np.minimum(height / np.maximum(-d[:, 2], np.float32(0.02)), limit)
-    error = np.zeros_like(t)
-    for _ in range(NEWTON_STEPS):
-        x, y = start[:, 0] + t * d[:, 0], start[:, 1] + t * d[:, 1]
-        error = start[:, 2] + t * d[:, 2] - terrain.height(x, y)
-        sx, sy = terrain.slope(x, y)
-        t = np.clip(t - error / np.minimum(d[:, 2] - sx * d[:, 0] - sy * d[:, 1], np.float32(-0.004)), 0, 2 * limit)
+    t, error, rise = meet(surface, tuple(start.T), tuple(d.T), t, flattest=0.004, span=(0.0, 2.0 * model.range_m))
+    facing = -rise
+    ok = (np.abs(error) < MAX_GROUND_ERROR_M) & (t > MIN_RANGE_M) & (t < limit) & (facing > 0.005)
     x, y = start[:, 0] + t * d[:, 0], start[:, 1] + t * d[:, 1]
-    error = start[:, 2] + t * d[:, 2] - terrain.height(x, y)
-    ok = (np.abs(error) < MAX_GROUND_ERROR_M) & (t > MIN_RANGE_M) & (t < limit)
-    sx, sy = terrain.slope(x, y)
-    facing = -(d[:, 2] - sx * d[:, 0] - sy * d[:, 1])
-    ok &= facing > 0.005
-    t = t - terrain.relief(x, y) / np.maximum(facing, np.float32(0.02))
+    t = t - surface.relief(x, y) / np.maximum(facing, np.float32(0.02))
     line, col = line[ok], col[ok]
     out.range_m[line, col], out.hit[line, col], out.incidence[line, col] = t[ok], GROUND, facing[ok]
     return out

@@ -59,13 +59,8 @@ Shape = tuple[tuple[float, float, float], tuple[Polytope, ...]]
 
 
 def _made(normals: Array, offsets: Array, low: Sequence[float], high: Sequence[float], material: Material) -> Polytope:
-    return Polytope(
-        np.asarray(normals, np.float32),
-        np.asarray(offsets, np.float32),
-        np.array(low, np.float64),
-        np.array(high, np.float64),
-        material,
-    )
+    planes = np.asarray(normals, np.float32), np.asarray(offsets, np.float32)
+    return Polytope(*planes, np.array(low, np.float64), np.array(high, np.float64), material)
 
 
 def prism(profile: Sequence[tuple[float, float]], width: float, material: Material, *, taper: float = 0.0) -> Polytope:
@@ -84,14 +79,9 @@ def prism(profile: Sequence[tuple[float, float]], width: float, material: Materi
     sides = np.array([[0, k, taper * k], [0, -k, taper * k]])
     z0 = points[:, 1].min()
     ends = np.full(2, (width / 2 + taper * z0) * k)
-    low, high = points.min(axis=0), points.max(axis=0)
-    return _made(
-        np.vstack([normals, sides]),
-        np.append(offsets, ends),
-        (low[0], -width / 2, low[1]),
-        (high[0], width / 2, high[1]),
-        material,
-    )
+    (x0, z0), (x1, z1) = points.min(axis=0), points.max(axis=0)
+    bounds = (x0, -width / 2, z0), (x1, width / 2, z1)
+    return _made(np.vstack([normals, sides]), np.append(offsets, ends), *bounds, material)
 
 
 def box(low: Sequence[float], high: Sequence[float], material: Material) -> Polytope:
@@ -100,9 +90,10 @@ def box(low: Sequence[float], high: Sequence[float], material: Material) -> Poly
 
 
 def column(
-    radius: float, z: tuple[float, float], material: Material, *, at: tuple[float, float] = (0.0, 0.0), sides: int = 6
+    radius: float, z: tuple[float, float], material: Material, *, at: tuple[float, float] = (0.0, 0.0)
 ) -> Polytope:
-    """Make an upright prism around a circle of a radius at x, y, between two heights, m."""
+    """Make an upright prism of six sides around a circle of a radius at x, y, between two heights, m."""
+    sides = 6
     angles = np.arange(sides) * 2 * np.pi / sides
     around = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(sides)])
     normals = np.vstack([around, [[0, 0, 1], [0, 0, -1]]])
@@ -112,8 +103,9 @@ def column(
     return _made(normals, offsets, (at[0] - reach, at[1] - reach, z[0]), (at[0] + reach, at[1] + reach, z[1]), material)
 
 
-def tube(radius: float, x: tuple[float, float], z: float, material: Material, *, sides: int = 8) -> Polytope:
-    """Make a lying prism around a circle of a radius at height z, between two x, m."""
+def tube(radius: float, x: tuple[float, float], z: float, material: Material) -> Polytope:
+    """Make a lying prism of eight sides around a circle of a radius at height z, between two x, m."""
+    sides = 8
     angles = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     around = np.column_stack([np.zeros(sides), np.cos(angles), np.sin(angles)])
     normals = np.vstack([around, [[1, 0, 0], [-1, 0, 0]]])
@@ -122,14 +114,9 @@ def tube(radius: float, x: tuple[float, float], z: float, material: Material, *,
     return _made(normals, offsets, (x[0], -reach, z - reach), (x[1], reach, z + reach), material)
 
 
-def _tread() -> Array:
-    """Return the normals (10, 3) of a wheel: eight around its axle, two along it."""
-    angles = (np.arange(8) + 0.5) * np.pi / 4
-    around = np.column_stack([np.cos(angles), np.zeros(8), np.sin(angles)])
-    return np.vstack([around, [[0, 1, 0], [0, -1, 0]]])
-
-
-_TREAD = _tread()
+_ROUND = (np.arange(8) + 0.5) * np.pi / 4
+# Normals of a wheel: eight around its axle, two along it.
+_TREAD = np.vstack([np.column_stack([np.cos(_ROUND), np.zeros(8), np.sin(_ROUND)]), [[0, 1, 0], [0, -1, 0]]])
 _FACES = np.vstack([np.eye(3), -np.eye(3)])
 
 
@@ -138,23 +125,13 @@ def wheel(radius: float, width: float, x: float, y: float) -> Polytope:
     offsets = radius + _TREAD[:, 0] * x + _TREAD[:, 2] * radius
     offsets[8:] = y + width / 2, width / 2 - y
     reach = radius / np.cos(np.pi / 8)
-    return _made(
-        _TREAD,
-        offsets,
-        (x - reach, y - width / 2, radius - reach),
-        (x + reach, y + width / 2, radius + reach),
-        Material.DARK,
-    )
+    low, high = (x - reach, y - width / 2, radius - reach), (x + reach, y + width / 2, radius + reach)
+    return _made(_TREAD, offsets, low, high, Material.DARK)
 
 
-def _ellipsoid_normals() -> Array:
-    golden = (1 + 5**0.5) / 2
-    points = [(0.0, s, t * golden) for s in (1, -1) for t in (1, -1)]
-    normals = np.array([np.roll(p, shift) for shift in range(3) for p in points])
-    return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
-
-
-_TWELVE = _ellipsoid_normals()
+_GOLDEN = (1 + 5**0.5) / 2
+_TWELVE = np.array([np.roll((0.0, s, t * _GOLDEN), shift) for shift in range(3) for s in (1, -1) for t in (1, -1)])
+_TWELVE /= np.linalg.norm(_TWELVE, axis=1)[:, None]
 
 
 def ellipsoid(radii: Sequence[float], center: Sequence[float], material: Material) -> Polytope:
@@ -220,12 +197,9 @@ def _faces(planes: Array, offsets: Array) -> tuple[Array, Array, NDArray[np.int6
     outside = np.einsum("bki,bti->btk", planes, point) > offsets[:, None, :] + INSIDE_M
     corner = meets & ~outside.any(2)
     on_face = [np.flatnonzero((triples == k).any(1)) for k in range(count)]
-    out = [_fan(planes[:, k], point[:, on], corner[:, on]) for k, on in enumerate(on_face)]
-    return (
-        np.concatenate([t for t, _, _ in out]),
-        np.concatenate([n for _, n, _ in out]),
-        np.concatenate([o for _, _, o in out]),
-    )
+    out = zip(*(_fan(planes[:, k], point[:, on], corner[:, on]) for k, on in enumerate(on_face)))
+    triangles, normals, owners = (np.concatenate(parts) for parts in out)
+    return triangles, normals, owners
 
 
 def _fan(normal: Array, point: Array, corner: NDArray[np.bool_]) -> tuple[Array, Array, NDArray[np.int64]]:

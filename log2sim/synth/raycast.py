@@ -153,28 +153,28 @@ def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool
     return np.where((enter <= leave) & ahead, enter, np.inf)
 
 
-def _standing_distance(triangles: Array, origin: Array, ray: Array) -> tuple[NDArray[np.int64], Array]:
-    """Rays that pass near triangles (F, 3, 3) in the map, and their distances to them."""
-    corners = triangles.reshape(-1, 3)
-    middle = (corners.min(0) + corners.max(0)) / 2
+def _near(middle: Array, radius: float, origin: Array, ray: Array) -> NDArray[np.intp]:
+    """Rays that pass through a sphere around a middle (3,), or one (N, 3) for each ray."""
     to = middle - origin
     along = np.einsum("ni,ni->n", to, ray)
     off = np.einsum("ni,ni->n", to, to) - along**2
-    radius = float(np.linalg.norm(corners - middle, axis=1).max())
-    rows = np.flatnonzero((off < radius**2) & (along > -radius))
+    return np.flatnonzero((off < radius**2) & (along > -radius))
+
+
+def _standing_distance(triangles: Array, origin: Array, ray: Array) -> tuple[NDArray[np.intp], Array]:
+    """Rays that pass near triangles (F, 3, 3) in the map, and their distances to them."""
+    corners = triangles.reshape(-1, 3)
+    middle = (corners.min(0) + corners.max(0)) / 2
+    rows = _near(middle, float(np.linalg.norm(corners - middle, axis=1).max()), origin, ray)
     return rows, first_hit(origin[rows], ray[rows], triangles)
 
 
 def _actor_distance(
     actor: Actor, t_s: Array, column: NDArray[np.int64], origin: Array, ray: Array
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[NDArray[np.intp], Array]:
     """Rays that meet the actor's box at their own time, and their distances to its shape."""
     states = actor.at(t_s)
-    to = states.center_m[column] - origin
-    along = np.einsum("ni,ni->n", to, ray)
-    off = np.einsum("ni,ni->n", to, to) - along**2
-    radius = np.linalg.norm(actor.spec.box_m) / 2
-    rows = np.flatnonzero((off < radius**2) & (along > -radius))
+    rows = _near(states.center_m[column], float(np.linalg.norm(actor.spec.box_m)) / 2, origin, ray)
     if len(rows) == 0:
         return rows, np.zeros(0)
     mesh = actor.mesh(float(t_s[column[rows]].mean()))

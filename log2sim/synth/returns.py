@@ -30,6 +30,7 @@ MAX_FILE_BYTES = 65536
 MAX_RAYS = 4_000_000
 
 Angle = Annotated[float, Field(ge=-90, le=90)]
+Azimuth = Annotated[float, Field(ge=-180, le=180)]
 
 
 class LidarModel(BaseModel):
@@ -39,11 +40,7 @@ class LidarModel(BaseModel):
 
     name: str = "custom"
     elevation_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=512)]  # of each line, deg
-    # right and left end of the field of view, deg
-    azimuth_deg: tuple[Annotated[float, Field(ge=-180, le=180)], Annotated[float, Field(ge=-180, le=180)]] = (
-        -180.0,
-        180.0,
-    )
+    azimuth_deg: tuple[Azimuth, Azimuth] = (-180.0, 180.0)  # right and left end of the field of view, deg
     azimuth_step_deg: Annotated[float, Field(ge=0.02, le=10)] = 0.2  # angle between two firings, deg
     range_m: Annotated[float, Field(ge=1, le=500)] = 100.0  # largest measured distance, m
     noise_m: Annotated[float, Field(ge=0, le=1)] = 0.02  # standard deviation of a distance, m
@@ -80,9 +77,7 @@ LIDAR_MODELS = {
     model.name: model
     for model in (
         LidarModel(name="vlp16", elevation_deg=_even(-15, 15, 16), noise_m=0.03, range_m=100),
-        LidarModel(
-            name="rslidar16-roadside", elevation_deg=_even(-15, 15, 16), range_m=150, height_m=3.6, pitch_deg=31.25
-        ),
+        LidarModel(name="rslidar16-roadside", elevation_deg=_even(-15, 15, 16), range_m=150, height_m=3.6, pitch_deg=31.25),
         LidarModel(name="rslidar16", elevation_deg=_even(-15, 15, 16), range_m=150),
         LidarModel(name="hdl32e", elevation_deg=_even(-30.67, 10.67, 32), range_m=80),
         LidarModel(name="vlp32c", elevation_deg=_VLP32C, noise_m=0.03, range_m=150),
@@ -90,22 +85,10 @@ LIDAR_MODELS = {
         LidarModel(name="pandar64", elevation_deg=_PANDAR64, range_m=150),
         LidarModel(name="os1-64", elevation_deg=_even(-22.5, 22.5, 64), azimuth_step_deg=0.3516, noise_m=0.015),
         LidarModel(name="os1-128", elevation_deg=_even(-22.5, 22.5, 128), azimuth_step_deg=0.3516, noise_m=0.015),
-        LidarModel(
-            name="rslidar-m1",
-            elevation_deg=_even(-12.5, 12.5, 125),
-            azimuth_deg=(-60.0, 60.0),
-            range_m=150,
-            noise_m=0.025,
-        ),
-        LidarModel(
-            name="pandargt",
-            elevation_deg=_even(-10, 10, 150),
-            azimuth_deg=(-30.0, 30.0),
-            azimuth_step_deg=0.1,
-            range_m=200,
-        ),
+        LidarModel(name="rslidar-m1", elevation_deg=_even(-12.5, 12.5, 125), azimuth_deg=(-60.0, 60.0), range_m=150, noise_m=0.025),
+        LidarModel(name="pandargt", elevation_deg=_even(-10, 10, 150), azimuth_deg=(-30.0, 30.0), azimuth_step_deg=0.1, range_m=200),
     )
-}
+}  # fmt: skip
 """Sensors by name: spinning ones of 16, 32, 64 and 128 lines, solid-state ones with a field of view of 120 and 60 degrees."""
 
 

@@ -46,12 +46,8 @@ def cross_products(a: Array, b: Array) -> Array:
 def merged(meshes: Sequence[Mesh]) -> Mesh:
     """Concatenate meshes."""
     offsets = np.cumsum([0, *(len(m.vertices_m) for m in meshes)])
-    return Mesh(
-        np.concatenate([m.vertices_m for m in meshes]),
-        np.concatenate([m.normals for m in meshes]),
-        np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]),
-        np.concatenate([m.part for m in meshes]),
-    )
+    columns = ((m.vertices_m, m.normals, m.faces + o, m.part) for m, o in zip(meshes, offsets))
+    return Mesh(*map(np.concatenate, zip(*columns)))
 
 
 def surface(vertices: Array, faces: NDArray[np.int64], part: int) -> Mesh:
@@ -91,24 +87,24 @@ def _across(axis: Array) -> Array:
     return np.asarray(across / np.linalg.norm(across))
 
 
-def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 10, flat: float = 1.0) -> Mesh:
-    """Make a round-ended tube along points (P, 3) with a radius at each; `flat` scales its second axis."""
+def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 10) -> Mesh:
+    """Make a round-ended tube along points (P, 3) with a radius at each."""
     p = np.asarray(points, dtype=np.float64)
     tangent = np.gradient(p, axis=0) if len(p) > 2 else np.repeat(p[1:] - p[:1], 2, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     angle = np.arange(count) * 2 * np.pi / count
     rings = []
     u = _across(p[-1] - p[0])
-    stations = [(p[0] - tangent[0] * radii[0] * h, radii[0] * c, tangent[0]) for h, c in ((1.0, 0.05), (0.8, 0.6))]
-    stations += [(p[i], radii[i], tangent[i]) for i in range(len(p))]
-    stations += [
-        (p[-1] + tangent[-1] * radii[-1] * h, radii[-1] * c, tangent[-1]) for h, c in ((0.8, 0.6), (1.0, 0.05))
+    ends = ((0, -1, ((1.0, 0.05), (0.8, 0.6))), (-1, 1, ((0.8, 0.6), (1.0, 0.05))))
+    caps = [
+        [(p[k] + s * tangent[k] * radii[k] * h, radii[k] * c, tangent[k]) for h, c in steps] for k, s, steps in ends
     ]
+    stations = [*caps[0], *((p[i], radii[i], tangent[i]) for i in range(len(p))), *caps[1]]
     for center, radius, axis in stations:
         across = u - axis * np.dot(u, axis)
         across /= np.linalg.norm(across)
         over = cross_products(axis, across)
-        rings.append(center + radius * (np.cos(angle)[:, None] * across * flat + np.sin(angle)[:, None] * over))
+        rings.append(center + radius * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * over))
     return loft(np.array(rings), part, caps=False)
 
 
@@ -146,8 +142,9 @@ def _quad(a: Array, b: Array, z0: float, z1: float, part: int) -> Mesh:
     return surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), part)
 
 
-def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int, *, count: int = 20) -> Mesh:
+def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int) -> Mesh:
     """Make a wheel with its axle along y."""
+    count = 20
     x, y, z = np.asarray(center, dtype=np.float64)
     angle = -np.arange(count) * 2 * np.pi / count
     rings = []
@@ -158,8 +155,9 @@ def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int, *,
     return loft(np.array(rings), part)
 
 
-def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int, *, count: int = 28) -> Mesh:
+def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int) -> Mesh:
     """Make a thin tire around an axle along y."""
+    count = 28
     c = np.asarray(center, dtype=np.float64)
     angle = -np.arange(count) * 2 * np.pi / count
     out = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], 1)

@@ -12,24 +12,28 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario, Stream, Waypoints
+from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario, Stream, Sweep, Waypoints
 from log2sim.datatypes.color_names import name_of
 from log2sim.errors import ConfigError
 from log2sim.files.documents import check_folder
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import raycast
-from log2sim.synth.actors import Actor, ActorStates, EgoMotion, MovingScene
-from log2sim.synth.render import camera_of, frame_stamps
-from log2sim.synth.scene import Scene, load_scene
+from log2sim.synth.actors import Actor, ActorStates, MovingScene
+from log2sim.synth.backdrop import Backdrop
+from log2sim.synth.ground import Ground, GroundPlan
+from log2sim.synth.light import Lamp, headlights, light_of, street_lights
+from log2sim.synth.paint import GroundReflectance
+from log2sim.synth.render import Body, SceneInstant, bodies_at, camera_of, frame_stamps, render, signals_of
+from log2sim.synth.scene import Scene
 from log2sim.synth.truth import (
+    Caster,
     FrameVisibility,
-    LidarVisibility,
     labels_2d,
     labels_3d,
     map_features_of,
@@ -37,16 +41,6 @@ from log2sim.synth.truth import (
     visibility_by_camera,
     visible_at,
 )
-
-if TYPE_CHECKING:
-    from log2sim.datatypes import Log, Scenario
-    from log2sim.synth.light import Lamp
-    from log2sim.synth.paint import GroundReflectance
-
-__all__ = ["Scene", "load_scene", "synthesize", "write_synthetic"]
-
-
-Caster = Callable[[str, int], raycast.LabeledSweep]
 
 TRUTH_STEP_S = 0.05
 # Sweeps that were cast for the visibility of agents and are read next: memory for some hundred of 64 lines.
@@ -86,12 +80,12 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     visible = None
     if observe:
         frames = visibility_by_camera(moving, cameras, _backdrop(scene, seed))
-        sweeps = {}
+        sweeps = []
         for spec in scene.lidar:
             stamps, count = streams[spec.name].t_ns, len(moving.actors)
             hits = (cast(spec.name, i).hit for i in range(len(stamps)))
             points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(len(stamps), count)
-            sweeps[spec.name] = LidarVisibility(stamps - round(NS_PER_S / spec.rate_hz / 2), points)
+            sweeps.append((stamps - round(NS_PER_S / spec.rate_hz / 2), points))
         t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
         visible = visible_at(t_ns, frames, sweeps, len(moving.actors))
     truth = _truth(moving, t_s, visible, seed)
@@ -115,25 +109,20 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     return log, truth
 
 
-def _read_sweep(cast: Caster, name: str, i: int) -> Any:
+def _read_sweep(cast: Caster, name: str, i: int) -> Sweep:
     return cast(name, i).sweep
 
 
 def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -> dict[str, Stream]:
-    from log2sim.synth.light import light_of
-
     scene, light = moving.scene, light_of(moving.scene.environment)
 
     def read(camera: Camera, index: int, t_ns: NDArray[np.int64], i: int) -> NDArray[np.uint8]:
-        from log2sim.synth.render import Body, SceneInstant, bodies_at, render
-
         map_T_cam = moving.map_T_mount(camera.mount, t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, index, i])
         bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.seen_from(camera.mount)]
         bodies += bodies_at(scene, moving.seconds(t_ns[i]))
         lamps = lamps_on(moving, map_T_cam, int(t_ns[i])) if light.lamps > 0 else ()
-        instant = SceneInstant(_backdrop(scene, seed), bodies, light, lamps)
-        return render(camera, map_T_cam, instant, rng)
+        return render(camera, map_T_cam, SceneInstant(_backdrop(scene, seed), bodies, light, lamps), rng)
 
     out = {}
     for index, spec in enumerate(scene.camera):
@@ -148,11 +137,8 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
 
 def lamps_on(moving: MovingScene, map_T_cam: Array, t_ns: int) -> tuple[Lamp, ...]:
     """List the headlights of all that drives and the street lights around a camera."""
-    from log2sim.synth.light import headlights, street_lights
-
     lamps = list(street_lights(moving.scene.road, map_T_cam[:2, 3]))
-    driving = (*moving.actors, *([] if moving.ego_body is None else [moving.ego_body]))
-    for actor in driving:
+    for actor in moving.seen_from("map"):
         if actor.spec.vehicle and actor.path is not None:
             pose = actor.at(moving.seconds(t_ns)).map_T_agent()[0]
             pose[2, 3] = 0.0
@@ -161,18 +147,12 @@ def lamps_on(moving: MovingScene, map_T_cam: Array, t_ns: int) -> tuple[Lamp, ..
 
 
 @lru_cache(maxsize=2)
-def _backdrop(scene: Scene, seed: int) -> Any:
-    from log2sim.synth.backdrop import Backdrop
-
+def _backdrop(scene: Scene, seed: int) -> Backdrop:
     return Backdrop.of(scene, seed)
 
 
 @lru_cache(maxsize=2)
 def _ground_reflectance(scene: Scene, seed: int) -> GroundReflectance:
-    from log2sim.synth.ground import Ground, GroundPlan
-    from log2sim.synth.light import light_of
-    from log2sim.synth.paint import GroundReflectance
-
     return GroundReflectance(Ground(GroundPlan.of(scene), seed), light_of(scene.environment).wetness)
 
 
@@ -191,7 +171,7 @@ def _caster(moving: MovingScene, seed: int) -> Caster:
     return cast
 
 
-def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> PoseTrack:
+def _measured_poses(ego: Actor, scene: Scene, rng: np.random.Generator) -> PoseTrack:
     """Poses of GNSS and IMU: each coordinate with a first-order Gauss-Markov error."""
     count = int(np.floor(scene.duration_s * scene.gnss.rate_hz + 1e-9)) + 1
     t = np.arange(count) / scene.gnss.rate_hz
@@ -201,7 +181,7 @@ def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> P
     error[0] = rng.normal(0, 1, 6) * sigma
     for k in range(1, count):
         error[k] = keep * error[k - 1] + np.sqrt(1 - keep**2) * rng.normal(0, 1, 6) * sigma
-    exact = ego.map_T_ego(t)
+    exact = ego.map_T_axle(t)
     turn = transform(rotation_from_rpy(error[:, 3], error[:, 4], error[:, 5]), np.zeros((count, 3)))
     poses = exact @ turn
     poses[:, :3, 3] = exact[:, :3, 3] + error[:, :3]
@@ -209,12 +189,11 @@ def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> P
 
 
 def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, seed: int) -> Scenario:
-    from log2sim.synth.render import signals_of
-
-    scene = moving.scene
-    agents = [] if moving.ego_body is None else [_ego_agent(moving.ego_body, t_s)]
+    scene, agents = moving.scene, []
+    if moving.ego is not None:
+        waypoints, offset_m = _waypoints(t_s, moving.ego.at(t_s), None), moving.ego.offset_m
+        agents.append(Agent("ego", "car", moving.ego.spec.box_m, waypoints, rear_axle_offset_m=offset_m))
     for index, actor in enumerate(moving.actors):
-        rgb = list(actor.spec.color)
         agents.append(
             Agent(
                 id=actor.spec.id,
@@ -223,7 +202,7 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
                 waypoints=_waypoints(t_s, actor.at(t_s), None if visible is None else visible[:, index]),
                 static=actor.path is None,
                 rear_axle_offset_m=actor.spec.rear_axle_offset_m,
-                color={"rgb": rgb, "name": name_of(actor.spec.color)},
+                color={"rgb": list(actor.spec.color), "name": name_of(actor.spec.color)},
             )
         )
     origin = scene.origin
@@ -246,13 +225,7 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
     )
 
 
-def _ego_agent(ego: Actor, t_s: Array) -> Agent:
-    waypoints = _waypoints(t_s, ego.at(t_s), None)
-    return Agent("ego", "car", ego.spec.box_m, waypoints, rear_axle_offset_m=ego.offset_m)
-
-
 def _waypoints(t_s: Array, states: ActorStates, visible: NDArray[np.bool_] | None) -> Waypoints:
-    n = len(t_s)
     return Waypoints(
         # Whole nanoseconds and nanometers: exact enough, and the file stays small.
         t_s=np.round(t_s, 9),
@@ -261,8 +234,8 @@ def _waypoints(t_s: Array, states: ActorStates, visible: NDArray[np.bool_] | Non
         z_m=np.round(states.center_m[:, 2], 9),
         yaw_rad=wrap_angle(np.round(states.yaw_rad, 9)),
         speed_mps=np.round(states.speed_mps, 9),
-        observed=np.ones(n, dtype=bool),
-        sigma_xy_m=np.zeros(n),
+        observed=np.ones(len(t_s), dtype=bool),
+        sigma_xy_m=np.zeros(len(t_s)),
         visible=visible,
     )
 

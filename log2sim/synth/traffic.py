@@ -18,78 +18,10 @@ from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_poly
 from log2sim.synth.polytopes import Polytope
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel, ReturnModel, Weather, lidar_model
 from log2sim.synth.scene import Environment
+from log2sim.synth.terrain import Road, Surface
 from log2sim.synth.traffic_shapes import draw_user, own_car
 
 Mount = Literal["vehicle", "roadside"]
-
-
-@dataclass(frozen=True, eq=False)
-class Road:
-    """A road of constant curvature with its reference line in the middle."""
-
-    origin_m: Array  # (2,), m: point of the line at s = 0
-    yaw_rad: float  # direction of the line there
-    curvature_per_m: float
-    half_width_m: float  # half of the carriageway, m
-    lanes: int  # in all
-    keeps_right: bool = True
-    one_way: bool = False
-
-    def at(self, s: float, d: float) -> tuple[Array, float]:
-        """Position (2,) and direction of the line at s along it and d to its left, m."""
-        k, a = self.curvature_per_m, self.yaw_rad
-        turn = a + k * s
-        if abs(k) < 1e-6:
-            along = np.array([np.cos(a), np.sin(a)]) * s
-        else:
-            along = np.array([np.sin(turn) - np.sin(a), np.cos(a) - np.cos(turn)]) / k
-        return self.origin_m + along + d * np.array([-np.sin(turn), np.cos(turn)]), float(turn)
-
-    def offset(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Distance (N,) to the left of the line, m."""
-        k = self.curvature_per_m
-        normal = np.array([-np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
-        dx, dy = x - np.float32(self.origin_m[0]), y - np.float32(self.origin_m[1])
-        if abs(k) < 1e-6:
-            return np.asarray(dx * np.float32(normal[0]) + dy * np.float32(normal[1]))
-        center = normal / k
-        radius = np.hypot(dx - np.float32(center[0]), dy - np.float32(center[1]))
-        return np.asarray((np.float32(abs(1 / k)) - radius) * np.float32(np.sign(k)))
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Ground: a tilted and bent plane with waves, and kerbs beside the roads."""
-
-    coefficients: Array  # (5,): of x, y, x^2, x y, y^2
-    waves: Array  # (K, 4): amplitude in m, wave numbers along x and y in rad/m, phase
-    roads: tuple[Road, ...]
-    kerb_m: float  # height of the ground beside the roads
-
-    def height(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return heights (N,) without kerbs, m."""
-        a, b, c, d, e = self.coefficients.astype(np.float32)
-        return np.asarray(x * (a + c * x + d * y) + y * (b + e * y))
-
-    def elevation(self, position: Array) -> float:
-        """Return the height with waves and kerbs at one position (2,) or (3,), m."""
-        x, y = position[:1].astype(np.float32), position[1:2].astype(np.float32)
-        return float(self.height(x, y)[0] + self.relief(x, y)[0])
-
-    def slope(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return derivatives (N,), (N,) of the height."""
-        a, b, c, d, e = self.coefficients.astype(np.float32)
-        return np.asarray(a + 2 * c * x + d * y), np.asarray(b + 2 * e * y + d * x)
-
-    def relief(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return waves and kerbs (N,), m."""
-        beside = np.ones(len(x), bool)
-        for road in self.roads:
-            beside &= np.abs(road.offset(x, y)) > road.half_width_m
-        out = np.float32(self.kerb_m) * beside.astype(np.float32)
-        for amplitude, kx, ky, phase in self.waves.astype(np.float32):
-            out += amplitude * np.sin(kx * x + ky * y + phase)
-        return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +72,11 @@ class TrafficScene:
 
     def cast(self, rng: np.random.Generator) -> Returns:
         """Cast the sweep whose middle is at time 0."""
-        solids = [
-            Solid(
-                o.parts,
-                o.position_m,
-                o.yaw_rad,
-                o.speed_mps * np.array([np.cos(o.yaw_rad), np.sin(o.yaw_rad)]),
-                glass_passes=float(rng.uniform(0.3, 0.9)),
-            )
-            for o in self.objects
-        ]
+        solids = []
+        for o in self.objects:
+            velocity = o.speed_mps * np.array([np.cos(o.yaw_rad), np.sin(o.yaw_rad)])
+            passes = float(rng.uniform(0.3, 0.9))
+            solids.append(Solid(o.parts, o.position_m, o.yaw_rad, velocity, glass_passes=passes))
         one = cast_polytopes(self.lidar, self.sensor, solids, self.surface, rng, self.returns)
         if self.second is None:
             return one
@@ -319,15 +246,12 @@ def _traffic(out: _Layout, road: Road) -> None:
                 if rng.random() < 0.07:
                     yaw += rng.uniform(-0.7, 0.7)
                 category = str(rng.choice(kinds, p=shares / shares.sum()))
-                standing = rng.random() < 0.15
-                placed = out.add_user(
-                    category, xy, yaw, speed=0.0 if standing else speed, turn=0.0 if standing else turn
-                )
+                moves = rng.random() >= 0.15
+                placed = out.add_user(category, xy, yaw, speed=speed * moves, turn=turn * moves)
                 if placed and category == "car" and rng.random() < 0.04:
-                    back = (out.objects[-1].size_m[0] / 2 + rng.uniform(2.5, 4.5)) * np.array(
-                        [np.cos(yaw), np.sin(yaw)]
-                    )
-                    out.add_user("other", xy - back, yaw, speed=0.0 if standing else speed, margin=0.0, kinds="trailer")
+                    heading = np.array([np.cos(yaw), np.sin(yaw)])
+                    back = (out.objects[-1].size_m[0] / 2 + rng.uniform(2.5, 4.5)) * heading
+                    out.add_user("other", xy - back, yaw, speed=speed * moves, margin=0.0, kinds="trailer")
             s += rng.uniform(5.5, 8) if queue else rng.uniform(6, 20)
 
 
@@ -389,9 +313,8 @@ def _people(out: _Layout, road: Road) -> None:
         heading = direction + rng.choice([0.0, np.pi / 2]) + np.pi * rng.integers(2)
         step = rng.uniform(0.6, 1.2) * np.array([np.cos(heading), np.sin(heading)])
         for k in range(rng.integers(3, 10)):
-            out.add_user(
-                "pedestrian", start + k * step + rng.normal(0, 0.1, 2), heading + rng.normal(0, 0.3), margin=0.0
-            )
+            place, turned = start + k * step + rng.normal(0, 0.1, 2), heading + rng.normal(0, 0.3)
+            out.add_user("pedestrian", place, turned, margin=0.0)
     for _ in range(rng.poisson(rng.choice([1, 4, 8]))):
         xy, direction = road.at(rng.uniform(-40, 40), rng.choice([-1, 1]) * (half + rng.uniform(-2.5, 2.5)))
         yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
@@ -416,9 +339,8 @@ def _market(out: _Layout, road: Road) -> None:
         d, s = side * (road.half_width_m + rng.uniform(-1.5, 2.5)), start
         while s < start + rng.uniform(10, 40):
             xy, direction = road.at(s, d + rng.normal(0, 0.15))
-            kind = out.one_of(
-                {"table": 0.8, "parasol": 0.2} if cafe else {"stall": 0.8, "crates": 0.13, "clothes rail": 0.07}
-            )
+            stands = {"table": 0.8, "parasol": 0.2} if cafe else {"stall": 0.8, "crates": 0.13, "clothes rail": 0.07}
+            kind = out.one_of(stands)
             out.add_small(kind, xy, direction + np.pi * rng.integers(2) + rng.normal(0, 0.1), 0.6)
             for _ in range(rng.poisson(crowd)):
                 away, angle = rng.uniform(0.7, 2.5), rng.uniform(-np.pi, np.pi)
@@ -491,9 +413,8 @@ def draw_scene(
     steep = rng.random() < 0.4
     tilt = rng.normal(0, 0.03 if steep else 0.008, 2)
     bend = rng.normal(0, 4e-4 if steep else 5e-5, 3)
-    waves = np.column_stack(
-        [rng.uniform(0, 0.025, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.uniform(0, 2 * np.pi, 3)]
-    )
+    amplitude, kx, ky = rng.uniform(0, 0.025, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3)
+    waves = np.column_stack([amplitude, kx, ky, rng.uniform(0, 2 * np.pi, 3)])
     kerb = float(rng.choice([0.0, rng.uniform(0.02, 0.2), rng.normal(0, 0.2)], p=[0.3, 0.6, 0.1]))
     surface = Surface(np.append(tilt, bend), waves, roads, kerb)
     model = lidar or _draw_lidar(mount, rng)
@@ -504,15 +425,10 @@ def draw_scene(
         speed = float(np.hypot(*sensor.velocity_mps))
         objects.append(TrafficObject("", np.zeros(3), sensor_forward, (4.4, 1.8, 1.5), parts, speed, kind="own car"))
     weather = weather or _draw_weather(rng)
-    returns = ReturnModel(
-        noise_m=model.noise_m if lidar else float(rng.uniform(0.008, 0.03)),
-        dropout=float(rng.uniform(0.0, 0.12)),
-        mixed=float(rng.uniform(0, 0.006)),
-        weather=weather,
-    )
-    second = (
-        _draw_second(sensor, sensor_forward, rng) if mount == "vehicle" and not lidar and rng.random() < 0.2 else None
-    )
+    noise = model.noise_m if lidar else float(rng.uniform(0.008, 0.03))
+    returns = ReturnModel(noise, float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 0.006)), weather)
+    two = mount == "vehicle" and not lidar and rng.random() < 0.2
+    second = _draw_second(sensor, sensor_forward, rng) if two else None
     return TrafficScene(mount, roads, surface, tuple(objects), model, sensor, returns, second)
 
 
@@ -556,17 +472,12 @@ def _draw_lidar(mount: Mount, rng: np.random.Generator) -> LidarModel:
         return model.model_copy(update={"range_m": float(rng.choice([80.0, 120.0, 150.0]))})
     if rng.random() < SPARSE_SHARE:
         # Any other spinning or solid-state sensor, of few lines or at a high rate.
-        lines, view = (
-            int(rng.choice([16, 24, 32, 40, 64])),
-            float(rng.choice([180.0, rng.uniform(50, 140)], p=[0.75, 0.25])),
-        )
+        lines = int(rng.choice([16, 24, 32, 40, 64]))
+        view = float(rng.choice([180.0, rng.uniform(50, 140)], p=[0.75, 0.25]))
         elevation = np.linspace(rng.uniform(-30, -12), rng.uniform(2, 15), lines)
-        return LidarModel(
-            elevation_deg=tuple(elevation.tolist()),
-            azimuth_deg=(-view, view),
-            azimuth_step_deg=float(rng.uniform(0.2, 0.7)),
-            range_m=float(rng.uniform(60, 150)),
-        )
+        step, reach = float(rng.uniform(0.2, 0.7)), float(rng.uniform(60, 150))
+        field = {"elevation_deg": tuple(elevation.tolist()), "azimuth_deg": (-view, view), "azimuth_step_deg": step}
+        return LidarModel.model_validate({**field, "range_m": reach})
     model = LIDAR_MODELS[str(rng.choice(VEHICLE_LIDARS, p=VEHICLE_LIDAR_SHARES))]
     elevation = np.array(model.elevation_deg) + rng.normal(0, 0.15)
     if rng.random() < 0.08:
@@ -583,17 +494,14 @@ def _draw_sensor(
         roll, velocity = np.deg2rad(rng.normal(0, 0.6)), np.zeros(2)
     else:
         # On cars, on robots and carts, on trucks.
-        height = float(
-            rng.choice([rng.uniform(1.55, 2.3), rng.uniform(0.7, 1.5), rng.uniform(2.3, 3.2)], p=[0.86, 0.07, 0.07])
-        )
+        heights = [rng.uniform(1.55, 2.3), rng.uniform(0.7, 1.5), rng.uniform(2.3, 3.2)]
+        height = float(rng.choice(heights, p=[0.86, 0.07, 0.07]))
         sx, sy = surface.slope(np.zeros(1, np.float32), np.zeros(1, np.float32))
         uphill = float(sx[0] * np.cos(forward) + sy[0] * np.sin(forward))
         leftward = float(-sx[0] * np.sin(forward) + sy[0] * np.cos(forward))
         # The car stands on the slope, so its sensor leans with it.
-        pitch, roll = (
-            -np.arctan(uphill) + np.deg2rad(rng.normal(0, 0.5)),
-            np.arctan(leftward) + np.deg2rad(rng.normal(0, 0.5)),
-        )
+        pitch = -np.arctan(uphill) + np.deg2rad(rng.normal(0, 0.5))
+        roll = np.arctan(leftward) + np.deg2rad(rng.normal(0, 0.5))
         speed = float(rng.choice([0.0, rng.uniform(0, 16), rng.uniform(16, 32)], p=[0.3, 0.55, 0.15]))
         velocity = speed * np.array([np.cos(forward), np.sin(forward)])
     rotation = rotation_from_rpy(roll, pitch, forward)
@@ -694,11 +602,6 @@ def draw_environment(rng: np.random.Generator, light: str | None, weather: str |
     drawn_light = str(rng.choice(lights, p=list(LIGHT_SHARES.values())))
     drawn_weather = str(rng.choice(weathers, p=list(WEATHER_SHARES.values())))
     visibility, rain = rng.uniform(*VISIBILITY_M), rng.uniform(*RAIN_MM_H)
-    return Environment.model_validate(
-        {
-            "light": light or drawn_light,
-            "weather": weather or drawn_weather,
-            "visibility_m": round(float(visibility), 1),
-            "rain_mm_h": round(float(rain), 1),
-        }
-    )
+    drawn = {"light": light or drawn_light, "weather": weather or drawn_weather}
+    amounts = {"visibility_m": round(float(visibility), 1), "rain_mm_h": round(float(rain), 1)}
+    return Environment.model_validate({**drawn, **amounts})

@@ -55,27 +55,6 @@ PNG_COMPRESSION = 1
 LIDAR_FROM_IMU_M, IMU_HEIGHT_M = (0.81, -0.32), 0.93
 
 
-@dataclass(frozen=True, eq=False)
-class KittiFrame:
-    """One frame."""
-
-    image: NDArray[np.uint8]  # (H, W, 3): BGR
-    points: NDArray[np.float32]  # (N, 4): x, y, z in m in the LiDAR's frame and intensity in [0, 1]
-    calibration: str  # contents of the text files
-    labels: str  # contents of the text files
-
-    def write(self, folder: Path, index: int) -> None:
-        """Write the four files of a frame below a folder such as `training`."""
-        paths = {name: folder / name / f"{index:06d}{suffix}" for name, suffix in FOLDERS.items()}
-        for path in paths.values():
-            path.parent.mkdir(parents=True, exist_ok=True)
-        encoded = cv2.imencode(".png", self.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])[1]
-        paths["image_2"].write_bytes(encoded.tobytes())
-        paths["velodyne"].write_bytes(self.points.astype("<f4").tobytes())
-        paths["calib"].write_text(self.calibration, encoding="ascii")
-        paths["label_2"].write_text(self.labels, encoding="ascii")
-
-
 def calibration_text(rig: Rig) -> str:
     """Write a calibration file: P0 to P3, R0_rect, Tr_velo_to_cam, Tr_imu_to_velo."""
     cam_R_level = (inverse(rig.map_T_cam)[:3, :3] @ rig.map_T_level[:3, :3]).round(12) + 0.0
@@ -142,9 +121,8 @@ def truncation(item: TrafficObject, rig: Rig) -> float:
     map_T_item = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), item.position_m)
     points = apply(inverse(rig.map_T_cam) @ map_T_item, grid)
     ahead = points[:, 2] > 0.1
-    uv: Array = (
-        points[:, :2] / np.where(ahead, points[:, 2], 1.0)[:, None] * np.diag(rig.camera.K)[:2] + rig.camera.K[:2, 2]
-    )
+    depth = np.where(ahead, points[:, 2], 1.0)[:, None]
+    uv = points[:, :2] / depth * np.diag(rig.camera.K)[:2] + rig.camera.K[:2, 2]
     inside = ahead & np.all((uv >= -0.5) & (uv < [rig.camera.width_px - 0.5, rig.camera.height_px - 0.5]), axis=1)
     return float(1 - inside.mean())
 
@@ -359,19 +337,20 @@ class _Film:
 
     def labels(self, t_s: Array) -> Labels:
         """Boxes of all road users in space at times (F,)."""
-        rows: list[tuple[int, int, str, Array, tuple[float, float, float], float]] = []
-        for t, stamp in zip(t_s, stamps_of(t_s)):
-            for k, item in enumerate(self._run.at(float(t)).objects):
-                if item.category:
-                    center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
-                    rows.append((int(stamp), k, item.category, center, item.size_m, item.yaw_rad))
+        rows = [
+            (stamp, f"user_{k}", o.category, o.position_m + np.array([0.0, 0.0, o.size_m[2] / 2]), o.size_m, o.yaw_rad)
+            for t, stamp in zip(t_s, stamps_of(t_s))
+            for k, o in enumerate(self._run.at(float(t)).objects)
+            if o.category
+        ]
+        stamps, names, categories, centers, sizes, yaws = zip(*rows) if rows else ((),) * 6
         return Labels(
-            t_ns=np.array([r[0] for r in rows], np.int64),
-            track_id=np.array([f"user_{r[1]}" for r in rows], dtype="<U16"),
-            category=np.array([r[2] for r in rows], dtype="<U16"),
-            center_m=np.array([r[3] for r in rows]).reshape(-1, 3),
-            size_m=np.array([r[4] for r in rows]).reshape(-1, 3),
-            yaw_rad=np.array([r[5] for r in rows]),
+            t_ns=np.array(stamps, np.int64),
+            track_id=np.array(names, dtype="<U16"),
+            category=np.array(categories, dtype="<U16"),
+            center_m=np.array(centers, dtype=np.float64).reshape(-1, 3),
+            size_m=np.array(sizes, dtype=np.float64).reshape(-1, 3),
+            yaw_rad=np.array(yaws, dtype=np.float64),
         )
 
     def image_labels(self, t_s: Array) -> ImageLabels:
@@ -382,9 +361,9 @@ class _Film:
             for k, part in zip(seen, segment(self._camera, map_T_cam, instant)):
                 if part is not None and scene.objects[k].category and _is_clear(part):
                     flat.append((int(stamp), part.box_px, scene.objects[k].category))
-        boxes = np.array([f[1] for f in flat]).reshape(-1, 4)
-        categories = np.array([f[2] for f in flat], dtype="<U16")
-        return ImageLabels(np.array([f[0] for f in flat], np.int64), boxes, categories)
+        stamps, boxes, categories = zip(*flat) if flat else ((),) * 3
+        shown = np.array(boxes, dtype=np.float64).reshape(-1, 4)
+        return ImageLabels(np.array(stamps, np.int64), shown, np.array(categories, dtype="<U16"))
 
 
 def _is_clear(part: Visibility) -> bool:
@@ -432,18 +411,13 @@ def write_traffic(
             scene, environment = draw_traffic(settings, index)
             seed = int(np.random.default_rng([settings.seed, index, 2]).integers(2**31))
             if settings.layout == "kitti":
-                frame_of(scene, environment, seed).write(folder / "training", index)
+                write_frame(folder / "training", index, scene, environment, seed)
             else:
                 _write_log(settings, scene, environment, folder / f"scene_{index:06d}", seed)
             users = [o.category for o in scene.objects if o.category]
-            scenes.append(
-                {
-                    "name": f"{index:06d}",
-                    "environment": environment.model_dump(),
-                    "lidar": scene.lidar.name,
-                    "road_users": {category: users.count(category) for category in sorted(set(users))},
-                }
-            )
+            counts = {category: users.count(category) for category in sorted(set(users))}
+            about = {"environment": environment.model_dump(), "lidar": scene.lidar.name, "road_users": counts}
+            scenes.append({"name": f"{index:06d}", **about})
             if progress is not None:
                 progress(index + 1, settings.scenes)
         if settings.layout == "kitti":
@@ -467,20 +441,23 @@ def draw_traffic(settings: TrafficSettings, index: int) -> tuple[TrafficScene, E
     return draw_scene(settings.mount, rng, lidar=lidar, weather=weather_of(environment)), environment
 
 
-def frame_of(scene: TrafficScene, environment: Environment, seed: int) -> KittiFrame:
-    """Take picture, cloud and labels of a scene at time 0."""
+def write_frame(folder: Path, index: int, scene: TrafficScene, environment: Environment, seed: int) -> None:
+    """Write picture, cloud, calibration and labels of a scene at time 0 below a folder such as `training`."""
     rig = rig_of(scene)
     painter = TrafficPainter(scene, seed)
     instant, seen = painter.instant(scene, light_of(environment), rig.camera, rig.map_T_cam)
     image = render(rig.camera, rig.map_T_cam, instant, np.random.default_rng([seed, 2]))
     parts = segment(rig.camera, rig.map_T_cam, instant)
     returns = scene.cast(np.random.default_rng([seed, 4]))
-    lidar_T_map = rig.map_T_lidar[:3, :3].T
-    points: Array = (returns.xyz_m - rig.map_T_lidar[:3, 3]) @ lidar_T_map.T
+    points: Array = (returns.xyz_m - rig.map_T_lidar[:3, 3]) @ rig.map_T_lidar[:3, :3]
+    cloud = np.column_stack([points, returns.intensity]).astype("<f4")
+    encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])[1]
     labels = label_text([scene.objects[k] for k in seen], parts, rig)
-    return KittiFrame(
-        image, np.column_stack([points, returns.intensity]).astype(np.float32), calibration_text(rig), labels
-    )
+    contents = (encoded.tobytes(), cloud.tobytes(), calibration_text(rig).encode("ascii"), labels.encode("ascii"))
+    for (name, suffix), data in zip(FOLDERS.items(), contents, strict=True):
+        path = folder / name / f"{index:06d}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
 
 
 def _write_log(

@@ -15,7 +15,7 @@ from log2sim.synth.polytopes import Material, Polytope, Shape, box, column, elli
 
 Rng = np.random.Generator
 Kinds = dict[str, tuple[float, Callable[[Rng], Shape]]]
-CLOTH, METAL, DARK = Material.CLOTH, Material.METAL, Material.DARK
+GROUND, PAINT, GLASS, DARK, CLOTH, WALL, LEAVES, METAL, MESH, WOOD = Material
 
 
 def _torso(
@@ -135,10 +135,10 @@ def seated(rng: Rng) -> Shape:
     ]
     things = []
     if seat > 0.3 and rng.random() < 0.7:
-        things = [box((-0.36, -0.24, seat - 0.06), (0.12, 0.24, seat), Material.WOOD)]
+        things = [box((-0.36, -0.24, seat - 0.06), (0.12, 0.24, seat), WOOD)]
         things += [box((x, y - 0.02, 0), (x + 0.04, y + 0.02, seat), METAL) for x in (-0.34, 0.08) for y in (-0.2, 0.2)]
         if rng.random() < 0.7:
-            things.append(box((-0.38, -0.23, seat), (-0.33, 0.23, seat + rng.uniform(0.35, 0.5)), Material.WOOD))
+            things.append(box((-0.38, -0.23, seat), (-0.33, 0.23, seat + rng.uniform(0.35, 0.5)), WOOD))
     return _person(parts, things)
 
 
@@ -157,7 +157,7 @@ def laden(rng: Rng) -> Shape:
         parts += [box((-0.17, y - 0.08, 0.15), (0.17, y + 0.08, 0.6), CLOTH) for y in sides]
     else:
         parts.append(
-            box((0.12, -0.25, hips + 0.05), (rng.uniform(0.4, 0.6), 0.25, hips + rng.uniform(0.25, 0.5)), Material.WOOD)
+            box((0.12, -0.25, hips + 0.05), (rng.uniform(0.4, 0.6), 0.25, hips + rng.uniform(0.25, 0.5)), WOOD)
         )
     return _person(parts)
 
@@ -179,7 +179,7 @@ def cart(rng: Rng) -> Shape:
     height, start = _height(rng), rng.uniform(0.4, 0.6)
     end, w, low = start + rng.uniform(0.6, 1.5), rng.uniform(0.24, 0.45), rng.uniform(0.2, 0.5)
     top = low + rng.uniform(0.3, 1.0)
-    mesh = Material.MESH if rng.random() < 0.4 else Material.WOOD
+    mesh = MESH if rng.random() < 0.4 else WOOD
     things = [box((start, -w, low), (end, w, top), mesh), box((start - 0.1, -w, 0.9), (start, w, 0.96), METAL)]
     things += _wheels([(x, y) for x in (start + 0.15, end - 0.15) for y in (-w, w)], rng.uniform(0.07, low * 0.8))
     return _person(_upright(rng, height, reach=start, lean=rng.uniform(0.05, 0.3)), things)
@@ -255,7 +255,7 @@ def _bicycle(rng: Rng, length: float, radius: float) -> list[Polytope]:
             box((-reach - 0.2, -0.17, radius * 2), (-reach + 0.2, 0.17, radius * 2 + rng.uniform(0.05, 0.35)), CLOTH)
         )
     if rng.random() < 0.25:
-        parts.append(box((reach * 0.75, -0.2, seat - 0.1), (reach * 0.75 + 0.3, 0.2, seat + 0.15), Material.MESH))
+        parts.append(box((reach * 0.75, -0.2, seat - 0.1), (reach * 0.75 + 0.3, 0.2, seat + 0.15), MESH))
     return parts
 
 
@@ -320,7 +320,7 @@ def cargo_cyclist(rng: Rng) -> Shape:
         wheel(radius, 0.05, -reach, 0.0),
         *(wheel(0.25, 0.05, reach, y) for y in ((-w, w) if rng.random() < 0.5 else (0.0,))),
     ]
-    parts.append(box((0.0, -w, 0.25), (reach, w, rng.uniform(0.7, 1.1)), Material.WOOD))
+    parts.append(box((0.0, -w, 0.25), (reach, w, rng.uniform(0.7, 1.1)), WOOD))
     parts.append(box((-reach, -0.03, 0.35), (0.0, 0.03, 0.5), METAL))
     return _ridden(length, 2 * w, parts)
 
@@ -348,18 +348,18 @@ def _motorcycle(rng: Rng, *, scooter: bool) -> tuple[float, float, list[Polytope
     ]
     if scooter:
         parts += [
-            box((-reach, -0.18, 0.25), (-0.05, 0.18, seat - 0.05), Material.PAINT),
+            box((-reach, -0.18, 0.25), (-0.05, 0.18, seat - 0.05), PAINT),
             box((-0.1, -0.16, 0.18), (reach * 0.6, 0.16, 0.26), DARK),
             prism(
                 [(reach * 0.55, 0.2), (reach * 0.85, 0.35), (reach * 0.7, seat + 0.2), (reach * 0.55, seat + 0.2)],
                 0.4,
-                Material.PAINT,
+                PAINT,
             ),
         ]
     else:
         parts += [
             box((-reach, -0.15, 0.3), (reach * 0.6, 0.15, seat - 0.05), DARK),
-            box((0.1, -0.16, seat - 0.15), (reach * 0.6, 0.16, seat + 0.15), Material.PAINT),
+            box((0.1, -0.16, seat - 0.15), (reach * 0.6, 0.16, seat + 0.15), PAINT),
         ]
     if rng.random() < 0.4:
         parts.append(
@@ -371,7 +371,7 @@ def _motorcycle(rng: Rng, *, scooter: bool) -> tuple[float, float, list[Polytope
                     (reach * 0.55, seat + 0.5),
                 ],
                 0.35,
-                Material.GLASS,
+                GLASS,
             )
         )
     return length, seat, parts
@@ -384,9 +384,7 @@ def motorcyclist(rng: Rng, *, scooter: bool = False, pillion: bool = False, boxe
     if pillion:
         parts += [shifted(p, -0.38, 0.0) for p in _rider(rng, rng.normal(1.68, 0.1), seat + 0.05, 0.05, 0.3)]
     if boxed:
-        parts.append(
-            box((-length / 2 - 0.1, -0.25, seat + 0.05), (-length / 2 + 0.4, 0.25, seat + 0.55), Material.PAINT)
-        )
+        parts.append(box((-length / 2 - 0.1, -0.25, seat + 0.05), (-length / 2 + 0.4, 0.25, seat + 0.55), PAINT))
     return _ridden(length, 0.75, parts)
 
 

@@ -18,7 +18,8 @@ from log2sim.synth.polytopes import Material, meshes_of
 from log2sim.synth.render import Body, Painter, SceneInstant, Values
 from log2sim.synth.scene import Road as PaintedRoad
 from log2sim.synth.shapes import Mesh
-from log2sim.synth.traffic import Road, TrafficObject, TrafficScene
+from log2sim.synth.terrain import Road
+from log2sim.synth.traffic import TrafficObject, TrafficScene
 
 Rgb = tuple[int, int, int]
 

@@ -16,6 +16,7 @@ from log2sim.datatypes import ImageLabels, Labels, MapFeatures, MapLane, Marking
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, project, rotation_from_rpy, transform
 from log2sim.synth import raycast
 from log2sim.synth.actors import Actor, MovingScene
+from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.ground import (
     GroundPlan,
     RoadLine,
@@ -26,8 +27,7 @@ from log2sim.synth.ground import (
     road_lines,
     stretch,
 )
-from log2sim.synth.raycast import sweep_stamps
-from log2sim.synth.render import frame_stamps
+from log2sim.synth.render import Body, SceneInstant, frame_stamps, segment
 from log2sim.synth.scene import Road, Scene, Zebra
 
 CELL_M = 1.0
@@ -145,9 +145,8 @@ def map_features_of(scene: Scene) -> MapFeatures:
         lanes += _lanes(road, k, plan.keeps_right, tuple(zip(lines, own)), sides, crossed)
     markings += [_crosswalk(zebra, k) for k, zebra in enumerate(plan.zebras)]
     for k, stop in enumerate(plan.stop_lines):
-        markings.append(
-            Marking(f"stop_line_{k}", "stop_line", _on_ground(np.array(stop.line)), stop.width_m, stop.color)
-        )
+        line = _on_ground(np.array(stop.line))
+        markings.append(Marking(f"stop_line_{k}", "stop_line", line, stop.width_m, stop.color))
     for k, arrow in enumerate(plan.arrows):
         outline = arrow_outline(arrow)
         turn = np.deg2rad(arrow.yaw_deg)
@@ -259,23 +258,15 @@ def _lanes(
         for n, ((begin, end), inside) in enumerate(pieces):
             points = stretch(middle, begin, end)
             ends = names[max(n - 1, 0) : n], names[n + 1 : n + 2]
-            right, left = (
-                (None, None) if inside else (_beside(points, sides[lane][1]), _beside(points, sides[lane + 1][0]))
-            )
+            right, left = (None, None) if inside else [_beside(points, s) for s in (sides[lane][1], sides[lane + 1][0])]
             if not forward[lane]:
                 points, ends, right, left = points[::-1], ends[::-1], left, right
-            parts[-1].append(
-                MapLane(
-                    id=names[n],
-                    points_m=_on_ground(points),
-                    width_m=np.full(len(points), float(np.diff(at)[lane])),
-                    left=left,
-                    right=right,
-                    predecessors=tuple(ends[0]),
-                    successors=tuple(ends[1]),
-                    junction=f"junction_{number}_{n}" if inside else None,
-                )
+            width, junction = (
+                np.full(len(points), float(np.diff(at)[lane])),
+                f"junction_{number}_{n}" if inside else None,
             )
+            links: dict[str, Any] = {"predecessors": tuple(ends[0]), "successors": tuple(ends[1]), "junction": junction}
+            parts[-1].append(MapLane(names[n], _on_ground(points), width, left=left, right=right, **links))
     out = []
     for lane, own_parts in enumerate(parts):
         for n, piece in enumerate(own_parts):
@@ -330,11 +321,9 @@ class FrameVisibility:
 
 
 def visibility_by_camera(
-    moving: MovingScene, cameras: Mapping[str, Camera], backdrop: Any
+    moving: MovingScene, cameras: Mapping[str, Camera], backdrop: Backdrop
 ) -> dict[str, list[FrameVisibility]]:
     """Segment every frame of every camera."""
-    from log2sim.synth.render import Body, SceneInstant, segment
-
     out: dict[str, list[FrameVisibility]] = {}
     for spec in moving.scene.camera:
         camera = cameras[spec.name]
@@ -363,23 +352,15 @@ def _box_inside(camera: Camera, cam_T_map: Array, actor: Actor, t_s: float) -> f
     return float(inside.prod() / (high - low).prod())
 
 
-@dataclass(frozen=True, eq=False)
-class LidarVisibility:
-    """Points of one LiDAR on the actors."""
-
-    t_ns: NDArray[np.int64]  # (F,): middles of the sweeps
-    points: NDArray[np.intp]  # (F, A): points on each actor
-
-
 def visible_at(
     t_ns: NDArray[np.int64],
     frames: Mapping[str, Sequence[FrameVisibility]],
-    sweeps: Mapping[str, LidarVisibility],
+    sweeps: Sequence[tuple[NDArray[np.int64], NDArray[np.intp]]],
     count: int,
 ) -> NDArray[np.bool_]:
     """Decide which of `count` actors are visible: mask (T, A) at stamps (T,).
 
-    An actor is visible when the frame of one camera and the sweep of one LiDAR nearest in time both show it well. Without
+    `sweeps`: of each LiDAR the middles of its sweeps (F,) and its points on each actor (F, A). An actor is visible when the frame of one camera and the sweep of one LiDAR nearest in time both show it well. Without
     cameras, or without LiDARs, the others decide.
     """
     by_camera = np.full((len(t_ns), count), not frames)
@@ -388,9 +369,9 @@ def visible_at(
             shown = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in parts])
             by_camera |= shown[_nearest(np.array([f.t_ns for f in parts]), t_ns)]
     by_lidar = np.full_like(by_camera, not sweeps)
-    for sweep in sweeps.values():
-        if len(sweep.t_ns):
-            by_lidar |= (sweep.points >= MIN_LIDAR_POINTS)[_nearest(sweep.t_ns, t_ns)]
+    for stamps, points in sweeps:
+        if len(stamps):
+            by_lidar |= (points >= MIN_LIDAR_POINTS)[_nearest(stamps, t_ns)]
     return np.asarray(by_camera & by_lidar)
 
 
@@ -429,7 +410,7 @@ def labels_3d(
     if scene.camera:
         t_ns = np.array([f.t_ns for f in frames_by_camera[scene.camera[0].name]], dtype=np.int64)
     else:
-        t_ns = sweep_stamps(scene.lidar[0], scene)
+        t_ns = raycast.sweep_stamps(scene.lidar[0], scene)
     t_s = (t_ns - scene.start_ns) / NS_PER_S
     states = [a.at(t_s) for a in actors]
     return Labels(

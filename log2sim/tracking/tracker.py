@@ -33,7 +33,8 @@ def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.b
     for one in tracks:
         m = one.measurements
         by_camera = [recorded[name] for name in {str(c) for c in m.camera} - {SWEEPS} if name in recorded]
-        by_any = by_camera + [recorded[SWEEPS]] * bool(SWEEPS in recorded and np.isfinite(m.box_yaw_rad).any())
+        in_sweeps = SWEEPS in recorded and np.isfinite(m.box_yaw_rad).any()
+        by_any = [*by_camera, recorded[SWEEPS]] if in_sweeps else by_camera
         unrecorded = np.flatnonzero(~np.any(by_any, axis=0)) if by_any else np.zeros(0, dtype=np.int64)
         searched = float(np.any(by_camera, axis=0)[one.tick].mean()) if by_camera else 1.0
         marked.append(replace(one, unrecorded=unrecorded, searched=searched))

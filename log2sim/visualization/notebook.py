@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -14,13 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EGO, Agent, Labels, Log, Scenario, Tick, Waypoints
+from log2sim.datatypes import EGO, Agent, AgentTable, Labels, Log, Scenario, Tick, Waypoints
 from log2sim.files.documents import refuse_existing, replaced
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.records import RecordSource
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.result import AgentReplay, Replay
@@ -28,7 +26,7 @@ from log2sim.visualization.overlay import draw_moment, read_moment
 from log2sim.visualization.plot.drawing import draw_collisions
 from log2sim.visualization.plot.layers import new_collisions
 from log2sim.visualization.plot.scene import plot
-from log2sim.visualization.plot.style import PAPER
+from log2sim.visualization.plot.style import new_figure, png_bytes
 
 WIDTH_IN, HEIGHT_IN, DPI = 5.2, 3.6, 100
 MAX_CAMERAS = 6
@@ -65,29 +63,23 @@ def thumbnails_of_log(log: Log) -> list[Thumbnail]:
     return found
 
 
-def thumbnail_of_scenario(scenario: Scenario) -> list[Thumbnail]:
-    """Draw the tracks from above."""
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), facecolor=PAPER)
-    FigureCanvasAgg(figure)
+def thumbnail_of_scenario(scenario: Scenario, collisions_m: Array | None = None) -> list[Thumbnail]:
+    """Draw the tracks from above, and collisions at places (K, 2)."""
+    figure = new_figure(WIDTH_IN, HEIGHT_IN)
     ax = figure.add_axes((0.005, 0.005, 0.99, 0.99))
     plot(scenario, ax)
+    if collisions_m is not None:
+        draw_collisions(ax, collisions_m)
     ax.set(xlabel="", ylabel="")
     ax.tick_params(length=0, labelbottom=False, labelleft=False)
-    return [_png(figure)]
+    return [Thumbnail("image/png", png_bytes(figure, DPI))]
 
 
 def thumbnail_of_replay(replay: Replay) -> list[Thumbnail]:
     """Draw the paths that were driven from above, with the collisions of the replay."""
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), facecolor=PAPER)
-    FigureCanvasAgg(figure)
-    ax = figure.add_axes((0.005, 0.005, 0.99, 0.99))
     agents = tuple(_as_agent(a) for a in replay.agents if len(a))
     end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
-    plot(Scenario(replay.scenario, 0, end_s, agents), ax)
-    draw_collisions(ax, new_collisions(replay)[1])
-    ax.set(xlabel="", ylabel="")
-    ax.tick_params(length=0, labelbottom=False, labelleft=False)
-    return [_png(figure)]
+    return thumbnail_of_scenario(Scenario(replay.scenario, 0, end_s, agents), new_collisions(replay)[1])
 
 
 def _as_agent(driven: AgentReplay) -> Agent:
@@ -106,12 +98,6 @@ def _middle_record(log: Log, name: str) -> Any:
 def _jpeg(image: NDArray[np.uint8], caption: str) -> Thumbnail:
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return Thumbnail("image/jpeg", data.tobytes(), caption)
-
-
-def _png(figure: Figure) -> Thumbnail:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
-    return Thumbnail("image/png", data.getvalue())
 
 
 MAX_TEXT = 200  # letters of a name or a note that are shown
@@ -229,9 +215,7 @@ class Picture:
 
     def _repr_png_(self) -> bytes:
         """Return the picture as a notebook shows it."""
-        data = io.BytesIO()
-        self.figure.savefig(data, format="png", dpi=SHOWN_DPI)
-        return data.getvalue()
+        return png_bytes(self.figure, SHOWN_DPI)
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
         """Write the picture, in the format of the file's name.
@@ -264,24 +248,13 @@ def notebook_labels(scenario: Scenario, log: Log, t_ns: int) -> Labels:
     shift = np.array(scenario.map.offset_m) - np.array(log.map.offset_m)
     t_s = (t_ns - scenario.t0_ns) / NS_PER_S + AROUND_S
     stamps = t_ns + np.round(AROUND_S * NS_PER_S).astype(np.int64)
-    rows: list[tuple[np.ndarray, str, str, np.ndarray, np.ndarray, np.ndarray]] = []
-    for agent in scenario.agents:
-        if agent.id == EGO:
-            continue
-        if agent.is_permanent:
-            states = agent.at(np.full(len(t_s), agent.waypoints.t_s[0]))
-        else:
-            states = agent.at(t_s)
-        there = states.valid
-        center = np.column_stack([states.x_m, states.y_m, states.z_m])[there] + shift
-        size = np.tile(np.array(agent.size_m, dtype=np.float64), (len(center), 1))
-        rows.append((stamps[there], agent.id, agent.category, center, size, states.yaw_rad[there]))
-    count = [len(row[0]) for row in rows]
+    table = AgentTable.of(scenario.others, t_s, permanent=True)
+    k, i = np.nonzero(table.present)
     return Labels(
-        t_ns=np.concatenate([np.zeros(0, np.int64), *(row[0] for row in rows)]),
-        track_id=np.repeat(np.array([row[1] for row in rows], dtype=np.str_), count),
-        category=np.repeat(np.array([row[2] for row in rows], dtype=np.str_), count),
-        center_m=np.concatenate([np.zeros((0, 3)), *(row[3] for row in rows)]),
-        size_m=np.concatenate([np.zeros((0, 3)), *(row[4] for row in rows)]),
-        yaw_rad=np.concatenate([np.zeros(0), *(row[5] for row in rows)]),
+        t_ns=stamps[i],
+        track_id=np.array([agent.id for agent in scenario.others], dtype=np.str_)[k],
+        category=table.category[k],
+        center_m=table.center_m[k, i] + shift,
+        size_m=table.size_m[k],
+        yaw_rad=table.yaw_rad[k, i],
     )

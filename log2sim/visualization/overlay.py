@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, CATEGORY, Boxes3D, Labels, Log, Sweep
 from log2sim.errors import ConfigError, RecordError
-from log2sim.files.documents import refuse_existing, replaced
+from log2sim.files.documents import refuse_existing
 from log2sim.geometry import (
     NS_PER_S,
     Array,
@@ -37,7 +35,9 @@ from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, printable_label
+from log2sim.visualization.plot.drawing import add_lines
+from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, new_figure, printable_label, save_png
+from log2sim.visualization.recording import require_cameras
 
 # Stamps of labels and frames of one moment differ by rounding in some logs.
 STAMP_TOLERANCE_NS = 1_000_000
@@ -97,10 +97,7 @@ def read_moment(
     `labels`: returns for the stamp of the tick the 3D boxes that are drawn in place of those of the log. Raises
     `ConfigError` for an unknown camera, and for a time outside the log.
     """
-    unknown = [name for name in cameras if name not in log.cameras]
-    if unknown:
-        there = ", ".join(log.cameras) or "none"
-        raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
+    require_cameras(log, cameras)
     notes = []
     mounts = {*(c.mount for c in log.cameras.values()), *(lidar.mount for lidar in log.lidars.values())}
     if log.ego is None and "ego" in mounts:
@@ -270,9 +267,7 @@ def write_overlay(moment: OverlayMoment, path: Path | str, *, overwrite: bool = 
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: an overlay is written as .png, not '{path.suffix}'")
     refuse_existing(path, overwrite=overwrite)
-    figure = draw_moment(moment)
-    with replaced(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+    save_png(draw_moment(moment), path, DPI)
 
 
 def draw_moment(moment: OverlayMoment, *, box_name: str = "3D label") -> Figure:
@@ -285,8 +280,7 @@ def draw_moment(moment: OverlayMoment, *, box_name: str = "3D label") -> Figure:
     picture_in = tile_in * (float(np.median(shares)) if shares else 1.0)
     width = columns * tile_in + SIDE_IN
     height = HEAD_IN + FOOT_IN + rows * (picture_in + CAPTION_IN)
-    figure = Figure(figsize=(width, height), facecolor=PAPER)
-    FigureCanvasAgg(figure)
+    figure = new_figure(width, height)
     for k in range(count):
         row, column = divmod(k, columns)
         bottom_in = height - HEAD_IN - (row + 1) * (picture_in + CAPTION_IN)
@@ -319,8 +313,8 @@ def _draw_shot(ax: Axes, shot: Shot, moment: OverlayMoment) -> tuple[str, str]:
     )  # fmt: skip
     for lines, category in shot.boxes:
         color = COLORS[CATEGORY[category].group]
-        ax.add_collection(LineCollection(list(lines), colors=INK, linewidths=1.9, alpha=0.6, zorder=3), autolim=False)
-        ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.9, zorder=3.1), autolim=False)
+        add_lines(ax, lines, colors=INK, linewidths=1.9, alpha=0.6, zorder=3)
+        add_lines(ax, lines, colors=color, linewidths=0.9, zorder=3.1)
     for u0, v0, u1, v1 in shot.image_boxes_px:
         ax.plot([u0, u1, u1, u0, u0], [v0, v0, v1, v1, v0], color=IMAGE_BOX_COLOR, lw=0.9, ls=(0, (3, 2)), zorder=4)
     shutter = shot.camera.rolling_shutter
@@ -355,8 +349,7 @@ def _draw_above(ax: Axes, moment: OverlayMoment, aspect: float) -> tuple[str, st
     boxes = moment.boxes
     corners = box_corners_bev(boxes.center_m[:, :2] - origin[:2], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad)
     colors = [COLORS[CATEGORY[str(c)].group] for c in boxes.category]
-    lines = LineCollection([_outline(c) for c in corners], colors=colors, linewidths=0.9, zorder=3)
-    ax.add_collection(lines, autolim=False)
+    add_lines(ax, [_outline(c) for c in corners], colors=colors, linewidths=0.9, zorder=3)
     for name in (*moment.log.lidars, *moment.log.cameras):
         at = moment.log.map_T_sensor(name, moment.t_ns)[0][0, :2, 3] - origin[:2]
         ax.plot(*at, "+", color="#FF5050", ms=5, mew=0.8, zorder=4)

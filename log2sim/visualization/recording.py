@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes import AgentTable, Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import (
     NS_PER_S,
@@ -39,15 +39,20 @@ MARGIN_S = 0.05  # records this far outside the scenario are taken too: half a t
 BACK_RAD = np.radians(150.0)  # cameras that are turned farther from the front than this look back
 
 
+def require_cameras(log: Log, asked: Sequence[str]) -> None:
+    """Raise `ConfigError` for a camera that a log does not have."""
+    unknown = [name for name in asked if name not in log.cameras]
+    if unknown:
+        there = ", ".join(log.cameras) or "none"
+        raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
+
+
 def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Return the cameras to show, from left to right: those asked for, else those that the scenario was made with, else all.
 
     Raises `ConfigError` for a camera that the log does not have.
     """
-    unknown = [name for name in asked if name not in log.cameras]
-    if unknown:
-        there = ", ".join(log.cameras) or "none"
-        raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
+    require_cameras(log, asked)
     used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
     return tuple(sorted(asked or used or log.cameras, key=lambda name: _place(log.cameras[name])))
 
@@ -119,7 +124,6 @@ class OutlineProjector:
     def __init__(self, log: Log, scenario: Scenario) -> None:
         self.agents = scenario.others
         self._log, self._t0_ns = log, scenario.t0_ns
-        self._size_m = np.array([a.size_m for a in self.agents], dtype=np.float64).reshape(-1, 3)
 
     def outlines(self, camera: str, t_ns: int) -> list[list[int]]:
         """Project the agents into the frame of a camera at a stamp, the farthest first.
@@ -130,27 +134,16 @@ class OutlineProjector:
         view = view_of(self._log, camera, t_ns)
         if view is None or not self.agents:
             return []
-        # Centers (A, 3), m, yaws (A,) and whether each agent is present at a time.
-        agents = self.agents
-        t_s = (t_ns - self._t0_ns) / NS_PER_S
-        center, yaw, present = (
-            np.full((len(agents), 3), np.nan),
-            np.zeros(len(agents)),
-            np.zeros(len(agents), dtype=bool),
-        )
-        for k, agent in enumerate(agents):
-            at = agent.at(float(agent.waypoints.t_s[0]) if agent.is_permanent else t_s)
-            if at.valid[0]:
-                center[k], yaw[k], present[k] = (at.x_m[0], at.y_m[0], at.z_m[0]), at.yaw_rad[0], True
-        rows = np.flatnonzero(present)
-        found = project_boxes_in_view(view, center[rows], self._size_m[rows], yaw[rows])
+        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / NS_PER_S]), permanent=True)
+        center, yaw, rows = table.center_m[:, 0], table.yaw_rad[:, 0], np.flatnonzero(table.present[:, 0])
+        found = project_boxes_in_view(view, center[rows], table.size_m[rows], yaw[rows])
         height_px = found.box_px[:, 3] - found.box_px[:, 1]
         with np.errstate(invalid="ignore"):
             shown = np.flatnonzero(found.valid & (height_px >= MIN_SHARE * view.camera.height_px))
         out = []
         for i in shown[np.argsort(-found.range_m[shown], kind="stable")]:
             row = int(rows[i])
-            corners = box_corners(center[row], self._size_m[row], yaw[row])[0]
+            corners = box_corners(center[row], table.size_m[row], yaw[row])[0]
             middle_px = found.box_px[i].reshape(2, 2).mean(axis=0)[None]
             kind, coordinates = ground_outline(view.camera, apply(_cam_T_map(view, middle_px), corners))
             if len(coordinates):
@@ -187,20 +180,17 @@ def _cam_T_map(view: View, middle_px: Array) -> Array:
 QUALITY = 72  # of JPEGs, of 100: at the sizes of a page, blocks are hardly seen
 
 
-class PictureSize(NamedTuple):
-    """Width of pictures, px, and how many a second are taken of each camera."""
+class Detail(NamedTuple):
+    """What a page shows of a sensor: width of pictures, px, or edge of the cells that keep one point each, m; and how often."""
 
-    width_px: int
+    size: float
     rate_hz: float
 
 
-# From the best down; the first that fits is taken. Motion is followed at 5 a second, and people are seen at 400 px.
-SIZES = tuple(
-    PictureSize(*size)
-    for size in (
-        (960, 10), (800, 10), (640, 10), (640, 5), (480, 5), (400, 5), (400, 2), (320, 2), (320, 1), (240, 1), (240, 0.5), (160, 0.5),
-        (160, 0.2),
-    )
+# Of pictures, from the best down; the first that fits is taken. Motion is followed at 5 a second, and people are seen at 400 px.
+PICTURE_DETAILS = (
+    Detail(960, 10), Detail(800, 10), Detail(640, 10), Detail(640, 5), Detail(480, 5), Detail(400, 5), Detail(400, 2),
+    Detail(320, 2), Detail(320, 1), Detail(240, 1), Detail(240, 0.5), Detail(160, 0.5), Detail(160, 0.2),
 )  # fmt: skip
 
 PROBES = 3  # pictures of each camera that are encoded in all sizes, to estimate how many bytes the others will have
@@ -256,9 +246,12 @@ def picture_document(
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
     within = {name: index for name, index in within.items() if len(index)}
     probes = _probe(log, within, projector, reader)
-    size, chosen = _fit(log, scenario.t0_ns, {name: within[name] for name in probes}, probes, budget_bytes)
-    pictures = ShrunkPictures(chosen, size.width_px)
-    give_pictures(reader, [pictures], progress, least_px=size.width_px)
+    known = {name: within[name] for name in probes}
+    what = "pictures", "one of each camera", ", or choose fewer cameras with --cameras"
+    detail, chosen = _fit(log, scenario.t0_ns, known, probes, PICTURE_DETAILS, budget_bytes, what)
+    width_px = int(detail.size)
+    pictures = ShrunkPictures(chosen, width_px)
+    give_pictures(reader, [pictures], progress, least_px=width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     _thin_out(entries, budget_bytes)
@@ -266,18 +259,18 @@ def picture_document(
         "cameras": list(entries.values()),
         "ahead": _ahead([log.cameras[name] for name in entries]),
         "agents": [agent.id for agent in projector.agents],
-        "width_px": min(size.width_px, max((log.cameras[name].width_px for name in entries), default=0)),
-        "rate_hz": size.rate_hz,
+        "width_px": min(width_px, max((log.cameras[name].width_px for name in entries), default=0)),
+        "rate_hz": detail.rate_hz,
         "bytes": sum(map(_bytes_of, entries.values())),
     }
 
 
 def _probe(
     log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordSource
-) -> dict[str, dict[int, float]]:
-    """Return the mean bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
-    widths = sorted({size.width_px for size in SIZES})
-    out: dict[str, dict[int, float]] = {}
+) -> dict[str, dict[float, float]]:
+    """Estimate the bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
+    widths = sorted({int(detail.size) for detail in PICTURE_DETAILS})
+    out: dict[str, dict[float, float]] = {}
     for name, index in within.items():
         sizes: dict[int, list[int]] = {width: [] for width in widths}
         for i in index[take_evenly(len(index), PROBES)].tolist():
@@ -288,7 +281,7 @@ def _probe(
             for width in widths:
                 sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines + POSE_BYTES)
         if sizes[widths[0]]:
-            out[name] = {width: float(np.mean(found)) for width, found in sizes.items()}
+            out[name] = {width: SAFETY * float(np.mean(found)) for width, found in sizes.items()}
     return out
 
 
@@ -296,24 +289,27 @@ def _fit(
     log: Log,
     start_ns: int,
     within: Mapping[str, NDArray[np.int64]],
-    probes: Mapping[str, Mapping[int, float]],
+    probes: Mapping[str, Mapping[float, float]],
+    details: Sequence[Detail],
     budget_bytes: int,
-) -> tuple[PictureSize, dict[str, NDArray[np.int64]]]:
-    """Choose the best size that fits, and the frames of each camera."""
-    chosen: dict[str, NDArray[np.int64]] = {}
-    size = SIZES[-1]
-    for size in SIZES:
-        chosen = {n: take_at_rate(log.streams[n].t_ns, index, size.rate_hz, start_ns) for n, index in within.items()}
-        if SAFETY * sum(len(index) * probes[n][size.width_px] for n, index in chosen.items()) <= budget_bytes:
-            return size, chosen
-    one_of_each = SAFETY * sum(probe[size.width_px] for probe in probes.values())
-    most = int(budget_bytes / one_of_each) if one_of_each else 0
+    what: tuple[str, str, str],
+) -> tuple[Detail, dict[str, NDArray[np.int64]]]:
+    """Choose the best detail that fits, and the records of each sensor, whose bytes by size are `probes`.
+
+    `what`: names of all records and of one moment, and what else could be done where not even that fits.
+    """
+    for detail in details:
+        chosen = {n: take_at_rate(log.streams[n].t_ns, index, detail.rate_hz, start_ns) for n, index in within.items()}
+        if sum(len(index) * probes[n][detail.size] for n, index in chosen.items()) <= budget_bytes:
+            return detail, chosen
+    moment = sum(probe[detail.size] for probe in probes.values())
+    most = int(budget_bytes / moment) if moment else 0
     if most < 1:
+        noun, one, otherwise = what
         raise ConfigError(
-            f"--max-mb: {budget_bytes / 1e6:.2f} MB are left for pictures, and one of each camera has {one_of_each / 1e6:.2f} MB; "
-            f"give more, or choose fewer cameras with --cameras"
+            f"--max-mb: {budget_bytes / 1e6:.2f} MB are left for {noun}, and {one} has {moment / 1e6:.2f} MB; give more{otherwise}"
         )
-    return size, {name: index[take_evenly(len(index), most)] for name, index in chosen.items()}
+    return detail, {name: index[take_evenly(len(index), most)] for name, index in chosen.items()}
 
 
 def _entry(
@@ -370,17 +366,10 @@ HEIGHT_UNIT_M = (MAX_HEIGHT_M - MIN_HEIGHT_M) / 255
 MAX_APART_S = 0.1  # between the sweeps of several LiDARs that are shown as one
 
 
-class PointSpacing(NamedTuple):
-    """Edge of the cells that keep one point each, m, and how many sweeps a second are taken."""
-
-    cell_m: float
-    rate_hz: float
-
-
 # From the best down; the first that fits is taken. People are still seen as a point or two at 0.4 m.
-SPACINGS = tuple(
-    PointSpacing(*spacing)
-    for spacing in ((0.15, 10), (0.25, 10), (0.4, 10), (0.4, 5), (0.6, 5), (0.6, 2), (1.0, 2), (1.0, 1), (1.0, 0.5), (1.0, 0.2))
+POINT_DETAILS = (
+    Detail(0.15, 10), Detail(0.25, 10), Detail(0.4, 10), Detail(0.4, 5), Detail(0.6, 5), Detail(0.6, 2), Detail(1.0, 2),
+    Detail(1.0, 1), Detail(1.0, 0.5), Detail(1.0, 0.2),
 )  # fmt: skip
 
 POINT_PROBES, POINT_SAFETY = 3, 1.15
@@ -418,13 +407,17 @@ def point_document(
         return None
     known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in probes])
     bright = max(float(np.percentile(known, 98)), 0.0) if len(known) else 0.0
-    spacing, chosen = _fit_points(
-        log.streams[main].t_ns, within, scenario.t0_ns, probes=probes, bright=bright, budget_bytes=budget_bytes
-    )
+    sizes = {}
+    for cell_m in dict.fromkeys(detail.size for detail in POINT_DETAILS):
+        mean = np.mean([len(pack_recording(p, cell_m, bright)) for p in probes])
+        sizes[cell_m] = POINT_SAFETY * float(mean) + BYTES_OF_ENTRY
+    what = "LiDAR points", "one sweep", ""
+    detail, by_name = _fit(log, scenario.t0_ns, {main: within}, {main: sizes}, POINT_DETAILS, budget_bytes, what)
+    chosen = by_name[main]
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
         if (points := sweeps.at(main, i)) is not None:
-            moments.append((points, pack_recording(points, spacing.cell_m, bright)))
+            moments.append((points, pack_recording(points, detail.size, bright)))
         progress(done + 1, len(chosen))
     while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
         moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
@@ -435,8 +428,8 @@ def point_document(
         "unit_m": UNIT_M,
         "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M],
         "intensity": bright > 0,
-        "cell_m": spacing.cell_m,
-        "rate_hz": spacing.rate_hz,
+        "cell_m": detail.size,
+        "rate_hz": detail.rate_hz,
         "bytes": total,
     }
 
@@ -459,33 +452,6 @@ def pack_recording(points: PointsAbove, cell_m: float, bright: float) -> str:
     intensity = np.clip(np.nan_to_num(points.intensity[kept]) / (bright or 1.0) * 255, 0, 255)
     planes = [steps[:, 0] & 255, steps[:, 0] >> 8, steps[:, 1] & 255, steps[:, 1] >> 8, height, intensity]
     return base64.b64encode(zlib.compress(np.concatenate(planes).astype(np.uint8).tobytes(), 9)).decode()
-
-
-def _fit_points(
-    t_ns: NDArray[np.int64],
-    within: NDArray[np.int64],
-    start_ns: int,
-    *,
-    probes: list[PointsAbove],
-    bright: float,
-    budget_bytes: int,
-) -> tuple[PointSpacing, NDArray[np.int64]]:
-    """Choose the finest spacing that fits, and the sweeps."""
-    sizes: Mapping[float, float] = {}
-    for spacing in SPACINGS:
-        if spacing.cell_m not in sizes:
-            mean = np.mean([len(pack_recording(p, spacing.cell_m, bright)) for p in probes])
-            sizes = {**sizes, spacing.cell_m: POINT_SAFETY * float(mean) + BYTES_OF_ENTRY}
-        chosen = take_at_rate(t_ns, within, spacing.rate_hz, start_ns)
-        if len(chosen) * sizes[spacing.cell_m] <= budget_bytes:
-            return spacing, chosen
-    most = int(budget_bytes / sizes[spacing.cell_m])
-    if most < 1:
-        raise ConfigError(
-            f"--max-mb: {budget_bytes / 1e6:.2f} MB are left for LiDAR points, and one sweep has {sizes[spacing.cell_m] / 1e6:.2f} MB; "
-            f"give more"
-        )
-    return spacing, chosen[take_evenly(len(chosen), most)]
 
 
 class _Sweeps:
@@ -567,14 +533,11 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     left = budget_bytes - (0 if points is None else points["bytes"])
     pictures = None
     if cameras:
-        pictures = picture_document(
-            log,
-            scenario,
-            cameras,
-            budget_bytes=left,
-            reader=reader,
-            progress=lambda done, total: report("page: pictures", done, total),
-        )
+
+        def told(done: int, total: int) -> None:
+            report("page: pictures", done, total)
+
+        pictures = picture_document(log, scenario, cameras, budget_bytes=left, reader=reader, progress=told)
     reader.require_some()
     if pictures is not None and not pictures["cameras"]:
         pictures = None

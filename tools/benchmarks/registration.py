@@ -24,7 +24,8 @@ from log2sim.localization.surfaces import exp_of
 from log2sim.plan import choose_detector, select_sensors
 from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel
-from log2sim.synth.traffic import Road, TrafficObject, TrafficScene, draw_scene
+from log2sim.synth.terrain import Road
+from log2sim.synth.traffic import TrafficObject, TrafficScene, draw_scene
 from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, TrafficRun, poses_of, run_of, stamps_of
 from log2sim.synth.traffic_shapes import ROAD_USERS
 

@@ -159,13 +159,13 @@ def moved(old: Agent | None, new: Agent) -> bool:
 
 
 def circle(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tuple[str, Figures]]:
-    """Reconstruct what is simulated of a scenario and of an edited one, and compare with each."""
+    """Reconstruct the recorded sweeps, and what is simulated of a scenario and of an edited one, and compare with what each shows."""
     world, rows = build_world(log, source, [name]), []
     known = {agent.id: agent for agent in source.agents}
-    for title, now in (("circle", source), ("circle, edited", edited)):
-        simulated = simulated_log(Simulation(log, world, now))
-        found = reconstruct(simulated, Config(detect="lidar:vehicle")).scenario
-        judged = evaluate(found, count_points(now, simulated), max_range_m=LIMIT_M)
+    for title, now in (("recorded", source), ("simulated", source), ("simulated, edited", edited)):
+        shown = log if title == "recorded" else simulated_log(Simulation(log, world, now))
+        found = reconstruct(shown, Config(detect="lidar:vehicle")).scenario
+        judged = evaluate(found, count_points(now, shown), max_range_m=LIMIT_M)
         figures = {k: float(judged[k]) for k in ("recall", "precision", "position_median_m")}
         changed = [row for row in judged["agents"] if moved(known.get(row["id"]), now[row["id"]])]
         if ticks := sum(r["ticks"] for r in changed):

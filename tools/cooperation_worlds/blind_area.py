@@ -161,7 +161,7 @@ def row(world: World, found: Found) -> dict[str, float | None]:
 
 def collides(world: World, known_s: float) -> bool:
     """Return whether the ego meets the person if it reacts to what it knows from `known_s` on."""
-    body = world.moving.ego_body
+    body = world.moving.ego
     assert body is not None
     t_s = np.arange(0.0, world.contact_s + AFTER_CONTACT_S, 0.02)
     braking = np.clip(t_s - known_s - REACTION_S, 0.0, SPEED_MPS / BRAKING_MPS2)

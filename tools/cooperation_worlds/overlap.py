@@ -50,10 +50,10 @@ def keeps_promise(world: World) -> bool:
 
 def _view_angle(world: World, t_s: np.ndarray) -> np.ndarray:
     moving = world.moving
-    assert moving.ego_body is not None
+    assert moving.ego is not None
     xy = next(a for a in moving.actors if a.spec.id == world.target).at(t_s).center_m[:, :2]
     pole = np.array(world.scene.lidar[1].position_m[:2])
-    views = [moving.ego_body.at(t_s).center_m[:, :2] - xy, pole - xy]
+    views = [moving.ego.at(t_s).center_m[:, :2] - xy, pole - xy]
     cross = views[0][:, 0] * views[1][:, 1] - views[0][:, 1] * views[1][:, 0]
     return np.abs(np.arctan2(cross, (views[0] * views[1]).sum(1)))
 

@@ -22,7 +22,7 @@ from log2sim.synth.raycast import mount_T_lidar, slab_distance, sweep_stamps
 from log2sim.synth.returns import LidarModel, ReturnModel
 from log2sim.synth.scene import Building, LidarSpec, Scene
 from log2sim.synth.synthesis import synthesize
-from log2sim.synth.traffic import Surface
+from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic_shapes import ROAD_USERS, SMALL
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class World:
 
     def distances_m(self, t_s: Array) -> Array:
         """Distances (T,) between the centers of the ego and the target."""
-        body = self.moving.ego_body
+        body = self.moving.ego
         assert body is not None
         return np.linalg.norm((self.target_actor.at(t_s).center_m - body.at(t_s).center_m)[:, :2], axis=1)
 
@@ -100,7 +100,7 @@ def cast(
     map_T_lidar = moving.map_T_mount(spec.mount, np.array([middle_ns]))[0] @ mount_T_lidar(spec)
     velocity = np.zeros(2)
     if spec.mount == "ego" and moving.ego is not None:
-        step = np.diff(moving.ego.map_T_ego([t_s - 0.05, t_s + 0.05])[:, :2, 3], axis=0)[0]
+        step = np.diff(moving.ego.map_T_axle([t_s - 0.05, t_s + 0.05])[:, :2, 3], axis=0)[0]
         velocity = step / 0.1
     sensor = SensorState(map_T_lidar[:3, :3], map_T_lidar[:3, 3], velocity)
     solids = [_solid(actor, world.parts[actor.spec.id], t_s) for actor in moving.seen_from(spec.mount)]
@@ -431,5 +431,5 @@ def things_touch(world: World, t_s: Array, gap_m: float) -> bool:
 
 def _all(world: World) -> tuple[Actor, ...]:
     moving = world.moving
-    assert moving.ego_body is not None
-    return (*moving.actors, moving.ego_body)
+    assert moving.ego is not None
+    return (*moving.actors, moving.ego)

@@ -45,12 +45,8 @@ PRIOR_SIGMA, MIN_EFFECT = 0.5, 0.05
 # A weight of a variance is not below this, so that its logarithm exists. Of what smoothing says remains at least a quarter, half
 # of the standard deviation: it alone knows gaps, ends and turns.
 MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
-# Recorded logs have more that looks a little like a road user than simulated ones, so that a score that speaks against an object
-# counts in full, as the calibrated probability that it is. So does what images that show its place do not show, which is a ratio
-# of likelihoods already: the simulated detector of images misses more than real ones do.
-FIXED = {"weak_sweep": 1.0, "missing": -1.0}
 # Columns that say nothing of whether something is there, and those that say nothing of whether it is right where it is.
-ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "range", "brief"), ("no_sweep", "no_image", "travel", "missing", "pointless", "nearer", "image", "sweep", "weak_sweep", "few")  # fmt: skip
+ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "brief"), ("no_image", "travel", "missing", "image", "sweep", "weak_sweep", "few")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +120,8 @@ def half_verdict(share: Array) -> Array:
     return (share + (share >= 1 - MAX_WRONG_SHARE)) / 2
 
 
-def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int], known: Array) -> tuple[float, Array]:
-    """Find the most likely bias and weights (F,) of evidence (A, F) for agents that are right to some share (A,).
-
-    `known` (A,) are log-odds of which it is known how much they count.
-    """
+def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> tuple[float, Array]:
+    """Find the most likely bias and weights (F,) of evidence (A, F) for agents that are right to some share (A,)."""
     from scipy.optimize import minimize
 
     mean, scale = x.mean(axis=0), x.std(axis=0)
@@ -136,7 +129,7 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int], kno
     z = (x - mean) / scale
 
     def loss(w: Array) -> tuple[float, Array]:
-        odds = w[0] + z @ w[1:] + known
+        odds = w[0] + z @ w[1:]
         value = weight @ (np.logaddexp(0.0, odds) - right * odds) + (w[1:] ** 2).sum() / (2 * PRIOR_SIGMA**2)
         slope = weight * (probability_of(odds) - right)
         return float(value), np.append(slope.sum(), z.T @ slope + w[1:] / PRIOR_SIGMA**2)
@@ -154,18 +147,14 @@ def fit_table(
     tables = {}
     for lidar in sorted({a.lidar for a in agents}, reverse=True):
         own = [a for a in agents if a.lidar == lidar]
-        names = [name for name in SIGNS if name not in (*out, *FIXED)]
-        fixed = {
-            name: weight for name, weight in FIXED.items() if name not in out and any(a.evidence[name] for a in own)
-        }
-        known = np.array([sum(w * a.evidence[name] for name, w in fixed.items()) for a in own], dtype=np.float64)
+        names = [name for name in SIGNS if name not in out]
         for _ in range(2):
             x = np.array([[a.evidence[name] for name in names] for a in own])
             # An agent of many ticks counts more, since they do in the calibration of ticks, but less than they are.
             w = np.sqrt([a.ticks for a in own]) * [weight(a) for a in own]
             y = half_verdict(np.array([target(a) for a in own]))
-            bias, found = fit_weights(x, y, w / w.mean(), [SIGNS[name] for name in names], known)
-            tables[lidar] = {"bias": bias, **fixed, **dict(zip(names, found.tolist()))}
+            bias, found = fit_weights(x, y, w / w.mean(), [SIGNS[name] for name in names])
+            tables[lidar] = {"bias": bias, **dict(zip(names, found.tolist()))}
             names = [n for n, effect in zip(names, np.abs(found) * x.std(axis=0)) if effect > MIN_EFFECT]
     return tables
 

@@ -3,16 +3,19 @@
     python tools/fit.py confidence_logs --logs 40 --seed 1 --out FOLDER
 
 Each log is random traffic (either side of the road, weather, LiDARs of the market, on a vehicle or at the roadside), with a
-detector in sweeps, a simulated one in images, or both, and a second time without LiDAR. Simulated are the errors that detectors in images have: boxes that jitter and are off, misses and scores that depend on the object and its
-height in the image, swapped categories, one box over two objects, two boxes on one, boxes on what is no road user or on a
-fixed part of the image, and boxes that appear for one frame. Files that exist are left as they are.
+detector in sweeps, a simulated one in images, or both, and a second time without LiDAR. Simulated are the errors that detectors
+in images have: boxes that jitter and are off, misses and scores that depend on the object and its height in the image, swapped
+categories, one box over two objects, two boxes on one, boxes on what is no road user or on a fixed part of the image, and boxes
+that appear for one frame; and those of a detector in sweeps that it has on recorded walls, hedges and fences, which are more
+various than those that it was trained on. Files that exist are left as they are.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +23,27 @@ import numpy as np
 from entry import parser_of
 
 from log2sim.config import Config
-from log2sim.datatypes import GROUP_OF, Detections, Frame, Log, Scenario, Stream
+from log2sim.datatypes import (
+    GROUP_OF,
+    MAX_SIZE_M,
+    MIN_SIZE_M,
+    TYPICAL_SIZE_M,
+    Boxes3D,
+    Detections,
+    Frame,
+    Log,
+    Scenario,
+    Stream,
+)
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.truth import points_in_labels, truth_from_log
 from log2sim.files.stages import StageClock
-from log2sim.geometry import Array, nearest_index
+from log2sim.geometry import Array, nearest_index, wrap_angle
 from log2sim.perception.detect.detectors import MIN_SIDE_PX
+from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.first_pass import Observations
+from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
 from log2sim.perception.run_detectors import Detectors
 from log2sim.pipeline import infer_scenario, observe_log, start
@@ -54,6 +71,12 @@ TAKEN_FOR = {
     "car": ("truck",), "truck": ("car", "bus"), "bus": ("truck",), "cyclist": ("pedestrian", "motorcycle", "bicycle"),
     "motorcycle": ("cyclist", "bicycle"), "bicycle": ("cyclist", "motorcycle"), "pedestrian": ("cyclist",),
 }  # fmt: skip
+
+
+# Pieces of fronts and things as large as a vehicle in which a detector in sweeps sees vehicles for the whole log, by category;
+# the share of them, which varies by log; log-odds of a box, of each thing and of each sweep; and how far sizes vary.
+SEEN_IN_SWEEPS = {"building": ("car", "truck", "bus"), "fence": ("car", "truck"), "container": ("car", "truck"), "shelter": ("car", "truck"), "bush": ("car",), "stall": ("car",)}  # fmt: skip
+SEEN_SHARE, SEEN_ODDS, SWEEP_ODDS, SEEN_SIZE_SIGMA, MIN_SEEN_IN_BOX = 0.06, (0.2, 0.8), 0.5, 0.2, 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +216,57 @@ class SimulatedDetector:
         return rows
 
 
+class MistakenDetector:
+    """Adds boxes of vehicles on what is none to those of a detector in sweeps; every box depends on the seed and its sweep alone."""
+
+    def __init__(self, detector: LidarDetector, scene: TrafficScene, seed: int) -> None:
+        self._detector, self._seed, self.name = detector, seed, detector.name
+        rng = np.random.default_rng([seed, 4])
+        share, self._seen = SEEN_SHARE * np.exp(rng.normal(0, 0.7)), []
+        for thing in scene.objects:
+            if thing.category or thing.kind not in SEEN_IN_SWEEPS or rng.random() > share:
+                continue
+            categories = rng.choice(SEEN_IN_SWEEPS[thing.kind], 2)
+            size = np.array(TYPICAL_SIZE_M[str(categories[0])]) * np.exp(rng.normal(0, SEEN_SIZE_SIGMA, 3))
+            size = np.clip(size, MIN_SIZE_M[str(categories[0])], MAX_SIZE_M[str(categories[0])])
+            # Fronts face -y of the thing; the box is laid against what is seen of them.
+            along, depth = (
+                rng.uniform(-0.4, 0.4) * thing.size_m[0],
+                size[1] / 2 - 0.2 if thing.kind == "building" else 0.0,
+            )
+            c, s = np.cos(thing.yaw_rad), np.sin(thing.yaw_rad)
+            at = thing.position_m + np.array([c * along - s * depth, s * along + c * depth, size[2] / 2])
+            self._seen.append((at, size, thing.yaw_rad + rng.normal(0, 0.04), categories, rng.normal(*SEEN_ODDS)))
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        found = self._detector.detect(cloud, earlier)
+        rng, rows = np.random.default_rng([self._seed, 5, cloud.stamp_ns // 1_000_000]), []
+        for at, size, yaw, categories, odds in self._seen:
+            forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+            center, own = at + rng.normal(0, 0.25) * forward, size * np.exp(rng.normal(0, 0.06, 3))
+            turned, score = (
+                yaw + np.pi * rng.integers(2) + rng.normal(0, 0.03),
+                probability_of(odds + rng.normal(0, SWEEP_ODDS)),
+            )
+            category = str(categories[int(rng.random() < 0.2)])
+            points = points_of_boxes(
+                cloud.xyz, (center - cloud.origin)[None], own[None], np.array([turned]), ~cloud.ground
+            ).count
+            if (
+                score >= MIN_SCORE
+                and points[0] >= MIN_SEEN_IN_BOX
+                and not (np.hypot(*(found.center_m - center)[:, :2].T) < 2).any()
+            ):
+                rows.append((center, own, wrap_angle(turned), rng.uniform(0.5, 0.8), category, score, points[0]))
+        if not rows:
+            return found
+        center, own, yaw, heading, category, score, points = (np.array(column) for column in zip(*rows))
+        stamps = np.full(len(rows), cloud.stamp_ns)
+        mistaken = Boxes3D(stamps, center, own, yaw, heading, category.astype("<U16"), score, points)
+        names = [f.name for f in fields(Boxes3D) if f.name != "seen_by"]
+        return Boxes3D(*(np.concatenate([getattr(found, name), getattr(mistaken, name)]) for name in names))
+
+
 def _iou(a: Array, b: Array) -> float:
     w, h = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     if w <= 0 or h <= 0:
@@ -251,7 +325,8 @@ def cases_of(seed: int, index: int) -> list[Case]:
 def _case(log: Log, scene: TrafficScene, truth: Scenario, detector: str, seed: int) -> Case:
     run = start(log, Config.load(settings=[f"detect.name={detector}"]))
     images = None if run.detectors.images is None else SimulatedDetector(log, scene, seed)
-    observations = observe_log(replace(run, detectors=Detectors(images, run.detectors.sweeps)))
+    sweeps = MistakenDetector(run.detectors.sweeps, scene, seed) if run.detectors.sweeps else None
+    observations = observe_log(replace(run, detectors=Detectors(images, sweeps)))
     observations.records = None
     kept = run.log.changed(streams={k: Stream(k, np.asarray(s.t_ns), silent) for k, s in run.log.streams.items()})
     named = [None if d is None else Named(d.name) for d in (images, run.detectors.sweeps)]

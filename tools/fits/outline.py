@@ -20,7 +20,8 @@ from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.boxes import rotate, subsample
 from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, ReturnModel
-from log2sim.synth.traffic import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS, Surface
+from log2sim.synth.terrain import Surface
+from log2sim.synth.traffic import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "log2sim" / "agents" / "heading" / "outline_weights.py"

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -45,20 +44,22 @@ from log2sim.evaluation.bench.settings import (
     short,
 )
 from log2sim.evaluation.metrics.evaluator import rounded_tree
-from log2sim.files.documents import check, replaced
+from log2sim.evaluation.road import cell
+from log2sim.files.documents import check
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.version import __version__
 from log2sim.visualization.plot.style import (
     CROWD_COLOR,
     FONT,
-    FRAME,
-    GRID,
     INK,
     MUTED,
     PALETTE,
     PAPER,
     halo,
+    new_figure,
     printable_label,
+    save_png,
+    style_axes,
 )
 
 __all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
@@ -122,7 +123,7 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[Point
     whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
     points = {
         "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
-        "measure": [_measure_point(context, r) for r in by_stage["measure"]],
+        "measure": [_point(context, "measure", r) for r in by_stage["measure"]],
         "homography": homographies,
         "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
         "whole run": _add_placed_shares(whole, homographies),
@@ -138,25 +139,17 @@ def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) ->
     return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_mask(points)), recommendation)
 
 
-def _name(context: BenchContext, stage: str, run: BenchRun) -> str:
-    """Name a run within a stage; the present run belongs to every stage."""
-    return run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
-
-
 def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
+    """Make the point of a run in a stage; the present run belongs to every stage."""
+    name = run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
     ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
-    return _scored_point(_name(context, stage, run), run.setting.present, ms, run.score, _error(context, stage))
+    if stage == "measure" and context.truth is not None:
+        return _scored_point(name, run.setting.present, ms, run.measurement_score, "error_m")
+    return _scored_point(name, run.setting.present, ms, run.score, _error(context, stage))
 
 
 def _scored_point(name: str, present: bool, ms: float, score: Score, error: str) -> Point:
     return Point(name, present, ms, score.figures.get(error), score.figures, score.by_object.get(error, {}))
-
-
-def _measure_point(context: BenchContext, run: BenchRun) -> Point:
-    point = _point(context, "measure", run)
-    if context.truth is None:
-        return point
-    return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
 
 
 def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
@@ -173,13 +166,8 @@ def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> Poi
     present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
     name = present if run.setting.present else run.setting.key
     stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
-    point = _scored_point(
-        name,
-        run.setting.present and compared,
-        context.ms_per_tick(run.seconds),
-        run.score,
-        _error(context, "whole run"),
-    )
+    marked, ms = run.setting.present and compared, context.ms_per_tick(run.seconds)
+    point = _scored_point(name, marked, ms, run.score, _error(context, "whole run"))
     return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
 
 
@@ -353,19 +341,16 @@ HEAD_IN = 0.62
 FRONT, CHOSEN = PALETTE[0], PALETTE[4]
 
 
-def write_picture(result: Benchmark, path: Path, *, dpi: int = 150) -> None:
+def write_picture(result: Benchmark, path: Path) -> None:
     """Write all panels into a PNG, atomically."""
-    figure = draw(result)
-    with replaced(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+    save_png(draw(result), path, 150)
 
 
 def draw(result: Benchmark) -> Figure:
     """Draw all panels; the last cell explains the marks and gives the recommendations."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
     width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
-    figure = Figure(figsize=(width, height), facecolor=PAPER)
-    FigureCanvasAgg(figure)
+    figure = new_figure(width, height)
     _title(figure, result)
     for k, panel in enumerate(result.panels):
         _draw_panel(figure.add_axes(_cell(k, rows, width, height)), panel)
@@ -405,12 +390,8 @@ def _title(figure: Figure, result: Benchmark) -> None:
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     shown = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
     ax.set_facecolor("#FBFCFD")
-    ax.set_axisbelow(True)
-    ax.grid(True, color=GRID, lw=0.7)
-    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
+    style_axes(ax)
     ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=MUTED, family=FONT)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
     style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
     ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
     label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
@@ -589,13 +570,9 @@ def _rows(panel: Panel) -> list[str]:
             short(p.ms_per_tick),
             short(p.error),
             "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
-            *(_table_cell(p.figures.get(key), digits) for key, _, digits in columns),
+            *(cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)
     ]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     return ["  ".join(c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(r, widths))) for r in cells]
-
-
-def _table_cell(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

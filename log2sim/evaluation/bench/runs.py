@@ -28,6 +28,7 @@ from log2sim.evaluation.bench.scores import (
     true_positions,
 )
 from log2sim.evaluation.bench.settings import Grid, Point, Setting
+from log2sim.evaluation.detection.detect_log import take_ticks
 from log2sim.files.stages import StageClock
 from log2sim.geometry import period_of
 from log2sim.perception.cooperative import detector_by_mounting
@@ -253,19 +254,9 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
 
 def warm_up(context: BenchContext) -> None:
     """Run the first tick once, so that imports and caches count for no stage."""
-    s = context.schedule
-    first = replace(
-        s,
-        t_ns=s.t_ns[:1],
-        frames={name: index[:1] for name, index in s.frames.items()},
-        sweeps={name: index[:, :1] for name, index in s.sweeps.items()},
-        residuals_s={name: r[:1] for name, r in s.residuals_s.items()},
-    )
-    short = replace(context, schedule=first)
-    observations, _ = timed_first_pass(
-        short, context.grid.present, context.grid.measure[0], lambda what, done, total: None
-    )
-    _concluded(short, context.grid.present, observations, StageClock())
+    grid, short = context.grid, replace(context, schedule=take_ticks(context.schedule, slice(1)))
+    observations, _ = timed_first_pass(short, grid.present, grid.measure[0], lambda what, done, total: None)
+    _concluded(short, grid.present, observations, StageClock())
 
 
 def score_of_measurements(context: BenchContext, observations: Observations) -> Score:

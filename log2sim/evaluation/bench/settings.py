@@ -112,26 +112,37 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     cannot be loaded.
     """
     if config.detect.name == AUTO:
-        config = change_section(config, "detect", name=IMAGE_DETECTOR)
+        config = config.changed(detect={"name": IMAGE_DETECTOR})
     if config.topdown.method == NO_METHOD:
-        config = change_section(config, "topdown", method=choices(config.topdown, "method")[0])
+        config = config.changed(topdown={"method": choices(config.topdown, "method")[0]})
+    # Methods other than the present one are fitted to each camera alone.
+    present, *others = _choices("homography", config, "topdown", "method")
+    homography = [present, *(replace(s, config=s.config.changed(topdown={"rig": "apart"})) for s in others)]
+    if len(config.cameras or log.cameras) > 1:
+        rig = choices(config.topdown, "rig")[1]
+        homography.append(Setting("homography", f"cameras {rig}", config.changed(topdown={"rig": rig}), False))
+    # Of other numbers of hypotheses only homographies are scored, no whole runs.
+    hypotheses = [
+        Setting("homography", f"{n} hypotheses", config.changed(topdown={"hypotheses": n}), False)
+        for n in HYPOTHESES
+        if n != config.topdown.hypotheses
+    ]
     # List smoothing on and off, and all values of its other settings.
     keys = type(config.smooth).model_fields
     switches = [key for key in keys if isinstance(getattr(config.smooth, key), bool)]
     named = [key for key in keys if config.smooth.choices(key)]
     out = [Setting("smooth", _smooth_name(config, switches, named), config, True)]
     for key in switches:
-        other = change_section(config, "smooth", **{key: not getattr(config.smooth, key)})
+        other = config.changed(smooth={key: not getattr(config.smooth, key)})
         out.append(Setting("smooth", _smooth_name(other, [key], []), other, False))
     for key in named:
-        for value in choices(config.smooth, key)[1:]:
-            other = change_section(config, "smooth", **{key: value})
-            out.append(Setting("smooth", value, other, False))
+        values = choices(config.smooth, key)[1:]
+        out += [Setting("smooth", value, config.changed(smooth={key: value}), False) for value in values]
     return Grid(
         detect=tuple(_detector_settings(log, config, detectors)),
         measure=_choices("measure", config, "measure", "mode"),
-        homography=(*_methods_apart(config), *_rig_settings(log, config)),
-        hypotheses=tuple(_hypotheses(config)),
+        homography=tuple(homography),
+        hypotheses=tuple(hypotheses),
         smooth=tuple(out),
     )
 
@@ -144,34 +155,6 @@ def default_settings(log: Log, config: Config) -> tuple[Setting, ...]:
     return (Setting("whole run", f"reconstruct's default, {chosen.detect.name}", chosen, True),)
 
 
-def _methods_apart(config: Config) -> list[Setting]:
-    """List the methods, the present one as it is and the others for each camera alone."""
-    present, *others = _choices("homography", config, "topdown", "method")
-    return [present, *(replace(s, config=change_section(s.config, "topdown", rig="apart")) for s in others)]
-
-
-def _rig_settings(log: Log, config: Config) -> list[Setting]:
-    """List the other way to fit several cameras: all together, or each apart."""
-    if len(config.cameras or log.cameras) < 2:
-        return []
-    other = choices(config.topdown, "rig")[1]
-    return [Setting("homography", f"cameras {other}", change_section(config, "topdown", rig=other), False)]
-
-
-def _hypotheses(config: Config) -> list[Setting]:
-    """List other numbers of hypotheses for the present method, for which only homographies are scored, no whole runs."""
-    return [
-        Setting("homography", f"{n} hypotheses", change_section(config, "topdown", hypotheses=n), False)
-        for n in HYPOTHESES
-        if n != config.topdown.hypotheses
-    ]
-
-
-def change_section(config: Config, section: str, **changes: Any) -> Config:
-    """Return a copy of the settings with changes in one section."""
-    return config.changed(**{section: changes})
-
-
 def choices(section: Section, key: str) -> list[str]:
     """List the allowed values of a setting, the present one first, without the one that leaves the stage out."""
     present = getattr(section, key)
@@ -180,9 +163,7 @@ def choices(section: Section, key: str) -> list[str]:
 
 def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Setting, ...]:
     names = choices(getattr(config, section), key)
-    return tuple(
-        Setting(stage, name, change_section(config, section, **{key: name}), k == 0) for k, name in enumerate(names)
-    )
+    return tuple(Setting(stage, name, config.changed(**{section: {key: name}}), k == 0) for k, name in enumerate(names))
 
 
 def _smooth_name(config: Config, switches: Sequence[str], named: Sequence[str]) -> str:
@@ -196,22 +177,22 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     """List every detector with all distinct numbers of tiles, and with other input sizes where the model accepts them."""
     names = list(dict.fromkeys([config.detect.name, *detectors]))
     for name in names:
-        if change_section(config, "detect", name=name).detect.in_sweeps:
+        if config.changed(detect={"name": name}).detect.in_sweeps:
             raise ConfigError(
                 f"bench: compares detectors in images, and '{name}' searches LiDAR sweeps; see log2sim detect"
             )
     out: list[Setting] = []
     for name in names:
-        own = (
-            config if name == config.detect.name else change_section(config, "detect", name=name, layout="", input_px=0)
-        )
+        own = config
+        if name != config.detect.name:
+            own = config.changed(detect={"name": name, "layout": "", "input_px": 0})
         label = f"{_short(name, names)} " if len(names) > 1 else ""
         detector = create_image_detector(log, own)
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
             continue
         for key, value in _inputs(log, own, detector):
-            other = change_section(own, "detect", **{key: value})
+            other = own.changed(detect={key: value})
             out.append(Setting("detect", f"{label}{_input_name(key, value)}", other, not out))
     return out
 
@@ -226,21 +207,16 @@ def _short(name: str, names: Sequence[str]) -> str:
 def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, int]]:
     """List settings of a detector with different inputs, the present one first."""
     inputs, seen = [], set()
+    side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
+    cameras = [log.cameras[name] for name in config.cameras or log.cameras]
     for tiles in dict.fromkeys([config.detect.tiles, *TILES]):
-        plan = _tile_plan(log, config, detector, tiles)
+        plan = tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
         if plan not in seen:
             seen.add(plan)
             inputs.append(("tiles", tiles))
     if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
         inputs += [("input_px", side) for side in SIDES_PX if side != detector.layout.preprocessing.default_px]
     return inputs
-
-
-def _tile_plan(log: Log, config: Config, detector: OnnxDetector, tiles: int) -> tuple[int, ...]:
-    """Count the tiles of a frame of each camera."""
-    side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
-    cameras = [log.cameras[name] for name in config.cameras or log.cameras]
-    return tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
 
 
 def _input_name(key: str, value: int) -> str:
@@ -334,7 +310,9 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
     sure = [p for p in better if _confidence(p, present) >= MIN_CONFIDENCE]
     if sure:
         chosen = _fastest_of_best(sure)
-        return Recommendation(chosen.setting, present.setting, _replacement_text(chosen, present, unit))
+        figures = f"{_figures(chosen, unit)} against {_figures(present, unit)}{_confidence_text(chosen, present)}"
+        reason = f"{chosen.setting} rather than {present.setting}: {figures}"
+        return Recommendation(chosen.setting, present.setting, reason)
     best = _fastest_of_best(better or others)
     reason = f"{present.setting} stays: {_figures(present, unit)}; "
     if better:
@@ -364,11 +342,6 @@ def _fastest_of_best(points: Sequence[Point]) -> Point:
     """Select the fastest of the points whose error is about the smallest."""
     least = min(p.error or 0.0 for p in points)
     return min((p for p in points if (p.error or 0.0) <= least * (1 + ERROR_TOLERANCE)), key=lambda p: p.ms_per_tick)
-
-
-def _replacement_text(chosen: Point, present: Point, unit: str) -> str:
-    figures = f"{_figures(chosen, unit)} against {_figures(present, unit)}"
-    return f"{chosen.setting} rather than {present.setting}: {figures}{_confidence_text(chosen, present)}"
 
 
 def _confidence_text(point: Point, present: Point) -> str:

@@ -90,18 +90,14 @@ class SceneBoxes:
         """
         if not scenes:
             return cls.of(np.zeros((0, 7)))
-        counted = all(s.points is not None for s in scenes if len(s))
-        return cls(
-            np.repeat(np.arange(len(scenes), dtype=np.int64), [len(s) for s in scenes]),
-            np.concatenate([s.box for s in scenes]),
-            np.concatenate([s.category for s in scenes]),
-            np.concatenate([s.score for s in scenes]),
-            np.concatenate([s.points for s in scenes if s.points is not None] or [np.zeros(0, np.int64)])
-            if counted
-            else None,
-            np.concatenate([s.range_m for s in scenes]),
-            np.concatenate([s.ignored for s in scenes]),
-        )
+        columns = {
+            k: np.concatenate([getattr(s, k) for s in scenes])
+            for k in ("box", "category", "score", "range_m", "ignored")
+        }
+        counts, points = [len(s) for s in scenes], [s.points for s in scenes if s.points is not None]
+        known = all(s.points is not None for s in scenes if len(s))
+        joined = np.concatenate([*points, np.zeros(0, np.int64)]) if known else None
+        return cls(scene=np.repeat(np.arange(len(scenes), dtype=np.int64), counts), points=joined, **columns)
 
     def take(self, index: Any) -> Self:
         """Take the rows at `index`, integers or a mask."""

@@ -19,7 +19,7 @@ from log2sim.perception.first_pass import CloudMaker
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import outside_ego
 from log2sim.perception.records import RecordSource
-from log2sim.perception.sync import sweep_middle_ns
+from log2sim.perception.sync import Schedule, sweep_middle_ns
 from log2sim.pipeline import start
 from log2sim.plan import FusionLevel
 from log2sim.report import Run, unreadable_records
@@ -52,18 +52,14 @@ def middle_ns(run: Run) -> int:
     return sweep_middle_ns(run.log, run.schedule.reference)
 
 
-def only_ticks(run: Run, ticks: NDArray[np.int64]) -> Run:
-    """Return a run with the ticks at an index (K,)."""
-    s = run.schedule
+def take_ticks(schedule: Schedule, ticks: NDArray[np.int64] | slice) -> Schedule:
+    """Return a schedule of the ticks at an index (K,)."""
     return replace(
-        run,
-        schedule=replace(
-            s,
-            t_ns=s.t_ns[ticks],
-            frames={name: index[ticks] for name, index in s.frames.items()},
-            sweeps={name: index[:, ticks] for name, index in s.sweeps.items()},
-            residuals_s={name: residual[ticks] for name, residual in s.residuals_s.items()},
-        ),
+        schedule,
+        t_ns=schedule.t_ns[ticks],
+        frames={name: index[ticks] for name, index in schedule.frames.items()},
+        sweeps={name: index[:, ticks] for name, index in schedule.sweeps.items()},
+        residuals_s={name: residual[ticks] for name, residual in schedule.residuals_s.items()},
     )
 
 

@@ -29,6 +29,7 @@ from log2sim.evaluation.detection.truth import ImageViews, SweepTruth, image_vie
 from log2sim.evaluation.metrics.comparison import MIN_REGION_SHARE
 from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.evaluation.metrics.table import columns_text, percent, verdict_text
+from log2sim.evaluation.road import cell
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, wrap_angle
 
@@ -181,18 +182,27 @@ POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))  # th
 
 
 @dataclass(frozen=True, eq=False)
-class ClassBoxes:
-    """Found and true boxes of one class."""
+class BothBoxes:
+    """Found and true boxes, of all classes or of one."""
 
-    # found, truth: m found and L true boxes; true ones are ignored where they never count.
-    found: SceneBoxes
-    truth: SceneBoxes
+    found: SceneBoxes  # M boxes
+    truth: SceneBoxes  # L boxes; of one class, those are ignored that never count
     far: Mask  # (M,) found boxes out of range, which are not false where they match nothing
-    unlabeled: Mask  # (M,) those where nothing was labeled, likewise
-    # found_views, truth_views: in the reference camera, for KITTI's difficulties.
+    region_share: Array  # (M,) share of found boxes where nothing was labeled
+    kind: NDArray[np.str_]  # (L,) the log's own word
+    occlusion: NDArray[np.int64]  # (L,) as the log states it
+    # In the reference camera, for KITTI's difficulties.
     found_views: ImageViews | None = None
     truth_views: ImageViews | None = None
-    occlusion: NDArray[np.int64] | None = None  # (L,) as the log states it
+    max_region_share: float = MIN_REGION_SHARE  # found boxes with more are not false where they match nothing
+
+    def take(self, mine: Any, true: Any) -> BothBoxes:
+        """Take some found and some true boxes."""
+        views, true_views = self.found_views, self.truth_views
+        return BothBoxes(
+            self.found.take(mine), self.truth.take(true), self.far[mine], self.region_share[mine], self.kind[true],
+            self.occlusion[true], views and views.take(mine), true_views and true_views.take(true),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +210,7 @@ class Objects:
     """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored."""
 
     name: str
-    boxes: ClassBoxes
+    boxes: BothBoxes
     found: SceneBoxes
     truth: SceneBoxes
     # (M,) found boxes that are not false where they match nothing, since they are out of range or of other objects.
@@ -209,10 +219,10 @@ class Objects:
     def matches(self, pairs: BoxPairs, criterion: Criterion) -> Matches:
         """Match them; boxes where nothing was labeled are not false."""
         found = assign_boxes(self.found, self.truth, pairs, criterion)
-        return found.excusing(self.elsewhere).excusing(self.boxes.unlabeled)
+        return found.excusing(self.elsewhere).excusing(self.boxes.region_share > self.boxes.max_region_share)
 
 
-def class_figures(boxes: ClassBoxes, of_class: ObjectClass, min_score: float) -> dict[str, Any]:
+def class_figures(boxes: BothBoxes, of_class: ObjectClass, min_score: float) -> dict[str, Any]:
     """Compute all figures of a class.
 
     `of_class`: the first of its criteria is that of the tables by range and by points. `min_score`: score from which
@@ -235,15 +245,15 @@ def class_figures(boxes: ClassBoxes, of_class: ObjectClass, min_score: float) ->
     }
 
 
-def all_objects(boxes: ClassBoxes) -> Objects:
+def all_objects(boxes: BothBoxes) -> Objects:
     """Select all objects with enough points."""
     few = np.zeros(len(boxes.truth), dtype=bool) if boxes.truth.points is None else boxes.truth.points < MIN_POINTS
     return Objects("all", boxes, boxes.found, boxes.truth.ignoring(few), boxes.far)
 
 
-def difficulties(boxes: ClassBoxes) -> Iterator[Objects]:
+def difficulties(boxes: BothBoxes) -> Iterator[Objects]:
     """Select the objects of each of KITTI's difficulties, whatever their number of points; none without views."""
-    if boxes.found_views is None or boxes.truth_views is None or boxes.occlusion is None:
+    if boxes.found_views is None or boxes.truth_views is None:
         return
     for level in DIFFICULTIES:
         truth = boxes.truth.ignoring(level.ignores_truth(boxes.truth_views, boxes.occlusion))
@@ -251,7 +261,7 @@ def difficulties(boxes: ClassBoxes) -> Iterator[Objects]:
         yield Objects(level.name, boxes, found, truth, boxes.far)
 
 
-def by_range(boxes: ClassBoxes) -> Iterator[Objects]:
+def by_range(boxes: BothBoxes) -> Iterator[Objects]:
     """Select the objects of each range; a found box that matches nothing is false in its own range."""
     everything = all_objects(boxes)
     for low, high in RANGES_M:
@@ -265,7 +275,7 @@ def by_range(boxes: ClassBoxes) -> Iterator[Objects]:
         )
 
 
-def by_points(boxes: ClassBoxes) -> Iterator[Objects]:
+def by_points(boxes: BothBoxes) -> Iterator[Objects]:
     """Select the objects of each number of points; a found box that matches nothing is false where its own points are.
 
     Found boxes whose points were not counted are false everywhere.
@@ -393,12 +403,12 @@ def format_table(result: Mapping[str, Any]) -> str:
             shown[name] = rows
     for name, rows in shown.items():
         for row in rows:
-            values = [_cell(row[key]) for key, _ in columns]
+            values = [cell(row[key], 3) for key, _ in columns]
             cells.append([name, row["objects"], str(Criterion(**row["match"])), str(row["truths"]), *values])
     if len(shown) > 1:
         for row in result["overall"]:
             if row["truths"]:
-                values = [_cell(row.get(key)) for key, _ in columns]
+                values = [cell(row.get(key), 3) for key, _ in columns]
                 cells.append(["all classes", row["objects"], "each its first", str(row["truths"]), *values])
     lines = columns_text(cells, heads=3)
     scores = [_score_note(name, result["classes"][name]["calibration"]) for name in shown]
@@ -437,10 +447,6 @@ def _scope(result: Mapping[str, Any]) -> str:
     if result["max_range_m"] is not None:
         parts.append(f"up to {result['max_range_m']:g} m")
     return f"{'; '.join(parts)}; precision, recall and what follows at scores from {result['min_score']:g}"
-
-
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 VERSION = 1
@@ -509,8 +515,8 @@ def evaluate_boxes(
         tables.append(SceneBoxes.of(box, b.category, b.score, points=b.points, range_m=away))
     joined = SceneBoxes.join(tables)
     found = replace(joined, scene=np.flatnonzero(truth.labeled)[joined.scene])
-    sides = _sides(log, detected.t_ns, found, truth, camera)
-    figures = {c.name: class_figures(_class_boxes(sides, c, options, protocol), c, options.min_score) for c in classes}
+    boxes = _project(log, detected.t_ns, found, truth, camera, options)
+    figures = {c.name: class_figures(_class_boxes(boxes, c), c, options.min_score) for c in classes}
     return {
         "detection_metrics_version": VERSION,
         "log": detected.log,
@@ -529,19 +535,6 @@ def evaluate_boxes(
     }
 
 
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    """Found and true boxes of all classes with what the cameras say about them."""
-
-    found: SceneBoxes
-    truth: SceneBoxes
-    unlabeled: Array
-    kind: NDArray[np.str_]
-    occlusion: NDArray[np.int64]
-    found_views: ImageViews | None
-    truth_views: ImageViews | None
-
-
 def _reference_camera(log: Log, protocol: Protocol) -> str | None:
     """Choose the camera of the difficulties: one whose objects are labeled; None for protocols without difficulties."""
     if not protocol.of_camera:
@@ -557,22 +550,24 @@ def _reference_camera(log: Log, protocol: Protocol) -> str | None:
     return found
 
 
-def _sides(log: Log, t_ns: NDArray[np.int64], found: SceneBoxes, truth: SweepTruth, camera: str | None) -> _Sides:
+def _project(
+    log: Log,
+    t_ns: NDArray[np.int64],
+    found: SceneBoxes,
+    truth: SweepTruth,
+    camera: str | None,
+    options: DetectionOptions,
+) -> BothBoxes:
     """Project boxes where it is needed; with a reference camera, only what it shows is kept."""
+    far = found.range_m > (np.inf if options.max_range_m is None else options.max_range_m)
+    beyond = truth.boxes.range_m > (np.inf if options.max_range_m is None else options.max_range_m)
+    true = truth.boxes.ignoring(beyond)
     if camera is None:
-        return _Sides(found, truth.boxes, _unlabeled(log, t_ns, found), truth.kind, truth.occlusion, None, None)
+        return BothBoxes(found, true, far, _unlabeled(log, t_ns, found), truth.kind, truth.occlusion)
     views = image_views(log, camera, t_ns, found)
-    true_views = image_views(log, camera, t_ns, truth.boxes, truncation=True)
-    shown, true_shown = views.shown, true_views.shown
-    return _Sides(
-        found.take(shown),
-        truth.boxes.take(true_shown),
-        views.region_share[shown],
-        truth.kind[true_shown],
-        truth.occlusion[true_shown],
-        views.take(shown),
-        true_views.take(true_shown),
-    )
+    true_views = image_views(log, camera, t_ns, true, truncation=True)
+    both = BothBoxes(found, true, far, views.region_share, truth.kind, truth.occlusion, views, true_views)
+    return both.take(views.shown, true_views.shown)
 
 
 def _unlabeled(log: Log, t_ns: NDArray[np.int64], found: SceneBoxes) -> Array:
@@ -586,19 +581,10 @@ def _unlabeled(log: Log, t_ns: NDArray[np.int64], found: SceneBoxes) -> Array:
     return np.where(np.isfinite(share), share, 0.0 if only is None else 1.0)
 
 
-def _class_boxes(sides: _Sides, of_class: ObjectClass, options: DetectionOptions, protocol: Protocol) -> ClassBoxes:
+def _class_boxes(boxes: BothBoxes, of_class: ObjectClass) -> BothBoxes:
     """Select the boxes of a class and decide what is ignored."""
-    mine, true = (np.isin(b.category, of_class.categories) for b in (sides.found, sides.truth))
-    far_m = np.inf if options.max_range_m is None else options.max_range_m
-    limit = of_class.criteria[0].limit if protocol.of_camera else MIN_REGION_SHARE
-    found, truth = sides.found.take(mine), sides.truth.take(true)
-    never = (truth.range_m > far_m) | np.isin(sides.kind[true], of_class.ignored_kinds)
-    return ClassBoxes(
-        found,
-        truth.ignoring(never),
-        found.range_m > far_m,
-        sides.unlabeled[mine] > limit,
-        None if sides.found_views is None else sides.found_views.take(mine),
-        None if sides.truth_views is None else sides.truth_views.take(true),
-        sides.occlusion[true],
-    )
+    own = boxes.take(*(np.isin(b.category, of_class.categories) for b in (boxes.found, boxes.truth)))
+    truth = own.truth.ignoring(np.isin(own.kind, of_class.ignored_kinds))
+    # By KITTI's rule, as much of a box may lie in regions without labels as boxes have to overlap.
+    limit = MIN_REGION_SHARE if own.found_views is None else of_class.criteria[0].limit
+    return replace(own, truth=truth, max_region_share=limit)

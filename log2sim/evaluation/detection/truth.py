@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from log2sim.config import Config
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.detect_log import clouds, middle_ns, only_ticks, stamps_of
-from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares
+from log2sim.evaluation.detection.detect_log import clouds, middle_ns, stamps_of, take_ticks
+from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares, rows_by_track
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of, project_boxes, wrap_angle
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import cloud_origin
@@ -40,18 +40,15 @@ class LabelTracks:
     @classmethod
     def of(cls, labels: Labels) -> LabelTracks:
         """Sort labels; of two of one object at one stamp the first is kept."""
-        _, track = np.unique(labels.track_id, return_inverse=True)
-        order = np.lexsort((labels.t_ns, track))
-        t, k = labels.t_ns[order], track[order]
-        order = order[np.r_[True, (np.diff(t) > 0) | (np.diff(k) != 0)]]
-        t, k = labels.t_ns[order], track[order]
-        steps = np.diff(t)[np.diff(k) == 0]
+        rows = rows_by_track(labels)
+        order = np.concatenate(rows)
+        steps = np.concatenate([np.diff(labels.t_ns[r]) for r in rows])
         return cls(
-            t,
+            labels.t_ns[order],
             np.column_stack([labels.center_m[order], labels.yaw_rad[order]]),
             labels.size_m,
-            order.astype(np.int64),
-            np.append(np.flatnonzero(np.diff(k, prepend=-1)), len(order)).astype(np.int64),
+            order,
+            np.cumsum([0, *map(len, rows)]),
             float(np.median(steps)) / NS_PER_S if len(steps) else 0.0,
         )
 
@@ -74,15 +71,9 @@ class LabelTracks:
         return moment[order].astype(np.int64), track[order].astype(np.int64)
 
     def at(self, track: NDArray[np.int64], t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-        """Interpolate tracks (P,) at stamps (P,).
+        """Interpolate tracks (P,) at stamps (P,); return poses (P, 4), x, y, z, yaw, and the nearest labels (P,) in the log's.
 
-        Returns
-        -------
-        pose : (P, 4) float64
-            Center x, y, z and yaw, on the line through the labels before and after; beyond the ends, and next to a gap, on
-            the line through the two nearest ones.
-        row : (P,) int64
-            Index of the nearest label in the log's labels.
+        On the line through the labels before and after; beyond the ends, and next to a gap, through the two nearest ones.
         """
         pose, row = np.empty((len(track), 4)), np.empty(len(track), dtype=np.int64)
         for k in np.unique(track):
@@ -279,7 +270,8 @@ def _seen_by_lidar(
     known = np.flatnonzero(np.abs(stamps[tick] - t_ns) <= MAX_STAMP_ERROR_NS)
     seen_ns, points = asked.t_ns.copy(), np.zeros(len(asked.sweep), dtype=np.int64)
     needed = known[np.isin(known, asked.sweep)]
-    for done, searched in enumerate(clouds(only_ticks(run, tick[needed]), RecordSource(run.log), None), start=1):
+    run = replace(run, schedule=take_ticks(run.schedule, tick[needed]))
+    for done, searched in enumerate(clouds(run, RecordSource(run.log), None), start=1):
         mine = np.flatnonzero(asked.sweep == needed[searched.tick])
         if searched.cloud is not None:
             for _ in range(2):  # where objects are in the middle of the sweep, then where they were seen

@@ -115,8 +115,8 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
     return {
         "rules": correctness_rules(MAX_WRONG_SHARE, MIN_TRUSTED_CONFIDENCE),
         **_detailed(judged, everything, ranged=ranged),
-        "by_kind": {k: _detailed(judged, _rows(c.other.group == k, everything), ranged=ranged) for k in kinds},
-        "by_category": {k: _figures(judged, _rows(c.other.category == k, everything)) for k in categories},
+        "by_kind": {k: _detailed(judged, over_ticks(c.other.group == k, everything), ranged=ranged) for k in kinds},
+        "by_category": {k: _figures(judged, over_ticks(c.other.category == k, everything)) for k in categories},
         "confusion": _confusion(judged, c.truth.category),
         "judged_agents": _agent_rows(judged, c.truth),
     }
@@ -150,7 +150,8 @@ def _present(j: JudgedAgents, column: NDArray[np.str_], names: Iterable[str]) ->
     return [name for name in names if name in known]
 
 
-def _rows(which: Mask, like: Mask) -> Mask:
+def over_ticks(which: Mask, like: Mask) -> Mask:
+    """Spread (A,) over the ticks of a mask (A, T)."""
     return np.broadcast_to(which[:, None], like.shape)
 
 

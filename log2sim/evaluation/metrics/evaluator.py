@@ -32,7 +32,7 @@ from log2sim.evaluation.metrics.comparison import (
     states_of_ego,
     truth_states,
 )
-from log2sim.evaluation.metrics.correctness import correctness
+from log2sim.evaluation.metrics.correctness import correctness, over_ticks
 from log2sim.evaluation.metrics.truth import load_truth
 from log2sim.evaluation.metrics.verdicts import (
     counting_rules,
@@ -97,7 +97,9 @@ def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | 
     np.add.at(potential, (pairs.truth, pairs.other), pairs.similarity / share)
     union = truth_count[:, None] + other_count[None] - potential
     alignment = np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
-    matched = _matched_pairs(pairs, alignment[pairs.truth, pairs.other] * pairs.similarity, truth_present.shape[1])
+    score = alignment[pairs.truth, pairs.other] * pairs.similarity
+    parts = pairwise(pairs.bounds(ticks))
+    matched = pairs.take(np.concatenate([a + assign(pairs.truth[a:b], pairs.other[a:b], score[a:b]) for a, b in parts]))
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
     for k, alpha in enumerate(ALPHAS):
@@ -112,15 +114,6 @@ def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | 
         ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
         det_a[k] = tpa.sum() / (total - tpa.sum())
     return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
-
-
-def _matched_pairs(pairs: AgentPairs, score: Array, ticks: int) -> AgentPairs:
-    bounds = pairs.bounds(ticks)
-    chosen = [
-        begin + assign(pairs.truth[begin:end], pairs.other[begin:end], score[begin:end])
-        for begin, end in pairwise(bounds)
-    ]
-    return pairs.take(np.concatenate(chosen))
 
 
 DIGITS = 6
@@ -191,23 +184,12 @@ Move = Callable[[Array, Array], Array]
 
 
 def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str, Any]]:
-    """Bring a truth into the map of a scenario.
+    """Bring a truth into the map of a scenario; where both maps have the same projection it stays, `Scenario.shift_to` does the rest.
 
-    Returns
-    -------
-    truth : Scenario
-        Unchanged where both maps have the same projection; `Scenario.shift_to` does the rest.
-    placement : dict
-        "method", how both maps were brought together: "same_map", "projection" or "ego_path"; "ego_apart_m", the median
-        distance of the egos in the end, None where not both are known.
+    Returns also "method", how both maps were brought together: "same_map", "projection" or "ego_path", and "ego_apart_m", the
+    median distance of the egos in the end, None where not both are known. Raises `ConfigError` when positions have no
+    coordinates in the projection of the scenario.
 
-    Raises
-    ------
-    ConfigError
-        When positions have no coordinates in the projection of the scenario.
-
-    Notes
-    -----
     Two projections scale alike only to some tenths of a percent, 0.1 m at 50 m. What moves with time is therefore kept as it
     is around the true ego, and only the ego is reprojected. Where a georeference is missing and the egos are farther apart
     than matches may be, the truth is rotated about the vertical and shifted so that front and rear of the egos coincide best
@@ -438,20 +420,9 @@ def evaluate(
 def compare_scenarios(
     scenario: Scenario, truth: Scenario, selection: Selection
 ) -> tuple[Comparison, Array, StateTable | None]:
-    """Match the agents of a scenario with those of its truth, without the egos.
+    """Match the agents of a scenario with those of its truth; also the ticks (T,), s of the scenario, and the ego, one row.
 
-    Returns
-    -------
-    compared : Comparison
-    ticks_s : (T,) float64, s
-        Of the scenario.
-    ego : StateTable or None
-        One row.
-
-    Raises
-    ------
-    ConfigError, ScenarioError
-        As `evaluate`.
+    Raises `ConfigError` and `ScenarioError` as `evaluate`.
     """
     ticks_s = evaluation_ticks_s(scenario, truth)
     if len(ticks_s) == 0 and scenario.agents and truth.agents:
@@ -490,9 +461,7 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
         **summarize_verdicts(state_errors(c.truth, c.other, c.match, counted)),
         "id_switches": id_switches,
         "mota": mota(truth_ticks, truth_ticks - matched, wrong, id_switches),
-        "hota": None if tracking is None else tracking.hota,
-        "det_a": None if tracking is None else tracking.det_a,
-        "ass_a": None if tracking is None else tracking.ass_a,
+        **(dict.fromkeys(("hota", "det_a", "ass_a")) if tracking is None else vars(tracking)),
         "coverage": coverage(c, truth_selected),
         "counts": {
             "truth_agents": int(agents.sum()),
@@ -510,11 +479,7 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
 
 def _by_range(c: Comparison) -> dict[str, Any]:
     return {
-        f"{low:g}-{high:g}": _figures(
-            c,
-            (c.truth.range_m >= low) & (c.truth.range_m < high),
-            (c.other.range_m >= low) & (c.other.range_m < high),
-        )
+        f"{low:g}-{high:g}": _figures(c, *((s.range_m >= low) & (s.range_m < high) for s in (c.truth, c.other)))
         for low, high in RANGES_M
     }
 
@@ -523,14 +488,12 @@ def _by_category(c: Comparison) -> dict[str, Any]:
     """Compute the figures by category: of the truth for matched ticks, of the reconstructed agent for false ones."""
     names = set(c.truth.category[c.asked_for.any(1)]) | set(c.other.category[c.false.any(1)])
     return {
-        name: _figures(c, _rows(c.truth.category == name, c.counted), _rows(c.other.category == name, c.false))
+        name: _figures(
+            c, over_ticks(c.truth.category == name, c.counted), over_ticks(c.other.category == name, c.false)
+        )
         for name in CATEGORIES
         if name in names
     }
-
-
-def _rows(which: Mask, like: Mask) -> Mask:
-    return np.broadcast_to(which[:, None], like.shape)
 
 
 def _while_observed(agent: Agent) -> Agent:

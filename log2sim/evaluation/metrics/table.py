@@ -9,7 +9,7 @@ from typing import Any
 from log2sim.evaluation.metrics.comparison import MIN_HIT_POINTS, REASONS
 from log2sim.evaluation.metrics.evaluator import describe_placement
 from log2sim.evaluation.metrics.verdicts import MEASURES
-from log2sim.evaluation.road import map_lines, road_verdict
+from log2sim.evaluation.road import cell, map_lines, road_verdict, whole_percent
 
 CORRECTNESS_COLUMNS = (
     ("invented", "invented"),
@@ -39,9 +39,11 @@ def wrong_parts(found: Mapping[str, Any]) -> list[str]:
     doubted = found["doubted"]
     lines = [text.replace("%", " %") + (f": {', '.join(parts)}" if parts else "")]
     if parts:
-        lines.append(f"{_share(doubted['wrong_ticks'])} of it doubted, {_share(doubted['right_ticks'])} of the right")
+        lines.append(
+            f"{whole_percent(doubted['wrong_ticks'])} of it doubted, {whole_percent(doubted['right_ticks'])} of the right"
+        )
     elif doubted["right_ticks"]:
-        lines.append(f"{_share(doubted['right_ticks'])} of the right doubted")
+        lines.append(f"{whole_percent(doubted['right_ticks'])} of the right doubted")
     return lines
 
 
@@ -73,8 +75,8 @@ def _cells(found: Mapping[str, Any]) -> list[list[str]]:
         if figures["ticks"]:
             parts = [figures[key] for key, _ in CORRECTNESS_COLUMNS]
             shares = [f"{100 * p['share']:.1f} ({p['agents']})" if p["ticks"] else "-" for p in parts]
-            doubted = [_cell(figures["doubted"][key], 0, 100) for key in ("wrong_ticks", "right_ticks")]
-            nees = [_cell(figures[key]["nees"], 1) for key in NEES]
+            doubted = [cell(figures["doubted"][key], 0, 100) for key in ("wrong_ticks", "right_ticks")]
+            nees = [cell(figures[key]["nees"], 1) for key in NEES]
             cells.append([name, str(figures["agents"]), str(figures["ticks"]), *shares, *doubted, *nees])
     return cells
 
@@ -101,8 +103,8 @@ def _calibration_lines(found: Mapping[str, Any]) -> list[str]:
     for a, b in zip(ticks["bins"], agents["bins"], strict=True):
         if a["count"]:
             lines.append(
-                f"  {a['low']:.1f}-{a['high']:.1f}: {_cell(a['right'], 3)} of {a['count']} ticks right, "
-                f"{_cell(b['right'], 3)} of {_noun(b['count'], 'agent')}"
+                f"  {a['low']:.1f}-{a['high']:.1f}: {cell(a['right'], 3)} of {a['count']} ticks right, "
+                f"{cell(b['right'], 3)} of {_noun(b['count'], 'agent')}"
             )
     return lines
 
@@ -133,10 +135,6 @@ def _sentence(row: Mapping[str, Any]) -> str:
 
 def _noun(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.0f} %"
 
 
 MAX_COLUMNS = 100
@@ -243,7 +241,7 @@ def format_table(result: Mapping[str, Any]) -> str:
         for name, figures in lines:
             part = figures["coverage"]
             if part["labeled"]:
-                hit = [_cell(part["hit"], 0), _cell(part["hit_recall"], 1, 100)]
+                hit = [cell(part["hit"], 0), cell(part["hit_recall"], 1, 100)]
                 why_not = [str(count or "-") for count in part["why_not"].values()]
                 cells.append([name, str(part["labeled"]), str(part["counted"]), *why_not, *hit])
         blocks += columns_text(cells)
@@ -260,7 +258,7 @@ def format_table(result: Mapping[str, Any]) -> str:
 def _values(figures: Mapping[str, Any]) -> list[str]:
     scale = {"recall": 100, "precision": 100}
     found = {**figures, "id_switches": figures.get("id_switches") or None}
-    return [_cell(found[key], n, scale.get(key, 1)) if key in found else "" for key, _, n in _COLUMNS]
+    return [cell(found[key], n, scale.get(key, 1)) if key in found else "" for key, _, n in _COLUMNS]
 
 
 def columns_text(cells: Sequence[Sequence[str]], heads: int = 1, columns: int = MAX_COLUMNS) -> list[str]:
@@ -304,7 +302,3 @@ def percent(share: float | None) -> str:
     if share is None:
         return "-"
     return f"{100 * share:.0f} %" if share in (0, 1) else f"{min(max(100 * share, 0.1), 99.9):.1f} %"
-
-
-def _cell(value: float | None, digits: int, scale: float = 1) -> str:
-    return "-" if value is None else f"{scale * value:.{digits}f}"

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, IgnoreRegions, Labels, LabelView, Log, Scenario, Sweep, Waypoints
+from log2sim.datatypes import Agent, AgentTable, IgnoreRegions, Labels, LabelView, Log, Scenario, Waypoints
 from log2sim.errors import ConfigError, LogError, MissingExtra
 from log2sim.files.plugins import nearest
 from log2sim.geometry import (
@@ -23,7 +25,6 @@ from log2sim.geometry import (
     inverse,
     nearest_index,
     outline,
-    points_in_box,
     project,
     quaternion_from_rotation,
     wrap_angle,
@@ -31,38 +32,11 @@ from log2sim.geometry import (
 )
 from log2sim.localization.choice import localize_like
 from log2sim.logs.opening import is_log_file, open_log
+from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
 
-CELL_M = 2.0
 SAMPLES_PER_SIDE = 32
-
-
-class PointGrid:
-    """Points (N, 3) sorted into cells of 2 x 2 m, to count those in a box without testing all."""
-
-    def __init__(self, points: NDArray[np.floating]) -> None:
-        self._corner = points[:, :2].min(axis=0) if len(points) else np.zeros(2)
-        cell = ((points[:, :2] - self._corner) / CELL_M).astype(np.int64)
-        self._rows = int(cell[:, 1].max()) + 1 if len(points) else 1
-        key = cell[:, 0] * self._rows + cell[:, 1]
-        order = np.argsort(key, kind="stable")
-        self._key, self._points = key[order], points[order].astype(np.float64)
-
-    def count(self, center_m: Array, size_m: Array, yaw_rad: float) -> int:
-        """Count the points inside one upright box."""
-        reach = np.hypot(size_m[0], size_m[1]) / 2
-        low = np.floor((center_m[:2] - reach - self._corner) / CELL_M).astype(np.int64)
-        high = np.floor((center_m[:2] + reach - self._corner) / CELL_M).astype(np.int64)
-        # A key outside 0 .. rows - 1 would spill into the neighboring column of cells.
-        bottom, top = max(int(low[1]), 0), min(int(high[1]), self._rows - 1)
-        if top < bottom:
-            return 0
-        columns = np.arange(low[0], high[0] + 1) * self._rows
-        begin = np.searchsorted(self._key, columns + bottom)
-        end = np.searchsorted(self._key, columns + top, side="right")
-        inside = (points_in_box(self._points[b:e], center_m, size_m, yaw_rad) for b, e in zip(begin, end) if e > b)
-        return int(sum(np.count_nonzero(mask) for mask in inside))
 
 
 def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> Array:
@@ -79,7 +53,7 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
     in_cam = in_cam.reshape(-1, 8, 3)
     shares = np.where(corner_inside.all(1), 1.0, 0.0)
     for k in np.flatnonzero(~corner_inside.all(1) & (in_cam[..., 2] > MIN_DEPTH_M).any(1)):
-        samples = _samples(convex_hull(outline(in_cam[k])))
+        samples = _samples(outline(in_cam[k]))
         if len(samples):
             _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))
             shares[k] = inside.mean()
@@ -99,16 +73,18 @@ def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arr
     low, high = (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
     found = []
     for box in corners:
-        rays = _samples(convex_hull(outline(box)), low, high)
+        rays = _samples(outline(box), low, high)
         uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
         found.append(uv[inside])
     return found
 
 
-def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
-    """Make a regular grid of points (S, 2) inside a convex polygon (K, 2), counter-clockwise, and between two corners (2,)."""
-    if len(polygon) < 3:
+def _samples(points: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
+    """Make a regular grid of points (S, 2) inside the convex hull of points (N, 2), and between two corners (2,)."""
+    hull = shapely.MultiPoint(points).convex_hull
+    if hull.geom_type != "Polygon":
         return np.zeros((0, 2))
+    polygon = shapely.get_coordinates(shapely.geometry.polygon.orient(hull))[:-1]
     low, high = np.maximum(polygon.min(axis=0), lowest), np.minimum(polygon.max(axis=0), highest)
     if np.any(low >= high):
         return np.zeros((0, 2))
@@ -118,29 +94,6 @@ def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | f
     edge = np.roll(polygon, -1, axis=0) - polygon
     to = points[:, None] - polygon[None]
     return points[np.all(edge[:, 0] * to[..., 1] - edge[:, 1] * to[..., 0] >= 0, axis=1)]
-
-
-def convex_hull(points: Array) -> Array:
-    """Compute the convex hull (K, 2), counter-clockwise, of points (N, 2).
-
-    Andrew's monotone chain (1979). Points on one line give a polygon without area.
-    """
-    ordered = np.unique(points, axis=0).tolist()
-    if len(ordered) < 3:
-        return np.array(ordered)
-    chains = []
-    for run in (ordered, ordered[::-1]):
-        chain: list[list[float]] = []
-        for p in run:
-            while len(chain) >= 2 and _turn(chain[-2], chain[-1], p) <= 0:
-                chain.pop()
-            chain.append(p)
-        chains += chain[:-1]
-    return np.array(chains)
-
-
-def _turn(a: list[float], b: list[float], c: list[float]) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 MAX_STAMP_LAG_NS = 50_000_000  # a region belongs to the frame nearest to its stamp within this time
@@ -286,7 +239,7 @@ def truth_from_log(
             visible &= in_some_image(log, labels, used, visible)
     ego_t_ns, map_T_ego = _ego_poses(log)
     t0_ns = int(min([labels.t_ns.min(), *ego_t_ns[:1]]))
-    agents = [_label_agent(labels, visible, counts, rows, t0_ns) for rows in _rows_by_track(labels)]
+    agents = [_label_agent(labels, visible, counts, rows, t0_ns) for rows in rows_by_track(labels)]
     if len(ego_t_ns):
         agents.insert(0, _ego_agent(log, ego_t_ns, map_T_ego, t0_ns))
     return Scenario(
@@ -302,32 +255,47 @@ def truth_from_log(
 
 def points_in_labels(log: Log, labels: Labels, progress: Progress | None = None) -> tuple[NDArray[np.int64], int]:
     """Count the points (L,) of all LiDARs inside each box, and the sweeps that could not be read."""
-    counts = np.zeros(len(labels.t_ns), dtype=np.int64)
-    streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
-    records, total, done = RecordSource(log), sum(len(s.t_ns) for _, s in streams), 0
-    for name, stream in streams:
-        index, near = nearest_record(stream.t_ns, labels.t_ns)
-        for i in range(len(stream.t_ns)):
-            rows = np.flatnonzero((index == i) & near)
-            if len(rows):
-                sweep = records.get(name, i)
-                if sweep is not None:
-                    counts[rows] += _points_of_sweep(log, name, sweep, labels, rows)
-            done += 1
-            if progress is not None:
-                progress(done, total)
+    counts, records = np.zeros(len(labels.t_ns), dtype=np.int64), RecordSource(log)
+    step = _stepper(log, progress)
+    for name in _lidars(log):
+        counts += _points_in_boxes(
+            log, name, records, labels.t_ns, labels.center_m, labels.size_m, labels.yaw_rad, step
+        )
     return counts, sum(len(problems) for problems in records.failed.values())
 
 
-def _points_of_sweep(
-    log: Log, lidar: str, sweep: Sweep, labels: Labels, rows: NDArray[np.int64]
-) -> NDArray[np.int64] | int:
-    """Count the points of a sweep inside the boxes at `rows`; 0 when the pose of the LiDAR is unknown."""
-    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
-    if mapped is None:
-        return 0
-    grid = PointGrid(mapped[0])
-    return np.array([grid.count(labels.center_m[k], labels.size_m[k], labels.yaw_rad[k]) for k in rows])
+def _lidars(log: Log) -> list[str]:
+    return [name for name in log.lidars if name in log.streams]
+
+
+def _stepper(log: Log, progress: Progress | None) -> Callable[[], None]:
+    """Return what reports the next of all sweeps as done."""
+    done, total = itertools.count(1), sum(len(log.streams[name].t_ns) for name in _lidars(log))
+    return lambda: None if progress is None else progress(next(done), total)
+
+
+def _points_in_boxes(
+    log: Log,
+    lidar: str,
+    records: RecordSource,
+    t_ns: NDArray[np.int64],
+    center_m: Array,
+    size_m: Array,
+    yaw_rad: Array,
+    step: Callable[[], None],
+) -> NDArray[np.int64]:
+    """Count the points (L,) of a LiDAR inside boxes (L,) at stamps (L,), each in the sweep nearest to it within `MAX_LAG_S`."""
+    counts = np.zeros(len(t_ns), dtype=np.int64)
+    index, near = nearest_record(log.streams[lidar].t_ns, t_ns)
+    for i in range(len(log.streams[lidar].t_ns)):
+        rows = np.flatnonzero((index == i) & near)
+        sweep = records.get(lidar, i) if len(rows) else None
+        mapped = None if sweep is None else sweep_to_map(log, lidar, sweep, compensate=True)
+        if mapped is not None:
+            xyz = np.asarray(mapped[0], dtype=np.float64)
+            counts[rows] = points_of_boxes(xyz, center_m[rows], size_m[rows], np.asarray(yaw_rad)[rows]).count
+        step()
+    return counts
 
 
 def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -358,7 +326,7 @@ def nearest_record(
     return index, np.abs(stream_t_ns[index] - t_ns) <= round(MAX_LAG_S * NS_PER_S)
 
 
-def _rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
+def rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
     """List the rows of each track in order of time; of two rows of one track at one stamp the first."""
     _, track = np.unique(labels.track_id, return_inverse=True)
     order = np.lexsort((labels.t_ns, track))
@@ -372,30 +340,21 @@ def count_points(truth: Scenario, log: Log, progress: Progress | None = None) ->
 
     A waypoint gets the points of the sweeps nearest to it within `MAX_LAG_S`; where the log has no LiDAR, nothing changes.
     """
-    streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
-    records, done, total = RecordSource(log), 0, sum(len(stream.t_ns) for _, stream in streams)
-    totals = [np.zeros(len(agent.waypoints)) for agent in truth.others]
-    for name, stream in streams:
-        states = [agent.at((stream.t_ns - truth.t0_ns) / NS_PER_S) for agent in truth.others]
-        counts = np.zeros((len(states), len(stream.t_ns)))
-        for i in range(len(stream.t_ns)):
-            rows = [k for k, state in enumerate(states) if state.valid[i]]
-            sweep = records.get(name, i) if rows else None
-            mapped = None if sweep is None else sweep_to_map(log, name, sweep, compensate=True)
-            grid = PointGrid(np.zeros((0, 3)) if mapped is None else mapped[0])
-            for k in rows:
-                s = states[k]
-                center = np.array([s.x_m[i], s.y_m[i], s.z_m[i]])
-                counts[k, i] = grid.count(center, np.array(truth.others[k].size_m), float(s.yaw_rad[i]))
-            done += 1
-            if progress is not None:
-                progress(done, total)
-        for k, agent in enumerate(truth.others):
-            t_ns = truth.t0_ns + np.round(agent.waypoints.t_s * NS_PER_S).astype(np.int64)
-            index, near = nearest_record(stream.t_ns, t_ns)
-            totals[k] += np.where(near, counts[k, index], 0) if len(stream.t_ns) else 0
-    if not streams:
+    if not _lidars(log):
         return truth
+    records, step = RecordSource(log), _stepper(log, progress)
+    totals = [np.zeros(len(agent.waypoints)) for agent in truth.others]
+    for name in _lidars(log):
+        stamps = log.streams[name].t_ns
+        table = AgentTable.of(truth.others, (stamps - truth.t0_ns) / NS_PER_S)
+        k, i = np.nonzero(table.present)
+        counts = np.zeros(table.present.shape, dtype=np.int64)
+        boxes = table.center_m[k, i], table.size_m[k], table.yaw_rad[k, i]
+        counts[k, i] = _points_in_boxes(log, name, records, stamps[i], *boxes, step)
+        for row, agent in enumerate(truth.others):
+            t_ns = truth.t0_ns + np.round(agent.waypoints.t_s * NS_PER_S).astype(np.int64)
+            index, near = nearest_record(stamps, t_ns)
+            totals[row] += np.where(near, counts[row, index], 0) if len(stamps) else 0
     agents = [replace(a, waypoints=replace(a.waypoints, lidar_points=n)) for a, n in zip(truth.others, totals)]
     return replace(truth, agents=(*([truth.ego] if truth.ego is not None else []), *agents))
 

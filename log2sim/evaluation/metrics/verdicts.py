@@ -148,23 +148,10 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     """Judge every selected tick of every reconstructed agent; `ego` has one row.
 
     Agents are associated one to one with labeled objects of their kind (`GROUPS`), visible or hidden, as for recall and
-    precision (`clear_mot.associate`): within 2 m, less than half a car's length, or a quarter of the true length where
-    that is more.
-
-    - `invented`: no labeled object of its kind is within the gate, matched or not.
-    - `duplicate`: one is, but another agent matches it.
-    - `in_ego`: its footprint overlaps that of the ego, and that of the labeled object that it matches does not.
-    - `wrong_speed`: the speed is off by more than 1 m/s. Both are signed along the true heading, so an agent that is only
-      turned round has none.
-    - `wrong_motion`: stands (below 0.5 m/s) while the truth moves (from 1 m/s), moves while it stands, or both move (from
-      0.5 m/s) with velocities more than 90 degrees apart.
-    - `backwards`: headings are more than 90 degrees apart; of standing pedestrians and of category other never.
-    - `wrong_size`: length or width is off by more than 25 % of the true one and by more than 0.3 m.
-    - `wrong_class`: the labeled object there has another category. Not among `MEASURES`: within a kind, logs draw the
-      borders differently (pickups, vans), and an agent at an object of another kind is `invented` already.
-
-    An agent that matches nothing has no state errors. Ticks are undecided in ignore regions (`label_coverage`) unless
-    the ego is there, and where the only labeled object within the gate is interpolated over a gap of its labels.
+    precision (`associate`); `correctness_rules` says when each measure is true. An agent that matches nothing has no state
+    errors. `wrong_class` is not among `MEASURES`: within a kind, logs draw the borders differently (pickups, vans), and an
+    agent at an object of another kind is `invented` already. Ticks are undecided in ignore regions unless the ego is there, and
+    where the only labeled object within the gate is interpolated over a gap of its labels.
     """
     truth, other = c.truth, c.other
     i, t = np.nonzero(c.match >= 0)

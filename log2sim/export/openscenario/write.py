@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -162,12 +162,10 @@ class AgentStory:
     name: str
     vertices: Array  # (V, 5) t, x, y, z, heading of the reference point
     speed_mps: float  # at the start
-    # enters, leaves: whether it is absent before and after the vertices.
-    enters: bool
-    leaves: bool
-    hidden_m: float = HIDDEN_DEPTH_M  # how far below it waits in revisions without spawning
-    # Whether it is driven from outside: it gets a place and a speed at the start, and nothing else.
-    external: bool = False
+    enters: bool  # whether it is absent before the vertices
+    leaves: bool  # whether it is absent after them
+    hidden_m: float  # how far below it waits in revisions without spawning
+    external: bool  # whether it is driven from outside: it gets a place and a speed at the start, and nothing else
 
     @property
     def first_s(self) -> float:
@@ -186,7 +184,9 @@ class AgentStory:
         return np.array([np.interp(t_s, self.vertices[:, 0], column) for column in self.vertices.T])
 
 
-def _agent_story(agent: Agent, name: str, duration_s: float, placement: ExportPlacement) -> AgentStory:
+def _agent_story(
+    agent: Agent, name: str, duration_s: float, placement: ExportPlacement, hidden_m: float, *, external: bool
+) -> AgentStory:
     """Return the story of an agent: the center of its rear axle on the ground, with unwrapped headings."""
     w = agent.waypoints
     states = placement.forward(np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad)]))
@@ -195,9 +195,9 @@ def _agent_story(agent: Agent, name: str, duration_s: float, placement: ExportPl
     vertices = np.column_stack([w.t_s, states[:, :3] - back, heading])
     if len(vertices) == 1:
         vertices = np.repeat(vertices, 2, axis=0) + np.outer([0, MIN_DURATION_S], [1, 0, 0, 0, 0])
-    enters, leaves = w.t_s[0] > SAME_TIME_S, vertices[-1, 0] < duration_s - SAME_TIME_S
+    enters, leaves = bool(w.t_s[0] > SAME_TIME_S), bool(vertices[-1, 0] < duration_s - SAME_TIME_S)
     # Players refuse a negative initial speed; a reversing agent takes its speed from the trajectory at once.
-    return AgentStory(name, vertices, max(float(w.speed_mps[0]), 0.0), bool(enters), bool(leaves))
+    return AgentStory(name, vertices, max(float(w.speed_mps[0]), 0.0), enters, leaves, hidden_m, external)
 
 
 def start_poses(stories: Sequence[AgentStory], revision: Revision) -> Array:
@@ -218,7 +218,7 @@ def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float
             private = element("Private", actions, entityRef=story.name)
             below_m = story.hidden_m if story.enters else 0.0
             _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
-            _add_speed(private, "PrivateAction", 0.0 if story.enters else story.speed_mps)
+            _add_speed(private, 0.0 if story.enters else story.speed_mps)
         if story.external:
             _add_external_control(actions[-1], revision)
     act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
@@ -273,7 +273,7 @@ def _add_group(act: Element, story: AgentStory, revision: Revision) -> None:
 def _add_end(maneuver: Element, story: AgentStory, revision: Revision) -> None:
     if not story.leaves:
         action, event = _event(maneuver, f"{story.name} stops", revision.override)
-        _add_speed(action, "PrivateAction", 0.0)
+        _add_speed(action, 0.0)
     else:
         action, event = _event(maneuver, f"{story.name} leaves", revision.override)
         if revision.spawns:
@@ -299,8 +299,8 @@ def _add_position(parent: Element, vertex: Array, below_m: float = 0.0) -> None:
     )  # fmt: skip
 
 
-def _add_speed(parent: Element, tag: str, speed_mps: float) -> None:
-    action = element("SpeedAction", element("LongitudinalAction", element(tag, parent)))
+def _add_speed(parent: Element, speed_mps: float) -> None:
+    action = element("SpeedAction", element("LongitudinalAction", element("PrivateAction", parent)))
     element("SpeedActionDynamics", action, dynamicsShape="step", value="0", dynamicsDimension="time")
     element("AbsoluteTargetSpeed", element("SpeedActionTarget", action), value=number(speed_mps, 4))
 
@@ -358,15 +358,17 @@ def openscenario_document(
     """Return the document of a scenario whose road is in the file `road` beside it; an `external` ego is driven from outside."""
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
-    stories = [_agent_story(agent, name, duration_s, placement) for agent, name in zip(scenario.agents, names)]
-    stories = [replace(story, hidden_m=HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k) for k, story in enumerate(stories)]
     driven = [external and agent.id == EGO for agent in scenario.agents]
-    stories = [replace(story, external=flag) for story, flag in zip(stories, driven)]
+    stories = [
+        _agent_story(agent, name, duration_s, placement, HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k, external=flag)
+        for k, (agent, name, flag) in enumerate(zip(scenario.agents, names, driven))
+    ]
     require_start_as_in_scenario(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
     root = element("OpenSCENARIO")
+    # A leading "CARLA:" in the description would switch ScenarioRunner to left-handed axes.
     element(
-        "FileHeader", root,
-        revMajor="1", revMinor=str(revision.minor), date=_date(scenario.t0_ns), author="log2sim", description=_title(scenario.name),
+        "FileHeader", root, revMajor="1", revMinor=str(revision.minor), date=_date(scenario.t0_ns), author="log2sim",
+        description=f"log2sim: {escaped(scenario.name)}",
     )  # fmt: skip
     _add_parameters(root, scenario, placement)
     element("CatalogLocations", root)
@@ -409,8 +411,3 @@ def _date(t0_ns: int) -> str:
     except OverflowError:
         moment = datetime(1970, 1, 1, tzinfo=UTC)
     return moment.replace(tzinfo=None).isoformat(timespec="seconds")
-
-
-def _title(name: str) -> str:
-    """Return the scenario's name, escaped: a leading "CARLA:" would switch ScenarioRunner to left-handed axes."""
-    return f"log2sim: {escaped(name)}"

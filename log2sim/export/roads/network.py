@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
+from log2sim.datatypes import MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.export.roads.cutting import ALIGNED_M, cut_together, is_connection
 from log2sim.export.roads.reference_line import ReferenceLine, fit
 from log2sim.geometry import Array
@@ -73,34 +73,19 @@ class RoadMark:
     width_m: float = USUAL_WIDTH_M
 
 
-@dataclass(frozen=True)
 class MarkFinder:
     """Finds the marks at the edges of lanes among markings and borders by their ids."""
 
-    sides: Mapping[str, Marking | RoadBorder]
+    def __init__(self, scenario: Scenario) -> None:
+        features = scenario.map_features or MapFeatures()
+        items: list[Marking | RoadBorder] = [*features.markings, *features.borders]
+        self.items: dict[str | None, Marking | RoadBorder] = {item.id: item for item in items}
 
-    @classmethod
-    def of(cls, scenario: Scenario) -> MarkFinder:
-        """Collect the markings and borders of a scenario."""
-        features = scenario.map_features
-        found: dict[str, Marking | RoadBorder] = {}
-        if features is not None:
-            found |= {marking.id: marking for marking in features.markings}
-            found |= {border.id: border for border in features.borders}
-        return cls(found)
-
-    def left_of(self, lane: MapLane) -> RoadMark:
-        """Return the mark at the left edge of a lane."""
-        return self._mark(lane.left)
-
-    def right_of(self, lane: MapLane) -> RoadMark:
-        """Return the mark at the right edge of a lane."""
-        return self._mark(lane.right)
-
-    def _mark(self, name: str | None) -> RoadMark:
-        item = self.sides.get(name) if name is not None else None
+    def mark(self, name: str | None) -> RoadMark:
+        """Return the mark that the item of that id is; "none" where there is no such item."""
+        item = self.items.get(name)
         if isinstance(item, RoadBorder):
-            return RoadMark("curb") if item.kind == "curb" else RoadMark("none")
+            return RoadMark("curb" if item.kind == "curb" else "none")
         if item is None:
             return RoadMark("none")
         return RoadMark("broken" if item.kind == "dashed" else "solid", item.color or "standard", item.width_m)

@@ -48,13 +48,8 @@ def _lane_of_standing_agent(agent: Agent) -> MapLane:
     ground = float(np.mean(w.z_m)) - agent.size_m[2] / 2
     ahead = np.array([-STANDING_M / 2, STANDING_M / 2])
     points = np.column_stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), [ground, ground]])
-    return MapLane(
-        "lane-1",
-        points,
-        np.full(2, max(STANDING_WIDTH_M, agent.size_m[1] + 0.8)),
-        inferred_from="paths",
-        confidence=0.0,
-    )
+    width = np.full(2, max(STANDING_WIDTH_M, agent.size_m[1] + 0.8))
+    return MapLane("lane-1", points, width, inferred_from="paths", confidence=0.0)
 
 
 def edges_of(lane: MapLane) -> tuple[Array, Array]:
@@ -146,10 +141,8 @@ def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float,
     s, t, heading = place
     middle = marking.points_m.mean(axis=0)
     gap = marking.points_m[:, :2] - middle[:2]
-    u, v = (
-        gap[:, 0] * np.cos(heading) + gap[:, 1] * np.sin(heading),
-        gap[:, 1] * np.cos(heading) - gap[:, 0] * np.sin(heading),
-    )
+    c, s_ = np.cos(heading), np.sin(heading)
+    u, v = gap[:, 0] * c + gap[:, 1] * s_, gap[:, 1] * c - gap[:, 0] * s_
     node = element(
         "object", parent, id=escaped(marking.id), name=escaped(marking.id), type="crosswalk", s=number(s, DIGITS), t=number(t, DIGITS),
         zOffset="0", orientation="none", hdg="0", pitch="0", roll="0", length=number(float(np.ptp(u)), DIGITS),
@@ -289,9 +282,8 @@ def _require_near(root: Element, scenario: Scenario, placement: ExportPlacement,
         [[require_number(p.get(key), f"{map_path}: geometry {key}") for key in ("x", "y", "length")] for p in pieces]
     )
     firsts = [(a.waypoints.x_m[0], a.waypoints.y_m[0], 0.0, 0.0) for a in scenario.agents]
-    gaps = [
-        (np.hypot(*(roads[:, :2] - state[:2]).T) - roads[:, 2]).min() for state in placement.forward(np.array(firsts))
-    ]
+    places = placement.forward(np.array(firsts))
+    gaps = [(np.hypot(*(roads[:, :2] - place[:2]).T) - roads[:, 2]).min() for place in places]
     if min(gaps) > FAR_M:
         raise ConfigError(
             f"--map {map_path}: its roads are {min(gaps) / 1000:.0f} km away from all agents; is it the map of this place, and do"
@@ -317,7 +309,7 @@ def opendrive_document(scenario: Scenario, placement: ExportPlacement) -> Elemen
     x, y, z = (float(a + b) for a, b in zip(scenario.map.offset_m, placement.origin_m))
     if (x, y, z) != (0.0, 0.0, 0.0):
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
-    marks, objects = MarkFinder.of(scenario), RoadObjects.of(scenario, network.roads)
+    marks, objects = MarkFinder(scenario), RoadObjects.of(scenario, network.roads)
     for road in network.roads:
         node = _add_road(root, road, placement, marks)
         # Add the crosswalks of a road.
@@ -372,7 +364,7 @@ def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
         for row in reversed(range(len(road.opposite))):
             _add_lane(left, road, 1 + row, road.opposite[row], road.opposite_widths[row], marks)
     middle = element("lane", element("center", section), id="0", type="none", level="false")
-    _add_mark(middle, marks.left_of(road.lanes[0]))
+    _add_mark(middle, marks.mark(road.lanes[0].left))
     right = element("right", section)
     for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
         _add_lane(right, road, -1 - row, lane, widths, marks)
@@ -386,7 +378,7 @@ def _add_lane(parent: Element, road: Road, id: int, lane: MapLane, widths: Array
             element(tag, links, id=str(link.lanes[id]))
     for s, *rest in widths:
         _add_cubic(node, "width", "sOffset", s, rest)
-    _add_mark(node, marks.right_of(lane))
+    _add_mark(node, marks.mark(lane.right))
 
 
 def _add_mark(lane: Element, mark: RoadMark) -> None:

@@ -104,30 +104,11 @@ def joined_pieces(steps: Sequence[tuple[float, float, float, float, float]]) -> 
     return ReferenceLine(tuple(pieces))
 
 
-def straight(x_m: float, y_m: float, heading_rad: float, length_m: float) -> ReferenceLine:
-    """Return a straight line of a length with its center at x, y."""
-    half = length_m / 2
-    start = (x_m - half * np.cos(heading_rad), y_m - half * np.sin(heading_rad))
-    return joined_pieces([(*start, heading_rad, length_m, 0.0)])
-
-
 def fit(xy_m: Array, start: Array | None = None, end: Array | None = None) -> tuple[ReferenceLine, Array]:
-    """Fit lines and arcs to points (N, 2), at least two, in order along the path.
+    """Fit lines and arcs to points (N, 2), m, at least two, in order along the path; return the line and the points' stations (N,).
 
-    Parameters
-    ----------
-    xy_m : (N, 2) float64, m
-    start, end : (3,) float64 or None
-        x, y, heading with which the line begins and ends exactly, next to the first and last point.
+    `start`, `end`: x, y, heading (3,) with which the line begins and ends exactly, next to the first and last point.
 
-    Returns
-    -------
-    line : ReferenceLine
-    s_m : (N,) float64
-        Stations of the points.
-
-    Notes
-    -----
     A smoothing spline removes millimeter noise, which would become curvature; then each stretch of it is replaced by the
     longest pair of arcs within `ARCS_M` of it, with continuous tangents (biarcs: Bolton 1975).
     Cost: a banded least-squares problem per spline, and O(N log N) for the arcs.
@@ -262,9 +243,8 @@ def _biarc(start: Array, end: Array) -> list[tuple[float, float, float, float, f
 def _arc(start: Array, heading: float, end: Array) -> tuple[float, float, float, float, float]:
     chord = end - start
     distance = float(np.hypot(*chord))
-    off = float(
-        np.arctan2(np.cos(heading) * chord[1] - np.sin(heading) * chord[0], chord @ [np.cos(heading), np.sin(heading)])
-    )
+    c, s = np.cos(heading), np.sin(heading)
+    off = float(np.arctan2(c * chord[1] - s * chord[0], chord @ [c, s]))
     if distance * abs(off) / 4 < MAX_LINE_SAGITTA_M:
         return float(start[0]), float(start[1]), heading, distance, 0.0
     return float(start[0]), float(start[1]), heading, distance * off / np.sin(off), 2 * np.sin(off) / distance

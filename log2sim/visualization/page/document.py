@@ -228,6 +228,13 @@ def page_document(
             f"such as with `log2sim edit --only`"
         )
     spans = [_span(e) for name in ("scenario", "replay") for e in layers.get(name, ())]
+    collisions, shown = [], list(metrics)
+    if replay is not None:
+        from log2sim.simulation.metrics.all_metrics import summarize
+
+        keys = ("t_s", "until_s", "agents", "belongs_to")
+        collisions = [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
+        shown.append(("Replay", summarize(replay)))
     m = scenario.map
     known = m.latitude_deg is not None and m.longitude_deg is not None
     return {
@@ -239,9 +246,9 @@ def page_document(
         "layers": layers,
         "features": feature_columns(scenario),
         "background": None if background is None else embed(background),
-        "events": [] if replay is None else _events(replay),
+        "events": collisions,
         "warnings": _warnings(replay),
-        "metrics": [[title, text] for title, text in (*metrics, *_replay_metrics(replay))],
+        "metrics": [[title, text] for title, text in shown],
         "recording": None,
         "studio": {
             "t0_ns": scenario.t0_ns,
@@ -252,19 +259,6 @@ def page_document(
             "corrections": [],
         },
     }
-
-
-def _replay_metrics(replay: Any) -> list[tuple[str, str]]:
-    """Return the summary of a replay with its title."""
-    from log2sim.simulation.metrics.all_metrics import summarize
-
-    return [] if replay is None else [("Replay", summarize(replay))]
-
-
-def _events(replay: Any) -> list[dict[str, Any]]:
-    """List the collisions of a replay in order of time."""
-    keys = ("t_s", "until_s", "agents", "belongs_to")
-    return [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
 
 
 def _warnings(replay: Any) -> dict[str, Any]:
@@ -293,22 +287,17 @@ def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
     roles, tell_ends = assign_view_roles(scenario), len(ends_of(scenario)) > 1
     for role in roles.movers:
         entry = _entry(role.agent, role.agent.waypoints, stationary=False, static=False)
-        yield {
-            **entry,
-            **_paint(role.agent),
-            **({"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}),
-            **_trust(role.agent),
-            **(_observers(role.agent) if tell_ends else {}),
-        }
+        mark = {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
+        yield {**entry, **_paint(role.agent), **mark, **_trust(role.agent), **_observers(role.agent, tell_ends)}
     for agent in roles.stationary:
         entry = _entry(agent, agent.waypoints, stationary=True, static=agent.static)
-        yield {**entry, **_paint(agent), **_trust(agent), **(_observers(agent) if tell_ends else {})}
+        yield {**entry, **_paint(agent), **_trust(agent), **_observers(agent, tell_ends)}
 
 
-def _observers(agent: Agent) -> dict[str, Any]:
+def _observers(agent: Agent, tell: bool) -> dict[str, Any]:
     """Return the spans, s, in which each end observed an agent; nothing for one that does not tell, such as the ego."""
     spans = {end: [[round(t, 3) for t in span] for span in found] for end, found in agent.observed_by.items() if found}
-    return {"observed_by": spans} if spans else {}
+    return {"observed_by": spans} if spans and tell else {}
 
 
 def _paint(agent: Agent) -> dict[str, Any]:

@@ -12,6 +12,7 @@ const byId = (id) => document.getElementById(id);
 const mark = (track) => {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
   svg.setAttribute("viewBox", "0 0 12 12");
+  svg.setAttribute("aria-hidden", "true");
   const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
   path.setAttribute("d", SHAPES[track.group]);
   path.style.fill = track.fill;

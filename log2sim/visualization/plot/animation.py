@@ -198,7 +198,7 @@ def draw_frames(
     layout: FigureLayout, artists: AnimatedArtists, timing: FrameTiming, progress: Progress
 ) -> Iterator[Image]:
     """Yield RGB frames (H, W, 3); static artists are drawn once."""
-    canvas: Any = layout.canvas  # its methods have no type hints
+    canvas: Any = layout.figure.canvas  # its methods have no type hints
     canvas.draw()
     background = canvas.copy_from_bbox(layout.figure.bbox)
     for k in range(timing.frames):

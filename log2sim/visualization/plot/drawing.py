@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -54,6 +54,16 @@ def draw_background(ax: Axes, picture: Background) -> None:
     )
 
 
+def add_polygons(ax: Axes, corners: Iterable[Array], **style: Any) -> None:
+    """Add polygons, each (K, 2), in one collection, which does not change the limits of the axes."""
+    ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
+
+
+def add_lines(ax: Axes, lines: Iterable[Array], **style: Any) -> None:
+    """Add lines, each (K, 2), in one collection, which does not change the limits of the axes."""
+    ax.add_collection(LineCollection(list(lines), **style), autolim=False)
+
+
 def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
     """Draw stationary agents as gray boxes; as a dot where the box would be too small to see."""
     if not agents:
@@ -61,23 +71,10 @@ def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
     middle = [len(a.waypoints) // 2 for a in agents]
     xy = np.array([centers_xy(a)[k] for a, k in zip(agents, middle)])
     corners = np.concatenate([viewport.footprints(a, p, a.waypoints.yaw_rad[k]) for a, p, k in zip(agents, xy, middle)])
-    style: dict[str, Any] = {
-        "facecolors": PARKED_FACE,
-        "edgecolors": PARKED_EDGE,
-        "linewidths": 0.6,
-        "zorder": STATIONARY,
-    }
-    ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
-    ax.add_collection(
-        PolyCollection(
-            list(viewport.heading_triangles(corners)),
-            facecolors=[paint_of(a, PARKED_EDGE) for a in agents],
-            edgecolors=PARKED_EDGE,
-            linewidths=0.3,
-            zorder=STATIONARY,
-        ),
-        autolim=False,
-    )
+    edge: dict[str, Any] = {"edgecolors": PARKED_EDGE, "zorder": STATIONARY}
+    add_polygons(ax, corners, facecolors=PARKED_FACE, linewidths=0.6, **edge)
+    paints = [paint_of(a, PARKED_EDGE) for a in agents]
+    add_polygons(ax, viewport.heading_triangles(corners), facecolors=paints, linewidths=0.3, **edge)
     small = np.array([max(a.size_m[:2]) < 5 * view.m_per_pt for a in agents])
     if small.any():
         ax.plot(xy[small, 0], xy[small, 1], "o", ms=3, mfc=PARKED_FACE, mec=PARKED_EDGE, mew=0.6, zorder=STATIONARY)
@@ -93,19 +90,11 @@ def draw_tracks(
     for leading in (False, True):
         same_rank = [r for r in roles.movers if r.leading is leading]
         _lines(ax, same_rank, alpha if leading else alpha * 0.5, leading)
-    heads = [
-        (head, role.color)
-        for role in roles.movers
-        if role.leading
-        for head in viewport.arrows(centers_xy(role.agent), view)
-    ]
+    shown = [role for role in roles.movers if role.leading]
+    heads = [(head, role.color) for role in shown for head in viewport.arrows(centers_xy(role.agent), view)]
     if heads and not faint:
-        ax.add_collection(
-            PolyCollection(
-                [h for h, _ in heads], facecolors=[c for _, c in heads], edgecolors=PAPER, linewidths=0.5, zorder=MARK
-            ),
-            autolim=False,
-        )
+        faces = [color for _, color in heads]
+        add_polygons(ax, [h for h, _ in heads], facecolors=faces, edgecolors=PAPER, linewidths=0.5, zorder=MARK)
     if not faint:
         _time_marks(ax, roles, view, step_s)
 
@@ -121,15 +110,17 @@ def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: flo
             apart = viewport.spaced_apart(at, xy[[0, -1]], 1.15 * agent.size_m[0])
             if apart.any():
                 ghost = viewport.footprints(agent, at[apart], agent.at(t[apart]).yaw_rad)
-                _polygons(
-                    ax, ghost, facecolors=to_rgba(role.color, 0.10), edgecolors=to_rgba(role.color, 0.4), z=TRACK - 0.5
-                )
+                faint = {"facecolors": to_rgba(role.color, 0.10), "edgecolors": to_rgba(role.color, 0.4)}
+                add_polygons(ax, ghost, linewidths=0.8, zorder=TRACK - 0.5, **faint)
         first, last = (viewport.footprints(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
-        _polygons(ax, first, facecolors=to_rgba(PAPER, 0.75), edgecolors=to_rgba(role.color, 0.9 * alpha), z=z - 0.6)
-        _polygons(ax, last, facecolors=to_rgba(role.color, 0.92 * alpha), edgecolors=PAPER, z=z)
         paint = paint_of(agent, to_rgba(PAPER, 0.85))
         rim = "none" if agent.color is None else to_rgba(PAPER, 0.85)
-        _polygons(ax, viewport.heading_triangles(last), facecolors=paint, edgecolors=rim, z=z)
+        for corners, face, edge, level in (
+            (first, to_rgba(PAPER, 0.75), to_rgba(role.color, 0.9 * alpha), z - 0.6),
+            (last, to_rgba(role.color, 0.92 * alpha), PAPER, z),
+            (viewport.heading_triangles(last), paint, rim, z),
+        ):
+            add_polygons(ax, corners, facecolors=face, edgecolors=edge, linewidths=0.8, zorder=level)
         if max(agent.size_m[:2]) < 9 * view.m_per_pt:
             face = to_rgba(role.color, alpha)
             ax.plot(*xy[-1], MARKERS[role.group], ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
@@ -144,29 +135,25 @@ def draw_truth(ax: Axes, truth: Scenario) -> None:
             tracks.append(xy)
         corners.append(viewport.footprints(agent, xy[-1], agent.waypoints.yaw_rad[-1])[0])
     style: dict[str, Any] = {"linewidths": 0.8, "linestyles": [(0, (3, 2))], "zorder": BOX + 0.8}
-    ax.add_collection(LineCollection(tracks, colors=to_rgba(INK, 0.9), **style), autolim=False)
-    ax.add_collection(PolyCollection(corners, facecolors="none", edgecolors=to_rgba(INK, 0.9), **style), autolim=False)
+    add_lines(ax, tracks, colors=to_rgba(INK, 0.9), **style)
+    add_polygons(ax, corners, facecolors="none", edgecolors=to_rgba(INK, 0.9), **style)
 
 
 def draw_replay(ax: Axes, replay: Any, roles: AgentRoles) -> None:
     """Draw replayed trajectories as dotted lines with a dotted box at the end, in the color of the track."""
     role_of = {role.agent.id: role for role in roles.movers}
-    tracks, colors, ends, end_colors = [], [], [], []
+    tracks, colors, ends = [], [], []
     for driven in replay.agents:
         role = role_of.get(driven.id)
-        if role is None or len(driven.t_s) == 0:
-            continue
-        xy = np.column_stack([driven.x_m, driven.y_m])
-        tracks.append(xy)
-        colors.append(to_rgba(role.color))
-        ends.append(viewport.footprints(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
-        end_colors.append(to_rgba(role.color))
+        if role is not None and len(driven.t_s):
+            xy = np.column_stack([driven.x_m, driven.y_m])
+            tracks.append(xy)
+            colors.append(to_rgba(role.color))
+            ends.append(viewport.footprints(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
     dots: dict[str, Any] = {"linestyles": [(0, (0.1, 2.0))], "linewidths": 1.6, "capstyle": "round"}
-    ax.add_collection(LineCollection(tracks, colors=colors, zorder=REPLAY, **dots), autolim=False)
+    add_lines(ax, tracks, colors=colors, zorder=REPLAY, **dots)
     dotted: dict[str, Any] = {"linestyles": [(0, (1, 1.2))], "linewidths": 1.1}
-    ax.add_collection(
-        PolyCollection(ends, facecolors="none", edgecolors=end_colors, zorder=BOX + 0.7, **dotted), autolim=False
-    )
+    add_polygons(ax, ends, facecolors="none", edgecolors=colors, zorder=BOX + 0.7, **dotted)
 
 
 def draw_collisions(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
@@ -182,16 +169,13 @@ def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> Non
             kind.extend((part, role.color) for part in parts)
     ribbon = 1.5 if alpha < 1.0 else 1.0
     width = [ribbon * (2.4 if c == INK else 1.7) for _, c in observed] if leading else [1.0] * len(observed)
+    parts, colors = [p for p, _ in observed], [to_rgba(c, alpha) for _, c in observed]
     if leading and alpha == 1.0:
-        rim = LineCollection([p for p, _ in observed], colors=to_rgba(PAPER, 0.85), linewidths=[w + 1.6 for w in width])
-        rim.set(zorder=TRACK - 0.2, capstyle="round")
-        ax.add_collection(rim, autolim=False)
-    solid = LineCollection([p for p, _ in observed], colors=[to_rgba(c, alpha) for _, c in observed], linewidths=width)
-    solid.set(zorder=TRACK, capstyle="round")
-    ax.add_collection(solid, autolim=False)
-    dashed = LineCollection([p for p, _ in filled], colors=[to_rgba(c, alpha) for _, c in filled], linewidths=1.3)
-    dashed.set(zorder=TRACK, linestyle=(0, (2.2, 1.8)))
-    ax.add_collection(dashed, autolim=False)
+        rim = {"colors": to_rgba(PAPER, 0.85), "linewidths": [w + 1.6 for w in width]}
+        add_lines(ax, parts, zorder=TRACK - 0.2, capstyle="round", **rim)
+    add_lines(ax, parts, colors=colors, linewidths=width, zorder=TRACK, capstyle="round")
+    gaps, colors = [p for p, _ in filled], [to_rgba(c, alpha) for _, c in filled]
+    add_lines(ax, gaps, colors=colors, linewidths=1.3, zorder=TRACK, linestyle=(0, (2.2, 1.8)))
 
 
 def _time_marks(ax: Axes, roles: AgentRoles, view: Viewport, step_s: float) -> None:
@@ -199,11 +183,7 @@ def _time_marks(ax: Axes, roles: AgentRoles, view: Viewport, step_s: float) -> N
         if not role.leading:
             continue
         t, xy = viewport.time_marks(role.agent, step_s)
-        apart = (
-            np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt])
-            if len(t)
-            else np.zeros(0, bool)
-        )
+        apart = np.append(True, np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt)[: len(t)]
         ax.plot(
             xy[apart, 0], xy[apart, 1], "o", ms=2.7, mfc=PAPER, mec=role.color, mew=0.8, zorder=MARK + 0.1, ls="none"
         )
@@ -212,10 +192,3 @@ def _time_marks(ax: Axes, roles: AgentRoles, view: Viewport, step_s: float) -> N
 def view_is_crowded(roles: AgentRoles) -> bool:
     """Tell whether there are too many movers for boxes at time marks."""
     return len(roles.movers) > MAX_UNCROWDED_MOVERS
-
-
-def _polygons(ax: Axes, corners: Array, *, facecolors: Any, edgecolors: Any, z: float) -> None:
-    ax.add_collection(
-        PolyCollection(list(corners), facecolors=facecolors, edgecolors=edgecolors, linewidths=0.8, zorder=z),
-        autolim=False,
-    )

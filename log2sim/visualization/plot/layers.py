@@ -31,7 +31,7 @@ from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.simulation.expected_motion import ends_of
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.visualization.plot import viewport
-from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, Background
+from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, Background, add_lines, add_polygons
 from log2sim.visualization.plot.selection import NO_OPTIONS, PlotOptions, TimeRange
 from log2sim.visualization.plot.style import (
     BORDER_COLOR,
@@ -66,8 +66,7 @@ def draw_observers(ax: Axes, roles: AgentRoles, view: Viewport) -> None:
     aside_m = BESIDE_PT * view.m_per_pt
     for end in ENDS:
         lines = [line for role in roles.movers for line in lines_of(role.agent, end, aside_m)]
-        artist = LineCollection(lines, colors=END_COLOR[end], linewidths=WIDTH_PT, capstyle="butt", zorder=TRACK - 0.2)
-        ax.add_collection(artist, autolim=False)
+        add_lines(ax, lines, colors=END_COLOR[end], linewidths=WIDTH_PT, capstyle="butt", zorder=TRACK - 0.2)
 
 
 def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
@@ -137,26 +136,16 @@ def warning_row() -> tuple[Line2D, str]:
 
 
 def new_collisions(replay: Any) -> tuple[Array, Array]:
-    """Find the collisions of a replay that its scenario does not have.
-
-    Returns
-    -------
-    t_s : (K,) float64
-        When each begins.
-    xy_m : (K, 2) float64
-        Midpoints between the centers of both boxes, map frame.
-    """
+    """Find when collisions of a replay begin (K,), s, that its scenario does not have, and the middles (K, 2) of both boxes, m."""
     if replay is None:
         return np.zeros(0), np.zeros((0, 2))
     events = [e for e in replay.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
     agents = {a.id: a for a in replay.agents}
-    places = [
-        np.mean(
-            [[np.interp(e["t_s"], agents[k].t_s, c) for c in (agents[k].x_m, agents[k].y_m)] for k in e["agents"]],
-            axis=0,
-        )
-        for e in events
-    ]
+
+    def place(t_s: float, id: str) -> list[float]:
+        return [float(np.interp(t_s, agents[id].t_s, c)) for c in (agents[id].x_m, agents[id].y_m)]
+
+    places = [np.mean([place(e["t_s"], id) for id in e["agents"]], axis=0) for e in events]
     return np.array([e["t_s"] for e in events], dtype=np.float64), np.array(places, dtype=np.float64).reshape(-1, 2)
 
 
@@ -185,9 +174,11 @@ class PredictedPaths:
         found, rows = self._found, self._rows[agent]
         table, ticks = found.table, found.tick[rows]
         k = int(np.searchsorted(table.t_s[ticks], t_s + 1e-6, side="right")) - 1
-        if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s or self._stands(rows[k]):
+        if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s:
             return None
         forecast, row = found.forecasts[DEFAULT_METHOD], rows[k]
+        if abs(table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS:
+            return None
         path = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
         along, across = forecast.sigma_m[row, -1]
         rim = path[-1] + forecast.course[row, -1] * (along * _CIRCLE.real + 1j * across * _CIRCLE.imag)
@@ -202,14 +193,9 @@ class PredictedPaths:
         t = found.table.t_s[found.tick[rows]]
         if len(t) < 2:
             return t[:0]
-        regular = (
-            np.arange(np.ceil(t[0] / self.horizon_s + 1e-6), np.floor(t[-1] / self.horizon_s) + 1) * self.horizon_s
-        )
-        return np.append(regular[regular < t[-1] - self.horizon_s / 3], t[-1])
-
-    def _stands(self, row: int) -> bool:
-        found = self._found
-        return bool(abs(found.table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS)
+        h = self.horizon_s
+        regular = np.arange(np.ceil(t[0] / h + 1e-6), np.floor(t[-1] / h) + 1) * h
+        return np.append(regular[regular < t[-1] - h / 3], t[-1])
 
 
 def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None:
@@ -222,10 +208,11 @@ def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None
         if role.agent.waypoints.t_s[0] <= t <= role.agent.waypoints.t_s[-1]
         if (expected := paths.at(role.agent.id, float(t))) is not None
     ]
-    for artist in (
+    lines, ellipses = (
         LineCollection([], zorder=MARK + 0.2, **DOTS),
         PolyCollection([], linewidths=0.7, zorder=TRACK - 0.4),
-    ):
+    )
+    for artist in (lines, ellipses):
         show_expected(artist, shown)
         ax.add_collection(artist, autolim=False)
 
@@ -308,7 +295,7 @@ def hatch_movers(ax: Axes, roles: AgentRoles, view: Viewport, z_track: float, z_
         if is_doubted_at(role.agent, float(role.agent.waypoints.t_s[-1])):
             _hatch(ax, role.agent, -1, view, stripe=PAPER, edge=role.color, z=z_box)
     dashes: dict[str, Any] = {"linestyles": [(0, (1.1, 1.4))], "linewidths": 1.3, "colors": PAPER, "zorder": z_track}
-    ax.add_collection(LineCollection(tracks, **dashes), autolim=False)
+    add_lines(ax, tracks, **dashes)
 
 
 def box_stripes(agent: Agent, xy_m: Array, yaw_rad: float, view: Viewport) -> list[Array]:
@@ -333,7 +320,9 @@ def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[An
     doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
     rows: list[tuple[Any, str]] = []
     for agent, color in doubtful[:MAX_NAMED]:
-        rows.append((_hatched_patch(color), _wrapped(f"{agent.id} is doubtful: {explain_doubt(agent)}")))
+        text = printable_label(f"{agent.id} is doubtful: {explain_doubt(agent)}", LINE_LETTERS * MAX_LINES)
+        lines = textwrap.wrap(text, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …")
+        rows.append((_hatched_patch(color), "\n".join(lines)))
     if len(doubtful) > MAX_NAMED:
         rows.append((Patch(fc="none", ec="none"), f"and {len(doubtful) - MAX_NAMED} more doubtful"))
     if not doubtful and any(a.is_doubtful for a in roles.stationary):
@@ -345,26 +334,21 @@ def _hatched_patch(color: str) -> Patch:
     return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
 
 
-def _wrapped(text: str) -> str:
-    whole = printable_label(text, LINE_LETTERS * MAX_LINES)
-    return "\n".join(textwrap.wrap(whole, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …"))
-
-
 def _hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
     """Draw stripes and outline of the box at waypoint `k`."""
     xy_m, yaw_rad = centers_xy(agent)[k], float(agent.waypoints.yaw_rad[k])
-    lines = LineCollection(box_stripes(agent, xy_m, yaw_rad, view), colors=stripe, linewidths=STRIPE_PT, zorder=z)
-    outline = list(viewport.footprints(agent, xy_m, yaw_rad))
-    ax.add_collection(lines, autolim=False)
-    ax.add_collection(
-        PolyCollection(outline, facecolors="none", edgecolors=edge, linewidths=0.9, zorder=z), autolim=False
-    )
+    add_lines(ax, box_stripes(agent, xy_m, yaw_rad, view), colors=stripe, linewidths=STRIPE_PT, zorder=z)
+    outline = viewport.footprints(agent, xy_m, yaw_rad)
+    add_polygons(ax, outline, facecolors="none", edgecolors=edge, linewidths=0.9, zorder=z)
 
 
 LANES, LINES = BACKGROUND + 0.2, BACKGROUND + 0.4  # z-order: above a picture of the ground, below what stands
 MIN_LINE_PT, BORDER_PT = 0.9, 0.8
 DASHES = (0, (4.0, 3.0))
 ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)  # arrows along lanes: distance from one to the next, length and half width
+
+
+SENSOR: dict[str, Any] = {"marker": "^", "ms": SENSOR_PT, "mfc": SENSOR_COLOR, "mec": PAPER, "mew": 0.8, "ls": "none"}
 
 
 def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: bool) -> None:
@@ -378,55 +362,32 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
         wedge = Wedge(place, sensor["range_m"], yaw - half, yaw + half, fc=face, ec=edge, lw=0.8)
         wedge.set_zorder(LANES - 0.2)
         ax.add_artist(wedge)
-        ax.plot(
-            *place,
-            marker="^",
-            ms=SENSOR_PT,
-            mfc=SENSOR_COLOR,
-            mec=PAPER,
-            mew=0.8,
-            ls="none",
-            zorder=LINES + 3,
-            scalex=False,
-            scaley=False,
-        )
+        ax.plot(*place, zorder=LINES + 3, scalex=False, scaley=False, **SENSOR)
     features = scenario.map_features
     if features is None:
         return
     if not over_picture:
         faces = [lane_outline(lane) for lane in features.lanes]
-        ax.add_collection(PolyCollection(faces, facecolors=LANE_FACE, edgecolors="none", zorder=LANES), autolim=False)
+        add_polygons(ax, faces, facecolors=LANE_FACE, edgecolors="none", zorder=LANES)
     arrows = [arrow for lane in features.lanes for arrow in lane_arrows(lane)]
-    ax.add_collection(PolyCollection(arrows, facecolors=LANE_ARROW, zorder=LANES + 0.1), autolim=False)
+    add_polygons(ax, arrows, facecolors=LANE_ARROW, zorder=LANES + 0.1)
     borders = [border.points_m[:, :2] for border in features.borders]
-    ax.add_collection(
-        LineCollection(borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1), autolim=False
-    )
+    add_lines(ax, borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1)
     _draw_markings(ax, features.markings, view)
 
 
 def _draw_markings(ax: Axes, markings: Sequence[Marking], view: Viewport) -> None:
     """Draw lines along their middle, dashed ones with dashes, and outlines of crosswalks and symbols; doubtful ones are pale."""
     areas = [m for m in markings if m.kind in ("crosswalk", "other")]
-    ax.add_collection(
-        PolyCollection(
-            [m.points_m[:, :2] for m in areas],
-            facecolors=[_shade(m, 0.25) for m in areas],
-            edgecolors=[_shade(m, 0.9) for m in areas],
-            linewidths=0.6,
-            hatch="////",
-            zorder=LINES,
-        ),
-        autolim=False,
-    )
+    faces, edges = ([_shade(m, alpha) for m in areas] for alpha in (0.25, 0.9))
+    style: dict[str, Any] = {"linewidths": 0.6, "hatch": "////", "zorder": LINES}
+    add_polygons(ax, [m.points_m[:, :2] for m in areas], facecolors=faces, edgecolors=edges, **style)
     for dashed in (False, True):
         lines = [m for m in markings if m not in areas and (m.kind == "dashed") is dashed]
         widths = [max(m.width_m / view.m_per_pt, MIN_LINE_PT) for m in lines]
-        style: dict[str, Any] = {"linestyles": [DASHES]} if dashed else {"capstyle": "butt"}
+        style = {"linestyles": [DASHES]} if dashed else {"capstyle": "butt"}
         points, colors = [m.points_m[:, :2] for m in lines], [_shade(m, 1.0) for m in lines]
-        ax.add_collection(
-            LineCollection(points, colors=colors, linewidths=widths, zorder=LINES, **style), autolim=False
-        )
+        add_lines(ax, points, colors=colors, linewidths=widths, zorder=LINES, **style)
 
 
 def draw_signals(ax: Axes, signals: Sequence[Signal], t_s: float) -> None:
@@ -467,8 +428,7 @@ def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
         if features.borders:
             rows.append((Line2D([0, 1], [0, 1], color=BORDER_COLOR, lw=BORDER_PT), "border of a road"))
     if scenario.sensors:
-        marker: dict[str, Any] = {"marker": "^", "ms": SENSOR_PT, "mfc": SENSOR_COLOR, "mec": PAPER, "ls": "none"}
-        rows.append((Line2D([], [], **marker), "sensor at the road, its field of view"))
+        rows.append((Line2D([], [], **{**SENSOR, "mew": 1.0}), "sensor at the road, its field of view"))
     if scenario.signals:
         style: dict[str, Any] = {"marker": "o", "ms": 5.0, "mfc": SIGNAL_COLOR["red"], "mec": PAPER, "ls": "none"}
         rows.append((Line2D([], [], **style), "traffic light"))

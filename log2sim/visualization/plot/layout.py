@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
@@ -23,8 +22,6 @@ from log2sim.visualization.plot.style import (
     COLLISION_MARK,
     CROWD_COLOR,
     FONT,
-    FRAME,
-    GRID,
     INK,
     MARKERS,
     MUTED,
@@ -33,7 +30,9 @@ from log2sim.visualization.plot.style import (
     PARKED_FACE,
     SENSOR_PT,
     halo,
+    new_figure,
     printable_label,
+    style_axes,
 )
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, nice_step
 
@@ -359,7 +358,6 @@ class FigureLayout:
     """A figure and its parts."""
 
     figure: Figure
-    canvas: FigureCanvasAgg
     ax: Axes  # of the map
     view: Viewport  # what the map shows
     foot_in: float = 0.0  # inch, height below the map for charts
@@ -394,16 +392,14 @@ def make_layout(
         width = max(WIDTH_IN, (max(needed, MIN_MAP_IN) + around) / aspect)
         map_width, map_height = width - LEFT_IN - SIDE_IN - GAP_IN, width * aspect - around
     height = map_height + around
-    figure = Figure(figsize=(width, height), facecolor=PAPER)
-    canvas = FigureCanvasAgg(figure)
+    figure = new_figure(width, height)
     bottom = foot_in + BOTTOM_IN
     ax = figure.add_axes((LEFT_IN / width, bottom / height, map_width / width, map_height / height))
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
     names = ("east", "north") if projected else ("map x", "map y")
-    ax.set_axisbelow(True)
-    ax.grid(True, color=GRID, lw=0.7)
+    style_axes(ax)
     step_m = nice_step(max(fitted.width_m, fitted.height_m) / 5)
     for axis, name, low in zip((ax.xaxis, ax.yaxis), names, (fitted.x0, fitted.y0)):
         # Seven-digit tick labels are unreadable; their common part goes into the axis label.
@@ -412,10 +408,7 @@ def make_layout(
         axis.set_major_formatter(FuncFormatter(lambda v, _, base_m=base_m: f"{v - base_m:.6g}".replace("-", "−")))
         since = f" − {base_m:.0f}" if base_m > 0 else f" + {-base_m:.0f}" if base_m < 0 else ""
         axis.set_label_text(f"{name}{since} (m)", fontsize=7.5, color=MUTED, family=FONT)
-    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
-    return FigureLayout(figure, canvas, ax, fitted, foot_in)
+    return FigureLayout(figure, ax, fitted, foot_in)
 
 
 def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
@@ -433,10 +426,15 @@ def draw_legend(layout: FigureLayout, rows: list[tuple[Any, str]]) -> None:
     """Draw the legend in the column beside the map, where it covers nothing."""
     height = layout.figure.get_figheight()
     x = 1 - SIDE_IN / layout.width_in
-    legend = layout.figure.legend(
-        [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=(x, 1 - TOP_IN / height),
-        borderaxespad=0, frameon=False, prop={"family": FONT, "size": 7.0}, handlelength=2.0, labelspacing=0.56,
-        handletextpad=0.7, labelcolor=INK,
+    place = (x, 1 - TOP_IN / height)
+    fill_legend(layout.figure, rows, place, handlelength=2.0, labelspacing=0.56, handletextpad=0.7)
+
+
+def fill_legend(owner: Axes | Figure, rows: list[tuple[Any, str]], place: tuple[float, float], **style: Any) -> None:
+    """Draw a legend whose upper left corner is at a place in fractions of axes or a figure."""
+    legend = owner.legend(
+        [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=place, borderaxespad=0,
+        frameon=False, prop={"family": FONT, "size": 7.0}, labelcolor=INK, **style,
     )  # fmt: skip
     for text in legend.get_texts():
         text.set_parse_math(False)

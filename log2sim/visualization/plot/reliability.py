@@ -7,11 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from log2sim.files.documents import replaced
-from log2sim.visualization.plot.style import FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, printable_label
+from log2sim.visualization.plot.style import (
+    FONT,
+    FRAME,
+    GRID,
+    INK,
+    MUTED,
+    PALETTE,
+    PAPER,
+    new_figure,
+    printable_label,
+    save_png,
+)
 
 SIDE_IN = 3.4
 # Area of the mark of the bin with the most boxes; the others in proportion, which shows what they weigh.
@@ -31,15 +39,12 @@ class Reliability:
     bins: tuple[tuple[int, float, float], ...]
 
 
-def write_reliability(diagrams: Sequence[Reliability], path: Path, *, dpi: int = 150) -> None:
+def write_reliability(diagrams: Sequence[Reliability], path: Path) -> None:
     """Write diagrams side by side into a PNG, atomically."""
-    # Draw diagrams side by side.
-    figure = Figure(figsize=(SIDE_IN * max(len(diagrams), 1), SIDE_IN + 0.3), facecolor=PAPER, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(SIDE_IN * max(len(diagrams), 1), SIDE_IN + 0.3, layout="constrained")
     for k, diagram in enumerate(diagrams, start=1):
         _draw(figure.add_subplot(1, len(diagrams), k), diagram)
-    with replaced(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+    save_png(figure, path, 150)
 
 
 def _draw(axes: Axes, diagram: Reliability) -> None:

@@ -29,6 +29,7 @@ from log2sim.visualization.plot.layout import (
     draw_labels,
     draw_legend,
     draw_scale_and_north,
+    fill_legend,
     legend_rows,
     make_layout,
     names_fit,
@@ -36,7 +37,7 @@ from log2sim.visualization.plot.layout import (
     write_title,
 )
 from log2sim.visualization.plot.selection import PlotOptions, TimeRange
-from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED
+from log2sim.visualization.plot.style import FONT, MUTED, style_axes
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import (
     AgentRoles,
@@ -240,7 +241,7 @@ def plot(
         ax = plt.subplots(figsize=SIZE_IN, layout="constrained")[1]
     roles = assign_view_roles(scenario)
     view = _set_view(ax, roles)
-    step_s = time_step_s(scenario.duration_s, len(roles.movers), _usual_speed(roles), view.m_per_pt)
+    step_s = time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
     draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
     placed = place_labels(roles, view, step_s, sensors=scenario.sensors)
@@ -250,7 +251,7 @@ def plot(
         overlays = {"truth": truth is not None, "replay": replay is not None}
         collisions = len(new_collisions(replay)[0])
         rows = legend_rows(roles, step_s, placed.told, collisions=collisions, outside=0, **overlays)
-        _draw_legend(ax, [*rows, *layers.doubt_rows(roles, placed.told), *road_rows(scenario)])
+        fill_legend(ax, [*rows, *layers.doubt_rows(roles, placed.told), *road_rows(scenario)], (1.01, 1.0))
     return ax
 
 
@@ -263,25 +264,7 @@ def _set_view(ax: Axes, roles: AgentRoles) -> Viewport:
         return Viewport(x0, x1, y0, y1, max((x1 - x0) / size_pt[0], (y1 - y0) / size_pt[1]))
     view = choose_viewport(roles).fitted(*size_pt)
     ax.set_aspect("equal", adjustable="box")
-    ax.set_axisbelow(True)
+    style_axes(ax, grid=False)
     ax.set_xlabel("x of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
     ax.set_ylabel("y of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
-    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
     return view
-
-
-def _usual_speed(roles: AgentRoles) -> float:
-    speeds = [float(abs(r.agent.waypoints.speed_mps).mean()) for r in roles.movers if is_moving(r.agent)]
-    return sum(speeds) / len(speeds) if speeds else 0.0
-
-
-def _draw_legend(ax: Axes, rows: list[tuple[Any, str]]) -> None:
-    """Draw the legend beside the map, where it covers nothing."""
-    made = ax.legend(
-        [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=(1.01, 1.0),
-        borderaxespad=0, frameon=False, prop={"family": FONT, "size": 7.0}, labelcolor=INK,
-    )  # fmt: skip
-    for text in made.get_texts():
-        text.set_parse_math(False)

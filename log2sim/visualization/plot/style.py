@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from matplotlib import font_manager
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
 from matplotlib.patheffects import AbstractPathEffect, withStroke
+
+from log2sim.files.documents import replaced
 
 # Ego, titles and truth.
 INK = "#1B2330"
@@ -55,6 +62,36 @@ FONT = "DejaVu Sans"
 def halo(width_pt: float = 2.2) -> list[AbstractPathEffect]:
     """Make a white outline that keeps letters readable on lines and pictures."""
     return [withStroke(linewidth=width_pt, foreground=PAPER, alpha=0.9)]
+
+
+def new_figure(width_in: float, height_in: float, **style: Any) -> Figure:
+    """Make a white figure that needs no display."""
+    figure = Figure(figsize=(width_in, height_in), facecolor=PAPER, **style)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_png(figure: Figure, path: Path, dpi: float) -> None:
+    """Write a figure as a PNG, atomically; the same figure gives the same bytes."""
+    with replaced(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+
+
+def png_bytes(figure: Figure, dpi: float) -> bytes:
+    """Return a figure as a PNG."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=dpi, metadata={"Software": None})
+    return data.getvalue()
+
+
+def style_axes(ax: Axes, *, size_pt: float = 7.0, length_pt: float = 2.5, grid: bool = True) -> None:
+    """Give axes pale frames, muted ticks and a grid below what is drawn."""
+    ax.set_axisbelow(True)
+    if grid:
+        ax.grid(True, color=GRID, lw=0.7)
+    ax.tick_params(labelsize=size_pt, colors=MUTED, length=length_pt, width=0.6, labelfontfamily=FONT)
+    for spine in ax.spines.values():
+        spine.set(color=FRAME, linewidth=0.8)
 
 
 def printable_label(text: str, longest: int = 80) -> str:

@@ -23,7 +23,7 @@ from log2sim.visualization.plot.layout import (
     TIME_IN,
     FigureLayout,
 )
-from log2sim.visualization.plot.style import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable_label
+from log2sim.visualization.plot.style import ALARM, FONT, FRAME, INK, MUTED, PAPER, halo, printable_label, style_axes
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 
 KMH = 3.6
@@ -196,16 +196,13 @@ def _draw_strip(
 
 
 def _style(ax: Axes, *, last: bool) -> None:
-    ax.set_axisbelow(True)
-    ax.grid(True, color=GRID, lw=0.7)
+    style_axes(ax, size_pt=6.5, length_pt=2.0)
     ax.yaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 5, 10]))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:.6g}".replace("-", "−")))
-    ax.tick_params(labelsize=6.5, colors=MUTED, length=2.0, width=0.6, labelfontfamily=FONT, labelbottom=last)
+    ax.tick_params(labelbottom=last)
     if last:
         ax.set_xlabel("time (s)", fontsize=7.5, color=MUTED, family=FONT)
-    for spine in ax.spines.values():
-        spine.set(color=FRAME, linewidth=0.8)
 
 
 def _read_out(ax: Axes, text: str, **style: Any) -> Any:

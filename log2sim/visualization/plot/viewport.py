@@ -158,10 +158,10 @@ def choose_viewport(roles: AgentRoles) -> Viewport:
     return _around(kept)
 
 
-def nice_step(target: float, steps: tuple[float, ...] = (1.0, 2.0, 5.0)) -> float:
+def nice_step(target: float) -> float:
     """Find the largest of 1, 2, 5 times a power of ten that is not above `target` > 0."""
     power = 10.0 ** np.floor(np.log10(target))
-    return float(max((s * power for s in steps if s * power <= target * (1 + 1e-9)), default=power))
+    return float(max((s * power for s in (1.0, 2.0, 5.0) if s * power <= target * (1 + 1e-9)), default=power))
 
 
 def time_step_s(duration_s: float, movers: int, speed_mps: float, m_per_pt: float) -> float:
@@ -264,16 +264,8 @@ def arrows(xy_m: Array, view: Viewport, spacing_pt: float = 110.0, size_pt: floa
         along = along / np.hypot(*along)
         across = np.array([-along[1], along[0]])
         tail = here - size * 0.8 * along
-        out.append(
-            np.stack(
-                [
-                    here + size * along,
-                    tail + 0.75 * size * across,
-                    here - size * 0.35 * along,
-                    tail - 0.75 * size * across,
-                ]
-            )
-        )
+        aside, back = 0.75 * size * across, here - size * 0.35 * along
+        out.append(np.stack([here + size * along, tail + aside, back, tail - aside]))
     return out
 
 
