@@ -21,6 +21,7 @@ from log2sim.perception.cooperative import (
     match_by_covariance,
     merge_by_covariance,
     moving_boxes,
+    refine_by_views,
     take_off_offset,
 )
 from log2sim.perception.lidar.cloud import (
@@ -283,6 +284,23 @@ def test_what_a_viewpoint_sees_is_judged_from_there() -> None:
     assert obstacles_of(parts[0]).sensor_of(np.arange(3)).tolist() == [-15, -5, 2]
     starts = {tuple(p) for p in obstacles.free.start.tolist()}
     assert starts == {(-15, -5, 2), (20, 5, 3)}
+
+
+def test_sides_of_boxes_in_the_points_of_both_ends_are_where_those_who_see_them_see_them() -> None:
+    # Each end sees two sides of a car that moves on by 0.2 m in between; the network's box is off.
+    outline = outline_points(0.0, 0.0)
+    rear, front = outline[(outline[:, 0] < -2.2) | (outline[:, 1] < -0.85)], outline[outline[:, 0] > -2.0]
+    front = front[(front[:, 0] > 2.2) | (front[:, 1] > 0.85)] + [0.2, 0, 0]
+    views = [view_of(rear, [-15, -8, 2]), view_of(front, [20, 9, 3], end="road", stamp_ns=20_000_000)]
+    guessed = boxes_at((-0.2, 0.15, 0.8, 4.5, 1.8, 1.5, 0.04), (30, 0, 0.8, 4.5, 1.8, 1.5, 0))
+    refined = refine_by_views(guessed, views)
+    assert refined.size_m[0, :2] == pytest.approx([4.5, 1.8], abs=0.05)
+    assert refined.center_m[0, 1] == pytest.approx(0.0, abs=0.05)
+    assert refined.yaw_rad[0] == pytest.approx(0.0, abs=0.01)
+    assert guessed.center_m[0, 0] + 0.05 < refined.center_m[0, 0] < 0.2
+    # Where nobody sees points, and without viewpoints, boxes stay.
+    assert refined.take(np.array([1])).center_m.tolist() == guessed.take(np.array([1])).center_m.tolist()
+    assert refine_by_views(guessed, ()) is guessed
 
 
 def test_points_of_a_moving_car_are_put_to_one_time() -> None:

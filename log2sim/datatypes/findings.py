@@ -254,9 +254,9 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         ROAD_POSE,
     ),
     "unknown_road_pose": Kind(
-        "the vehicle sees too little of what a roadside unit sees to say whether its pose is right",
-        "its place in the plane cannot be verified: the vehicle sees too little of what it sees (sigma {x_sigma_m:.2f}, "
-        "{y_sigma_m:.2f} m, {yaw_sigma_deg:.1f} degrees of yaw); kept",
+        "the vehicle sees too little of what a roadside unit sees to know its pose to 0.1 m and 0.3 degrees",
+        "its place in the plane is known no better than to a sigma of {x_sigma_m:.2f}, {y_sigma_m:.2f} m and {yaw_sigma_deg:.1f} degrees "
+        "of yaw: the vehicle sees too little of what it sees",
         ROAD_POSE,
     ),
     "wrong_road_pose": Kind(

@@ -89,37 +89,31 @@ class RoadView:
             return np.zeros((0, 2)), np.zeros((0, 2))
         start = cv2.goodFeaturesToTrack(first, ROAD_POINTS, MIN_CORNER, ROAD_SPACING_PX, mask=self.shown)
         rows, columns = -self.axes @ guess_m * ROAD_PX_PER_M
+        guess_px = np.array([columns, rows])
         begin, end = follow_points(
-            first, second, start, FollowSettings(ROAD_WINDOW_PX, ROAD_LEVELS, (float(columns), float(rows)))
+            first, second, start, window_px=ROAD_WINDOW_PX, levels=ROAD_LEVELS, guess_px=guess_px
         )
         inside = np.clip(np.round(end).astype(int), 0, np.array(self.shown.shape)[::-1] - 1)
         good = self.shown[inside[:, 1], inside[:, 0]] > 0
         return self.in_ego(begin[good]), self.in_ego(end[good])
 
 
-@dataclass(frozen=True)
-class FollowSettings:
-    """How points are followed."""
+def follow_points(
+    first: Any, second: Any, start: Any, *, window_px: int, levels: int, guess_px: Array | None = None
+) -> tuple[Array, Array]:
+    """Follow points (N, 1, 2), or None, to the next image and back: pixels (M, 2) of those that return.
 
-    window_px: int  # side of the patch around a point
-    levels: int  # halvings of the image in which motion is searched first
-    guess_px: tuple[float, float] = (0.0, 0.0)  # (2,) tuple of float: expected motion
-
-
-def follow_points(first: Any, second: Any, start: Any, settings: FollowSettings) -> tuple[Array, Array]:
-    """Follow points (N, 1, 2), or None, to the next image and back: pixels (M, 2) of those that return."""
+    `window_px`: side of the patch around a point. `levels`: halvings of the image in which motion is searched first. `guess_px`: (2,):
+    expected motion.
+    """
     import cv2
 
     if start is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    shift, levels = np.array(settings.guess_px, dtype=np.float32), settings.levels
-    window, flags = (settings.window_px, settings.window_px), cv2.OPTFLOW_USE_INITIAL_FLOW
-    ahead, found, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, start, start + shift, winSize=window, maxLevel=levels, flags=flags
-    )
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, ahead, np.asarray(ahead) - shift, winSize=window, maxLevel=levels, flags=flags
-    )
+    shift = np.zeros(2, np.float32) if guess_px is None else guess_px.astype(np.float32)
+    how: Any = {"winSize": (window_px, window_px), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start + shift, **how)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, np.asarray(ahead) - shift, **how)
     returned = np.linalg.norm((np.asarray(back) - start)[:, 0], axis=1) < MAX_RETURN_PX
     good = (np.asarray(found)[:, 0] == 1) & (np.asarray(found_back)[:, 0] == 1) & returned
     return np.asarray(start[good, 0], dtype=np.float64), np.asarray(np.asarray(ahead)[good, 0], dtype=np.float64)
@@ -355,4 +349,4 @@ def _followed(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Arra
     import cv2
 
     corners = cv2.goodFeaturesToTrack(first, MAX_POINTS, MIN_CORNER, SPACING_PX)
-    return follow_points(first, second, corners, FollowSettings(WINDOW_PX, LEVELS))
+    return follow_points(first, second, corners, window_px=WINDOW_PX, levels=LEVELS)

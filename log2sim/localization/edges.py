@@ -246,18 +246,18 @@ def estimate_yaw(frames: Sequence[FrameScores]) -> YawEstimate | None:
     scores = np.stack([frame.scores for frame in frames])
     sides = np.sum([frame.edges for frame in frames], axis=0)
     count, chance = int(sides.sum()), float(np.sqrt(sum(frame.squares for frame in frames)))
-    best = _highest(scores.sum(axis=0))
-    if sides.min() < MIN_EDGES_A_SIDE or _count_supporting(scores, best.angle_rad) < MIN_FRAMES:
+    angle_rad, height, ratio = _highest(scores.sum(axis=0))
+    if sides.min() < MIN_EDGES_A_SIDE or _count_supporting(scores, angle_rad) < MIN_FRAMES:
         return None
-    gain = best.height / count
-    if best.ratio < MIN_RATIO or gain < MIN_GAIN or best.height < MIN_CHANCES * chance:
+    gain = height / count
+    if ratio < MIN_RATIO or gain < MIN_GAIN or height < MIN_CHANCES * chance:
         return None
     block = np.arange(len(scores)) * BLOCKS // len(scores)
-    others = np.array([_highest(scores[block != b].sum(axis=0)).angle_rad for b in range(BLOCKS)])
+    others = np.array([_highest(scores[block != b].sum(axis=0))[0] for b in range(BLOCKS)])
     scatter = float(np.sqrt((BLOCKS - 1) * others.var()))
     if scatter > MAX_SCATTER_RAD:
         return None
-    return YawEstimate(best.angle_rad, float(np.hypot(scatter, SYSTEMATIC_RAD)), gain, count)
+    return YawEstimate(angle_rad, float(np.hypot(scatter, SYSTEMATIC_RAD)), gain, count)
 
 
 def _count_supporting(scores: Array, angle_rad: float) -> float:
@@ -267,17 +267,8 @@ def _count_supporting(scores: Array, angle_rad: float) -> float:
     return float(height.sum() ** 2 / (height**2).sum()) if height.any() else 0.0
 
 
-@dataclass(frozen=True)
-class _Maximum:
-    """The maximum over all angles: where, how high above the median, and that relative to the next one."""
-
-    angle_rad: float
-    height: float
-    ratio: float
-
-
-def _highest(scores: Array) -> _Maximum:
-    """Find the maximum of scores (2, D) over angle and overhang."""
+def _highest(scores: Array) -> tuple[float, float, float]:
+    """Find the maximum of scores (2, D) over angle and overhang: its angle, rad, height above the median, and that over the next one's."""
     angles, steps = yaw_angles(), round(MAX_OVERHANG_RAD / STEP_RAD)
     reach = round(2 * SPREAD_RAD / STEP_RAD)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * STEP_RAD / SPREAD_RAD) ** 2)
@@ -288,16 +279,13 @@ def _highest(scores: Array) -> _Maximum:
     k = int(np.argmax(joint))
     height, next_one = float(joint[k]), float(joint[np.abs(angles - angles[k]) > APART_RAD].max())
     ratio = height / max(next_one, height / 1000) if height > 0 else 0.0
-    return _Maximum(float(angles[k]) + _offset_of_vertex(joint, k) * STEP_RAD, height, ratio)
-
-
-def _offset_of_vertex(values: Array, k: int) -> float:
-    """Return how far, in steps, the maximum of a parabola through three values is from the middle one; 0 at the ends."""
-    if not 0 < k < len(values) - 1:
-        return 0.0
-    before, middle, after = values[k - 1 : k + 2]
-    bend = before - 2 * middle + after
-    return float((before - after) / bend / 2) if bend < 0 else 0.0
+    offset = 0.0
+    if 0 < k < len(joint) - 1:
+        # The vertex of a parabola through three values.
+        before, middle, after = joint[k - 1 : k + 2]
+        bend = before - 2 * middle + after
+        offset = float((before - after) / bend / 2) if bend < 0 else 0.0
+    return float(angles[k]) + offset * STEP_RAD, height, ratio
 
 
 # Frames of a camera that are looked at: more make the estimate no better than its systematic part.

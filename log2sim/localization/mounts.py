@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, Camera, inverse, rotation_from_rpy, transform, undistort
-from log2sim.localization.camera_motion import FollowSettings, follow_points
+from log2sim.localization.camera_motion import follow_points
 from log2sim.localization.choice import during_ns
 from log2sim.localization.clocks import check_lidars, turn_mount
 from log2sim.localization.edges import (
@@ -106,12 +106,6 @@ def find_exchanged(cameras: Mapping[str, Camera], pairs: Mapping[str, Sequence[F
     return {name: others[0] for name, others in both.items() if len(others) == 1}
 
 
-def agrees(camera: Camera, pairs: Sequence[FlowPair]) -> bool:
-    """Return whether points move in the images of a camera as its mount says."""
-    cosine = flow_agreement(camera, pairs)
-    return cosine is not None and cosine > MIN_AGREEMENT
-
-
 def _choose_pairs(log: Log, t_ns: NDArray[np.int64], during_ns: tuple[int, int] | None) -> list[tuple[int, int]]:
     """Choose up to `MAX_PAIRS` pairs of rows between which the ego moves by about `MIN_APART_M`."""
     assert log.ego is not None
@@ -140,7 +134,7 @@ def _follow(camera: Camera, first: NDArray[np.uint8], second: NDArray[np.uint8])
     import cv2
 
     corners = cv2.goodFeaturesToTrack(first, MAX_CORNERS, CORNER_QUALITY, SPACING_PX)
-    followed = follow_points(first, second, corners, FollowSettings(WINDOW_PX, LEVELS))
+    followed = follow_points(first, second, corners, window_px=WINDOW_PX, levels=LEVELS)
     scale = first.shape[1] / camera.width_px
     xy = [undistort(camera, (px + 0.5) / scale - 0.5) for px in followed]
     usable = np.isfinite(xy[0]).all(axis=1) & np.isfinite(xy[1]).all(axis=1)
@@ -247,7 +241,7 @@ def _find_by_flow(check: MountCheck, names: Sequence[str], during_ns: tuple[int,
     log = check.log
     pairs = {name: follow_pairs(log, name, during_ns) for name in names}
     known = any(yaw is not None for yaw in check.yaws.values())
-    if not known and not any(agrees(log.cameras[name], pairs[name]) for name in names):
+    if not known and not any((flow_agreement(log.cameras[name], pairs[name]) or 0.0) > MIN_AGREEMENT for name in names):
         return {}
     return {
         name: Mistake(

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform, yaw_of
 from log2sim.localization.choice import during_ns
+from log2sim.localization.given_poses import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.odometry import lidars_on_ego
 from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside_fit import (
@@ -44,7 +45,7 @@ from log2sim.localization.roadside_fit import (
     view_from_road,
     view_from_vehicle,
 )
-from log2sim.localization.surfaces import exp_of, log_of
+from log2sim.localization.surfaces import adjoint_of, exp_of, log_of
 from log2sim.plan import Sensors
 
 # Sensors of one pole are not farther apart in the plane.
@@ -109,8 +110,11 @@ OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
 # Delays that are tried; stamps of a sweep's begin instead of its end are early by a period.
 TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
-# Of the vehicle's way, to see how far its poses err.
+# Of the vehicle's way, to see how far its poses drift.
 PARTS, HELD_SHARE = 3, 0.3
+POSE = slice(0, DELAY)
+# Of the sides of the ego's box and its yaw, which GNSS with an IMU gives.
+OWN_SIGMA_M, OWN_SIGMA_RAD = 0.05, 0.005
 # Where structure holds the pose in the plane, objects are needed for the delay alone, for which fewer moments do.
 HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
@@ -124,6 +128,8 @@ class Sight:
     surfaces: Surfaces | None
     ground: CommonGround | None
     objects: CommonObjects
+    # (7, 7): of what the unit's pose seems to lack because the ego's poses err
+    of_poses: Array = field(default_factory=lambda: np.zeros((7, 7)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +158,8 @@ def collect_sight(log: Log, config: Config, unit: Unit, report: Callable[[int, i
     surfaces = None if view is None else surfaces_of(view, road.xyz_m)
     report(2, 3)
     ground = None if view is None else common_ground(view, road.xyz_m)
-    sight = Sight(view, road, surfaces, ground, CommonObjects(()))
+    of_poses = np.zeros((7, 7)) if view is None or log.ego is None else covariance_of_poses(log.ego, view)
+    sight = Sight(view, road, surfaces, ground, CommonObjects(()), of_poses)
     covariance = _refine(sight, np.zeros(7), with_objects=False)[1]
     held = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]) < HELD_M
     moments = choose_moments(log, unit.site_m, during, FEW_MOMENTS if held else MANY_MOMENTS)
@@ -168,8 +175,11 @@ def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array, moments
     at_pole = np.repeat((unit.site_m + np.array([0.0, 0.0, ground_below(road_m)]))[None], len(moments), axis=0)
     start = int(moments[0])
     places = log.ego_centers(pose) - unit.site_m
-    known = np.ones((len(moments), 1))
-    own = np.hstack([(moments - start)[:, None] / NS_PER_S, places, 0 * known, np.inf * known])
+    half = np.array(log.ego_vehicle.size_m[:2]) / 2
+    of_box = np.tile([*half, *[OWN_SIGMA_M] * 4], (len(moments), 1))
+    own = np.column_stack(
+        [0 * moments, (moments - start) / NS_PER_S, places, of_box, yaw_of(pose), 0 * moments + OWN_SIGMA_RAD]
+    )
     seen = link_boxes(detect_boxes(log, lidars_on_ego(log), of_vehicle, moments, floor), unit.site_m, start)
     road = link_boxes(detect_boxes(log, unit.lidars, of_road, moments, at_pole), unit.site_m, start)
     return CommonObjects.of((track_of(own), *seen), road)
@@ -188,18 +198,31 @@ def estimate_error(sight: Sight) -> Estimate:
     values, covariance = max(tried, key=lambda found: _gain(sight, found[0], OBJECT_WITHIN_M[-1]))
     return Estimate(
         values,
-        covariance,
+        covariance + sight.of_poses,
         (_structure(sight, np.zeros(7), JUDGED_WITHIN_M), _structure(sight, values, JUDGED_WITHIN_M)),
         (_objects(sight, np.zeros(7), OBJECT_WITHIN_M[0]), _objects(sight, values, OBJECT_WITHIN_M[0])),
     )
 
 
-def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate:
-    """Return the estimate with the errors of the ego's poses in its covariance: those that the track states, and those seen.
+def covariance_of_poses(track: PoseTrack, view: VehicleView) -> Array:
+    """Compute how far the errors of the ego's poses move a unit: the covariance (7, 7) of what it seems to lack.
+
+    The poses err for seconds, so that the mean over the ego's way errs by the root of `PARTS` less. What is turned where the ego is, at
+    the middle of its sweeps, moves the site by its distance from there too.
+    """
+    sigma_m, sigma_rad = track.sigmas_at(view.t_ns, (USUAL_SIGMA_M, USUAL_SIGMA_RAD)).mean(axis=0)
+    site_T_ego = adjoint_of(transform(np.eye(3), view.sensor_m.mean(axis=0)))
+    out = np.zeros((7, 7))
+    out[POSE, POSE] = site_T_ego @ np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3) @ site_T_ego.T / PARTS
+    return out
+
+
+def add_drift(sight: Sight, found: Estimate) -> Estimate:
+    """Return the estimate with the drift of the ego's poses that is seen in its covariance.
 
     Notes
     -----
-    The ego's poses err for seconds. What parts of its way say about the unit's pose differs by that, and the mean of them all
+    What parts of the ego's way say about the unit's pose differs by the errors of its poses, and the mean of them all
     errs by the square root of their number less. Of each kind, translation and rotation, one variance is taken for all axes.
     """
     if sight.view is None:
@@ -208,17 +231,14 @@ def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate
     for part in (part for part in sight.view.parts(PARTS) if len(part.xyz_m)):
         of_part = replace(sight, view=part, surfaces=surfaces_of(part, road), ground=common_ground(part, road))
         fits.append(_refine(of_part, np.zeros(7), with_objects=False))
-    variance = np.zeros(7)
-    if len(fits) == PARTS:
-        values = np.array([value for value, _ in fits])
-        # What structure does not hold scatters by the noise of surfaces alone.
-        held = np.max([np.diag(covariance) for _, covariance in fits], axis=0) < (HELD_SHARE * PRIOR_SIGMA) ** 2
-        for rows in (np.arange(3), np.arange(3, DELAY)):
-            if held[rows].any():
-                variance[rows] = values[:, rows[held[rows]]].var(axis=0, ddof=1).mean() / PARTS
-    sigma_m, sigma_rad = track.sigmas_at(sight.view.t_ns, (0.0, 0.0)).mean(axis=0)
-    variance[:3] += sigma_m**2
-    variance[5] += sigma_rad**2
+    if len(fits) < PARTS:
+        return found
+    values, variance = np.array([value for value, _ in fits]), np.zeros(7)
+    # What structure does not hold scatters by the noise of surfaces alone.
+    held = np.max([np.diag(covariance) for _, covariance in fits], axis=0) < (HELD_SHARE * PRIOR_SIGMA) ** 2
+    for rows in (np.arange(3), np.arange(3, DELAY)):
+        if held[rows].any():
+            variance[rows] = values[:, rows[held[rows]]].var(axis=0, ddof=1).mean() / PARTS
     return replace(found, covariance=found.covariance + np.diag(variance))
 
 
@@ -267,14 +287,13 @@ MIN_SHIFT_M, MIN_TURN_RAD, MIN_DELAY_S = 0.1, np.radians(0.3), 0.02
 # Chance explains as much in one of 100 checks of six normal variables, or of the three in the plane (chi-square), and in one of
 # 300 of one. The sigmas of poses are bounds by what points have in common: on streets with houses, estimates are within a third.
 MAX_CHANCE_CHI2, MAX_CHANCE_PLANE_CHI2, MIN_SIGMAS = 16.8, 11.3, 3.0
-# Nothing is verified that could be off by more than objects are apart.
+# Nothing is corrected by what could be off by more than objects are apart.
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.25, np.radians(1.0)
 # Of upright points that the vehicle looked at, the share that it saw through: in synthetic streets up to 3 % with a right pose,
 # 7 % with an error of 0.5 m and 2 degrees, 17 to 77 % with larger ones.
 MAX_CONTRADICTING, MAX_LEFT, MIN_LOOKED_AT = 0.2, 0.1, 50
 # Of matched points, where both ends show one place; in synthetic streets 66 to 96 % of them lie on surfaces, of wrong ones 20 to 36 %.
 MIN_ON_SURFACE = 0.5
-POSE = slice(0, DELAY)
 HEIGHT_AND_TILT, PLANE = [2, 3, 4], [0, 1, 5]
 
 
@@ -295,7 +314,7 @@ class Findings:
     def _looked_rows(self) -> list[int]:
         """The rows of the pose that both ends show: all, or height, roll and pitch where the ground alone ties them."""
         certain = self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 and self._objects_agree
-        return list(range(DELAY)) if self.verified or certain else HEIGHT_AND_TILT
+        return list(range(DELAY)) if self._known_to(MAX_SIGMA_M, MAX_SIGMA_RAD) or certain else HEIGHT_AND_TILT
 
     @property
     def _objects_agree(self) -> bool:
@@ -352,9 +371,12 @@ class Findings:
 
     @cached_property
     def verified(self) -> bool:
-        """Whether the pose is known in the plane, in which agents are placed, as well as it must be."""
+        """Whether the pose is known in the plane, in which agents are placed, to what matters."""
+        return self._known_to(MIN_SHIFT_M, MIN_TURN_RAD)
+
+    def _known_to(self, sigma_m: float, sigma_rad: float) -> bool:
         plane = np.linalg.eigvalsh(self.found.covariance[:2, :2])[-1]
-        return bool(self._fits and np.sqrt(plane) < MAX_SIGMA_M and self.sigma[5] < MAX_SIGMA_RAD)
+        return bool(self._fits and np.sqrt(plane) < sigma_m and self.sigma[5] < sigma_rad)
 
     @cached_property
     def contradicted(self) -> bool:
@@ -370,11 +392,14 @@ class Findings:
 
     @cached_property
     def applied(self) -> Array:
-        """What is corrected (7,): all, or what is likeliest of a part where the rest is taken to be right."""
+        """What is corrected (7,): the whole pose as it was found, or what is likeliest of a part where the rest is taken to be right."""
         rows = [*(self._looked_rows if self.moved else []), *([DELAY] if self.late else [])]
         if self.contradicted or not rows:
             return np.zeros(7)
-        return self.found.values if len(rows) == len(self.found.values) else self._likeliest(rows)[0]
+        if rows[:DELAY] != list(range(DELAY)):
+            return self._likeliest(rows)[0]
+        # A delay that is not certain is not applied, but may well be there: the pose is not what it would be without.
+        return self.found.values * np.isin(np.arange(7), rows)
 
     @property
     def correction(self) -> Array:
@@ -466,8 +491,7 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
     at_road = [n for n, lidar in used.lidars.items() if lidar.mount == "map" and len(log.streams[n].t_ns)]
     if not config.cooperation.register_road or log.ego is None or not at_road or not lidars_on_ego(used):
         return RoadRegistration(log)
-    ego, figures = log.ego, []
-    faults: list[Finding] = []
+    figures, faults = list[dict[str, Any]](), list[Finding]()
     for unit in units_of(used, at_road):
         stage = f"register {unit.lidars[0]}"
         sight = collect_sight(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]
@@ -480,7 +504,7 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
         shift_m, turn_rad = np.linalg.norm(found.values[:3]), np.linalg.norm(found.values[3:DELAY])
         if findings.moved and shift_m < MAX_POSE_ERROR_M and turn_rad < MAX_POSE_ERROR_RAD:
             # It may be an error of the ego's poses.
-            findings = replace(findings, found=add_pose_errors(sight, found, ego))
+            findings = replace(findings, found=add_drift(sight, found))
         if findings.applied.any():
             log = correct_unit(log, unit, findings.correction, float(findings.applied[-1]))
         faults += findings.faults()

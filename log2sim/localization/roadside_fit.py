@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
-from log2sim.datatypes import Boxes3D, Log, Sweep
-from log2sim.geometry import NS_PER_S, Array, nearest_index
+from log2sim.datatypes import Log, Sweep
+from log2sim.geometry import NS_PER_S, Array, nearest_index, wrap_angle
 from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
 from log2sim.localization.surfaces import (
     CAUCHY,
@@ -24,6 +24,8 @@ from log2sim.localization.surfaces import (
     number_voxels,
     thin,
 )
+from log2sim.perception.boxes import rotate
+from log2sim.perception.cooperative import SeenBoxes, refine_boxes
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Ground, assemble_cloud, estimate_ground, sweep_to_map
 from log2sim.perception.records import RecordSource
@@ -314,8 +316,8 @@ def choose_moments(log: Log, site_m: Array, during_ns: tuple[int, int] | None, c
 
 def detect_boxes(
     log: Log, lidars: Sequence[str], detector: LidarDetector, moments_ns: NDArray[np.int64], floor_m: Array
-) -> list[Boxes3D]:
-    """Detect road users in the clouds of some LiDARs nearest to moments (K,).
+) -> list[SeenBoxes]:
+    """Detect road users in the clouds of some LiDARs nearest to moments (K,); sides are moved to the points.
 
     `floor_m`: (K, 3): where clouds begin: a place on the ground, map frame.
     """
@@ -333,7 +335,8 @@ def detect_boxes(
         )
         if cloud is not None:
             boxes = detector.detect(cloud)
-            out.append(boxes.take(boxes.score >= MIN_SCORE))
+            boxes = refine_boxes(boxes.take(boxes.score >= MIN_SCORE), cloud)
+            out.append(SeenBoxes.of(boxes, cloud.sensor.astype(np.float64) + cloud.origin))
     return out
 
 
@@ -538,45 +541,42 @@ MAX_GAP_S = 0.7
 MIN_STEP_S, UNLIKELY_M = 0.01, 1e6
 # Kinds of road users that detectors distinguish.
 GROUPS = {"car": 0, "truck": 0, "bus": 0, "pedestrian": 1, "cyclist": 2, "motorcycle": 2, "bicycle": 2}
-# How far centers of boxes by both ends are apart, measured in synthetic streets and roads with exact poses: the standard
-# deviation of one, and what all of one object have in common, as each end sees another side of it. Along and across the motion
-# of a vehicle, of others that move, and of what stands, which says little.
-SPREAD_M = {
-    "vehicle": ((0.17, 0.09), (0.2, 0.1)),
-    "small": ((0.07, 0.07), (0.12, 0.08)),
-    "standing": ((0.1, 0.1), (0.3, 0.3)),
-}
-# Of boxes with so many points; those with fewer err more.
-USUAL_POINTS, MAX_FACTOR = 100.0, 3.0
+
+
+# Axes of boxes that differ by more are those of a length and of a width, or of somebody who walks, whose axes say little.
+MAX_AXES_APART_RAD = np.pi / 4
 # Two tracks of one object have velocities as similar as boxes over a second show.
 MAX_VELOCITY_APART_MPS = 4.0
 # Boxes so many standard deviations apart count a quarter (Geman, McClure 1987), as they may be of different objects.
 TOO_FAR = 2.5
 MOVING_MPS = 1.0
+# Columns of `ObjectTrack.box`.
+HALF, SIDES, YAW, YAW_SIGMA = slice(3, 5), slice(5, 9), 9, 10
 # By an error of a unit's pose, and of boxes.
 MAX_APART_M = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """Places of one road user as one end saw it."""
+    """Boxes of one road user as one end saw it."""
 
     t_s: Array  # (K,): since a common time, by the clock of the end, increasing
-    xyz_m: Array  # (K, 3): in the frame of the site
+    # (K, 11): place in the frame of the site, half the length and the width, standard deviations of the rear, the front, the
+    # right and the left side, m; yaw without jumps by half turns and more, and its standard deviation, rad
+    box: Array
     velocity_mps: Array  # (K, 2)
     group: int
-    points: float = np.inf  # median number of points in its boxes
 
     def at(self, t_s: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Interpolate places (N, 3) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
+        """Interpolate boxes (N, 11) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
         after = np.searchsorted(self.t_s, t_s, side="left").clip(1, len(self.t_s) - 1)
         begin, gap = self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
         share = ((t_s - begin) / gap)[:, None]
-        place, velocity = (c[after - 1] + share * (c[after] - c[after - 1]) for c in (self.xyz_m, self.velocity_mps))
-        return place, velocity, (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & (gap <= MAX_GAP_S)
+        box, velocity = (c[after - 1] + share * (c[after] - c[after - 1]) for c in (self.box, self.velocity_mps))
+        return box, velocity, (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & (gap <= MAX_GAP_S)
 
 
-def link_boxes(boxes: Sequence[Boxes3D], site_m: Array, start_ns: int) -> list[ObjectTrack]:
+def link_boxes(boxes: Sequence[SeenBoxes], site_m: Array, start_ns: int) -> list[ObjectTrack]:
     """Link boxes of successive moments to tracks."""
     growing: list[list[Array]] = []
     done: list[list[Array]] = []
@@ -590,39 +590,44 @@ def link_boxes(boxes: Sequence[Boxes3D], site_m: Array, start_ns: int) -> list[O
         for b, a in taken.items():
             growing[a].append(rows[b])
         growing += [[row] for b, row in enumerate(rows) if b not in taken]
-        over_s = rows[:, 0].max() - MAX_GAP_S
-        done += [track for track in growing if track[-1][0] < over_s]
-        growing = [track for track in growing if track[-1][0] >= over_s]
+        over_s = rows[:, 1].max() - MAX_GAP_S
+        done += [track for track in growing if track[-1][1] < over_s]
+        growing = [track for track in growing if track[-1][1] >= over_s]
     return [track_of(np.array(track)) for track in (*done, *growing) if len(track) >= MIN_BOXES]
 
 
-def _rows_of(boxes: Boxes3D, site_m: Array, start_ns: int) -> Array:
-    """Return rows (M, 6) of time, place, group, and number of points."""
-    group = [GROUPS.get(str(category), -1) for category in boxes.category]
-    return np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, group, boxes.points])
+def _rows_of(seen: SeenBoxes, site_m: Array, start_ns: int) -> Array:
+    """Return rows (M, 13) of group, time, and box as in `ObjectTrack`."""
+    boxes, group = seen.boxes, [GROUPS.get(str(category), -1) for category in seen.boxes.category]
+    sides = seen.sigma_m.reshape(-1, 4)
+    at = np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, boxes.size_m[:, :2] / 2])
+    return np.column_stack([group, at, sides, boxes.yaw_rad, seen.sigma_rad])
 
 
 def _costs(track: list[Array], rows: Array) -> Array:
     """Compute how far boxes (M,) are from where a track leads, m; infinite where they cannot be one object."""
     last = track[-1]
-    ahead_s = rows[:, 0] - last[0]
-    expected, limit = last[1:3], MAX_SPEED_MPS * ahead_s + MAX_JUMP_M
+    ahead_s = rows[:, 1] - last[1]
+    expected, limit = last[2:4], MAX_SPEED_MPS * ahead_s + MAX_JUMP_M
     if len(track) > 1:
-        velocity = (last[1:3] - track[-2][1:3]) / (last[0] - track[-2][0])
-        expected, limit = last[1:3] + velocity * ahead_s[:, None], np.full(len(rows), MAX_JUMP_M)
-    away = np.hypot(*(rows[:, 1:3] - expected).T)
-    return np.where((rows[:, 4] == last[4]) & (ahead_s > MIN_STEP_S) & (away < limit), away, np.inf)
+        velocity = (last[2:4] - track[-2][2:4]) / (last[1] - track[-2][1])
+        expected, limit = last[2:4] + velocity * ahead_s[:, None], np.full(len(rows), MAX_JUMP_M)
+    away = np.hypot(*(rows[:, 2:4] - expected).T)
+    return np.where((rows[:, 0] == last[0]) & (ahead_s > MIN_STEP_S) & (away < limit), away, np.inf)
 
 
 def track_of(rows: Array) -> ObjectTrack:
-    """Make a track of rows (K, 6): time, place, group, number of points."""
-    t_s, xyz = rows[:, 0], rows[:, 1:4]
+    """Make a track of rows (K, 13): group, time, and box as in `ObjectTrack`, whose yaw may jump."""
+    t_s, box = rows[:, 1], rows[:, 2:].copy()
+    box[:, YAW] = np.unwrap(rows[:, 2 + YAW], period=np.pi)
+    turned = np.cos(box[:, YAW] - rows[:, 2 + YAW]) < 0
+    box[turned, SIDES] = box[turned][:, [6, 5, 8, 7]]
     near = np.abs(t_s[:, None] - t_s) <= VELOCITY_SPAN_S
     count = near.sum(axis=1)
     mean_s = near @ t_s / count
     off_s = np.where(near, t_s - mean_s[:, None], 0.0)
-    velocity = (off_s @ xyz[:, :2]) / np.maximum((off_s**2).sum(axis=1), 1e-6)[:, None]
-    return ObjectTrack(t_s, xyz, velocity, int(rows[0, 4]), float(np.median(rows[:, 5])))
+    velocity = (off_s @ box[:, :2]) / np.maximum((off_s**2).sum(axis=1), 1e-6)[:, None]
+    return ObjectTrack(t_s, box, velocity, int(rows[0, 0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -642,7 +647,7 @@ def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
     if first.group != second.group:
         return False
     (low, high), (other_low, other_high) = (
-        (track.xyz_m[:, :2].min(axis=0), track.xyz_m[:, :2].max(axis=0)) for track in (first, second)
+        (track.box[:, :2].min(axis=0), track.box[:, :2].max(axis=0)) for track in (first, second)
     )
     return bool((low < other_high + MAX_APART_M).all() and (other_low < high + MAX_APART_M).all())
 
@@ -659,41 +664,31 @@ class Matched:
 
 
 def match_objects(objects: CommonObjects, correction: Array, delay_s: float, within_m: float) -> Matched | None:
-    """Match places of road users with those nearest to them, given a correction (4, 4) and a delay of the road's stamps."""
+    """Match boxes of road users with those nearest to them, given a correction (4, 4) and a delay of the road's stamps."""
     information, gradient = np.zeros((7, 7)), np.zeros(7)
     away, moving, gain = [], 0, 0.0
     for seen, others in objects.pairs:
         best = _best_match(seen, others, correction, delay_s, within_m)
         if best is None:
             continue
-        place, velocity, off, points = best
-        away.append(np.hypot(*off.T))
-        moves, turn, sigma, bias = _spread_of(seen, velocity, min(points, seen.points))
-        moving += moves
+        axes, place, velocity, off, sigma = best
+        away.append(np.hypot(*off[:, :2].T))
+        moving += float(np.hypot(*velocity.mean(axis=0))) > MOVING_MPS
         gain += float((1 - away[-1] ** 2 / within_m**2).sum())
-        turned, jacobian = off @ turn.T, turn @ _jacobian(place, velocity)
-        # Boxes that jump say less than their number, all together too.
-        sigma, bias = np.maximum(sigma, turned.std(axis=0)), np.maximum(bias, turned.std(axis=0))
-        share = (1.0 + (turned**2 / (sigma**2 + bias**2)).sum(axis=1) / TOO_FAR**2) ** -2.0
-        weight = share[:, None] / (sigma**2 + share.sum() * bias**2)
+        jacobian = np.zeros((len(off), 3, 7))
+        jacobian[:, :2] = axes @ _jacobian(place, velocity)
+        jacobian[:, 2, 5] = 1.0
+        # Each end sees the same sides again and again, so that all boxes of a track say as much as one; those that jump say less.
+        sigma = np.maximum(sigma, off.std(axis=0))
+        share = (1.0 + ((off / sigma)[:, :2] ** 2).sum(axis=1) / TOO_FAR**2) ** -2.0
+        weight = (share / share.sum())[:, None] / sigma**2
         information += np.einsum("naj,na,nak->jk", jacobian, weight, jacobian)
-        gradient += np.einsum("naj,na,na->j", jacobian, weight, turned)
+        gradient += np.einsum("naj,na,na->j", jacobian, weight, off)
     if not away:
         return None
     # Of a distance in the plane, the median is 1.18 times the standard deviation along an axis.
     rms_m = float(np.median(np.concatenate(away))) / 1.18 * np.sqrt(2.0)
     return Matched(Evidence(information, gradient), len(away), moving, gain, float(rms_m))
-
-
-def _spread_of(seen: ObjectTrack, velocity: Array, points: float) -> tuple[bool, Array, Array, Array]:
-    """Return whether an object moves, the axes (2, 2) along and across its motion, and the sigmas and biases (2,) along them."""
-    forward = velocity.mean(axis=0)
-    speed = float(np.hypot(*forward))
-    moves = speed > MOVING_MPS
-    kind = "standing" if not moves else "vehicle" if seen.group == GROUPS["car"] else "small"
-    sigma, bias = np.array(SPREAD_M[kind]) * np.clip(np.sqrt(USUAL_POINTS / points), 1.0, MAX_FACTOR)
-    x, y = forward / speed if moves else (1.0, 0.0)
-    return moves, np.array([[x, y], [-y, x]]), sigma, bias
 
 
 def _jacobian(place: Array, velocity: Array) -> Array:
@@ -706,20 +701,50 @@ def _jacobian(place: Array, velocity: Array) -> Array:
     return out
 
 
+Match = tuple[Array, Array, Array, Array, Array]
+"""Of N boxes: axes (N, 2, 2), places (N, 3), velocities (N, 2), and along both axes and in yaw offsets (N, 3) and their sigmas."""
+
+
 def _best_match(
     seen: ObjectTrack, road: Sequence[ObjectTrack], correction: Array, delay_s: float, within_m: float
-) -> tuple[Array, Array, Array, float] | None:
-    """Find the track of the road that a vehicle's track is nearest to: places, velocities, offsets from the latter's, and points."""
-    best, best_gain = None, 0.0
+) -> Match | None:
+    """Find the track of the road whose boxes lie on those of a vehicle's track best."""
+    best: Match | None = None
+    best_gain = 0.0
     for other in road:
-        place, velocity, known = other.at(seen.t_s + delay_s)
+        box, velocity, known = other.at(seen.t_s + delay_s)
         known &= np.hypot(*(velocity - seen.velocity_mps).T) < MAX_VELOCITY_APART_MPS
         if not known.any():
             continue
-        place = place @ correction[:3, :3].T + correction[:3, 3]
-        off = (place - seen.xyz_m)[:, :2]
-        known &= np.hypot(*off.T) < within_m
-        gain = float((1 - (off[known] ** 2).sum(axis=1) / within_m**2).sum())
+        box[:, :3] = box[:, :3] @ correction[:3, :3].T + correction[:3, 3]
+        box[:, YAW] += np.arctan2(correction[1, 0], correction[0, 0])
+        off, sigma = _offsets(seen.box, box, walks=seen.group == GROUPS["pedestrian"])
+        away = np.hypot(*off[:, :2].T)
+        known &= away < within_m
+        gain = float((1 - away[known] ** 2 / within_m**2).sum())
         if gain > best_gain and known.sum() >= min(MIN_BOXES, len(known)):
-            best, best_gain = (place[known], velocity[known], off[known], other.points), gain
+            cos, sin = np.cos(seen.box[:, YAW]), np.sin(seen.box[:, YAW])
+            axes = np.stack([cos, sin, -sin, cos], axis=1).reshape(-1, 2, 2)
+            best = axes[known], box[known, :3], velocity[known], off[known], sigma[known]
+            best_gain = gain
     return best
+
+
+def _offsets(seen: Array, road: Array, *, walks: bool) -> tuple[Array, Array]:
+    """Compare boxes (N, 11) along the axes of the first ones: offsets (N, 3) of the others, m and rad of yaw, and their sigmas.
+
+    Each end knows the sides that it sees: what both see well decides, not the centers.
+    """
+    turn = road[:, YAW] - seen[:, YAW]
+    center = rotate(road[:, :2] - seen[:, :2], -seen[:, YAW])
+    sides = [np.square(box[:, SIDES]).reshape(-1, 2, 2) for box in (seen, road)]
+    sides[1] = np.where((np.cos(turn) < 0)[:, None, None], sides[1][..., ::-1], sides[1])
+    variance = sides[0] + sides[1]
+    weight = 1 / variance
+    longer = (road[:, HALF] - seen[:, HALF]) * (weight[..., 1] - weight[..., 0]) / weight.sum(axis=-1)
+    off_yaw = wrap_angle(2 * turn) / 2
+    alike = (np.abs(off_yaw) < MAX_AXES_APART_RAD) & (not walks)
+    off = np.where(alike[:, None], center + longer, center)
+    sigma = np.where(alike[:, None], np.sqrt(1 / weight.sum(axis=-1)), np.sqrt(variance.sum(axis=-1)) / 2)
+    yaw_sigma = np.where(alike, np.hypot(seen[:, YAW_SIGMA], road[:, YAW_SIGMA]), np.inf)
+    return np.column_stack([off, np.where(alike, off_yaw, 0.0)]), np.column_stack([sigma, yaw_sigma])

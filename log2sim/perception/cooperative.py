@@ -78,6 +78,8 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
 
 # Fewer points are too far apart to say where a side ends: in random scenes they made boxes worse.
 MIN_REFINED_POINTS = 20
+# Between the sweeps of two ends, road users in towns move so far.
+MOVED_M = 0.3
 
 
 def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
@@ -352,6 +354,37 @@ def merge_by_points(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
     return replace(chosen, boxes=_join_evidence(merged, a.boxes, b.boxes))
 
 
+def refine_by_views(boxes: Boxes3D, views: Sequence[Cloud]) -> Boxes3D:
+    """Move the sides of boxes (M,) that were found in the points of several viewpoints to where each of these sees them.
+
+    What a network makes of the points of both ends is less exact than what the sides show that each end sees well, put to one time.
+    """
+    rows, known = np.zeros(0, dtype=np.intp), list[SeenBoxes]()
+    for view in views:
+        # Objects move between the times of the viewpoints.
+        around = boxes.center_m - view.origin, boxes.size_m + 2 * MOVED_M, boxes.yaw_rad
+        inside = points_of_boxes(view.xyz, *around, ~view.ground)
+        count = np.bincount(inside.box, minlength=len(boxes))
+        late_s = np.bincount(inside.box, view.t_s[inside.point], len(boxes)) / np.maximum(count, 1)
+        t_ns = view.stamp_ns + np.round(late_s * NS_PER_S).astype(np.int64)
+        own = np.flatnonzero(count >= MIN_REFINED_POINTS)
+        found = refine_boxes(replace(boxes, points=count, t_ns=t_ns).take(own), view)
+        seen = SeenBoxes.of(found, view.sensor.astype(np.float64) + view.origin)
+        if known:
+            _, i, j = np.intersect1d(rows, own, return_indices=True)
+            alone, new = np.setdiff1d(np.arange(len(rows)), i), np.setdiff1d(np.arange(len(own)), j)
+            parts = [merge_by_covariance(known[0].take(i), seen.take(j)), known[0].take(alone), seen.take(new)]
+            rows, known = np.concatenate([rows[i], rows[alone], own[new]]), [join(parts)]
+        else:
+            rows, known = own, [seen]
+    if not known:
+        return boxes
+    t_ns, center, size, yaw = boxes.t_ns.copy(), boxes.center_m.copy(), boxes.size_m.copy(), boxes.yaw_rad.copy()
+    refined = known[0].boxes
+    t_ns[rows], center[rows], size[rows], yaw[rows] = refined.t_ns, refined.center_m, refined.size_m, refined.yaw_rad
+    return replace(boxes, t_ns=t_ns, center_m=center, size_m=size, yaw_rad=yaw)
+
+
 METHODS = {
     "covariance": Method(match_by_covariance, merge_by_covariance, True),
     "overlap": Method(match_by_overlap, merge_by_points, False),
@@ -524,6 +557,8 @@ def _members(boxes: Boxes3D, speed: Array, cloud: Cloud, index: NDArray[np.intp]
 
 
 AUTO = "auto"
+# What labels say is not to be moved.
+LABELS = "lidar:labels"
 
 
 @dataclass(frozen=True, eq=False)
@@ -531,24 +566,28 @@ class EndsDetector:
     """Detector of road users in the clouds of both ends."""
 
     vehicle: LidarDetector  # `vehicle`, `road`: for the clouds of each end
-    road: LidarDetector
+    road: LidarDetector | None  # without it the points of both ends are searched together, by the vehicle's
     method: Method | None  # how boxes of the ends are joined; without it each end keeps its own
 
     @property
     def name(self) -> str:
         """Names of both detectors, the vehicle's first; one where they are the same."""
-        names = dict.fromkeys((self.vehicle.name, self.road.name))
+        names = dict.fromkeys(d.name for d in (self.vehicle, self.road) if d is not None)
         return "|".join(names)
 
     @property
     def cache_key(self) -> str | None:
         """What its boxes depend on besides the clouds; None where a detector does not say."""
-        keys = [getattr(detector, "cache_key", None) for detector in (self.vehicle, self.road)]
+        keys = [
+            "" if detector is None else getattr(detector, "cache_key", None) for detector in (self.vehicle, self.road)
+        ]
         method = [name for name, method in METHODS.items() if method is self.method]
         return f"{keys} {method}" if all(isinstance(key, str) for key in keys) else None
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in the cloud of each viewpoint and join them; `earlier` clouds are those of the same viewpoint."""
+        if self.road is None:
+            return refine_by_views(self.vehicle.detect(cloud, earlier), cloud.parts)
         parts = [self._search(view, earlier) for view in cloud.views]
         if self.method is None:
             out = join(parts).boxes
@@ -559,7 +598,7 @@ class EndsDetector:
 
     def _search(self, view: Cloud, earlier: Sequence[Cloud]) -> SeenBoxes:
         """Search the cloud of one viewpoint."""
-        detector = self.road if view.end == ROAD else self.vehicle
+        detector = (self.road if view.end == ROAD else None) or self.vehicle
         before = [other for cloud in earlier for other in cloud.views if _is_same_view(view, other)]
         found = detector.detect(view, before)
         if self.method is not None and self.method.refines:
@@ -583,8 +622,10 @@ def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None
     """
     name, level = config.detect.in_sweeps, fusion_level(log, config)[0]
     vehicle = given or create_lidar_detector(name, log, config.lidar)
-    if level in (None, FusionLevel.POINTS):
+    if level is None or (level is FusionLevel.POINTS and name == LABELS):
         return vehicle
+    if level is FusionLevel.POINTS:
+        return EndsDetector(vehicle, None, None)
     chosen = config.cooperation.road_detector
     road_name = detector_by_mounting(log, name) if chosen == AUTO else chosen
     road = vehicle if road_name == name else create_lidar_detector(road_name, log, config.lidar)
